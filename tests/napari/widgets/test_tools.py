@@ -8,11 +8,12 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from qtpy.QtWidgets import QFileDialog
+from qtpy.QtWidgets import QFileDialog, QLabel
 
 from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import metadata_for, role_of, source_of, unit_of
 from napari_shadowinv._napari.layers import add_inversion
+from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, ModelPicker
 from napari_shadowinv._napari.widgets.line_profile import measure_peak
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
@@ -55,6 +56,40 @@ def test_a_widget_fits_beside_the_canvas(
         assert widget.width() >= widget.minimumSizeHint().width()
         bottom = widget.mapTo(window.window._qt_window, widget.rect().bottomLeft()).y()
         assert bottom <= size[1]
+
+
+def orange_texts(tool: Any) -> list[str]:
+    return [
+        label.text()
+        for label in tool.findChildren(QLabel)
+        if PROBLEM_STYLE in label.styleSheet() and label.text() and label.isVisibleTo(tool)
+    ]
+
+
+def test_nothing_is_orange_before_something_is_typed(
+    window: Any, open_widget: Any, shot: Array, qtbot: Any
+) -> None:
+    """In every form that can be chosen, and once there is an image."""
+    tools = {name: open_widget(name) for name in NAMES}
+    chosen = 0
+    for name, tool in tools.items():
+        assert orange_texts(tool) == [], name
+        for picker in tool.findChildren(ModelPicker):
+            before = picker.choice.currentIndex()
+            for index in range(picker.choice.count()):
+                picker.choice.setCurrentIndex(index)
+                assert orange_texts(tool) == [], (name, picker.choice.currentText())
+                chosen += 1
+            picker.choice.setCurrentIndex(before)
+    assert chosen > 20
+    window.add_image(shot, name="shot")
+    qtbot.wait(50)
+    for name, tool in tools.items():
+        assert orange_texts(tool) == [], name
+    setup = tools["Invert shot"].setup.picker
+    setup.set_kind("proton")
+    setup.form.editors["energy"].set_value(14.7)
+    assert any("source" in text for text in orange_texts(tools["Invert shot"]))
 
 
 def test_an_estimate_becomes_a_layer_after_its_preview(

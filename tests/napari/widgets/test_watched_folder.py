@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._napari.layer_metadata import metadata_of, role_of
+from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -106,16 +107,29 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
     qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
 
 
-def test_it_fits_and_a_folder_that_is_not_there_is_a_mistake(
-    tool: Any, qtbot: Any, messages: list[str], assert_it_fits: Any, tmp_path: Path
+def test_it_fits_and_a_refused_watch_has_its_reason_under_the_button(
+    tool: Any, qtbot: Any, messages: list[str], assert_it_fits: Any, tmp_path: Path, out: Path
 ) -> None:
     assert_it_fits(tool)
-    tool.shots.folder.folder.edit.setText(str(tmp_path / "nowhere"))
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(messages), timeout=PATIENCE)
-    assert "does not exist: expected a folder to watch" in messages[0]
-    messages.clear()
-    tool.shots.folder.folder.edit.setText("")
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(messages), timeout=PATIENCE)
-    assert "o folder is selected" in messages[0]
+    (tmp_path / "notes.txt").write_text("no folder")
+    reasons = {
+        str(tmp_path / "nowhere"): "does not exist: expected a folder to watch",
+        str(tmp_path / "notes.txt"): "expected a folder to watch",
+        "": "o folder is selected",
+    }
+    for folder, reason in reasons.items():
+        messages.clear()
+        tool.shots.folder.folder.edit.setText(folder)
+        tool.panel.button.click()
+        qtbot.waitUntil(lambda: bool(messages), timeout=PATIENCE)
+        qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+        qtbot.wait(50)
+        status, button = tool.panel.status, tool.panel.button
+        assert reason in messages[0]
+        assert status.text() == messages[0]
+        assert status.styleSheet() == PROBLEM_STYLE
+        assert not status.visibleRegion().isEmpty()
+        assert status.geometry().top() > button.geometry().bottom()
+        assert button.text() == "Run"
+        assert button.isEnabled()
+    assert not out.exists()

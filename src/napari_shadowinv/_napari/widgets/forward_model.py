@@ -260,12 +260,13 @@ class ForwardModel(ToolPanel):
         self.keep()
 
     def _show_interpretation(self) -> None:
+        layer = self.potential.layer
         try:
-            layer = self.potential.layer
             field = input_field(layer, self.viewer.dims.point, self.setup.setup())
         except InputError as error:
             self.interpretation.setText(error_text(error))
-            self.interpretation.setStyleSheet(forms.PROBLEM_STYLE)
+            # Nothing to choose from yet is no mistake.
+            self.interpretation.setStyleSheet("" if layer is None else forms.PROBLEM_STYLE)
             return
         self.interpretation.setText(field.text)
         is_unlabelled = not is_field(layer)
