@@ -33,6 +33,7 @@ def test_a_fit_tells_that_it_compiles_and_can_be_cancelled(monkeypatch: pytest.M
         "noise": 0.1,
         "options": FitOptions(samples=0, steps=1),
     }
+    ensure_compiled()  # else transport tells that it compiles, too
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
     fit(images, **keywords, on_progress=progress.append)
     assert [news.stage for news in progress[:4]] == ["compile"] * 3 + ["fit"]

@@ -209,8 +209,8 @@ def test_sites_are_hidden_when_their_cells_are_empty(kind: str, seed: int) -> No
 @given(seed=seeds, spread=st.sampled_from([0.0, 1e-4, 1e-2]))
 def test_power_centres_span_the_cells(seed: int, spread: float) -> None:
     rng = np.random.default_rng(seed)
-    sites = rng.random((80, 2))
-    triangulation = RegularTriangulation(sites, spread * rng.random(80))
+    sites = rng.random((40, 2))
+    triangulation = RegularTriangulation(sites, spread * rng.random(40))
     areas = dual_areas(triangulation)
     for i in np.flatnonzero(np.isfinite(areas) & ~triangulation.hidden):
         expected = area(clipped_cell(i, triangulation, 0.0))
