@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from napari.components import ViewerModel
-from qtpy.QtCore import QSettings
 
 from napari_shadowinv import OpticalSetup, ProtonSetup, read
 from napari_shadowinv._napari import samples
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of, source_of
-from napari_shadowinv._napari.widgets.fit_images import FitImages
-from napari_shadowinv.fitting import FitOptions, Verdict
 
 SHOTS = ("toroid", "toroid_with_caustics", "four_toroids", "coaxial_line")
 
@@ -62,29 +57,6 @@ def test_two_energies_are_one_object_in_one_beam_that_is_not_told(viewer: Viewer
     shares = np.array(corners) / np.mean(corners, axis=1, keepdims=True)
     assert np.ptp(shares[0]) > 0.2
     np.testing.assert_allclose(shares[0], shares[1], atol=0.05)
-
-
-def test_two_energies_are_fitted_as_they_open(
-    make_napari_viewer: Callable[[], Any], tmp_path: Path
-) -> None:
-    QSettings.setPath(QSettings.Format.IniFormat, QSettings.Scope.UserScope, str(tmp_path))
-    viewer = make_napari_viewer()
-    viewer.open_sample("napari-shadowinv", "two_energies")
-    tool = FitImages(viewer)
-    tool.source.picker.set_kind("unknown")
-    tool.noise.setCurrentIndex(tool.noise.findData("poisson"))
-    job = tool.request()
-    assert job.names == ("14.7 MeV", "3 MeV")
-    setups: Any = [shot.setup for shot in job.shots]
-    assert [setup.energy for setup in setups] == [14.7, 3.0]
-    choices = job.choices.model_copy(update={"options": FitOptions(samples=0)})
-    fit_result = replace(job, recipe=job.recipe.model_copy(update={"fit": choices})).compute()
-    assert fit_result.verdict is Verdict.DETERMINED
-    (field,) = fit_result.fields
-    strength = np.hypot(*setups[0].path_integrated_b(field.displacement, "MG um"))
-    assert strength.max() == pytest.approx(30.3, rel=0.02)
-    unevenness = fit_result.source[0].std() / fit_result.source[0].mean()
-    assert unevenness == pytest.approx(0.103, rel=0.05)
 
 
 def test_the_same_sample_is_the_same_every_time() -> None:

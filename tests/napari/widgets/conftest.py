@@ -27,9 +27,9 @@ def settings_folder(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def _lasting() -> None:
-    """Exclude lasting objects from the garbage collections of napari, two a test."""
+    """Exclude what earlier modules leave from the garbage collections of napari, two a test."""
     import_module("napari._qt.qt_main_window")
     gc.collect()
     gc.freeze()
