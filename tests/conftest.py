@@ -49,6 +49,16 @@ def opened_paths() -> Iterator[list[str]]:
     _opened_paths = None
 
 
+@pytest.fixture(scope="session", autouse=True)
+def dots_per_inch() -> int:
+    """Write figures with few pixels, which take half as long; return the usual resolution."""
+    from napari_shadowinv.plotting import _figures
+
+    usual = _figures.DOTS_PER_INCH
+    _figures.DOTS_PER_INCH = 40
+    return usual
+
+
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 

@@ -1269,7 +1269,7 @@ def test_neither_result_nor_figure_is_left_on_a_full_disk(
     disk, resize = small_disk
     assert resize("64k")
     for out, figure in (("shot.shadowinv", disk / "a.png"), (disk / "a.shadowinv", "a.png")):
-        (disk / "other").write_bytes(bytes(40_000))
+        (disk / "other").write_bytes(bytes(60_000))
         result = shadowinv("invert", shot, "--n-sites", 300, "--out", out, "--report", figure)
         assert result.exit_code == 2
         (line,) = result.stderr.splitlines()
