@@ -351,7 +351,7 @@ class Linear:
     @property
     def _has_others(self) -> bool:
         """Whether the Jacobians have columns for the beam and the frame."""
-        return self.jacobians[0].shape[1] > math.prod(self.scene.rays.shape)
+        return bool(self.jacobians[0].shape[1] > math.prod(self.scene.rays.shape))
 
     @cached_property
     def _transposed(self) -> list[csc_array]:
