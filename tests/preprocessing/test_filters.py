@@ -48,9 +48,9 @@ def test_high_pass_and_low_pass_add_up_to_the_image(width):
 @pytest.mark.parametrize("numbers", [(0, 4), (5, 0), (3, 7), (20, 31)])
 def test_gaussian_filters_attenuate_a_wave_by_the_textbook_factor(numbers):
     image, k = wave(*numbers)
-    kept = np.exp(-((2.0 * k) ** 2) / 2)
-    np.testing.assert_allclose(low_pass(image, 2.0), kept * image, atol=1e-14)
-    np.testing.assert_allclose(high_pass(image, 2.0), (1 - kept) * image, atol=1e-14)
+    gain = np.exp(-((2.0 * k) ** 2) / 2)
+    np.testing.assert_allclose(low_pass(image, 2.0), gain * image, atol=1e-14)
+    np.testing.assert_allclose(high_pass(image, 2.0), (1 - gain) * image, atol=1e-14)
 
 
 @pytest.mark.parametrize("order", [1, 2, 5, 400])
@@ -98,9 +98,9 @@ def test_the_kept_mean_does_not_keep_a_dark_spot_of_a_peaked_beam_positive():
 @pytest.mark.parametrize("name", FILTERS)
 def test_filters_ignore_units_and_leave_their_input_alone(name):
     image = random_image(3)
-    kept = image.copy()
+    original = image.copy()
     np.testing.assert_allclose(FILTERS[name](1e6 * image), 1e6 * FILTERS[name](image), rtol=1e-9)
-    np.testing.assert_array_equal(image, kept)
+    np.testing.assert_array_equal(image, original)
 
 
 @pytest.mark.parametrize("name", FILTERS)
@@ -157,9 +157,9 @@ def test_the_background_is_blind_to_what_the_mask_leaves_out():
     image = random_image(6)
     mask = np.ones(SHAPE, dtype=bool)
     mask[5:30, 10:50] = False
-    other = np.where(mask, image, 1e4 * image)
+    changed_image = np.where(mask, image, 1e4 * image)
     np.testing.assert_array_equal(
-        fit_polynomial(image, 2, mask=mask), fit_polynomial(other, 2, mask=mask)
+        fit_polynomial(image, 2, mask=mask), fit_polynomial(changed_image, 2, mask=mask)
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import (
     Estimate,
@@ -84,10 +85,10 @@ def test_a_source_that_is_dark_behind_the_source_mask_is_told_of() -> None:
     """A straight line that falls from 120 to 21 where it is seen, and below zero where not."""
     x = np.mgrid[: SHAPE[0], : SHAPE[1]][1]
     for image, count in ((np.maximum(120.0 - x, 15), 1), (np.full(SHAPE, 100.0), 0)):
-        told: list[str] = []
+        cautions: list[Caution] = []
         estimate = PolynomialEstimate(degree=1)
         shot = Radiograph(image, mask=DEAD, source_mask=x < 100)
-        estimated_source(estimate, shot, on_warning=told.append)
-        assert len(told) == count
+        estimated_source(estimate, shot, on_caution=cautions.append)
+        assert len(cautions) == count
         # Nor where nothing of it is inverted.
         estimated_source(estimate, Radiograph(image, mask=x < 100))

@@ -35,13 +35,13 @@ def test_defaults_are_those_of_the_function(recipe: Any, function: Any) -> None:
     "recipe", [*preprocessing.ESTIMATES.values(), *preprocessing.STEPS.values()]
 )
 def test_a_choice_tells_its_values_apart(recipe: Any) -> None:
-    one = recipe()
-    assert pickle.loads(pickle.dumps(one)) == one
-    assert one.described.startswith(recipe.title)
-    for name, value in one.values().items():
+    choice = recipe()
+    assert pickle.loads(pickle.dumps(choice)) == choice
+    assert choice.described.startswith(recipe.title)
+    for name, value in choice.values().items():
         if isinstance(value, (int, float)):
-            other = one.model_copy(update={name: value + 1})
-            assert other.described != one.described
+            changed_choice = choice.model_copy(update={name: value + 1})
+            assert changed_choice.described != choice.described
 
 
 @pytest.mark.parametrize("junk", [np.nan, -1e6, 1e6])
@@ -61,13 +61,13 @@ NEAR = paper_setup().model_copy(update={"pixel_size": 6.5e-6})
 
 def test_an_isotropic_estimate_is_the_function_in_its_experiment() -> None:
     image = 1 + np.random.default_rng(0).random((30, 40))
-    whole = preprocessing.IsotropicEstimate().placed(NEAR, image.shape)
+    placed = preprocessing.IsotropicEstimate().placed(NEAR, image.shape)
     expected = preprocessing.isotropic_source(image, NEAR)
-    np.testing.assert_array_equal(whole.source(image, None), expected)
-    assert pickle.loads(pickle.dumps(whole)) == whole
+    np.testing.assert_array_equal(placed.source(image, None), expected)
+    assert pickle.loads(pickle.dumps(placed)) == placed
     # Another experiment is another estimate, also for what keeps the last one.
-    other = NEAR.model_copy(update={"source_object_distance": 2.6e-3})
-    assert preprocessing.IsotropicEstimate().placed(other, image.shape) != whole
+    nearer_setup = NEAR.model_copy(update={"source_object_distance": 2.6e-3})
+    assert preprocessing.IsotropicEstimate().placed(nearer_setup, image.shape) != placed
     # Of a part, with the axis in the middle of the whole.
     shifted = np.array([[1.0, 0, 10], [0, 1, 4], [0, 0, 1]])
     part = (

@@ -1,6 +1,6 @@
-"""What is done to a shot before its inversion, and the recipe that says so.
+"""Preparation of a shot for its inversion, and the recipe of it.
 
-- the shot: `Radiograph`; the recipe: `Recipe`; what it was applied to: `Provenance`
+- the shot: `Radiograph`; the recipe: `Recipe`; the files it was applied to: `Provenance`
 - whether image and source look right: `image_warnings`, `ReferencePair`
 - steps: `Dark`, `Rotate`, `Crop`, `Bin`, and filters by name in `FILTERS`; as functions `low_pass`,
   `high_pass`, `butterworth`, `remove_background`, `remove_hot_pixels`

@@ -19,7 +19,7 @@ _TOLERANCE = 1e-7  # change of the energy in one step, as a share of the energy 
 def least_variation(
     image: FloatArray, weight: float, iterations: int, report: Reporter
 ) -> FloatArray:
-    """The u that minimises ½∑(u - image)² + weight·∑|∇u|, differences forward up to the border.
+    """Return the u that minimises ½∑(u - image)² + weight·∑|∇u|, with forward differences.
 
     Chambolle's fixed-point iteration for the dual field p, u being the image plus the divergence
     of p: Journal of Mathematical Imaging and Vision 20, 89 (2004), equation (9).
@@ -47,19 +47,19 @@ _FAST = {"reassoc", "contract", "nsz"}
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=_FAST)
 def _step(image: FloatArray, dual_y: FloatArray, dual_x: FloatArray, weight: float) -> float:
-    """One step of the iteration in place; returns the energy before it."""
-    # A single pass: the smooth rows here and below are made of what is not changed yet.
+    """Iterate once in place; return the energy before."""
+    # A single pass: the two smooth rows come from rows that have not changed yet.
     height, width = image.shape
-    here, below = np.empty(width), np.empty(width)
+    upper, lower = np.empty(width), np.empty(width)
     energy = 0.0
-    _smooth_row(image, dual_y, dual_x, 0, here)
+    _smooth_row(image, dual_y, dual_x, 0, upper)
     for row in range(height):
         if row + 1 < height:
-            _smooth_row(image, dual_y, dual_x, row + 1, below)
+            _smooth_row(image, dual_y, dual_x, row + 1, lower)
         else:
-            below[:] = here
-        energy += _step_row(image[row], dual_y[row], dual_x[row], here, below, weight)
-        here, below = below, here
+            lower[:] = upper
+        energy += _step_row(image[row], dual_y[row], dual_x[row], upper, lower, weight)
+        upper, lower = lower, upper
     return energy
 
 
@@ -68,24 +68,24 @@ def _step_row(
     image: FloatArray,
     dual_y: FloatArray,
     dual_x: FloatArray,
-    here: FloatArray,
-    below: FloatArray,
+    upper: FloatArray,
+    lower: FloatArray,
     weight: float,
 ) -> float:
-    """One row of a step, from the smooth row and the one below it; returns its energy."""
-    last = len(here) - 1
+    """Iterate one row, from its smooth row and the next lower one; return its energy."""
+    last = len(upper) - 1
     rate = _STEP / weight
     energy: float = 0.0
     for column in range(last):
-        slope_y, slope_x = below[column] - here[column], here[column + 1] - here[column]
+        slope_y, slope_x = lower[column] - upper[column], upper[column + 1] - upper[column]
         size = math.sqrt(slope_y * slope_y + slope_x * slope_x)
-        change = here[column] - image[column]
+        change = upper[column] - image[column]
         energy += change * change + weight * size
         shrunk = 1.0 / (1.0 + rate * size)
         dual_y[column] = shrunk * (dual_y[column] + _STEP * slope_y)
         dual_x[column] = shrunk * (dual_x[column] + _STEP * slope_x)
-    # Nothing lies to the right of the last column.
-    slope_y, change = below[last] - here[last], here[last] - image[last]
+    # The last column has no neighbour on its right.
+    slope_y, change = lower[last] - upper[last], upper[last] - image[last]
     energy += change * change + weight * abs(slope_y)
     dual_y[last] = (dual_y[last] + _STEP * slope_y) / (1.0 + rate * abs(slope_y))
     return energy
@@ -95,7 +95,7 @@ def _step_row(
 def _smooth_row(
     image: FloatArray, dual_y: FloatArray, dual_x: FloatArray, row: int, smooth: FloatArray
 ) -> None:
-    """One row of the image plus the divergence of the dual field."""
+    """Compute one row of the image plus the divergence of the dual field."""
     for column in range(image.shape[1]):
         smooth[column] = image[row, column] + dual_y[row, column] + dual_x[row, column]
     for column in range(1, image.shape[1]):

@@ -9,7 +9,7 @@ none was recorded, or the beam changes from shot to shot, it must be estimated f
 - the beam varies slowly, in no known way: `polynomial_source`, `low_pass_source`
 - the beam has edges that matter: `total_variation_source`
 - the object covers a known part of the image: `interpolated_source`
-- what all have in common in a recipe: `Estimate`
+- their base class in a recipe: `Estimate`
 
 Each takes an image ``[y, x]``, counts or any linear measure of fluence, and returns float64
 of the same shape and unit that is positive everywhere and has the same flux over the usable
@@ -63,11 +63,11 @@ class Estimate(Choice):
     def placed(
         self, setup: Setup | None, shape: tuple[int, int], matrix: FloatArray | None = None
     ) -> Estimate:
-        """Return the same for the images of an experiment; most estimates do not depend on it.
+        """Return the estimate for the images of an experiment; most do not depend on it.
 
-        The setup, None if it is not known, is that of the image whose source is estimated, the
-        shape (H, W) that of the image as recorded; the matrix, shape (3, 3), takes (y, x, 1) from
-        the first to the second, by default the same. An `InputError` if it needs another setup.
+        The setup, or None if unknown, belongs to the image whose source is estimated, the shape
+        (H, W) to the recorded image; the matrix, shape (3, 3), takes (y, x, 1) from the first to
+        the second. Default: both are the same. Raises an `InputError` if it needs another setup.
         """
         return self
 
@@ -99,7 +99,7 @@ class Estimate(Choice):
         return self.function(image, mask=mask, should_stop=should_stop, **self.values())
 
     def coarser(self, factor: int) -> Estimate:
-        """Return the same for an image with pixels `factor` times as large."""
+        """Return the estimate for an image with pixels `factor` times as large."""
         lengths = {
             name: getattr(self, name) / factor
             for name, field in self.parameters().items()
@@ -224,7 +224,7 @@ class LowPassEstimate(Estimate):
 def _masked_blur(
     values: FloatArray, usable: BoolArray, width: float, report: Reporter
 ) -> tuple[FloatArray, BoolArray]:
-    """Blur of the usable pixels, and where there was enough of them to tell."""
+    """Blur the usable pixels; return also where enough of them are within reach."""
     report("source", 0, 2)
     support = _blurred(usable.astype(np.float64), width)
     report("source", 1, 2)
@@ -233,10 +233,10 @@ def _masked_blur(
 
 
 def _blurred(values: FloatArray, width: float) -> FloatArray:
-    """Gaussian blur with a mirrored border."""
+    """Blur by a Gaussian with a mirrored border."""
     if width < _NARROWEST_WAVES:
         return np.asarray(scipy.ndimage.gaussian_filter(values, width, mode="reflect"))
-    # Takes no longer for a wide Gaussian than for a narrow one.
+    # Its time does not depend on the width.
     return low_pass(values, width)
 
 
@@ -273,9 +273,9 @@ def total_variation_source(
     weight = pixels.checked_number("weight", weight, above=0, unit="px")
     iterations = pixels.checked_integer("iterations", iterations, least=1)
     report = Reporter(None, should_stop)
-    whole = values if usable.all() else filled(values, usable, FILL_WIDTH, 2, report)
+    complete = values if usable.all() else filled(values, usable, FILL_WIDTH, 2, report)
     mean = values[usable].mean()
-    beam = mean * least_variation(whole / mean, weight, iterations, report)
+    beam = mean * least_variation(complete / mean, weight, iterations, report)
     return pixels.with_flux_of(beam, values, usable)
 
 

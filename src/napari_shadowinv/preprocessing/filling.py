@@ -1,4 +1,4 @@
-"""Parts of an image filled in from around them.
+"""Parts of an image filled in from their surroundings.
 
 - the beam under an object: `interpolated_source`
 - masked pixels: `without_masked`
@@ -25,7 +25,7 @@ _TOLERANCE = 1e-6
 def without_masked(
     image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
 ) -> FloatArray:
-    """Return an image with masked pixels filled in, so that nothing of them leaks out."""
+    """Return an image with masked pixels filled in, so that filters do not spread their values."""
     if mask is None or mask.all() or not mask.any():
         return image
     return np.where(mask, image, interpolated_source(image, mask, should_stop=should_stop))
@@ -39,9 +39,9 @@ def interpolated_source(
     kind: Literal["biharmonic", "laplace"] = "biharmonic",
     should_stop: ShouldStop | None = None,
 ) -> FloatArray:
-    """The image itself, with the part that the object covers filled in from around it.
+    """The image itself, with the part under the object filled in from its surroundings.
 
-    An estimate like those of `napari_shadowinv.preprocessing.estimates`.
+    It is an estimate as in `napari_shadowinv.preprocessing.estimates`.
 
     Parameters
     ----------
@@ -85,61 +85,61 @@ def interpolated_source(
 def filled(
     values: FloatArray, usable: BoolArray, width: float, power: int, report: Reporter
 ) -> FloatArray:
-    """Smoothing spline through the usable pixels, continued over the others."""
+    """Fit a smoothing spline to the usable pixels and continue it over the others."""
     mean = values[usable].mean()
-    known = np.where(usable, values / mean, 0.0)
+    weighted = np.where(usable, values / mean, 0.0)
     share = usable.astype(np.float64)
-    return np.asarray(_spline(known, share, width, power, report) * mean)
+    return np.asarray(_spline(weighted, share, width, power, report) * mean)
 
 
 def _spline(
-    known: FloatArray, share: FloatArray, width: float, power: int, report: Reporter
+    weighted: FloatArray, share: FloatArray, width: float, power: int, report: Reporter
 ) -> FloatArray:
-    """Minimise ∑ share·(u - value)² + width^2p ∑ u(-Δ)ᵖu, `known` being share·value."""
-    squares = [4 * np.sin(0.5 * np.pi * np.arange(side) / side) ** 2 for side in known.shape]
+    """Minimise ∑ share·(u - value)² + width^2p ∑ u(-Δ)ᵖu, `weighted` being share·value."""
+    squares = [4 * np.sin(0.5 * np.pi * np.arange(side) / side) ** 2 for side in weighted.shape]
     roughness = (width**2 * np.add.outer(*squares)) ** power
 
     def stiffness(flat: FloatArray) -> FloatArray:
         report("source", 0)
-        u = flat.reshape(known.shape)
+        u = flat.reshape(weighted.shape)
         bent = scipy.fft.idctn(roughness * scipy.fft.dctn(u, norm="ortho"), norm="ortho")
         return np.asarray(share * u + bent).ravel()
 
     typical = float(share.mean())
 
     def nearly_inverse(flat: FloatArray) -> FloatArray:
-        coefficients = scipy.fft.dctn(flat.reshape(known.shape), norm="ortho") / (
+        coefficients = scipy.fft.dctn(flat.reshape(weighted.shape), norm="ortho") / (
             typical + roughness
         )
         return np.asarray(scipy.fft.idctn(coefficients, norm="ortho")).ravel()
 
-    shape = (known.size, known.size)
+    shape = (weighted.size, weighted.size)
     solution, _ = scipy.sparse.linalg.cg(
         scipy.sparse.linalg.LinearOperator(shape, matvec=stiffness, dtype=np.float64),
-        known.ravel(),
-        x0=_coarse_spline(known, share, width, power, report).ravel(),
+        weighted.ravel(),
+        x0=_coarse_spline(weighted, share, width, power, report).ravel(),
         M=scipy.sparse.linalg.LinearOperator(shape, matvec=nearly_inverse, dtype=np.float64),
         rtol=_TOLERANCE,
         maxiter=500,
     )
-    return np.asarray(solution.reshape(known.shape))
+    return np.asarray(solution.reshape(weighted.shape))
 
 
 def _coarse_spline(
-    known: FloatArray, share: FloatArray, width: float, power: int, report: Reporter
+    weighted: FloatArray, share: FloatArray, width: float, power: int, report: Reporter
 ) -> FloatArray:
-    """First guess of `_spline`, from pixels twice as large."""
-    if min(known.shape) < _COARSEST_SIDE:
-        return np.full(known.shape, known.sum() / share.sum())
+    """Return a first guess of `_spline`, from pixels twice as large."""
+    if min(weighted.shape) < _COARSEST_SIDE:
+        return np.full(weighted.shape, weighted.sum() / share.sum())
     coarse = _spline(
-        pixels.block_means(known, 2), pixels.block_means(share, 2), width / 2, power, report
+        pixels.block_means(weighted, 2), pixels.block_means(share, 2), width / 2, power, report
     )
-    height, length = known.shape
+    height, length = weighted.shape
     return _doubled(_doubled(coarse, height).T, length).T
 
 
 def _doubled(coarse: FloatArray, side: int) -> FloatArray:
-    """Rows twice as many, cut to `side`, linear between the middles of the coarse ones."""
+    """Interpolate to twice as many rows, cut to `side`, linearly between the coarse ones."""
     padded = np.pad(coarse, [(1, 1), (0, 0)], mode="edge")
     near, before, after = padded[1:-1], padded[:-2], padded[2:]
     rows = np.stack([0.75 * near + 0.25 * before, 0.75 * near + 0.25 * after], axis=1)

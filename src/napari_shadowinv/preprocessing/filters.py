@@ -3,7 +3,7 @@
 - keep only small or only large structures: `high_pass`, `low_pass`, `butterworth`
 - flatten an uneven beam: `remove_background`
 - each with its parameters, to be one step of a recipe: `LowPassFilter`, `HighPassFilter`,
-  `ButterworthFilter`, `BackgroundFilter`; what they have in common: `Filter`
+  `ButterworthFilter`, `BackgroundFilter`; their base class: `Filter`
 
 All take an image or a potential ``[y, x]``, in any unit, and return float64 of the same shape
 and unit. An `InputError` refuses an image that is not two-dimensional and finite, and a parameter
@@ -65,7 +65,7 @@ class Filter(Step):
     def filtered(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
     ) -> FloatArray:
-        """Apply it, so that what is masked, even NaN, does not touch the rest."""
+        """Apply the filter, so that masked pixels, even NaN, do not affect the others."""
         values = np.asarray(image, dtype=np.float64)
         return self._filtered(without_masked(values, mask, should_stop), mask, should_stop)
 
@@ -75,7 +75,7 @@ class Filter(Step):
         return self.function(image, **self.values())
 
     def note(self, before: FloatArray, after: FloatArray, mask: BoolArray | None) -> str:
-        """Say what was done."""
+        """Return a note on what the filter changed."""
         return self.described
 
     def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
@@ -151,8 +151,8 @@ def high_pass(image: ArrayLike, width: float, *, keep_mean: bool = True) -> Floa
     dividing (`remove_background`, or a source estimate) serves better: it keeps the sign.
     """
     values, _ = pixels.checked_pixels(image)
-    kept = values.mean() if keep_mean else 0.0
-    return values - low_pass(values, width) + kept
+    mean = values.mean() if keep_mean else 0.0
+    return values - low_pass(values, width) + mean
 
 
 class HighPassFilter(Filter):

@@ -1,4 +1,4 @@
-"""How a fit was made, kept with its result: `FitProvenance`, with a `FitOrigin` for each image."""
+"""Provenance of a fit, stored with its result: `FitProvenance`, a `FitOrigin` for each image."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LONGEST_MASKS, _LONGEST_FIDUCIALS = 36_000, 9_000
 
 
 class FitOrigin(CheckedModel):
-    """Where an image of a fit came from, and what was known about it.
+    """Origin of an image of a fit, with its setup, noise and other inputs.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class FitOrigin(CheckedModel):
     strength, gain, psf, noise
         As given for this image; None where the recipe counts.
     notes : tuple of str
-        What the steps found and did.
+        Notes of the steps.
     warnings : tuple of Caution
         Reasons to doubt the image, its source or its setup.
     """
@@ -52,7 +52,7 @@ class FitOrigin(CheckedModel):
 
 
 class FitProvenance(CheckedModel):
-    """How a fit was made, so that it can be made again.
+    """Provenance of a fit, by which it can be repeated.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class FitProvenance(CheckedModel):
     fiducial_rows : tuple or None
         Its rows, if they are not too many.
     start : Provenance or None
-        The inversion that the fit refines: its image, source and masks are those of the fit.
+        The inversion that the fit refines, with the same image, source and masks.
     """
 
     model_config = _CONFIG
@@ -83,7 +83,7 @@ class FitProvenance(CheckedModel):
 
     @classmethod
     def of(cls, attributes: Mapping[str, Any]) -> FitProvenance | None:
-        """Read it from a dataset's attributes; None if they do not tell, or as no version does."""
+        """Read the provenance from a dataset's attributes; None if it is missing or unreadable."""
         try:
             return cls.model_validate_json(attributes.get("provenance", ""))
         except ValidationError:
@@ -91,15 +91,15 @@ class FitProvenance(CheckedModel):
 
 
 def short_masks(masks: Iterable[Origin]) -> tuple[Origin, ...]:
-    """Masks as they can be kept: those that no longer fit without their pixels."""
-    room, kept = _LONGEST_MASKS, []
+    """Return the masks, without pixels where these exceed the room in the file."""
+    room, shortened = _LONGEST_MASKS, []
     for mask in masks:
         room -= len(mask.pixels or "")
-        kept.append(mask if room >= 0 else mask.model_copy(update={"pixels": None}))
-    return tuple(kept)
+        shortened.append(mask if room >= 0 else mask.model_copy(update={"pixels": None}))
+    return tuple(shortened)
 
 
 def short_fiducials(rows: Iterable[Iterable[float]]) -> list[list[float]] | None:
-    """Rows of a table as they can be kept; None if they are too many."""
+    """Return the rows of a table as lists for the file; None if they are too many."""
     listed = [[float(value) for value in row] for row in rows]
     return listed if len(str(listed)) <= _LONGEST_FIDUCIALS else None

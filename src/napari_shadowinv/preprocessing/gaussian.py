@@ -48,7 +48,7 @@ def gaussian_source(
 ) -> FloatArray:
     """Elliptical Gaussian plus a constant, fitted to the image.
 
-    An estimate like those of `napari_shadowinv.preprocessing.estimates`.
+    It is an estimate as in `napari_shadowinv.preprocessing.estimates`.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def gaussian_source(
     Returns
     -------
     ndarray of float64, shape (H, W)
-        The same everywhere if the fit rises, where nothing is seen, to ten times what is seen.
+        Uniform if the fit rises under the mask to ten times the brightest usable pixel.
 
     Notes
     -----
@@ -69,7 +69,7 @@ def gaussian_source(
     in proportion, not squared. Centre, both widths, tilt, height and constant are free; the
     last two are not negative. Large images are averaged in blocks for the fit. A Gaussian
     narrower than 1/256 of the image, higher than 1000 times the mean, or more than three sides
-    away from the middle of what is seen is not considered.
+    away from the middle of the usable pixels is not considered.
     """
     values, usable = pixels.beam_pixels(image, mask)
     side, mean = max(values.shape), values[usable].mean()
@@ -97,12 +97,12 @@ def gaussian_source(
 
 
 def _samples(values: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Positions y, x and means of blocks of usable pixels, few enough for a fit."""
+    """Return positions y, x and means of blocks of usable pixels, few enough for a fit."""
     block = int(np.ceil(np.sqrt(values.size / _MOST_FITTED_PIXELS)))
     share = pixels.block_means(usable.astype(np.float64), block)
     means = pixels.block_means(np.where(usable, values, 0.0), block)
-    # A block is taken only if it is whole: the middle of a part of it lies elsewhere.
-    # A mask so fine that no block is whole leaves the fullest.
+    # A block is used only if it is complete, since a part of it has another middle.
+    # Under a mask so fine that no block is complete, the fullest are used.
     y, x = np.nonzero(share >= share.max())
     middle = (block - 1) / 2
     rows, columns = (np.asarray(axis * block + middle, dtype=np.float64) for axis in (y, x))
@@ -112,7 +112,7 @@ def _samples(values: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatAr
 def _fitted_gaussian(
     y: FloatArray, x: FloatArray, sample: FloatArray, report: Reporter
 ) -> FloatArray:
-    """Parameters of `_gaussian` that fit samples, by repeated robust least squares."""
+    """Fit the parameters of `_gaussian` to samples, by repeated robust least squares."""
     bounds = _bounds(y, x)
 
     def excess(p: FloatArray) -> FloatArray:
@@ -139,7 +139,7 @@ def _fitted_gaussian(
 
 
 def _bounds(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least and greatest parameters of `_gaussian`: without them it may hide behind a mask."""
+    """Return bounds of the parameters of `_gaussian`, without which it may hide behind a mask."""
     steepest = math.sqrt(_MOST_FITTED_PIXELS)  # one over the width of a block of pixels
     ranges = [
         (0, _HIGHEST),
@@ -152,7 +152,7 @@ def _bounds(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _first_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatArray:
-    """Parameters of `_gaussian` from the moments of what rises above the dark corners."""
+    """Return parameters of `_gaussian` by the moments of the image above its dark corners."""
     constant, peak = (float(level) for level in np.percentile(sample, [2, 98]))
     weights = np.maximum(sample - constant, 0) + 1e-9
     centre_y, centre_x = np.average(y, weights=weights), np.average(x, weights=weights)
@@ -167,7 +167,7 @@ def _first_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatAr
 
 
 def _gaussian(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArray:
-    """Height · exp(-½(u² + v²)) + constant, with u = a·dy + b·dx and v = c·dx."""
+    """Return height · exp(-½(u² + v²)) + constant, with u = a·dy + b·dx and v = c·dx."""
     # The factors of the inverse covariance, unlike its entries, may take any value.
     height, constant, centre_y, centre_x, a, b, c = parameters
     u = a * (y - centre_y) + b * (x - centre_x)
@@ -176,7 +176,7 @@ def _gaussian(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArra
 
 
 def _gaussian_slopes(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArray:
-    """Derivatives of `_gaussian` with respect to its parameters, shape (samples, 7)."""
+    """Return the derivatives of `_gaussian` by its parameters, shape (samples, 7)."""
     height, _, centre_y, centre_x, a, b, c = parameters
     dy, dx = y - centre_y, x - centre_x
     u, v = a * dy + b * dx, c * dx

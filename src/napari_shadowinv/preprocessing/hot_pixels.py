@@ -1,4 +1,4 @@
-"""Broken pixels, found and replaced: `remove_hot_pixels`; as a step: `HotPixelFilter`."""
+"""Detection and replacement of broken pixels: `remove_hot_pixels`; as a step: `HotPixelFilter`."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def remove_hot_pixels(
 def _neighbours(
     values: FloatArray, size: int, report: Reporter
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Median of the pixels around each, and the brightest and darkest that may be sound."""
+    """Return each pixel's median neighbour, and its brightest and darkest sound ones."""
     # The pixel itself does not count: with it, the noise would seem smaller than it is.
     footprint = np.ones((size, size), dtype=np.bool_)
     footprint[size // 2, size // 2] = False
@@ -149,7 +149,7 @@ def _neighbours(
 
 
 def _noise(difference: FloatArray, brightness: FloatArray) -> FloatArray:
-    """Standard deviation of each pixel's difference, by its brightness."""
+    """Return the standard deviation of each pixel's difference, by its brightness."""
     n_bins = min(max(difference.size // _PIXELS_PER_NOISE_BIN, 1), _MOST_NOISE_BINS)
     groups = np.array_split(np.argsort(brightness, axis=None, kind="stable"), n_bins)
     flat, positive = difference.ravel(), np.maximum(brightness, 0).ravel()
@@ -168,7 +168,7 @@ def _noise(difference: FloatArray, brightness: FloatArray) -> FloatArray:
 
 
 def _deviation(difference: FloatArray) -> float:
-    """Robust standard deviation about zero."""
+    """Return the robust standard deviation about zero."""
     size = np.abs(difference)
     # In few-bit images more than half the pixels can equal their median.
     return float(pixels.NORMAL_MAD * np.median(size)) or float(_NORMAL_MEAN * size.mean())

@@ -1,13 +1,13 @@
-"""Signs in an image and its reference that they are not what an inversion takes them for.
+"""Checks of an image and its reference for violated assumptions of an inversion.
 
-- all of them, in sentences: `image_warnings`
+- all of them, as cautions: `image_warnings`
 - of one image: `saturated_share`, `stray_pixels`
 - of an image and its reference: `dark_level`, `ReferencePair`
 
-An image shall be linear in the fluence, without offset, and on the same pixels as its reference.
-Nothing here changes an image: each sentence says what was seen, what it does to the field, and
-which step helps. What images cannot show is listed in docs/trust.md: the offset of an image
-without deep shadows, the gamma of a detector.
+An image must be linear in the fluence, without offset, and on the same pixels as its reference.
+No check changes an image: each sentence states the observation, its effect on the field, and the
+step that helps. docs/trust.md lists the errors that no image shows: the offset of an image without
+deep shadows, the gamma of a detector.
 
 The limits were chosen with `benchmarks/wrong_inputs.py`, which counts how many wrong inputs are
 noticed, and how often right ones cause an alarm.
@@ -55,8 +55,8 @@ _USABLE = 0.999  # share of a block's pixels
 _RING = 0.2  # of the side: there is rarely an object
 _MAX_SHIFT = 0.2  # of the side
 _MATCH = 0.5  # of the mismatch that may be left after a shift
-_ABOVE_NOISE = 1.2  # of the median mismatch, so that a shift can be told
-_MIN_SIDES = 3  # of the image, that tell
+_ABOVE_NOISE = 1.2  # of the median mismatch, so that a shift is detectable
+_MIN_SIDES = 3  # of the image, with enough blocks
 _MIN_OVERLAP = 0.4  # of the ring
 _MIN_CONTRAST = 0.01  # of the mean
 _NEGATIVE_CORRELATION = -0.4
@@ -257,7 +257,7 @@ class ReferencePair:
 
     @cached_property
     def shift(self) -> tuple[float, float] | None:
-        """How far (y, x), in px, the image lies from the source; None if nothing says so.
+        """Shift (y, x) of the image against the source in px; None if there is no sign of one.
 
         The borders of both are compared, where an object displaces least.
         """
@@ -293,7 +293,7 @@ class ReferencePair:
         noise = float(np.median(np.diff(shot - beam, axis=1)[pair] ** 2)) / 2
 
         def gain(part: BoolArray) -> float:
-            """Share that is left of the mismatch, apart from noise."""
+            """Return the share of the mismatch that remains, apart from noise."""
             before, after = (float(np.median(values[part])) for values in (unmoved, moved))
             return (after - noise) / max(before - noise, 1e-300)
 
@@ -302,8 +302,8 @@ class ReferencePair:
         if gain(common) > _MATCH:
             return False
         y, x = np.ogrid[rows, columns]
-        top, left = height * _RING, width * _RING
-        sides = (y < top, y >= height - top, x < left, x >= width - left)
+        y_top, x_left = height * _RING, width * _RING
+        sides = (y < y_top, y >= height - y_top, x < x_left, x >= width - x_left)
         parts = [common & side for side in sides]
         better = [gain(part) < 1 for part in parts if part.sum() >= _MIN_BLOCKS]
         return len(better) >= _MIN_SIDES and sum(better) >= len(better) - 1
@@ -347,7 +347,7 @@ def _block_mean(values: AnyArray, step: int) -> FloatArray:
 
 
 def _contrast(values: FloatArray, usable: BoolArray) -> float:
-    """R.m.s. of what neighbouring blocks have in common, which noise is not."""
+    """Return the r.m.s. of the structure that neighbouring blocks share, free of noise."""
     return float(np.sqrt(max(_neighbour_covariance(values, values, usable), 0.0)))
 
 
@@ -357,9 +357,7 @@ def _neighbour_covariance(first: FloatArray, second: FloatArray, usable: BoolArr
         return 0.0
     forth = first[:, 1:][pair], second[:, :-1][pair]
     back = first[:, :-1][pair], second[:, 1:][pair]
-    return float(
-        np.mean([((one - one.mean()) * (two - two.mean())).mean() for one, two in (forth, back)])
-    )
+    return float(np.mean([((a - a.mean()) * (b - b.mean())).mean() for a, b in (forth, back)]))
 
 
 def _details(values: FloatArray) -> FloatArray:
@@ -374,7 +372,7 @@ def _correlation(first: FloatArray, second: FloatArray) -> float:
 
 
 def _mismatch(image: FloatArray, source: FloatArray, ring: BoolArray) -> FloatArray:
-    """Mean square difference at every shift of the image against the source, both in a ring."""
+    """Return the mean square difference at every shift of image against source, in a ring."""
     shape = [fft.next_fast_len(2 * side, real=True) for side in image.shape]
     weights = ring.astype(float)
     # About 1, where both are, so that rounding stays small.

@@ -44,7 +44,7 @@ class IsotropicEstimate(Estimate):
     method: Literal["isotropic"] = "isotropic"
     centre_y: float | None = _centre_field("y", "Row")
     centre_x: float | None = _centre_field("x", "Column")
-    # Not a parameter: every face of the package asks for the setup elsewhere.
+    # Not a parameter: the user gives the setup elsewhere.
     _setup: Any = PrivateAttr(default=None)
 
     def placed(
@@ -67,9 +67,9 @@ class IsotropicEstimate(Estimate):
         return isotropic_source(image, self._setup, mask=mask, **self.values())
 
     def _at(self, y: float, x: float, setup: Setup) -> Self:
-        placed = self.model_copy(update={"centre_y": y, "centre_x": x})
-        placed._setup = setup
-        return placed
+        estimate = self.model_copy(update={"centre_y": y, "centre_x": x})
+        estimate._setup = setup
+        return estimate
 
 
 def centre_within(
@@ -78,9 +78,9 @@ def centre_within(
     y: float | None = None,
     x: float | None = None,
 ) -> tuple[float, float]:
-    """Return where a place in the image as recorded, by default its centre, lies in part of it."""
+    """Return the coordinates of a pixel of the recorded image, by default its centre, in a part."""
     middle = [(side - 1) / 2 for side in shape]
-    recorded = [m if given is None else given for m, given in zip(middle, (y, x), strict=True)]
+    recorded = [m if c is None else c for m, c in zip(middle, (y, x), strict=True)]
     if matrix is not None:
         recorded = [float(v) for v in np.linalg.solve(matrix, [*recorded, 1.0])[:2]]
     return recorded[0], recorded[1]
@@ -96,14 +96,14 @@ def _without_setup() -> InputError:
 def uniform_warnings(
     shape: tuple[int, int], setup: Setup | None, *, centre: tuple[float, float] | None = None
 ) -> tuple[Caution, ...]:
-    """Say if a point source would light an image too unevenly to be taken as uniform.
+    """Warn if a point source would light an image too unevenly to count as uniform.
 
     Parameters
     ----------
     shape : tuple of int
         Height and width of the image.
     setup : Setup or None
-        The experiment; nothing is said where it is not known.
+        The experiment; no warning if it is unknown.
     centre : tuple of float, optional
         Pixel (y, x) in which the detector faces the point. Default: the middle of the image.
 
@@ -140,8 +140,8 @@ def isotropic_source(
 ) -> FloatArray:
     """Beam of a point that shines evenly in all directions, on a flat detector.
 
-    An estimate like those of `napari_shadowinv.preprocessing.estimates`; an `InputError` refuses a
-    setup whose beam is collimated, too.
+    It is an estimate as in `napari_shadowinv.preprocessing.estimates`; an `InputError` also refuses
+    a setup with a collimated beam.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def isotropic_source(
 
 
 def point_distance(setup: Setup) -> float:
-    """Return how far the point source is from the detector, in px of the detector."""
+    """Return the distance from the point source to the detector, in px of the detector."""
     if setup.collimated:
         raise InputError(
             "got the source 'isotropic' and a setup with a collimated beam "
@@ -191,7 +191,7 @@ def point_distance(setup: Setup) -> float:
 
 
 def _edges(side: int, name: str, centre: float | None) -> FloatArray:
-    """Edges of `side` pixels, relative to the given centre or to their middle."""
+    """Return the edges of `side` pixels, relative to the centre, by default their middle."""
     if centre is not None and not math.isfinite(centre):
         raise InputError(f"{name} is {centre!r}, expected a finite number of px")
     return np.arange(-0.5, side) - ((side - 1) / 2 if centre is None else centre)

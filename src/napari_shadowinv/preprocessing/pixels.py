@@ -1,4 +1,4 @@
-"""Images as numbers: checks of what was given, and a robust polynomial fit.
+"""Images as numbers: checks of images and parameters, and a robust polynomial fit.
 
 - values and usable pixels of an image: `checked_pixels`; of a beam, which has flux: `beam_pixels`
 - one number or integer: `checked_number`, `checked_integer`
@@ -29,7 +29,7 @@ MOST_EXTRAPOLATION = 10.0  # times the brightest pixel seen
 def checked_pixels(
     image: ArrayLike, mask: ArrayLike | None = None, *, name: str = "image"
 ) -> tuple[FloatArray, BoolArray]:
-    """Return a copy of an image as floats and its usable pixels, or say what is wrong with them.
+    """Return a copy of an image as floats and its usable pixels, or raise an `InputError`.
 
     Masked pixels, which may be NaN, are set to the mean of the usable ones.
     """
@@ -71,7 +71,7 @@ def _checked_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str) -> 
 
 
 def checked_number(name: str, value: float, *, above: float, unit: str) -> float:
-    """Return a finite number above a limit, or say what was received instead."""
+    """Return a finite number above a limit, or raise an `InputError`."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -82,19 +82,19 @@ def checked_number(name: str, value: float, *, above: float, unit: str) -> float
 
 
 def checked_integer(name: str, value: int, *, least: int, most: int | None = None) -> int:
-    """Return an integer within limits, or say what was received instead."""
+    """Return an integer within limits, or raise an `InputError`."""
     try:
         number = operator.index(value)
     except TypeError:
         number = least - 1
     if number < least or (most is not None and number > most):
-        wanted = f"at least {least}" if most is None else f"from {least} to {most}"
-        raise InputError(f"{name} is {value!r}, expected an integer {wanted}")
+        limits = f"at least {least}" if most is None else f"from {least} to {most}"
+        raise InputError(f"{name} is {value!r}, expected an integer {limits}")
     return number
 
 
 def beam_pixels(image: ArrayLike, mask: ArrayLike | None) -> tuple[FloatArray, BoolArray]:
-    """Values and usable pixels of an image that has flux."""
+    """Return values and usable pixels of an image, refusing one without flux."""
     values, usable = checked_pixels(image, mask)
     flux = values[usable].sum()
     if flux <= 0:
@@ -106,21 +106,21 @@ def beam_pixels(image: ArrayLike, mask: ArrayLike | None) -> tuple[FloatArray, B
 
 
 def with_flux_of(beam: FloatArray, values: FloatArray, usable: BoolArray) -> FloatArray:
-    """A beam made positive and given the flux of an image over its usable pixels."""
+    """Return a beam, positive and with the flux of an image over its usable pixels."""
     mean = values[usable].mean()
     positive = np.maximum(beam, _FLOOR * mean)
     source = np.asarray(positive * (mean / positive[usable].mean()))
-    seen = float(values[usable].max())
-    if not source.max() <= MOST_EXTRAPOLATION * seen:
+    brightest = float(values[usable].max())
+    if not source.max() <= MOST_EXTRAPOLATION * brightest:
         raise InputError(
             f"the estimated source rises to {source.max():.3g} under the mask, while the image "
-            f"is at most {seen:.3g} elsewhere: mask less, or choose another estimate"
+            f"is at most {brightest:.3g} elsewhere: mask less, or choose another estimate"
         )
     return source
 
 
 def block_means(values: FloatArray, block: int) -> FloatArray:
-    """Means over square blocks; incomplete ones at the far edges are padded by mirroring."""
+    """Return means over square blocks; incomplete ones at the far edges are mirrored."""
     padding = [(0, -side % block) for side in values.shape]
     padded = np.pad(values, padding, mode="symmetric")
     height, width = padded.shape
@@ -148,7 +148,7 @@ def fit_polynomial(
     mask : array_like of bool, shape (H, W), optional
         True where the fit may look. Default: everywhere.
     should_stop : callable, optional
-        Asked at each step; `InversionCancelled` when it returns true.
+        Called at each step; `InversionCancelled` when it returns true.
 
     Returns
     -------
@@ -190,7 +190,7 @@ def fit_polynomial(
 def _weighted_fit(
     values: FloatArray, weights: FloatArray, rows: FloatArray, columns: FloatArray
 ) -> FloatArray:
-    """Polynomial of least weighted squares, from bases along y and x."""
+    """Fit a polynomial by weighted least squares, from bases along y and x."""
     # The normal equations need sums of the weights over products of the bases only; those
     # separate into y and x, so no matrix of pixels × coefficients is formed.
     n = rows.shape[1]
@@ -199,9 +199,9 @@ def _weighted_fit(
     ]
     gram = (pairs[0].T @ weights @ pairs[1]).reshape(n, n, n, n).transpose(0, 2, 1, 3)
     moments = (rows.T @ (weights * values) @ columns).ravel()
-    kept = np.flatnonzero(np.add.outer(np.arange(n), np.arange(n)) < n)
+    low_degree = np.flatnonzero(np.add.outer(np.arange(n), np.arange(n)) < n)
     coefficients = np.zeros(n * n)
-    square = gram.reshape(n * n, n * n)[np.ix_(kept, kept)]
-    coefficients[kept] = np.linalg.lstsq(square, moments[kept], rcond=None)[0]
+    square = gram.reshape(n * n, n * n)[np.ix_(low_degree, low_degree)]
+    coefficients[low_degree] = np.linalg.lstsq(square, moments[low_degree], rcond=None)[0]
     fit: FloatArray = rows @ coefficients.reshape(n, n) @ columns.T
     return fit

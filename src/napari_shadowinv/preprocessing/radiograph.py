@@ -1,4 +1,4 @@
-"""An image as it was measured, with what is known about it: `Radiograph`."""
+"""A measured image with its metadata: `Radiograph`."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ class Radiograph:
     image : ndarray of float64, shape (H, W)
         Intensity or counts, ``[y, x]``, as stored.
     setup, path : optional
-        The geometry, where the file tells all of it; the file it comes from.
+        The geometry, where the file contains all of it; the file of the image.
     metadata : mapping
-        What else the file says: ``kind``, ``dtype``, ``bits``, ``sha256``, and for pradformat
-        ``geometry``, the part of the setup that the file knows.
+        Other facts from the file: ``kind``, ``dtype``, ``bits``, ``sha256``, and for pradformat
+        ``geometry``, the part of the setup in the file.
     source : ndarray, shape (H, W), or None
         The undisturbed beam.
     mask, source_mask : ndarray of bool, shape (H, W), or None
-        True where a pixel can be used; where the object is not, and the source can be estimated.
+        True where a pixel can be used; where it shows the bare beam, for an estimate of the source.
     warnings : tuple of Caution
-        What the user should know before trusting what the file says.
+        Reasons to doubt the content of the file.
     dark : ndarray, shape (H, W), or None
         Image of the detector without light, for a step `Dark` with a file.
     """
@@ -58,11 +58,11 @@ class Radiograph:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was done to it so far, for people."""
+        """Notes on the steps applied so far, for people."""
         return tuple(self.metadata.get("notes", ()))
 
     def noted(self, *notes: str) -> Radiograph:
-        """Return the same with word of what was done to it."""
+        """Return the same with more notes."""
         return replace(self, metadata={**self.metadata, "notes": (*self.notes, *notes)})
 
     def mapped(
@@ -82,7 +82,7 @@ class Radiograph:
         """Sum blocks of `factor` × `factor` pixels; the setup's pixel grows with them.
 
         Rows and columns that fill no block are cut off at the end. A block can be used if all its
-        pixels can. The metadata's ``bin`` tells the factor. An `InputError` if `factor` is less
+        pixels can. The metadata's ``bin`` is the factor. An `InputError` if `factor` is less
         than 1 or leaves less than 2×2 blocks.
 
         Examples

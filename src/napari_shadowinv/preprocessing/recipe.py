@@ -1,8 +1,8 @@
-"""Everything that is done to a shot, as one model: `Recipe`.
+"""All steps from a shot to its field, as one model: `Recipe`.
 
-- the steps there are, by name: `STEPS`; those that filter: `FILTERS`; those before a fit:
-  `FIT_STEPS`; estimates of the source: `ESTIMATES`
-- a recipe with what it was applied to, kept with a result: `Provenance`, `Origin`
+- all steps, by name: `STEPS`; only filters: `FILTERS`; steps allowed before a fit: `FIT_STEPS`;
+  estimates of the source: `ESTIMATES`
+- a recipe with the files it was applied to, stored with a result: `Provenance`, `Origin`
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 _CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
-_LEAST_VISIBLE = 0.1  # of what the source mask hides in one place, for the inversion to see it
+_LEAST_VISIBLE = 0.1  # of an object under the source mask, for the inversion to see it
 _LEAST_OBJECT = 10  # pixels
 _MOST_FALL = 10.0  # times below the dimmest pixel seen
 _LONGEST_MASK = 48_000  # characters: HDF5 keeps no longer attributes
@@ -56,10 +56,10 @@ class MeasuredSource(Choice):
     )
 
 
-# Whatever is defined in the modules imported here is a step, or a source, of a recipe.
+# All choices defined in the modules imported here are steps, or sources, of a recipe.
 STEPS = choices_of(Step)
 FILTERS = {name: step for name, step in STEPS.items() if issubclass(step, Filter)}
-# Filters that blur or flatten would change what the forward model is fitted to.
+# Filters that blur or flatten would change the data that the forward model is fitted to.
 FIT_STEPS = {
     name: step
     for name, step in STEPS.items()
@@ -78,7 +78,7 @@ else:
 
 
 class Recipe(CheckedModel):
-    """Everything that is done to a shot, from its image to the field.
+    """All steps from the image of a shot to its field.
 
     Raises
     ------
@@ -133,7 +133,7 @@ class Recipe(CheckedModel):
         return files.pop() if files else None
 
     def with_dark_file(self, file: Path) -> Recipe:
-        """Return the same with its dark frame in another place."""
+        """Return the recipe with its dark frame in another file."""
         steps = tuple(
             Dark(level=file) if isinstance(step, Dark) and step.frame_file else step
             for step in self.steps
@@ -142,17 +142,17 @@ class Recipe(CheckedModel):
 
     @property
     def estimate(self) -> Estimate | None:
-        """How the source is estimated; None if it is measured, or uniform by default."""
+        """Estimate of the source; None if it is measured, or uniform by default."""
         return self.source if isinstance(self.source, Estimate) else None
 
     def shape_after(self, shape: tuple[int, int]) -> tuple[int, int]:
-        """Return the shape of what is inverted, for an image of a shape."""
+        """Return the shape after all steps, for an image of a shape."""
         for step in self.steps:
             shape = step.shape_after(shape)
         return shape
 
     def matrix(self, shape: tuple[int, int]) -> FloatArray:
-        """Return what takes (y, x, 1) in what is inverted to (y, x, 1) in an image of a shape."""
+        """Return the matrix from (y, x, 1) after all steps to (y, x, 1) in an image of a shape."""
         matrix = np.eye(3)
         for step in self.steps:
             matrix = matrix @ step.matrix(shape)
@@ -160,7 +160,7 @@ class Recipe(CheckedModel):
         return matrix
 
     def moved(self, shot: Radiograph) -> Radiograph:
-        """Return a shot after those steps alone that move pixels, such as for its masks."""
+        """Return a shot after only the steps that move pixels, such as for its masks."""
         for step in self.steps:
             if step.moves_pixels:
                 shot = step.applied(shot)
@@ -215,7 +215,7 @@ class Recipe(CheckedModel):
 
 
 def check_masks(mask: BoolArray | None, bare: BoolArray | None) -> None:
-    """Reject with an `InputError` a mask that leaves next to nothing of the object, ``~bare``."""
+    """Refuse with an `InputError` a mask that hides nearly all of the object, ``~bare``."""
     if mask is None or bare is None or bare.all():
         return
     from scipy.ndimage import label
@@ -244,15 +244,15 @@ def estimated_source(
     *,
     by: Callable[..., FloatArray] | None = None,
 ) -> FloatArray:
-    """Estimate the source of a shot after its steps, from what neither mask hides.
+    """Estimate the source of a shot after its steps, from the pixels that neither mask hides.
 
     Parameters
     ----------
     estimate : Estimate
-        How, placed for the shot; its `source` takes `should_stop` and `on_caution`.
+        Placed for the shot; its `source` takes `should_stop` and `on_caution`.
     shot : Radiograph
     by : callable, optional
-        Called in place of `Estimate.source`, such as one that remembers.
+        Called instead of `Estimate.source`, such as a cached one.
     """
     masks = [mask for mask in (shot.mask, shot.source_mask) if mask is not None]
     usable = np.logical_and.reduce(masks) if masks else None
@@ -274,27 +274,27 @@ def _check_fall(
     """Report a source that is much darker behind the source mask than anywhere around it."""
     if bare is None:
         return
-    seen, object_ = (bare, ~bare) if mask is None else (bare & mask, ~bare & mask)
-    if object_.any() and source[object_].min() < image[seen].min() / _MOST_FALL:
+    surroundings, object_ = (bare, ~bare) if mask is None else (bare & mask, ~bare & mask)
+    if object_.any() and source[object_].min() < image[surroundings].min() / _MOST_FALL:
         text = (
             f"the estimated source falls to {source[object_].min():.3g} under the source mask, "
-            f"while the image is at least {image[seen].min():.3g} elsewhere: compare it with "
-            "another estimate"
+            f"while the image is at least {image[surroundings].min():.3g} elsewhere: compare it "
+            "with another estimate"
         )
         (on_caution or warn_of)(Caution("source", text))
 
 
 class Origin(CheckedModel):
-    """Where an image came from.
+    """Origin of an image.
 
     Attributes
     ----------
     file, sha256 : str
         Name of the file, without its folder, and its checksum; "" if it was an array.
     variable, channel : str or int or None
-        What of the file was taken.
+        Array and colour channel taken from the file.
     pixels, shape : str and tuple of int, or None
-        A mask that was drawn, packed, and its shape.
+        A drawn mask, packed, and its shape.
     """
 
     model_config = _CONFIG
@@ -307,7 +307,7 @@ class Origin(CheckedModel):
 
     @classmethod
     def of_mask(cls, mask: BoolArray) -> Origin:
-        """Pack a mask, unless it is too complicated to be kept."""
+        """Pack a mask, unless it is too complicated for the file."""
         packed = base64.b85encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode()
         height, width = mask.shape
         return cls(pixels=packed if len(packed) <= _LONGEST_MASK else None, shape=(height, width))
@@ -328,11 +328,11 @@ class Origin(CheckedModel):
 
 
 class Provenance(CheckedModel):
-    """How a result was made, so that it can be made again.
+    """Provenance of a result, by which it can be repeated.
 
-    The `recipe` has the setup and the kind of source that came with the image's file, too; `setup`
-    is that of the result's pixels; the image was divided by its `gain`, if it has one; `notes` tell
-    people what the steps found and did.
+    The `recipe` includes the setup and the kind of source from the image's file; `setup` describes
+    the result's pixels; the image was divided by its `gain`, if it has one; `notes` are notes of
+    the steps, for people.
     """
 
     model_config = _CONFIG
@@ -349,7 +349,7 @@ class Provenance(CheckedModel):
 
     @classmethod
     def of(cls, attributes: Mapping[str, Any]) -> Provenance | None:
-        """Read it from a dataset's attributes; None if they do not tell, or as no version does."""
+        """Read the provenance from a dataset's attributes; None if it is missing or unreadable."""
         try:
             return cls.model_validate_json(attributes.get("provenance", ""))
         except ValidationError:

@@ -1,4 +1,4 @@
-"""Steps of a recipe that are no filters, and what all steps share: `Step`.
+"""Steps of a recipe that are no filters, and the base class of all steps: `Step`.
 
 - subtract the detector's dark level: `Dark`
 - move pixels: `Rotate`, `Crop`, `Bin`
@@ -26,18 +26,18 @@ if TYPE_CHECKING:
 
 
 _SMALLEST_SIDE = 4  # px of a crop
-_WHOLE = 0.999  # share of a rotated pixel that must be known
+_MIN_SHARE = 0.999  # of a rotated pixel that must have data
 
 
 class Choice(CheckedModel):
     """One of several ways to do something, with its parameters."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-    title: ClassVar[str]  # what the forms call it
+    title: ClassVar[str]  # in forms
     key: ClassVar[str]  # the field that names it in files, "step" or "method"
     # The parameter that the command's flag of the same name sets; "" if each has its own flag.
     primary: ClassVar[str] = ""
-    # Where it stands in lists; steps that flags ask for are done in the order of their places.
+    # Its order in lists; steps chosen by flags are applied in this order.
     place: ClassVar[int] = 100
 
     @classmethod
@@ -65,12 +65,12 @@ C = TypeVar("C", bound=Choice)
 
 
 def choices_of(base: type[C]) -> dict[str, type[C]]:
-    """Return the classes made of a base, by name, in the order of their places."""
+    """Return the subclasses of a base by name, in the order of `place`."""
     classes = [base]
-    for one in classes:
-        classes += one.__subclasses__()
-    named = sorted((c for c in classes if c.key in c.model_fields), key=lambda c: c.place)
-    return {one.name(): one for one in named}
+    for choice in classes:
+        classes += choice.__subclasses__()
+    choices = sorted((c for c in classes if c.key in c.model_fields), key=lambda c: c.place)
+    return {choice.name(): choice for choice in choices}
 
 
 def degree_field(description: str) -> Any:
@@ -98,7 +98,7 @@ def width_field(default: float, description: str, least: float, most: float) -> 
 
 
 class Step(Choice):
-    """Something done to a shot before its inversion."""
+    """A step applied to a shot before its inversion."""
 
     key = "step"
 
@@ -114,14 +114,14 @@ class Step(Choice):
 
     @property
     def smooths(self) -> bool:
-        """Whether it takes noise from pixels that it leaves in their mean over many."""
+        """Whether it reduces pixel noise but keeps low-frequency noise."""
         return False
 
     def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
-        """Return the shot with this done to image, source, masks and setup.
+        """Return the shot with the step applied to image, source, masks and setup.
 
-        An `InputError` if it cannot be done to this image; `InversionCancelled` if `should_stop`,
-        asked now and then by steps that take long, returned true.
+        Raises an `InputError` if it does not apply to this image, and `InversionCancelled` if
+        `should_stop`, called repeatedly by slow steps, returned true.
         """
         raise NotImplementedError
 
@@ -159,8 +159,8 @@ Level = Annotated[
 class Dark(Step):
     """Subtract the detector's dark level from image and source.
 
-    An image without it is linear in the fluence, as an inversion assumes. Pixels of a source that
-    are negative then are set to zero; those of the image are left to the inversion's options.
+    An image without it is linear in the fluence, as an inversion assumes. Pixels of the source that
+    become negative are set to zero; for the image, the inversion's options decide.
     """
 
     title = "subtract dark level"
@@ -215,8 +215,8 @@ def _turned(array: AnyArray, turns: int) -> Any:
 class Rotate(Step):
     """Rotate about the image centre; exact for multiples of 90°.
 
-    Other angles interpolate linearly between pixels and keep the image's size; corners that
-    are not known then are masked.
+    Other angles interpolate linearly between pixels and keep the image's size; corners without data
+    are masked.
     """
 
     title = "rotate"
@@ -234,8 +234,8 @@ class Rotate(Step):
 
     @property
     def _turns(self) -> int | None:
-        turns, rest = divmod(self.angle, 90)
-        return None if rest else int(turns) % 4
+        turns, remainder = divmod(self.angle, 90)
+        return None if remainder else int(turns) % 4
 
     @property
     def smooths(self) -> bool:
@@ -252,11 +252,11 @@ class Rotate(Step):
     def _interpolated(self, shot: Radiograph) -> Radiograph:
         usable = np.isfinite(shot.image) if shot.mask is None else shot.mask
         share = self._moved(usable.astype(np.float64))
-        mask = share > _WHOLE
+        mask = share > _MIN_SHARE
 
         def values(image: FloatArray) -> FloatArray:
             moved = self._moved(np.where(usable, image, 0.0))
-            return np.where(mask, moved / np.maximum(share, _WHOLE), 0.0)
+            return np.where(mask, moved / np.maximum(share, _MIN_SHARE), 0.0)
 
         rotated = shot.mapped(values, lambda bare: self._moved(bare.astype(float)) > 0.5)
         return replace(rotated, mask=mask)
@@ -328,7 +328,7 @@ class Crop(Step):
     )
 
     def slices(self, shape: tuple[int, int]) -> tuple[slice, slice]:
-        """Return the rows and columns that are kept of an image; at least 4 × 4 pixels."""
+        """Return the rows and columns of an image inside the crop; at least 4 × 4 pixels."""
         rows, columns = (
             slice(*slice(*part).indices(side))
             for part, side in zip((self.y, self.x), shape, strict=True)
