@@ -87,15 +87,15 @@ def scan(tmp_path: Path) -> Path:
 def test_a_track_has_the_place_and_the_size_that_its_bytes_tell(tmp_path: Path) -> None:
     tracks = [ROUND, (640, 40, 99, 98, 0, HEIGHT)]
     path = save(tmp_path / "a.cpsa", (2, 2), snake(2, 2, lambda c, r: tracks * (c > r)))
-    found = read_tracks(path)
-    assert len(found) == 2
-    np.testing.assert_allclose(found.size, (400e-6, 800e-6))
+    read = read_tracks(path)
+    assert len(read) == 2
+    np.testing.assert_allclose(read.size, (400e-6, 800e-6))
     # The upper right frame: x counts from its right edge to the left, y from its lower edge up.
-    np.testing.assert_allclose(found.x, [800e-6 - 100 * 0.5e-6, 800e-6], atol=1e-12)
-    np.testing.assert_allclose(found.y, [200e-6 - 50 * 0.5e-6, 0.0], atol=1e-12)
-    np.testing.assert_allclose(found.diameter, [10 * PIXEL, 6.4 * PIXEL], rtol=1e-6)
-    np.testing.assert_array_equal(found.eccentricity, [5, 40])
-    np.testing.assert_array_equal(found.contrast, [20, 99])
+    np.testing.assert_allclose(read.x, [800e-6 - 100 * 0.5e-6, 800e-6], atol=1e-12)
+    np.testing.assert_allclose(read.y, [200e-6 - 50 * 0.5e-6, 0.0], atol=1e-12)
+    np.testing.assert_allclose(read.diameter, [10 * PIXEL, 6.4 * PIXEL], rtol=1e-6)
+    np.testing.assert_array_equal(read.eccentricity, [5, 40])
+    np.testing.assert_array_equal(read.contrast, [20, 99])
 
 
 def test_frames_lie_where_their_places_say(tmp_path: Path) -> None:
@@ -197,14 +197,14 @@ def test_headers_that_cannot_be_are_refused(tmp_path: Path, told: Any, words: st
 
 
 def test_wherever_a_file_is_cut_it_is_told(tmp_path: Path, scan: Path) -> None:
-    whole = scan.read_bytes()
-    end = len(whole) - len(struct.pack("<i", -1) + b"Scan of shot 17\n\xb5m")
+    content = scan.read_bytes()
+    end = len(content) - len(struct.pack("<i", -1) + b"Scan of shot 17\n\xb5m")
     cut = tmp_path / "cut.cpsa"
     for length in (1, 47, 48, 60, 88, 95, end // 2, end - 1):
-        cut.write_bytes(whole[:length])
+        cut.write_bytes(content[:length])
         with pytest.raises(FileFormatError, match="truncated"):
             read_tracks(cut)
-    cut.write_bytes(whole[:end])  # the trailer is not needed
+    cut.write_bytes(content[:end])  # the trailer is not needed
     assert len(read_tracks(cut)) == 432
 
 
@@ -252,8 +252,8 @@ def test_the_command_inverts_a_scan_and_makes_it_again(
     np.testing.assert_allclose(read(Path("a.shadowinv"))["residual"].shape, image.shape)
     again = shadowinv("rerun", "a.shadowinv")
     assert again.exit_code == 0, again.output
-    told = flat(shadowinv("info", scan, "--variable", chosen).output)
-    assert "CR-39 tracks" in told
-    assert "288 of 432 tracks counted in bins of 100 µm" in told
-    assert "detector pixel size (m)" in told
+    report = flat(shadowinv("info", scan, "--variable", chosen).output)
+    assert "CR-39 tracks" in report
+    assert "288 of 432 tracks counted in bins of 100 µm" in report
+    assert "detector pixel size (m)" in report
     assert "all 432 tracks are counted" in flat(shadowinv("info", scan).output)

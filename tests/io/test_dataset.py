@@ -130,17 +130,17 @@ def test_attributes_tell_how_and_from_what(tmp_path: Path, proton_setup: ProtonS
     )
     inversion = run(recipe, tmp_path / "shot.npy", source=tmp_path / "beam.npy", mask=dead)
     dataset = inversion.to_dataset()
-    made = Provenance.of(dataset.attrs)
-    assert made == inversion.provenance == Inversion.from_dataset(dataset).provenance
-    assert made is not None
-    assert made.recipe == recipe.model_copy(update={"source": MeasuredSource()})
-    for origin, name in ((made.image, "shot.npy"), (made.source, "beam.npy")):
+    provenance = Provenance.of(dataset.attrs)
+    assert provenance == inversion.provenance == Inversion.from_dataset(dataset).provenance
+    assert provenance is not None
+    assert provenance.recipe == recipe.model_copy(update={"source": MeasuredSource()})
+    for origin, name in ((provenance.image, "shot.npy"), (provenance.source, "beam.npy")):
         assert origin is not None
         digest = hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
         assert (origin.file, origin.sha256) == (name, digest)
-    assert made.mask is not None
-    np.testing.assert_array_equal(made.mask.mask(), dead)
-    assert made.setup == proton_setup
+    assert provenance.mask is not None
+    np.testing.assert_array_equal(provenance.mask.mask(), dead)
+    assert provenance.setup == proton_setup
     assert "path_integrated_b" in dataset
     assert json.loads(dataset.attrs["options"])["n_sites"] == 300
     # A text of another version, or none, is no error.

@@ -38,8 +38,8 @@ def assert_same(before: Any, after: Any, name: str = "fit") -> None:
         np.testing.assert_array_equal(after, before, err_msg=name)
     elif isinstance(before, tuple):
         assert len(before) == len(after), name
-        for number, (one, other) in enumerate(zip(before, after, strict=True)):
-            assert_same(one, other, f"{name}[{number}]")
+        for number, (first, second) in enumerate(zip(before, after, strict=True)):
+            assert_same(first, second, f"{name}[{number}]")
     elif dataclasses.is_dataclass(before):
         for field in dataclasses.fields(before):
             values = getattr(before, field.name), getattr(after, field.name)
@@ -72,10 +72,10 @@ def test_file_gives_back_every_bit(
 
 
 def test_what_is_not_known_stays_so(tmp_path: Path, make_fit: MakeFit) -> None:
-    whole = make_fit(strengths=(1.0,), verdict=Verdict.AMBIGUOUS, explanation="cannot tell")
-    fields = tuple(dataclasses.replace(field, uncertainty=None) for field in whole.fields)
-    report = dataclasses.replace(whole.report, uncertainty=float("nan"))
-    fit = dataclasses.replace(whole, fields=fields, report=report)
+    complete_fit = make_fit(strengths=(1.0,), verdict=Verdict.AMBIGUOUS, explanation="cannot tell")
+    fields = tuple(dataclasses.replace(field, uncertainty=None) for field in complete_fit.fields)
+    report = dataclasses.replace(complete_fit.report, uncertainty=float("nan"))
+    fit = dataclasses.replace(complete_fit, fields=fields, report=report)
     again = Fit.from_dataset(read_back(tmp_path / "fit.shadowinv", fit))
     assert_same(fit, again)
     assert again.fields[0].uncertainty is None

@@ -32,8 +32,8 @@ def test_an_ending_is_written_in_the_registry_alone() -> None:
     spelled = re.compile(rf"(?:\*|_\w+)?({endings})")
     places: dict[str, set[str]] = {}
     for place, text in strings():
-        if found := spelled.fullmatch(text):
-            places.setdefault(found[1], set()).add(place)
+        if match := spelled.fullmatch(text):
+            places.setdefault(match[1], set()).add(place)
     assert places == {suffix: {"io/formats.py"} for suffix in SUFFIXES}
 
 
@@ -55,7 +55,7 @@ def test_its_functions_exist(each: Format) -> None:
 
 def test_marks_lie_in_what_is_read_of_a_file() -> None:
     ends = [at + len(mark) for each in FORMATS for at, mark in each.marks]
-    assert max(ends) <= formats._HEAD
+    assert max(ends) <= formats._HEAD_BYTES
 
 
 def test_messages_and_help_list_every_format(tmp_path: Path) -> None:
@@ -64,8 +64,8 @@ def test_messages_and_help_list_every_format(tmp_path: Path) -> None:
         format_of(tmp_path / "empty")
     listed = [each for each in FORMATS if each.title]
     assert all(each.title in str(error.value) for each in listed)
-    told = CliRunner().invoke(app, ["invert", "--help-all"], env={"COLUMNS": "300"}).output
-    words = " ".join(told.replace("│", " ").split())  # in a table of any width
+    output = CliRunner().invoke(app, ["invert", "--help-all"], env={"COLUMNS": "300"}).output
+    words = " ".join(output.replace("│", " ").split())  # in a table of any width
     assert all(each.title in words for each in listed if "image" in each.holds)
 
 

@@ -52,23 +52,24 @@ def test_array_comes_back(tmp_path: Path, layout: str, dtype: str) -> None:
 @pytest.mark.parametrize("layout", ["5", "7", "7.3"])
 def test_scalars_vectors_and_stacks_are_no_candidates(tmp_path: Path, layout: str) -> None:
     path = tmp_path / "shot.mat"
-    held = {"a": np.ones((1, 1)), "b": np.ones((1, 9)), "c": np.ones((2, 3, 4)), "shot": RAMP * 0.5}
+    arrays = {"a": np.ones((1, 1)), "b": np.ones((1, 9)), "c": np.ones((2, 3, 4))}
+    arrays["shot"] = RAMP * 0.5
     if layout == "7.3":
-        save_73(path, held)
+        save_73(path, arrays)
     else:
-        others = {"note": "film 3", "s": {"x": RAMP}, "cell": np.array([1, "a"], dtype=object)}
-        savemat(path, {**others, **held}, do_compression=layout == "7")
+        foreign = {"note": "film 3", "s": {"x": RAMP}, "cell": np.array([1, "a"], dtype=object)}
+        savemat(path, {**foreign, **arrays}, do_compression=layout == "7")
     np.testing.assert_array_equal(read_radiograph(path).image, RAMP / 2)
 
 
 @pytest.mark.parametrize("layout", ["5", "7", "7.3"])
 def test_several_candidates_are_listed_and_chosen(tmp_path: Path, layout: str) -> None:
     path = tmp_path / "shot.mat"
-    held = {"shot": RAMP * 0.5, "beam": np.ones((4, 5), np.uint16), "z": np.ones((1, 3))}
+    arrays = {"shot": RAMP * 0.5, "beam": np.ones((4, 5), np.uint16), "z": np.ones((1, 3))}
     if layout == "7.3":
-        save_73(path, held)
+        save_73(path, arrays)
     else:
-        savemat(path, held, do_compression=layout == "7")
+        savemat(path, arrays, do_compression=layout == "7")
     with pytest.raises(InputError, match="holds 2 images: choose one with variable") as error:
         read_radiograph(path)
     assert "'shot' (6×9 double)" in str(error.value)

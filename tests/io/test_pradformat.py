@@ -111,8 +111,8 @@ def test_published_examples(
 
 
 def written(path: Path, inversion: Inversion, setup: ProtonSetup) -> Path:
-    made = Provenance(version="1", recipe=Recipe(), image=Origin(file="shot.tif"))
-    return write(path, dataclasses.replace(inversion, provenance=made), setup=setup)
+    provenance = Provenance(version="1", recipe=Recipe(), image=Origin(file="shot.tif"))
+    return write(path, dataclasses.replace(inversion, provenance=provenance), setup=setup)
 
 
 def test_inversion_follows_the_format(
@@ -143,9 +143,9 @@ def test_inversion_comes_back(
     tmp_path: Path, inversion: Inversion, proton_setup: ProtonSetup
 ) -> None:
     dataset = read(written(tmp_path / "shot.h5", inversion, proton_setup))
-    made = Provenance.of(dataset.attrs)
-    assert made is not None
-    assert made.image.file == "shot.tif"
+    provenance = Provenance.of(dataset.attrs)
+    assert provenance is not None
+    assert provenance.image.file == "shot.tif"
     assert isinstance(dataset, xr.Dataset)
     np.testing.assert_allclose(dataset["displacement"], inversion.displacement, rtol=1e-12)
     np.testing.assert_allclose(dataset["potential"], inversion.potential, rtol=1e-12)
@@ -165,13 +165,13 @@ def test_a_field_of_another_program_is_kept_as_a_result(
 ) -> None:
     field = read(written(tmp_path / "field.h5", inversion, proton_setup))
     assert isinstance(field, xr.Dataset)
-    kept = read(write(tmp_path / "field.shadowinv", field))
-    assert isinstance(kept, xr.Dataset)
-    assert set(kept.variables) == set(field.variables)
+    reloaded = read(write(tmp_path / "field.shadowinv", field))
+    assert isinstance(reloaded, xr.Dataset)
+    assert set(reloaded.variables) == set(field.variables)
     for name in field.variables:
-        np.testing.assert_array_equal(kept[name], field[name])
-    assert setup_from_dataset(kept) == setup_from_dataset(field)
-    assert setup_from_dataset(kept) is not None
+        np.testing.assert_array_equal(reloaded[name], field[name])
+    assert setup_from_dataset(reloaded) == setup_from_dataset(field)
+    assert setup_from_dataset(reloaded) is not None
 
 
 def test_potential_alone_gives_the_displacement(
@@ -193,7 +193,7 @@ def test_potential_alone_gives_the_displacement(
 def test_inversion_needs_a_particle_beam(
     tmp_path: Path, inversion: Inversion, optical_setup: OpticalSetup
 ) -> None:
-    for setup, found in ((None, "none"), (optical_setup, "'optical'")):
-        with pytest.raises(InputError, match=f"needs a setup of kind 'proton', received.*{found}"):
+    for setup, kind in ((None, "none"), (optical_setup, "'optical'")):
+        with pytest.raises(InputError, match=f"needs a setup of kind 'proton', received.*{kind}"):
             write(tmp_path / "shot.h5", inversion, setup=setup)
     assert list(tmp_path.iterdir()) == []

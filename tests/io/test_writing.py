@@ -124,13 +124,13 @@ for name in ("b.shadowinv", "b.h5"):
 def test_hdf5_that_finds_no_room_does_not_end_the_process(
     tmp_path: Path, inversion: Inversion, proton_setup: ProtonSetup
 ) -> None:
-    whole = write(tmp_path / "a.shadowinv", inversion, setup=proton_setup)
+    complete_file = write(tmp_path / "a.shadowinv", inversion, setup=proton_setup)
     printed = subprocess.run(
-        [sys.executable, "-c", _LONGEST, str(whole)], capture_output=True, text=True
+        [sys.executable, "-c", _LONGEST, str(complete_file)], capture_output=True, text=True
     )
     assert (printed.returncode, printed.stderr) == (0, "")
     lines = printed.stdout.splitlines()
     assert [line.split(" (")[0] for line in lines] == [
         f"{tmp_path / name} cannot be written" for name in ("b.shadowinv", "b.h5")
     ]
-    assert list(tmp_path.iterdir()) == [whole]
+    assert list(tmp_path.iterdir()) == [complete_file]

@@ -393,7 +393,7 @@ def shot_of(name: str) -> int:
 @pytest.fixture
 def quick(monkeypatch) -> None:
     """Make signs of life come, and their absence count, within a moment."""
-    for name, seconds in (("_BEAT", 0.02), ("_WATCH", 1.0), ("_SETTLE", 0.05)):
+    for name, seconds in (("_BEAT_S", 0.02), ("_WATCH_S", 1.0), ("_SETTLE_S", 0.05)):
         monkeypatch.setattr(locking, name, seconds)
 
 
@@ -493,7 +493,7 @@ class TestLocks:
     def test_of_two_that_take_a_stale_lock_one_gets_it(self, tmp_path, quick, monkeypatch):
         lock = tmp_path / ".store.lock"
         lock.write_text('{"host": "elsewhere", "pid": 7}')
-        monkeypatch.setattr(locking, "_SETTLE", 0.3)
+        monkeypatch.setattr(locking, "_SETTLE_S", 0.3)
 
         def sign() -> None:
             wait_for(lambda: "elsewhere" not in lock.read_text(), "the first to sign")

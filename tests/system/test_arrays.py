@@ -139,8 +139,8 @@ def test_uncertainty_draws_no_noise_under_a_mask(burnt: np.ma.MaskedArray[Any, A
 
     expected = uncertainty(burnt.data, 2, mask=~burnt.mask, options=OPTIONS)
 
-    standard_error = uncertainty(burnt, 2, options=OPTIONS)
-    assert np.array_equal(standard_error.displacement_std, expected.displacement_std)
+    result = uncertainty(burnt, 2, options=OPTIONS)
+    assert np.array_equal(result.displacement_std, expected.displacement_std)
 
 
 def test_estimate_ignores_masked_pixels(burnt: np.ma.MaskedArray[Any, Any]) -> None:

@@ -42,13 +42,13 @@ def test_without_ctrl_c_nothing_is_raised() -> None:
 
 
 def test_other_threads_leave_signals_alone() -> None:
-    signals = []
+    handlers = []
 
     def look() -> None:
         with defer_interrupts():
-            signals.append(signal.getsignal(signal.SIGINT))
+            handlers.append(signal.getsignal(signal.SIGINT))
 
     thread = threading.Thread(target=look)
     thread.start()
     thread.join()
-    assert signals == [signal.getsignal(signal.SIGINT)]
+    assert handlers == [signal.getsignal(signal.SIGINT)]

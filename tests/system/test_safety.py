@@ -59,10 +59,10 @@ def test_whatever_a_reader_raises_is_one_error_with_its_reason(tmp_path: Path) -
         broken("a.tif", MemoryError())
     with pytest.raises(FileFormatError, match="Permission denied"):
         broken("a.tif", PermissionError(13, "Permission denied"))
-    for expected_error in (InputError("mine"), FileFormatError("mine"), InversionCancelled()):
-        with pytest.raises(type(expected_error)) as told:
-            broken("a.tif", expected_error)
-        assert told.value is expected_error
+    for clear_error in (InputError("mine"), FileFormatError("mine"), InversionCancelled()):
+        with pytest.raises(type(clear_error)) as told:
+            broken("a.tif", clear_error)
+        assert told.value is clear_error
     with pytest.raises(KeyboardInterrupt):
         broken("a.tif", KeyboardInterrupt())
 

@@ -1,1 +1,1 @@
-"""What the package asks of Python and the machine: threads, memory, interrupts, locks, checks."""
+"""Services of Python and the machine: threads, memory, interrupts, locks, checks."""

@@ -1,7 +1,7 @@
 """Arrays as users hold them: numpy's masked arrays and xarray's labelled ones.
 
 - values in the order of the axes, and the mask: `unpack_array`
-- the same where a mask has no meaning: `plain_array`; in whatever order: `unmasked`
+- the same where a mask has no meaning: `plain_array`; in any order: `unmasked`
 - image, source and mask of one shot: `unpack_shot`; several planes: `unpack_planes`
 - numbers as floats: `as_numbers`
 - two masks together: `join_masks`; size of a pixel by the coordinates: `coordinate_spacing`
@@ -38,10 +38,10 @@ _UNEVEN = 1e-2  # of the mean spacing
 def unpack_array(
     values: Any, name: str, dims: Sequence[str] = PLANE, *, unit: str = ""
 ) -> tuple[Any, BoolArray | None]:
-    """Return the values in the order of `dims`, and which of them can be used (None: all).
+    """Return the values in the order of `dims`, and a mask of the usable ones (None: all).
 
-    `name` is for messages; `unit` is that of the values, where another one would be wrong. An
-    `InputError` if dimensions have other names, or pixels are not square.
+    `name` is for messages; values in another unit than `unit` are refused. Raises an `InputError`
+    if dimensions have other names, or pixels are not square.
     """
     if _is_labelled(values):
         values = _in_order(values, name, dims, unit)
@@ -67,7 +67,7 @@ def plain_array(values: Any, name: str, dims: Sequence[str] = PLANE, *, unit: st
 
 
 def unmasked(values: Any, name: str) -> Any:
-    """Return values in whatever order, unless some are masked."""
+    """Return the values unchanged, unless some are masked."""
     if isinstance(values, np.ma.MaskedArray) and np.ma.getmaskarray(values).any():
         raise InputError(
             f"{name} has {int(np.ma.getmaskarray(values).sum())} masked values, expected none: "
@@ -96,7 +96,7 @@ def join_masks(*masks: Any) -> Any:
 
 
 def unpack_shot(image: Any, source: Any, mask: Any) -> tuple[Any, Any, Any]:
-    """Return image, source and mask as plain planes; pixels masked in either are not used."""
+    """Return image, source and mask as plain planes; the mask excludes pixels masked in either."""
     image, usable = unpack_array(image, "image")
     if source is not None:
         source, lit = unpack_array(source, "source")
@@ -125,7 +125,7 @@ def mask_of_each(mask: BoolArray | None, data: FloatArray) -> BoolArray | None:
 
 
 def as_numbers(name: str, values: ArrayLike) -> FloatArray:
-    """Return a copy of values as floats, or raise an `InputError` that shows what they are."""
+    """Return a copy of values as floats, or raise an `InputError` that shows the values."""
     try:
         return np.array(unmasked(values, name), dtype=np.float64)
     except InputError:
@@ -166,28 +166,28 @@ def _is_labelled(values: Any) -> bool:
 
 
 def _in_order(array: Any, name: str, dims: Sequence[str], unit: str) -> Any:
-    """Values of a labelled array in the order of the dimensions."""
-    found = tuple(map(str, array.dims))
+    """Return the values of a labelled array in the order of the dimensions."""
+    names = tuple(map(str, array.dims))
     received = str(array.attrs.get("units", unit)).replace(" ", "")
     if unit and received not in ("", *_UNITS[unit]):
         raise InputError(f"{name} has the unit {received!r}, expected {unit!r}: convert it first")
     coordinate_spacing(array, name)
-    if all(map(_UNNAMED.fullmatch, found)):
+    if all(map(_UNNAMED.fullmatch, names)):
         return array.data
     # Only the plane's axes have names that everybody uses.
-    leading = [dim for dim in found if dim.lower() not in PLANE]
-    plane = [dim for axis in PLANE for dim in found if dim.lower() == axis]
+    leading = [dim for dim in names if dim.lower() not in PLANE]
+    plane = [dim for axis in PLANE for dim in names if dim.lower() == axis]
     if len(plane) != len(PLANE) or len(leading) != len(dims) - len(PLANE):
-        step = "rename" if len(found) == len(dims) else "select one of what is too many, or rename"
+        step = "rename" if len(names) == len(dims) else "select one of what is too many, or rename"
         raise InputError(
-            f"{name} has the dimensions {', '.join(map(repr, found))}, expected "
+            f"{name} has the dimensions {', '.join(map(repr, names))}, expected "
             f"{', '.join(map(repr, dims))}: {step} them"
         )
     return array.transpose(*leading, *plane).data
 
 
 def _spacing(array: Any, dim: str, name: str) -> float | None:
-    """Distance between pixels along one dimension in m, None if that is not known."""
+    """Return the distance between pixels along one dimension in m, or None if unknown."""
     if dim not in array.coords:
         return None
     coordinate = array.coords[dim]

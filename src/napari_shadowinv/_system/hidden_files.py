@@ -1,11 +1,11 @@
 """Temporary files and folders, named after the process that writes them.
 
-- beside a file that is being written: `hidden_name`; in the system's temporary folder:
+- in the folder of a file that is being written: `hidden_name`; in the system's temporary folder:
   `temporary_folder`
-- remove those of processes that were killed: `sweep`
+- remove the leftovers of killed processes: `sweep`
 
-A name holds the machine and user, the process, its start and a random part. So what a process left
-behind that had no time to clear up can be told from what another one is writing now.
+A name holds the machine and user, the process, its start and a random part. So leftovers of a
+killed process can be distinguished from files that another process is writing now.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _swept: set[Path] = set()
 
 
 def hidden_name(path: Path, ending: str = "") -> Path:
-    """Return an unused hidden name beside a path, however long the path's own name is.
+    """Return an unused hidden name in the folder of a path, however long the path's name is.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def temporary_folder(kind: str) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> None:
-    """Remove what processes of this user that no longer exist left in a folder.
+    """Remove the leftovers of this user's dead processes from a folder.
 
     Each process looks into a folder once.
     """
@@ -114,8 +114,8 @@ def _start_of(pid: int) -> str:
 
 
 def _is_dead(pid: int, start: str) -> bool:
-    """Tell whether a process has ended; where the system does not say, it has not."""
-    if os.name == "nt":  # there, the question would end the process
+    """Return whether a process has ended, or False where the system does not say."""
+    if os.name == "nt":  # there, this signal would end the process
         return False
     try:
         os.kill(pid, 0)

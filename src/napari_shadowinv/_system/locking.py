@@ -19,14 +19,14 @@ from napari_shadowinv._system.hidden_files import MAX_NAME_BYTES
 from napari_shadowinv.errors import FileFormatError
 
 _MAX_LOCKED_BYTES = MAX_NAME_BYTES - len("..lock")
-_BEAT = 2.0  # seconds between two signs of life
-_WATCH = 30.0  # seconds without one after which a lock is stale
-_SETTLE = 1.0  # seconds after which another that took a stale lock, too, has been seen
+_BEAT_S = 2.0  # between two signs of life
+_WATCH_S = 30.0  # without one after which a lock is stale
+_SETTLE_S = 1.0  # in which another process that took the same stale lock has signed it
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Keep other processes from writing to a path, by a hidden file beside it, in a block."""
+    """Keep other processes from writing to a path within a block, by a hidden file next to it."""
     # The operating system takes the lock from a process that dies. Where a file system has no
     # locks, or is shared and they do not reach other hosts, signs of life stand in for them: a
     # lock whose file does not change while one watches is stale, whatever the clocks say.
@@ -37,7 +37,7 @@ def locked(path: Path) -> Iterator[None]:
         ended = threading.Event()
 
         def beat() -> None:
-            while not ended.wait(_BEAT):
+            while not ended.wait(_BEAT_S):
                 with suppress(OSError):
                     os.utime(lock)
 
@@ -59,7 +59,7 @@ def _shortened(name: str) -> str:
 
 
 def _opened(path: Path, lock: Path) -> tuple[BinaryIO, bool]:
-    """Open the lock file without following links, and tell whether it was made here."""
+    """Open the lock file without following links, and return whether it is new."""
     flags = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0)
     try:
         while True:
@@ -67,7 +67,7 @@ def _opened(path: Path, lock: Path) -> tuple[BinaryIO, bool]:
                 number, is_new = os.open(lock, flags | os.O_CREAT | os.O_EXCL, 0o666), True
                 break
             with suppress(FileNotFoundError):
-                # Not truncated: who holds it is told in it.
+                # Not truncated: it names its holder.
                 number, is_new = os.open(lock, flags), False
                 break
     except OSError as error:
@@ -75,8 +75,8 @@ def _opened(path: Path, lock: Path) -> tuple[BinaryIO, bool]:
             raise _no_file_of_its_own(path, lock) from None
         raise _not_writable(path, error) from None
     file = cast(BinaryIO, os.fdopen(number, "r+b", buffering=0))
-    found = os.fstat(number)
-    if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+    status = os.fstat(number)
+    if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
         file.close()
         raise _no_file_of_its_own(path, lock)
     return file, is_new
@@ -104,32 +104,32 @@ def _take(path: Path, lock: Path, file: BinaryIO, is_new: bool) -> None:
         _give_back(file, lock)
         raise _not_writable(path, error) from None
     if not is_certain:
-        time.sleep(_SETTLE)
+        time.sleep(_SETTLE_S)
         if _content(file) != signature:
             raise _held(path, file)
 
 
 def _held(path: Path, file: BinaryIO) -> FileFormatError:
-    found = _content(file)
-    holder = f"process {found.get('pid')} on {found.get('host')}" if found else "another process"
+    owner = _content(file)
+    holder = f"process {owner.get('pid')} on {owner.get('host')}" if owner else "another process"
     return FileFormatError(
         f"{path} is being written by {holder}: wait for that process, or stop it first"
     )
 
 
 def _is_silent(lock: Path) -> bool:
-    """Watch whether a lock stays as it is."""
+    """Return whether a lock stays unchanged while it is watched."""
     before = _look(lock)
-    end = time.monotonic() + _WATCH
+    end = time.monotonic() + _WATCH_S
     while time.monotonic() < end:
-        time.sleep(_BEAT / 4)
+        time.sleep(_BEAT_S / 4)
         if _look(lock) != before:
             return False
     return True
 
 
 def _look(lock: Path) -> tuple[int, bytes] | None:
-    """Return time stamp and content; opened anew, as a network file system looks only then."""
+    """Return time stamp and content, opening the file anew to refresh a network file system."""
     try:
         with lock.open("rb") as file:
             return os.fstat(file.fileno()).st_mtime_ns, file.read()
@@ -160,13 +160,13 @@ def _sign(file: BinaryIO) -> dict[str, object]:
 def _content(file: BinaryIO) -> dict[str, object]:
     file.seek(0)
     try:
-        found = json.loads(file.read() or b"{}")
+        owner = json.loads(file.read() or b"{}")
     except (ValueError, OSError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return owner if isinstance(owner, dict) else {}
 
 
-# `_taken` tells whether the operating system gave the lock; None where it has no locks.
+# `_taken` returns whether the operating system gave the lock; None where it has no locks.
 if os.name == "nt":  # pragma: no cover - Windows only
     import msvcrt
 

@@ -17,7 +17,7 @@ from typing import Any
 
 
 def physical_memory() -> int | None:
-    """Physical memory in bytes, or None where the system does not tell."""
+    """Return the physical memory in bytes, or None where the system does not report it."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
@@ -47,18 +47,18 @@ def in_ranges(
         kernel(0, n, *args)
         return
     pool = _helpers()
-    others = [pool.submit(kernel, bounds[k], bounds[k + 1], *args) for k in range(1, ranges)]
+    futures = [pool.submit(kernel, bounds[k], bounds[k + 1], *args) for k in range(1, ranges)]
     try:
         kernel(bounds[0], bounds[1], *args)
     finally:
-        wait(others)
-    for other in others:
-        other.result()
+        wait(futures)
+    for future in futures:
+        future.result()
 
 
 @cache
 def _helpers() -> ThreadPoolExecutor:
-    """Threads for the kernels, kept because to start one takes as long as a small kernel."""
+    """Return the pool of kernel threads; starting a thread takes as long as a small kernel."""
     return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="kernels of shadowinv")
 
 
@@ -66,7 +66,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_helpers.cache_clear)  # threads are not copied
 
 
-# Ctrl-C, and what a scheduler of jobs or a terminal that closes sends.
+# Ctrl-C, and the signals of a job scheduler or a closing terminal.
 ENDING_SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
@@ -74,10 +74,7 @@ ENDING_SIGNALS = tuple(
 
 @contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Put Ctrl-C, SIGTERM and SIGHUP off until the end of a block that must not be left half done.
-
-    The block should be short.
-    """
+    """Defer Ctrl-C, SIGTERM and SIGHUP to the end of a short block that must run to its end."""
     late: list[int] = []
     with handling(ENDING_SIGNALS, lambda number, frame: late.append(number)):
         yield
@@ -95,14 +92,14 @@ def clear_up_when_terminated() -> Iterator[None]:
     def leave(number: int, frame: Any) -> None:
         raise SystemExit(128 + number)
 
-    fatal = [one for one in ENDING_SIGNALS if signal.getsignal(one) is signal.SIG_DFL]
+    fatal = [number for number in ENDING_SIGNALS if signal.getsignal(number) is signal.SIG_DFL]
     with handling(fatal, leave):
         yield
 
 
 @contextmanager
 def handling(numbers: Iterable[int], handler: Callable[[int, Any], None]) -> Iterator[None]:
-    """Handle signals in a block of the main thread, but for those that are ignored."""
+    """Handle signals in a block of the main thread, except ignored ones."""
     before: dict[int, Any] = {}
     if threading.current_thread() is threading.main_thread():  # they never reach others
         for number in numbers:

@@ -1,9 +1,9 @@
-"""What every reader relies on: no file blocks it, fills the memory or ends it with a traceback.
+"""Safety of readers: no file blocks them, fills the memory or ends them with a traceback.
 
-- whatever a damaged file makes a reader raise is told in one sentence: `as_file_errors`
-- the same for the content of a dataset: `refusing_junk`
+- any error that a damaged file causes in a reader becomes one sentence: `as_file_errors`
+- the same for the content of a dataset: `as_input_errors`
 - only regular files are opened: `check_regular`; links followed: `resolved_path`
-- a limit on what a file may unfold to in memory: `check_size`
+- a limit on the size of a file in memory: `check_size`
 - a forecast of the memory that work on an image takes: `check_memory`
 - small files of text, such as setups and calibrations: `small_text`
 """
@@ -42,7 +42,7 @@ class _DamagedContentError(InputError):
 def as_file_errors(
     read: Callable[Concatenate[Path, P], Content],
 ) -> Callable[Concatenate[str | Path, P], Content]:
-    """Turn what a file makes its reader raise into a `FileFormatError`, with it as the cause."""
+    """Turn any error of a reader of files into a `FileFormatError`, with it as the cause."""
 
     @functools.wraps(read)
     def guarded(path: str | Path, *args: P.args, **kwargs: P.kwargs) -> Content:
@@ -81,8 +81,8 @@ def _reason(error: BaseException) -> str:
 
 
 @contextmanager
-def refusing_junk(name: str) -> Iterator[None]:
-    """Turn whatever the content of a dataset makes its reader raise into an `InputError`."""
+def as_input_errors(name: str) -> Iterator[None]:
+    """Turn any error that the content of a dataset causes in a block into an `InputError`."""
     try:
         yield
     except (InputError, ImportError, NameError, MemoryError):
@@ -95,7 +95,7 @@ def refusing_junk(name: str) -> Iterator[None]:
 
 
 def check_regular(path: Path, expected: str) -> None:
-    """Refuse what is no regular file, before it is opened: a pipe would block for ever."""
+    """Refuse anything but a regular file before it is opened: a pipe would block for ever."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
@@ -114,8 +114,8 @@ def check_regular(path: Path, expected: str) -> None:
     if stat.S_ISDIR(mode):
         raise FileFormatError(f"{path} is a folder: expected {expected}")
     if not stat.S_ISREG(mode):
-        found = "pipe" if stat.S_ISFIFO(mode) else "socket" if stat.S_ISSOCK(mode) else "device"
-        raise FileFormatError(f"{path} is a {found}: expected {expected}; save it as a file first")
+        kind = "pipe" if stat.S_ISFIFO(mode) else "socket" if stat.S_ISSOCK(mode) else "device"
+        raise FileFormatError(f"{path} is a {kind}: expected {expected}; save it as a file first")
 
 
 def resolved_path(path: str | Path) -> Path:
@@ -134,7 +134,7 @@ def _shown(path: Path) -> str:
 
 
 def size_limit() -> int:
-    """Return how many bytes a file may unfold to, by `LIMIT_VARIABLE` or the memory."""
+    """Return the largest size of a file in memory (bytes), by `LIMIT_VARIABLE` or the memory."""
     text = os.environ.get(LIMIT_VARIABLE)
     if text is None:
         return int(_SHARE_OF_MEMORY * (physical_memory() or _MEMORY_IF_UNKNOWN))
@@ -159,7 +159,7 @@ def check_size(path: str | Path, promised: int) -> None:
 
 
 def memory_limit() -> int | None:
-    """Return how many bytes work may take, by `LIMIT_VARIABLE` or the memory; None if unknown."""
+    """Return the memory for work (bytes), by `LIMIT_VARIABLE` or the memory; None if unknown."""
     return physical_memory() if os.environ.get(LIMIT_VARIABLE) is None else size_limit()
 
 
@@ -176,7 +176,7 @@ def check_memory(shape: Sequence[int], bytes_per_pixel: float, work: str) -> Non
 
 
 def small_text(path: Path, expected: str, encoding: str = "utf-8") -> str:
-    """Return the text of a file that nobody makes large."""
+    """Return the text of a file, refusing a large one."""
     check_regular(path, expected)
     with path.open("rb") as file:
         raw = file.read(_LARGEST_TEXT + 1)

@@ -13,7 +13,7 @@ from napari_shadowinv.errors import InputError
 
 Model = TypeVar("Model", bound=BaseModel)
 
-# What pydantic calls a bound, and how it reads after "it must be".
+# Name of a bound in pydantic: its key there, and its wording after "it must be".
 _BOUNDS = {
     "greater_than": ("gt", "greater than"),
     "greater_than_equal": ("ge", "at least"),
@@ -62,7 +62,7 @@ def as_model(model_class: type[Model], value: Any, name: str) -> Model:
 
 
 def check_instance(value: object, expected: type | tuple[type, ...], name: str) -> None:
-    """Refuse what is neither None nor an instance of one of the classes."""
+    """Refuse a value that is neither None nor an instance of one of the classes."""
     if value is None or isinstance(value, expected):
         return
     classes = expected if isinstance(expected, tuple) else (expected,)
@@ -84,15 +84,15 @@ def validated(
         raise InputError(f"{where}: {_sentence(model_class, error)}") from error
 
 
-def nearest(name: str, known: list[str]) -> str | None:
-    """Return the known name that is spelled most like `name`, None if none is like it."""
-    matches = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+def nearest(name: str, choices: list[str]) -> str | None:
+    """Return the choice that is spelled most like `name`, None if none is similar."""
+    matches = difflib.get_close_matches(name, choices, n=1, cutoff=0.6)
     return matches[0] if matches else None
 
 
 def _sentence(model_class: type[BaseModel], error: ValidationError) -> str:
     details = error.errors(include_url=False)
-    meant = {
+    intended = {
         nearest(str(detail["loc"][-1]), list(_place(model_class, detail["loc"])[0].model_fields))
         for detail in details
         if detail["type"] == "extra_forbidden"
@@ -100,14 +100,14 @@ def _sentence(model_class: type[BaseModel], error: ValidationError) -> str:
     return "; ".join(
         _clause(model_class, dict(detail))
         for detail in details
-        if not (detail["type"] == "missing" and detail["loc"][-1] in meant)
+        if not (detail["type"] == "missing" and detail["loc"][-1] in intended)
     )
 
 
 def _place(
     model_class: type[BaseModel], loc: tuple[int | str, ...]
 ) -> tuple[type[BaseModel], list[str]]:
-    """Model in which a value stands, and the names that lead there, without those of unions."""
+    """Return the model that contains a value, and the names of the path to it, without unions."""
     names: list[str] = []
     models = [model_class]
     for part in loc:
@@ -140,9 +140,9 @@ def _clause(model_class: type[BaseModel], detail: dict[str, Any]) -> str:
     kind, context = detail["type"], detail.get("ctx", {})
     tag_key = context.get("discriminator", "").strip("'")
     if kind == "extra_forbidden":
-        known = list(model.model_fields)
-        match = nearest(names[-1], known)
-        hint = f", did you mean '{match}'?" if match else f"; known keys are {', '.join(known)}"
+        keys = list(model.model_fields)
+        match = nearest(names[-1], keys)
+        hint = f", did you mean '{match}'?" if match else f"; known keys are {', '.join(keys)}"
         return f"unknown key '{name}'{hint}"
     if kind == "union_tag_not_found":
         return f"'{name}' has no '{tag_key}': give it, to say which"

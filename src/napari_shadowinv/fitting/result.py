@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from napari_shadowinv._system.safety import refusing_junk
+from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
@@ -370,7 +370,7 @@ class Fit:
             raise InputError(
                 f"dataset has no {', '.join(map(repr, missing))}: expected the result of a fit"
             )
-        with refusing_junk("the fit"):
+        with as_input_errors("the fit"):
             return cls._from_parts(dataset)
 
     @classmethod

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv import __version__
-from napari_shadowinv._system.safety import refusing_junk
+from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ def setup_from_dataset(dataset: xarray.Dataset) -> Setup | None:
 
     own = dataset.get("setup")  # of each shot, in a stack of which one is chosen
     text = dataset.attrs.get("setup", "") if own is None or own.ndim else str(own.values)
-    with refusing_junk("the dataset's setup"):
+    with as_input_errors("the dataset's setup"):
         return setup_from_dict(json.loads(text), "the dataset's setup") if text else None
 
 

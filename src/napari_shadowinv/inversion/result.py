@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._system.safety import refusing_junk
+from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
@@ -353,7 +353,7 @@ class Inversion:
                 f"dataset has no {', '.join(map(repr, missing))}: expected the result of an "
                 "inversion"
             )
-        with refusing_junk("the result"):
+        with as_input_errors("the result"):
             return cls._from_parts(dataset)
 
     @classmethod

@@ -78,7 +78,7 @@ def _number(header: bytes, code: str, offset: int) -> Any:
 
 
 def _check_footer(path: Path, start: int) -> None:
-    """Refuse several regions: one after another they are no picture."""
+    """Refuse a frame of several sensor regions, which do not form one image."""
     check_promise(path, "SPE", start, path.stat().st_size)
     with path.open("rb") as file:
         file.seek(start)

@@ -1,4 +1,4 @@
-"""Pictures in colour: one plane of them (`to_grey`), and signs of a film scan (`film_warnings`)."""
+"""Colour images: reduction to one plane (`to_grey`), signs of a film scan (`film_warnings`)."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def film_warnings(array: AnyArray, channel: str | int | None) -> tuple[Caution, 
 
 
 def _is_lit_around(image: FloatArray) -> bool:
-    """Whether all four sides are as bright as the brightest part, and the middle is darker."""
+    """Return whether all four sides are as bright as the brightest part, the middle darker."""
     # Light or particles that are deflected out of the middle make something else brighter.
     height, width = image.shape
     rim = max(1, round(_RIM * min(height, width)))

@@ -1,7 +1,7 @@
 """Scans of etched CR-39, ``.cpsa``: tracks found frame by frame by a microscope.
 
 - all tracks of a scan: `read_tracks`
-- an image of those that are wanted, by ranges that are typed or given: `read_image`, `as_text`
+- an image of the tracks within ranges, written as text: `read_image`, `as_text`
 
 All numbers are little-endian. A header of 48 bytes holds 4 int32, 2 float32, 6 int32: the
 version (negative), the numbers of frames along x and y, a number of bins (unused), the width of
@@ -69,7 +69,7 @@ def read_tracks(path: Path) -> Tracks:
     Raises
     ------
     FileFormatError
-        If the file is missing, truncated, or its numbers cannot be those of a scan.
+        If the file is missing, truncated, or has numbers that no scan has.
     """
     return _read(path)[0]
 
@@ -77,9 +77,9 @@ def read_tracks(path: Path) -> Tracks:
 def read_image(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[str, Any]]:
     """Count the tracks of a scan in bins, uint32, shape (H, W), with its ``geometry``.
 
-    `variable` tells ranges and bin as `as_text` writes them: ``"diameter=4:12 bin=300"``.
+    `variable` is the ranges and the bin as `as_text` writes them: ``"diameter=4:12 bin=300"``.
     """
-    chosen = {} if variable is None else _chosen(variable)
+    chosen = {} if variable is None else _parse_ranges(variable)
     tracks, warnings = _read(path)
     bin_ = chosen.pop("bin", None)
     counts, _, bin_ = tracks.selected(**chosen).image(bin_)
@@ -133,8 +133,8 @@ def _number(value: float) -> str:
     return repr(float(value)).removesuffix(".0")
 
 
-def _chosen(text: str) -> dict[str, Any]:
-    """Ranges and bin that a text tells."""
+def _parse_ranges(text: str) -> dict[str, Any]:
+    """Parse the ranges and the bin from a text."""
     chosen: dict[str, Any] = {}
     try:
         if not text.strip() or _WORD.sub("", text).strip():
@@ -156,7 +156,7 @@ def _chosen(text: str) -> dict[str, Any]:
 
 
 def _read(path: Path) -> tuple[Tracks, tuple[Caution, ...]]:
-    """Tracks of a scan, and what is odd about it."""
+    """Read the tracks of a scan and the warnings about them."""
     check_regular(path, "a CR-39 scan, .cpsa")
     check_size(path, _IN_MEMORY * path.stat().st_size)
     data = path.read_bytes()
@@ -165,23 +165,24 @@ def _read(path: Path) -> tuple[Tracks, tuple[Caution, ...]]:
     hits = frames[:, 3]
     ends = np.concatenate([[0], np.cumsum(hits)])
     columns = {"d": "<i2", "e": "u1", "c": "u1", "mean": "u1", "x": "<i2", "y": "<i2"}
-    found = {name: np.empty(ends[-1], kind) for name, kind in columns.items()}
+    fields = {name: np.empty(ends[-1], kind) for name, kind in columns.items()}
     for place, first, last in zip(frames[:, 0], ends[:-1], ends[1:], strict=True):
         for name, kind in columns.items() if last > first else ():
-            found[name][first:last] = np.frombuffer(data, kind, last - first, place)
+            fields[name][first:last] = np.frombuffer(data, kind, last - first, place)
             place += (last - first) * np.dtype(kind).itemsize
     middles = frames[:, 1:3] * _STAGE_STEP
-    left, bottom = middles.min(axis=0) - frame_size / 2
-    right, top = middles.max(axis=0) + frame_size / 2
-    x = np.repeat(middles[:, 0] + frame_size[0] / 2 - left, hits) - found["x"] * (pixel * 1e-6)
-    y = np.repeat(top - middles[:, 1] + frame_size[1] / 2, hits) - found["y"] * (pixel * 1e-6)
-    diameter = found["d"] * np.float32(0.01 * pixel)
-    tracks = Tracks(y, x, diameter, found["c"], found["e"], (top - bottom, right - left))
-    return tracks, _pitch_warnings(shape, np.array([right - left, top - bottom]), frame_size)
+    x_left, y_bottom = middles.min(axis=0) - frame_size / 2
+    x_right, y_top = middles.max(axis=0) + frame_size / 2
+    x = np.repeat(middles[:, 0] + frame_size[0] / 2 - x_left, hits) - fields["x"] * (pixel * 1e-6)
+    y = np.repeat(y_top - middles[:, 1] + frame_size[1] / 2, hits) - fields["y"] * (pixel * 1e-6)
+    diameter = fields["d"] * np.float32(0.01 * pixel)
+    width, height = x_right - x_left, y_top - y_bottom
+    tracks = Tracks(y, x, diameter, fields["c"], fields["e"], (height, width))
+    return tracks, _pitch_warnings(shape, np.array([width, height]), frame_size)
 
 
 def _header(path: Path, data: bytes) -> tuple[tuple[int, int], float, FloatArray]:
-    """Numbers of frames along x and y, width of a pixel (µm), and size of a frame (m) in x, y."""
+    """Return the frames along x and y, a pixel's width (µm), and a frame's size in x, y (m)."""
     check_promise(path, "CPSA", _HEADER.size, len(data))
     version, columns, rows, _, pixel, _, _, _, _, _, width, height = _HEADER.unpack_from(data)
     if version >= 0:
@@ -204,20 +205,20 @@ def _header(path: Path, data: bytes) -> tuple[tuple[int, int], float, FloatArray
 
 
 def _frames(path: Path, data: bytes, shape: tuple[int, int]) -> AnyArray:
-    """Of each frame: where its tracks begin, x and y of its middle, and how many tracks it has."""
+    """Return a row for each frame: offset of its tracks, x and y of its middle, track count."""
     columns, rows = shape
     frames = np.empty((columns * rows, 4), np.int64)
-    seen = np.zeros((columns, rows), bool)
+    filled = np.zeros((columns, rows), bool)
     at = _HEADER.size
     for number in range(columns * rows):
         check_promise(path, f"frame {number + 1}", at + _FRAME.size, len(data))
         _, x, y, hits, _, _, _, _, column, row = _FRAME.unpack_from(data, at)
-        if hits < 0 or not (0 <= column < columns and 0 <= row < rows) or seen[column, row]:
+        if hits < 0 or not (0 <= column < columns and 0 <= row < rows) or filled[column, row]:
             raise FileFormatError(
                 f"{path} is damaged: frame {number + 1} is at column {column}, row {row} with "
                 f"{hits} tracks; expected each place of {columns} × {rows} once; copy it again"
             )
-        seen[column, row] = True
+        filled[column, row] = True
         at += _FRAME.size
         frames[number] = at, x, y, hits
         at += _TRACK * hits

@@ -1,4 +1,4 @@
-"""What every file needs, whatever its format.
+"""Checks, checksums and safe writing of files of any format.
 
 - its fingerprint: `sha256`; its name as text: `text_of`; many in order: `in_counting_order`
 - refuse a header that promises more than there is: `check_promise`
@@ -26,12 +26,12 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _CUT_SHORT = re.compile(r"\d+ requested and \d+ written")  # numpy's words where there is no room
 
 
-def check_promise(path: Path, header: str, promised: int, held: int) -> None:
-    """Refuse a file whose `header` promises more than it holds, before memory is asked for."""
-    if promised > held:
+def check_promise(path: Path, header: str, promised: int, present: int) -> None:
+    """Refuse a file whose `header` promises more bytes than the file has, before allocating."""
+    if promised > present:
         raise FileFormatError(
             f"{path} is damaged or truncated: its {header} header implies {promised} bytes, but "
-            f"at most {held} are present; copy it again"
+            f"at most {present} are present; copy it again"
         )
 
 
@@ -43,14 +43,14 @@ def sha256(path: str | Path) -> str:
 
 
 def text_of(path: str | Path) -> str:
-    """Return a path as text that can be kept in a file, bytes that are no text as escapes."""
+    """Return a path as text that a file can store, with undecodable bytes as escapes."""
     return os.fsencode(path).decode("utf-8", errors="backslashreplace")
 
 
 def in_counting_order(paths: Iterable[Path]) -> list[Path]:
-    """Sort files as one counts, folder by folder: numbers in names count by their value.
+    """Sort files folder by folder, with numbers in their names by value.
 
-    Upper and lower case are the same but for names that differ in nothing else.
+    Case counts only between names that are otherwise equal.
 
     Examples
     --------
@@ -81,13 +81,13 @@ def check_output(
     Raises
     ------
     FileFormatError
-        If the path exists, is a folder, has no folder to lie in, or cannot be written.
+        If the path exists, is a folder, is in no folder, or cannot be written.
     """
     path = Path(path)
     if suffixes and path.suffix.lower() not in suffixes:
-        found = f"'{path.suffix}'" if path.suffix else "none"
+        ending = f"'{path.suffix}'" if path.suffix else "none"
         raise FileFormatError(
-            f"{path} cannot be written: its ending is {found}, expected one of "
+            f"{path} cannot be written: its ending is {ending}, expected one of "
             f"{', '.join(sorted(suffixes))}"
         )
     check_folder_of(path)
@@ -102,7 +102,7 @@ def check_output(
 
 
 def check_folder_of(path: Path) -> None:
-    """Refuse a path that has no folder to lie in, or one that nothing can be written to."""
+    """Refuse a path whose folder does not exist or is read-only."""
     length = len(os.fsencode(path.name))
     if length > MAX_NAME_BYTES:
         raise FileFormatError(
@@ -121,12 +121,12 @@ def check_folder_of(path: Path) -> None:
 
 @contextmanager
 def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
-    """Write a file completely or not at all; path and overwrite are those of `check_output`.
+    """Write a file completely or not at all; path and overwrite as in `check_output`.
 
     Yields
     ------
     Path
-        A new name beside `path`, with the same ending, to write to. It becomes `path` when the
+        A temporary path in the folder of `path`, with the same ending. It becomes `path` when the
         block ends well and the disk has taken it, and is removed on any error or interruption.
 
     Raises

@@ -20,8 +20,8 @@ from typing import Any, Literal
 from napari_shadowinv._system.safety import as_file_errors, check_regular
 from napari_shadowinv.errors import FileFormatError
 
-# How much of a file holds every mark, and how much shows what a file without one is.
-_HEAD, _SEEN = 4100, 64
+_HEAD_BYTES = 4100  # they hold every mark
+_EXCERPT_BYTES = 64  # they show the kind of a file without a mark
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class Format:
     suffixes: tuple[str, ...]  # in lower case, the usual one first
     title: str = ""  # in messages and the command's help; empty if it cannot be read
     marks: tuple[tuple[int, bytes], ...] = ()  # where its files hold which bytes; one is enough
-    test: str = ""  # tells of a path with a mark whether it is one, where others begin the same way
-    unmarked: Literal["text", "binary", ""] = ""  # what it looks like without a mark
+    test: str = ""  # of a path with a mark: whether it is one, where others begin the same way
+    unmarked: Literal["text", "binary", ""] = ""  # its appearance without a mark
     holds: tuple[Literal["image", "result"], ...] = ("image",)
-    reader: str = ""  # of a path: image and metadata, which replace what `read` says, or a dataset
-    named_reader: str = ""  # the same, of a path and the name of an array, or what to count
+    reader: str = ""  # of a path: image and metadata, which replace those of `read`, or a dataset
+    named_reader: str = ""  # the same, of a path and the name of an array, or the tracks to count
     image_writer: str = ""  # of a path, an image and its pixel size (m) or None
     result_writer: str = ""  # of a path and a dataset
     fit_writer: str = ""  # of a path and a fit's dataset
@@ -45,26 +45,26 @@ class Format:
 
     @property
     def suffix(self) -> str:
-        """The usual ending."""
+        """Usual ending."""
         return self.suffixes[0]
 
     def read(self, path: Path, variable: str | None = None) -> Any:
-        """Return what a file holds, or one of its arrays; see `reader` and `named_reader`."""
-        named = () if variable is None else (variable,)
-        return function(self.named_reader if named else self.reader)(path, *named)
+        """Return the content of a file, or one of its arrays; see `reader` and `named_reader`."""
+        selection = () if variable is None else (variable,)
+        return function(self.named_reader if selection else self.reader)(path, *selection)
 
     def fits(self, path: Path, head: bytes) -> bool:
-        """Tell whether a file that begins with `head` is of this format."""
+        """Return whether a file that begins with `head` is of this format."""
         if any(head[at : at + len(mark)] == mark for at, mark in self.marks):
             return not self.test or bool(function(self.test)(path))
-        found = "text" if _is_text(head[:_SEEN]) else "binary"
-        return found == self.unmarked and path.suffix.lower() in self.suffixes
+        appearance = "text" if _is_text(head[:_EXCERPT_BYTES]) else "binary"
+        return appearance == self.unmarked and path.suffix.lower() in self.suffixes
 
 
 def function(reference: str) -> Callable[..., Any]:
     """Import the function that a format names."""
-    found: Callable[..., Any] = resolve_name(f"napari_shadowinv.io.{reference}")
-    return found
+    resolved: Callable[..., Any] = resolve_name(f"napari_shadowinv.io.{reference}")
+    return resolved
 
 
 # MATLAB 7.3 is HDF5 behind a header of its own, which other programs keep when they add to a file.
@@ -142,7 +142,7 @@ FORMATS = (
 )
 
 
-def _listed(titles: Iterable[str]) -> str:
+def _join_titles(titles: Iterable[str]) -> str:
     *most, last = filter(None, titles)
     return f"{', '.join(most)}, or {last}"
 
@@ -154,12 +154,12 @@ def _suffixes(formats: Iterable[Format]) -> frozenset[str]:
 def _writers(
     kind: Literal["image_writer", "result_writer", "fit_writer", "pack_writer"],
 ) -> dict[str, str]:
-    found = {suffix: getattr(each, kind) for each in FORMATS for suffix in each.suffixes}
-    return {suffix: writer for suffix, writer in found.items() if writer}
+    writers = {suffix: getattr(each, kind) for each in FORMATS for suffix in each.suffixes}
+    return {suffix: writer for suffix, writer in writers.items() if writer}
 
 
-READABLE = _listed(each.title for each in FORMATS)
-IMAGE_TITLES = _listed(each.title for each in FORMATS if "image" in each.holds)
+READABLE = _join_titles(each.title for each in FORMATS)
+IMAGE_TITLES = _join_titles(each.title for each in FORMATS if "image" in each.holds)
 RADIOGRAPH_SUFFIXES = _suffixes(each for each in FORMATS if "image" in each.holds)
 SCAN_SUFFIXES = _suffixes(each for each in FORMATS if each.is_scan)
 # Endings that napari opens itself: the manifest leaves them out, so that nobody has to choose.
@@ -171,7 +171,7 @@ PACK_WRITERS = _writers("pack_writer")
 FIGURE_SUFFIXES = (PNG.suffix, ".pdf", ".svg")
 NEW_SHOTS = f"*{TIFF.suffix}"  # names in a folder that is watched
 
-_OTHERS = {
+_FOREIGN_FORMATS = {
     b"PK\x03\x04": "a zip archive (such as NPZ or XLSX)",
     b"\x1f\x8b": "a gzip archive",
     b"%PDF": "a PDF document",
@@ -183,21 +183,21 @@ _OTHERS = {
 
 @as_file_errors
 def format_of(path: Path) -> Format:
-    """Tell the format of a file from its content, because its name may lie.
+    """Return the format of a file by its content, because its name may be wrong.
 
-    Numbers as text have no mark: they need one of the usual endings, too.
+    Numbers as text have no mark, so they also need one of the usual endings.
     """
     check_regular(path, f"a file ({READABLE})")
     with path.open("rb") as file:
-        head = file.read(_HEAD)
+        head = file.read(_HEAD_BYTES)
     if not head:
         raise FileFormatError(f"{path} is empty (0 bytes): expected {READABLE}; copy it again")
     for each in FORMATS:
         if each.fits(path, head):
             return each
     raise FileFormatError(
-        f"{path} is {_describe(head[:_SEEN])}: expected {READABLE}; export the image to one of "
-        "these"
+        f"{path} is {_describe(head[:_EXCERPT_BYTES])}: expected {READABLE}; export the image to "
+        "one of these"
     )
 
 
@@ -207,8 +207,8 @@ def kind_of(path: str | Path) -> str:
 
 
 def _describe(head: bytes) -> str:
-    found = next((text for mark, text in _OTHERS.items() if head.startswith(mark)), None)
-    return found or ("a text file" if _is_text(head) else "not in a recognised image format")
+    title = next((text for mark, text in _FOREIGN_FORMATS.items() if head.startswith(mark)), None)
+    return title or ("a text file" if _is_text(head) else "not in a recognised image format")
 
 
 def _is_text(head: bytes) -> bool:

@@ -1,11 +1,11 @@
-"""Any HDF5 file, for its arrays by name.
+"""Arrays of any HDF5 file, by name.
 
 - the array that the user names: `read_hdf5`, as an image `read_plane`; the choice: `held_arrays`
-- for those who know the layout: an item, `member`; its values, `load_dataset`; `check_arrays`
+- for callers that know the layout: an item, `member`; its values, `load_dataset`; `check_arrays`
 - write one: `hdf5_in_memory`; compare its checksum: `check_hdf5_seal`
 
 An HDF5 file can point to others: by external links, external storage and virtual arrays. No
-reader follows them, because whatever lies there would pass for the file's own pixels.
+reader follows them, because the content of another file would pass for the file's own pixels.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 
-_MOST_LISTED = 30
+_MAX_LISTED = 30
 _SEAL = b"\nshadowinv sha256 "
 _BLOCK_BYTES = 1 << 20
-_MOST_LINKS = 16
+_MAX_LINKS = 16
 
 
 def member(path: Path, group: Any, name: str, depth: int = 0) -> Any | None:
-    """Return an item by its name, with those of its groups, or None; refuse one in another file."""
+    """Return an item by its name with groups, or None; refuse an item in another file."""
     import h5py
 
     item = group.file if name.startswith("/") else group
@@ -45,7 +45,7 @@ def member(path: Path, group: Any, name: str, depth: int = 0) -> Any | None:
         if kind == h5py.h5l.TYPE_EXTERNAL:
             _refuse(path, name, f"links to {item.id.links.get_val(key)[0].decode()!r}")
         if kind == h5py.h5l.TYPE_SOFT:
-            if depth > _MOST_LINKS:
+            if depth > _MAX_LINKS:
                 raise ValueError(f"the links of {name!r} form a loop")
             item = member(path, item, item.id.links.get_val(key).decode(), depth + 1)
         else:
@@ -53,15 +53,15 @@ def member(path: Path, group: Any, name: str, depth: int = 0) -> Any | None:
     return item
 
 
-def _refuse(path: Path, name: str, found: str) -> None:
+def _refuse(path: Path, name: str, origin: str) -> None:
     raise FileFormatError(
-        f"{path} does not hold {name!r} itself but {found}: expected all data in one file; save "
+        f"{path} does not hold {name!r} itself but {origin}: expected all data in one file; save "
         "the data as an array in this file"
     )
 
 
 def members(path: Path, group: Any) -> Iterator[tuple[str, Any]]:
-    """Yield names and items of a group, those in other files left out."""
+    """Yield names and items of a group, except items in other files."""
     import h5py
 
     for name in group:
@@ -70,7 +70,7 @@ def members(path: Path, group: Any) -> Iterator[tuple[str, Any]]:
 
 
 def load_dataset(path: Path, dataset: Any) -> AnyArray:
-    """Return the values of an array; what the file does not hold, HDF5 would fill with zeros."""
+    """Return the values of an array, refusing missing ones, which HDF5 would replace by zeros."""
     check_size(path, _unfolded(path, dataset))
     _check_promise(path, dataset)
     return np.asarray(dataset[()])
@@ -83,21 +83,22 @@ def _check_promise(path: Path, dataset: Any) -> None:
 
 
 def _unfolded(path: Path, dataset: Any) -> int:
-    """Bytes in memory of an array that lies in the file itself."""
+    """Return the bytes in memory of an array, which must be in the file itself."""
     layout = dataset.id.get_create_plist()
     if layout.get_external_count():
-        other = layout.get_external(0)[0].decode(errors="replace")
-        _refuse(path, dataset.name, f"in the raw file {other!r}")
+        external_file = layout.get_external(0)[0].decode(errors="replace")
+        _refuse(path, dataset.name, f"in the raw file {external_file!r}")
     if dataset.is_virtual:
-        others = sorted({source.file_name for source in dataset.virtual_sources()})
-        _refuse(path, dataset.name, f"as a virtual array from {', '.join(map(repr, others))}")
+        source_files = sorted({source.file_name for source in dataset.virtual_sources()})
+        names = ", ".join(map(repr, source_files))
+        _refuse(path, dataset.name, f"as a virtual array from {names}")
     # One chunk may be far larger than what is used of it.
     chunk = int(np.prod(dataset.chunks or (0,), dtype=float)) * dataset.dtype.itemsize
     return int(max(chunk, dataset.size * max(8, dataset.dtype.itemsize)))
 
 
 def check_arrays(path: Path) -> None:
-    """Refuse a file whose arrays lie in other files or do not fit into memory together."""
+    """Refuse a file whose arrays are in other files or do not fit into memory together."""
     import h5py
 
     total = 0
@@ -164,15 +165,15 @@ def check_hdf5_seal(path: Path) -> None:
 
 @as_file_errors
 def read_hdf5(path: Path, name: str) -> AnyArray:
-    """Read one array by its name, with those of its groups: ``shots/3/image``."""
+    """Read one array by its name with groups: ``shots/3/image``."""
     import h5py
 
     with h5py.File(path, "r") as file:
         item = member(path, file, name)
         if isinstance(item, h5py.Dataset) and _is_numeric(item):
             return load_dataset(path, item)
-        held = ", ".join(held_arrays(path, file)) or "none"
-    raise InputError(f"{path} has no array {name!r}: it holds {held}")
+        content = ", ".join(held_arrays(path, file)) or "none"
+    raise InputError(f"{path} has no array {name!r}: it holds {content}")
 
 
 def read_plane(path: Path, name: str) -> tuple[AnyArray, dict[str, Any]]:
@@ -187,26 +188,26 @@ def read_plane(path: Path, name: str) -> tuple[AnyArray, dict[str, Any]]:
 
 
 def held_arrays(path: Path, file: Any) -> list[str]:
-    """Name images of an open file and its groups, with shape and type, in a list that is cut."""
-    found = [
+    """List the first images of an open file and its groups, with shape and type."""
+    images = [
         f"{name!r} ({'×'.join(map(str, item.shape))} {item.dtype})"
-        for name, item in itertools.islice(_items(path, file), 10 * _MOST_LISTED)
+        for name, item in itertools.islice(_items(path, file), 10 * _MAX_LISTED)
         if _is_numeric(item) and item.ndim in (2, 3)
     ]
-    return found if len(found) <= _MOST_LISTED else [*found[:_MOST_LISTED], "…"]
+    return images if len(images) <= _MAX_LISTED else [*images[:_MAX_LISTED], "…"]
 
 
 def _items(path: Path, file: Any) -> Iterator[tuple[str, Any]]:
-    """Datasets of the file and of its groups."""
+    """Yield the datasets of the file and of its groups."""
     import h5py
 
     for name, item in members(path, file):
         if isinstance(item, h5py.Dataset):
             yield name, item
         elif isinstance(item, h5py.Group):
-            for inner, one in members(path, item):
-                if isinstance(one, h5py.Dataset):
-                    yield f"{name}/{inner}", one
+            for inner, dataset in members(path, item):
+                if isinstance(dataset, h5py.Dataset):
+                    yield f"{name}/{inner}", dataset
 
 
 def _is_numeric(item: Any) -> bool:

@@ -48,7 +48,7 @@ def _check(path: Path, name: str, array: AnyArray) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """A TIFF; the decoder's log lines stay off the terminal, because the error says it once."""
+    """Open a TIFF with the decoder's log silenced, because the error says it once."""
     import tifffile
 
     logger = logging.getLogger("tifffile")
@@ -114,8 +114,8 @@ def _decode(path: Path, page: Any) -> AnyArray:
             raise
     # Pillow brings some codecs, LZW among them, but not for every pixel type.
     array = _read_with_pillow(path, page.index)
-    same = array.dtype == page.dtype.newbyteorder("=") and array.shape == page.shape
-    if not same or page.photometric.name not in ("MINISBLACK", "RGB"):
+    is_same_type = array.dtype == page.dtype.newbyteorder("=") and array.shape == page.shape
+    if not is_same_type or page.photometric.name not in ("MINISBLACK", "RGB"):
         raise FileFormatError(
             f"{path} is compressed with {page.compression.name}, which is not supported: save it "
             "without compression, or install the package imagecodecs"
@@ -132,9 +132,9 @@ def _check_complete(path: Path, page: Any) -> None:
         raise FileFormatError(
             f"{path} is truncated: its TIFF header implies {end} bytes, found {size}; copy it again"
         )
-    held = sum(page.databytecounts)
+    packed_bytes = sum(page.databytecounts)
     packing = 1 if page.compression.name == "NONE" else _TIFF_RATIO
-    check_promise(path, "TIFF", page.size * page.bitspersample // 8, packing * held)
+    check_promise(path, "TIFF", page.size * page.bitspersample // 8, packing * packed_bytes)
     # One tile may be far larger than what is used of it.
     check_size(path, max(page.size, math.prod(page.chunks)) * max(8, page.dtype.itemsize))
     if page.compression.name in _UNPACKERS:
@@ -142,7 +142,7 @@ def _check_complete(path: Path, page: Any) -> None:
 
 
 def _check_strips(path: Path, page: Any) -> None:
-    """Refuse a strip or tile that unpacks to far more than its pixels, as the decoder would not."""
+    """Refuse a strip or tile that unpacks to far more than its pixels; the decoder accepts it."""
     pixels = math.prod(page.chunks) * page.dtype.itemsize
     most = max(2 * pixels, _SMALL_STRIP)
     with path.open("rb") as file:
@@ -242,7 +242,7 @@ def write_npy(path: Path, array: AnyArray, pixel_size: float | None = None) -> N
     """Write an array as it is; the format does not keep the size of a pixel."""
     content = BytesIO()
     np.save(content, array, allow_pickle=False)
-    # Numpy does not tell why it cannot write to a file.
+    # numpy gives no reason when it cannot write to a file.
     path.write_bytes(content.getbuffer())
 
 

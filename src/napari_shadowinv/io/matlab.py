@@ -1,7 +1,7 @@
 """MATLAB's MAT-files, version 5 to 7 (its own layout) and 7.3 (HDF5).
 
 - the one image of a file, or the variable that the user names: `read_mat`
-- what there is to choose from: `mat_variables`; MATLAB 7.3 or other HDF5: `is_matlab`
+- the variables of a file: `mat_variables`; MATLAB 7.3 or other HDF5: `is_matlab`
 
 scipy's reader of MATLAB's own layout asks for the memory that a damaged length names, and a damaged
 type crashes it together with the whole program; so planes of numbers, all that is needed, are read
@@ -70,7 +70,7 @@ class Variable:
 
 
 def is_matlab(path: Path) -> bool:
-    """Tell whether a file that begins as MATLAB's, or as HDF5, is one of MATLAB's."""
+    """Return whether a file that begins like a MAT-file or HDF5 is a MAT-file."""
     import h5py
 
     with path.open("rb") as file:
@@ -108,17 +108,17 @@ def mat_variables(path: Path) -> list[Variable]:
 
 
 def _choose(path: Path, variables: list[Variable], name: str | None) -> Variable:
-    held = ", ".join(map(str, variables)) or "nothing"
+    content = ", ".join(map(str, variables)) or "nothing"
     images = [item for item in variables if item.is_image]
     if name is not None:
         images = [item for item in images if item.name == name]
         if not images:
-            raise InputError(f"{path} has no numeric plane {name!r}: it holds {held}")
+            raise InputError(f"{path} has no numeric plane {name!r}: it holds {content}")
         return images[0]
     if not images:
         raise FileFormatError(
-            f"{path} holds {held}: expected a numeric array (height, width); save the image as a "
-            "variable of its own"
+            f"{path} holds {content}: expected a numeric array (height, width); save the image as "
+            "a variable of its own"
         )
     if len(images) > 1:
         raise InputError(

@@ -1,7 +1,7 @@
-"""pradformat, the HDF5 layout that codes for proton radiography exchange files in.
+"""pradformat, the HDF5 layout in which codes for proton radiography exchange files.
 
-What differs from this package: energies are in eV; a radiograph's ``pixel_width`` is in
-the detector plane; axis 1 is the first of the array, here y; an inversion's ``phi`` (m) has
+It differs from this package in its conventions: energies are in eV; a radiograph's ``pixel_width``
+is in the detector plane; axis 1 is the first of the array, here y; an inversion's ``phi`` (m) has
 the deflection angle as its gradient, where here the angle is *minus* the gradient.
 
 References
@@ -51,19 +51,19 @@ _SYMBOLS: dict[Species, str] = {
 
 
 def is_result(path: Path) -> bool:
-    """Tell whether a file that begins as HDF5 or MATLAB's is a ``.shadowinv`` result."""
+    """Return whether a file that begins like HDF5 or a MAT-file is a ``.shadowinv`` result."""
     import h5py
 
     if not h5py.is_hdf5(path):
         return False
     attributes = _root_attributes(path)
-    known = is_fit(attributes) or is_pack(attributes)
-    return known or str(attributes.get("format", "")).startswith(FORMAT)
+    is_fit_or_pack = is_fit(attributes) or is_pack(attributes)
+    return is_fit_or_pack or str(attributes.get("format", "")).startswith(FORMAT)
 
 
 @as_file_errors
 def is_ours(path: Path) -> bool:
-    """Tell whether an HDF5 file is a ``.shadowinv`` result or pradformat; much else is HDF5 too."""
+    """Return whether an HDF5 file is a ``.shadowinv`` result or pradformat."""
     check_regular(path, "an HDF5 file")
     attributes = _root_attributes(path)
     return "format" in attributes or attributes.get("object_type") in ("radiograph", "inversion")
@@ -82,8 +82,8 @@ def _root_attributes(path: Path) -> dict[str, Any]:
     import h5py
 
     with h5py.File(path, "r") as file:
-        known = [name for name in _ATTRIBUTES.split() if name in file.attrs]
-        return {name: _plain(file.attrs[name]) for name in known}
+        names = [name for name in _ATTRIBUTES.split() if name in file.attrs]
+        return {name: _plain(file.attrs[name]) for name in names}
 
 
 def _plain(value: Any) -> Any:
@@ -104,22 +104,22 @@ def read_pradformat(path: Path) -> tuple[AnyArray, dict[str, Any]] | xarray.Data
     if kind == "radiograph":
         image = _read_datasets(path, ("image",)).get("image")
         if image is None or image.ndim != 2:
-            found = "no image" if image is None else f"an image of shape {image.shape}"
+            content = "no image" if image is None else f"an image of shape {image.shape}"
             raise FileFormatError(
-                f"{path} is a pradformat radiograph with {found}: expected a dataset 'image' of "
+                f"{path} is a pradformat radiograph with {content}: expected a dataset 'image' of "
                 "shape (height, width); export it again"
             )
         geometry = _geometry(path, attributes, "pixel_width")
         return image, {**attributes, "kind": "pradformat", "geometry": geometry}
     if kind == "inversion":
         return _read_inversion(path, attributes)
-    found = f"the object type {kind!r}" if kind else "no attribute 'object_type'"
+    object_type = f"the object type {kind!r}" if kind else "no attribute 'object_type'"
     with h5py.File(path, "r") as file:
-        held = ", ".join(held_arrays(path, file))
-    advice = f"name one of its arrays with variable, of {held}" if held else "export it as TIFF"
+        names = ", ".join(held_arrays(path, file))
+    advice = f"name one of its arrays with variable, of {names}" if names else "export it as TIFF"
     raise FileFormatError(
-        f"{path} is an HDF5 file with {found}: expected a pradformat radiograph or inversion, or "
-        f"a .shadowinv result; {advice}"
+        f"{path} is an HDF5 file with {object_type}: expected a pradformat radiograph or "
+        f"inversion, or a .shadowinv result; {advice}"
     )
 
 
@@ -127,12 +127,12 @@ def _read_datasets(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray]:
     import h5py
 
     with h5py.File(path, "r") as file:
-        found = {name: member(path, file, name) for name in names}
-        return {name: load_dataset(path, item) for name, item in found.items() if item is not None}
+        items = {name: member(path, file, name) for name in names}
+        return {name: load_dataset(path, item) for name, item in items.items() if item is not None}
 
 
 def _geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[str, Any]:
-    """Fields of a setup of particles that the attributes tell."""
+    """Return the fields of a particle setup that the attributes contain."""
     geometry: dict[str, Any] = {"kind": "proton"}
     source, image = _distances(attributes)
     species = {symbol: name for name, symbol in _SYMBOLS.items()}.get(
@@ -184,9 +184,9 @@ def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
         displacement = setup.displacement(np.stack([arrays["defl_ax1"], arrays["defl_ax2"]]))
     else:
         displacement = displacement_from_potential(-setup.normalized_potential(arrays["phi"]))
-    told = {name: attributes[name] for name in ("provenance",) if name in attributes}
-    told["format"] = "pradformat"
-    return dataset_from_field(displacement, potential, setup, attributes=told)
+    labels = {name: attributes[name] for name in ("provenance",) if name in attributes}
+    labels["format"] = "pradformat"
+    return dataset_from_field(displacement, potential, setup, attributes=labels)
 
 
 def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
@@ -205,7 +205,7 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
         "object_type": "inversion",
         "inversion_type": "simple",
         "dr": setup.object_pixel_size,
-        **_described(setup),
+        **_beam_attributes(setup),
         "description": "Power-diagram inversion by napari-shadowinv",
     }
     if fields:
@@ -221,18 +221,18 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
 
 def write_radiograph(path: Path, image: AnyArray, setup: Setup, description: str) -> None:
     """Write an image, proportional to the fluence, as a pradformat radiograph."""
-    known = check_pradformat_setup(setup)
+    proton_setup = check_pradformat_setup(setup)
     attributes = {
         "object_type": "radiograph",
-        "pixel_width": known.object_pixel_size * known.magnification,
-        **_described(known),
+        "pixel_width": proton_setup.object_pixel_size * proton_setup.magnification,
+        **_beam_attributes(proton_setup),
         "description": description,
     }
     _write(path, {"image": image}, attributes)
 
 
-def _described(setup: Any) -> dict[str, Any]:
-    """What every object of the format tells of the beam and the distances."""
+def _beam_attributes(setup: Any) -> dict[str, Any]:
+    """Return the attributes of the beam and the distances that every object has."""
     return {
         "pradformat_version": _VERSION,
         "source_object_dist": setup.source_object_distance,
@@ -255,7 +255,7 @@ def _write(path: Path, datasets: dict[str, AnyArray], attributes: dict[str, Any]
 
 
 def check_pradformat_fields(names: Sequence[str]) -> None:
-    """Refuse several fields, of which a pradformat inversion holds one."""
+    """Refuse several fields, because a pradformat inversion holds one."""
     if len(names) > 1:
         raise InputError(
             f"a pradformat inversion holds one field, received {' and '.join(names)}: write "
@@ -264,11 +264,11 @@ def check_pradformat_fields(names: Sequence[str]) -> None:
 
 
 def check_pradformat_setup(setup: Setup | None) -> Any:
-    """Refuse a setup that a pradformat inversion cannot be written with; the format needs all."""
+    """Refuse a setup of a kind without all the attributes that pradformat needs."""
     if setup is None or not setup.in_pradformat:
-        found = "none" if setup is None else f"kind '{setup.kind}'"
+        kind = "none" if setup is None else f"kind '{setup.kind}'"
         raise InputError(
-            f"a pradformat inversion needs a setup of kind 'proton', received {found}: give one, "
+            f"a pradformat inversion needs a setup of kind 'proton', received {kind}: give one, "
             "or write .shadowinv"
         )
     return setup

@@ -1,4 +1,4 @@
-"""Published shadowgrams, downloaded on request, checked by their checksums and cached.
+"""Published shadowgrams, downloaded on request, verified by checksum and cached.
 
 - the plume of an alcohol burner with its reference, ten frames and the beam: `fetch_burner`
 """

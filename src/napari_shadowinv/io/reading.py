@@ -1,7 +1,7 @@
-"""Read whatever a user points at; the content decides what it is, not the name.
+"""Readers of any file; its content decides on the format, not its name.
 
 - any file: `read`; where only one makes sense: `read_radiograph`, `read_dataset`
-- a scan of CR-39, of whose tracks some count: `read_cpsa`
+- a scan of CR-39, with the ranges of the tracks to count: `read_cpsa`
 - a file with options or a setup: `read_toml`
 """
 
@@ -54,7 +54,7 @@ def read(
         inversion, a ``.shadowinv`` result, or a ``.shadowinv.zarr`` store of many shots (read
         lazily).
     channel : {"red", "green", "blue", "mean"} or int, optional
-        What to take of a colour image whose channels differ.
+        Channel to take from a colour image whose channels differ.
     variable : str, optional
         Name of the array to take from a MATLAB file that holds several, or from any HDF5 file,
         with its groups: ``"shots/3/image"``. For CR-39 the tracks to count:
@@ -74,25 +74,33 @@ def read(
     """
     if is_stack(path):
         return read_stack(path)
-    found = format_of(path)
-    if variable is not None and not found.named_reader:
+    file_format = format_of(path)
+    if variable is not None and not file_format.named_reader:
         raise InputError(
             f"{path} is neither a MATLAB nor an HDF5 file nor a CR-39 scan (its kind is "
-            f"{found.name!r}): variable {variable!r} does not apply; leave it out"
+            f"{file_format.name!r}): variable {variable!r} does not apply; leave it out"
         )
-    content: xarray.Dataset | tuple[AnyArray, dict[str, Any]] = found.read(path, variable)
+    content: xarray.Dataset | tuple[AnyArray, dict[str, Any]] = file_format.read(path, variable)
     if not isinstance(content, tuple):
         return content
     array, metadata = content
-    return _radiograph(path, found, array, metadata, channel)
+    return _radiograph(path, file_format, array, metadata, channel)
 
 
 def _radiograph(
-    path: Path, found: Format, array: AnyArray, metadata: dict[str, Any], channel: str | int | None
+    path: Path,
+    file_format: Format,
+    array: AnyArray,
+    metadata: dict[str, Any],
+    channel: str | int | None,
 ) -> Radiograph:
-    described: dict[str, Any]
-    described = {"kind": found.name, "dtype": str(array.dtype), "bits": 8 * array.dtype.itemsize}
-    described |= {"sha256": sha256(path), **metadata}
+    facts: dict[str, Any] = {
+        "kind": file_format.name,
+        "dtype": str(array.dtype),
+        "bits": 8 * array.dtype.itemsize,
+        "sha256": sha256(path),
+        **metadata,
+    }
     if array.dtype.kind not in "buif":
         raise FileFormatError(
             f"{path} holds {array.dtype} pixels: expected whole or real numbers; convert them"
@@ -103,17 +111,17 @@ def _radiograph(
             f"{path} holds no finite pixel: expected an image; check how the file was saved"
         )
     if array.ndim == 3 and channel is not None:
-        described["channel"] = channel
-    source, mask = described.pop("source", None), described.pop("mask", None)
-    warnings = tuple(described.pop("warnings", ()))
+        facts["channel"] = channel
+    source, mask = facts.pop("source", None), facts.pop("mask", None)
+    warnings = tuple(facts.pop("warnings", ()))
     return Radiograph(
         image=image,
         setup=_complete_setup(path, metadata.get("geometry", {})),
         path=path,
-        metadata=described,
+        metadata=facts,
         source=None if source is None else np.ascontiguousarray(source, dtype=np.float64),
         mask=mask,
-        warnings=(*warnings, *(film_warnings(array, channel) if found.is_scan else ())),
+        warnings=(*warnings, *(film_warnings(array, channel) if file_format.is_scan else ())),
     )
 
 
@@ -122,7 +130,7 @@ def _complete_setup(path: Path, geometry: dict[str, Any]) -> Setup | None:
         return None
     from napari_shadowinv.physics.setup import setup_from_dict
 
-    # What tells an energy is a beam of particles.
+    # A geometry with an energy belongs to a beam of particles.
     return setup_from_dict({"kind": "proton", **geometry}, str(path))
 
 
@@ -177,7 +185,7 @@ def read_cpsa(
     InputError
         If a range or the bin is impossible, or no track is within the ranges.
     """
-    from napari_shadowinv.io.cpsa import as_text  # what reads tracks needs more of the package
+    from napari_shadowinv.io.cpsa import as_text  # the reader of tracks imports much more
 
     if format_of(path) is not CPSA:
         raise FileFormatError(f"{path} is no CR-39 scan: expected {CPSA.title}; read it with read")
@@ -187,8 +195,8 @@ def read_cpsa(
 def read_dataset(path: str | Path) -> xarray.Dataset:
     """Read a ``.shadowinv`` file, a pradformat inversion, or a ``.shadowinv.zarr`` store.
 
-    The dataset has the displacement at least. Errors are those of `read`, and a `FileFormatError`
-    if the file holds an image.
+    The dataset has at least the displacement. It raises the errors of `read`, and a
+    `FileFormatError` if the file holds an image.
     """
     content = read(path) if is_stack(path) or "result" in format_of(path).holds else None
     if content is None or isinstance(content, Radiograph):

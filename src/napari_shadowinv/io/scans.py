@@ -1,4 +1,4 @@
-"""Scans of film, in all their colours: `read_scan`."""
+"""Scans of film in colour: `read_scan`."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ def read_scan(path: Path) -> Scan:
     InputError
         If it has no colours.
     """
-    found = format_of(path)
-    content = found.read(path) if found.is_scan else None
+    file_format = format_of(path)
+    content = file_format.read(path) if file_format.is_scan else None
     if not isinstance(content, tuple) or content[0].ndim != 3 or content[0].shape[-1] not in (3, 4):
         raise InputError(f"{path} is no picture in colour: expected a scan in red, green and blue")
     return Scan(content[0][..., :3], _pixel_size(path), sha256(path))
 
 
 def _pixel_size(path: Path) -> float | None:
-    """By the resolution that a TIFF tells; other formats tell none that scanners keep to."""
+    """Return the pixel size by a TIFF's resolution; scanners do not set that of other formats."""
     import tifffile
 
     try:

@@ -1,11 +1,11 @@
 """Results of many shots in one Zarr store, written shot by shot.
 
 - write one shot, or why it failed: `ShotWriter`
-- what has been written: `read_stack` (lazy, for everyone), `StackStore` (for a run)
+- read the results: `read_stack` (lazy, for everyone), `StackStore` (for a run)
 
 Each variable has one chunk for each shot, each chunk is a file that appears whole or not at
-all, and the last one of a shot is its `status`: what is not marked there is pending and will be
-written again. So workers can write side by side, and any of them may die.
+all, and the last one of a shot is its `status`: a shot that is not marked there is pending and will
+be written again. So workers can write at the same time, and any of them may die.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def check_store_path(path: str | Path) -> Path:
 
 
 def is_stack(path: str | Path) -> bool:
-    """Tell whether a folder is a store of many shots."""
+    """Return whether a folder is a store of many shots."""
     return _attributes(Path(path)).get("format") == FORMAT
 
 
@@ -128,12 +128,12 @@ def summary_of(attributes: Mapping[Any, Any]) -> dict[str, tuple[type, dict[str,
 
 
 def nothing_yet(kind: type) -> Any:
-    """Return what stands for a number of a shot that is not known."""
+    """Return the placeholder of a number that a shot does not have yet."""
     return "" if kind is str else np.nan if kind is float else 0
 
 
 def number_of(report: Mapping[str, Any], name: str, kind: type) -> Any:
-    """Return what a shot's report says of one of the numbers that are gathered."""
+    """Return one of the gathered numbers from a shot's report."""
     return report.get("residual" if name == "flux_residual" else name, nothing_yet(kind))
 
 
@@ -143,7 +143,7 @@ def _document(path: Path) -> dict[str, Any]:
         document = dict(json.loads(small_text(path / "zarr.json", "metadata of a store")))
         return document if isinstance(document["attributes"], dict) else {}
     except Exception:
-        # Who opens it says more of what is wrong.
+        # The error on opening it says more about the damage.
         return {}
 
 
@@ -152,7 +152,7 @@ def _attributes(path: Path) -> dict[str, Any]:
 
 
 def store_error(path: Path, error: OSError) -> StoreError:
-    """Say that a store cannot be written, why, and what to do."""
+    """Return the error of a store that cannot be written, with its reason and advice."""
     if not (path / "zarr.json").exists():
         return StoreError(
             f"{path} was removed or moved while it was being written: put it back and run again to "
@@ -166,14 +166,14 @@ def store_error(path: Path, error: OSError) -> StoreError:
 
 @dataclass(frozen=True)
 class ShotWriter:
-    """Writes shots into a store that is there; it can be sent to a worker."""
+    """Writer of shots into an existing store; it can be sent to a worker."""
 
     path: Path
     store_id: str  # another store may have taken its place
     shots: int  # it may have had fewer when this process opened it before
 
     def write(self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
-        """Write a shot and how it went; it is done when this returns, pending if this fails."""
+        """Write a shot and its report; it is done when this returns, pending if this fails."""
         self._commit(index, arrays, report, DONE)
 
     def fail(self, index: int, report: Mapping[str, Any]) -> None:
@@ -196,8 +196,8 @@ class ShotWriter:
                     group[name][index : index + 1] = np.asarray(arrays[name])[np.newaxis]
                 else:
                     erase(self.path, group[name], index)
-            noted = note_shot(self.path, group, index, self.labels(index, attributes))
-            text = json.dumps({**report, **noted})
+            checksums = note_shot(self.path, group, index, self.labels(index, attributes))
+            text = json.dumps({**report, **checksums})
             group["report"][index : index + 1] = np.array([text], dtype=object)
             group["status"][index : index + 1] = np.int8(status)
         except OSError as error:
@@ -259,17 +259,17 @@ def _labels_of_all(
 @lru_cache(maxsize=4)
 def _opened(path: Path, store_id: str, shots: int) -> dict[str, Any]:
     arrays = open_to_write(path)
-    found = arrays["status"].shape[0]
-    if found != shots:
+    shot_count = arrays["status"].shape[0]
+    if shot_count != shots:
         raise StoreError(
-            f"{path} has {found} shots here and {shots} where the run was started: wait until "
+            f"{path} has {shot_count} shots here and {shots} where the run was started: wait until "
             "the file system is in sync on all machines, then run again to resume"
         )
     return arrays
 
 
 class StackStore:
-    """A store as a run sees it: what is done, failed, pending, damaged.
+    """Store of a run: the status and the report of each shot, and damage to files.
 
     Parameters
     ----------
@@ -281,7 +281,7 @@ class StackStore:
     Attributes
     ----------
     field : str or None
-        What was fitted.
+        The fitted field; None where shots were inverted.
     own_setups : bool
         Whether its shots are rows of a table.
     """
@@ -322,20 +322,20 @@ class StackStore:
         return statuses
 
     def report(self, index: int) -> dict[str, Any]:
-        """Return how a shot went; ``reason`` says why it failed, or how it is damaged."""
+        """Return a shot's report; ``reason`` says why it failed, or how it is damaged."""
         if index in self.damage.shots:
             return {"reason": self.damage.shots[index]}
         return _parsed(self.path, [str(self._values("report", index))])[0]
 
     def reports(self) -> Sequence[dict[str, Any]]:
-        """Return how each shot went, as `report` does."""
+        """Return the report of each shot, as `report` does."""
         if self.damage.shots:
             return [self.report(index) for index in range(len(self.names))]
         return _parsed(self.path, self._values("report").tolist())
 
     @cached_property
     def damage(self) -> Damage:
-        """Return what is lost, exchanged or damaged; nothing in a store without checksums."""
+        """Return the lost, exchanged or damaged files; none in a store without checksums."""
         if self._layout is None:
             return Damage()
         damage = find_damage(self._layout, every_byte=self._every_byte)
@@ -431,7 +431,7 @@ def _parsed(path: Path, texts: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def is_along_shots(array: Any) -> bool:
-    """Tell whether an array of a store has a value for each shot."""
+    """Return whether an array of a store has a value for each shot."""
     return tuple(array.metadata.dimension_names or ())[:1] == ("shot",)
 
 
@@ -448,9 +448,9 @@ def read_stack(path: Path) -> xarray.Dataset:
     -------
     xarray.Dataset
         Dimensions shot, y, x and component. ``status`` is 0 where a shot is pending, 1 done,
-        2 failed, 3 damaged; the values of shots that are not done are NaN, and those of damaged
-        shots cannot be read. Where shots have setups of their
-        own, ``setup`` has that of each, empty until it is done.
+        2 failed, 3 damaged; the values of shots that are not done are NaN, and damaged shots
+        cannot be read. Where shots have different setups, ``setup`` has one for each shot, empty
+        until the shot is done.
 
     Raises
     ------
@@ -469,31 +469,31 @@ def read_stack(path: Path) -> xarray.Dataset:
     if dataset.sizes["shot"] > len(store.names):  # grown since
         dataset = dataset.isel(shot=slice(len(store.names)))
     check_files(store)
-    # They hold for this folder, and not for what is made of the dataset.
+    # They hold for this folder, not for datasets derived from this one.
     dataset.attrs = {k: v for k, v in dataset.attrs.items() if k not in (SEAL, FIXED)}
     setup = setup_from_dataset(dataset)
     complete = _with_fields(with_own_setups(dataset), setup)
     # The folder's own order is arbitrary.
     order = [*_labels(dataset, setup), *_OWN_ORDER]
-    shown = complete[[name for name in order if name in complete]]
-    return shown.assign(status=shown["status"].copy(data=store.statuses()))
+    ordered = complete[[name for name in order if name in complete]]
+    return ordered.assign(status=ordered["status"].copy(data=store.statuses()))
 
 
 def _labels(dataset: xarray.Dataset, setup: Any) -> dict[str, Any]:
-    """What a store's dataset may hold, by name, and how it is labelled."""
+    """Return dimensions and labels of the variables that a store's dataset may have, by name."""
     field = fitted_field(dataset.attrs)
     return variable_labels(setup) if field is None else fit_labels(field, setup)
 
 
 def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:
-    """Add the fields in SI units that follow from what is stored, lazily."""
+    """Add the fields in SI units, computed lazily from the stored ones."""
     if setup is None:
         return dataset
-    found = {}
+    fields = {}
     in_si = {field.name for field in setup.si_fields}
     for name, (dims, labels) in _labels(dataset, setup).items():
         origin = "displacement" if "component" in dims else "potential"
         if name in dataset or name not in in_si or origin not in dataset:
             continue
-        found[name] = (("shot", *dims), field_in_si(dataset, origin, name, setup), labels)
-    return dataset.assign(found)
+        fields[name] = (("shot", *dims), field_in_si(dataset, origin, name, setup), labels)
+    return dataset.assign(fields)

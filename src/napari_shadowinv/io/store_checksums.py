@@ -1,9 +1,9 @@
 """Checksums of a store, so that no damage to its files is read as data.
 
-Each chunk ends with its CRC-32C, which Zarr checks when it unpacks the chunk. Chunks that were
-lost, or that lie in the place of others, are noticed by what is noted elsewhere: the report of a
-shot holds the checksums of the shot's chunks and its name, the folder's ``zarr.json`` those of
-chunks that belong to no shot, and its own SHA-256.
+Each chunk ends with its CRC-32C, which Zarr checks when it unpacks the chunk. Lost and exchanged
+chunks are noticed by checksums in other files: the report of a shot holds the shot's name and the
+checksums of its chunks, the folder's ``zarr.json`` holds its own SHA-256 and the checksums of
+chunks that belong to no shot.
 
 - note them: `seal`, `reseal`, `note_shot`
 - compare them: `check_seal`, `check_chunk`, `check_content`, `find_damage`
@@ -33,15 +33,15 @@ from napari_shadowinv.errors import FileFormatError
 SEAL = "metadata_sha256"  # attribute: checksum of the folder's description
 FIXED = "chunk_checksums"  # attribute: checksums of chunks that belong to no shot (JSON)
 CHUNKS = "chunks"  # in a shot's report: checksums of its chunks, None of those that are not there
-LABELS = "labels"  # in a shot's report: its name, and what else labels it
+LABELS = "labels"  # in a shot's report: its name and its other labels
 _CODEC = "crc32c"
 _CRC_BYTES = 4
 _READS = 3  # of a shot that another process may be writing again
-_RECORD = ("status", "report")  # what is kept of each shot beside its fields
+_RECORD = ("status", "report")  # arrays with an entry for each shot that are no fields
 
 
 class Status(IntEnum):
-    """What became of a shot; damage is noticed when a store is opened, and never stored."""
+    """Status of a shot; damage is noticed when a store is opened, and never stored."""
 
     PENDING = 0
     DONE = 1
@@ -62,7 +62,7 @@ def reseal(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_sealed(document: Mapping[str, Any]) -> bool:
-    """Tell whether a store has checksums."""
+    """Return whether a store has checksums."""
     return SEAL in document.get("attributes", {})
 
 
@@ -90,7 +90,7 @@ class Layout:
 
     @classmethod
     def of(cls, root: Path, document: Mapping[str, Any]) -> Layout | None:
-        """Return the layout of a store, None of one without checksums."""
+        """Return the layout of a store, or None for a store without checksums."""
         if not is_sealed(document):
             return None
         arrays = document["consolidated_metadata"]["metadata"]
@@ -144,7 +144,7 @@ def fixed_keys(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def has_checksums(array: Any) -> bool:
-    """Tell whether the chunks of an open Zarr array end with their checksums."""
+    """Return whether the chunks of an open Zarr array end with their checksums."""
     names: list[str] = [codec.to_dict()["name"] for codec in array.metadata.codecs]
     return _CODEC in names
 
@@ -152,7 +152,7 @@ def has_checksums(array: Any) -> bool:
 def note_shot(
     root: Path, arrays: Mapping[str, Any], index: int, labels: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what the report of a shot says of its chunks and labels, once these are written."""
+    """Return the checksums of a shot's written chunks and its labels, for its report."""
     chunks: dict[str, str | None] = {}
     for name, array in arrays.items():
         if (array.metadata.dimension_names or (None,))[0] != "shot" or name in _RECORD:
@@ -225,7 +225,7 @@ def _report(root: Path, index: int) -> dict[str, Any]:
 
 
 def check_chunk(layout: Layout, key: str, name: str, index: int) -> None:
-    """Refuse a chunk that is lost, or is not the one that was written there.
+    """Refuse a chunk that is lost or was exchanged.
 
     Parameters
     ----------
@@ -251,7 +251,7 @@ def check_chunk(layout: Layout, key: str, name: str, index: int) -> None:
 
 
 def check_content(layout: Layout, key: str, name: str, index: int, raw: bytes) -> None:
-    """Refuse a chunk that has changed since it was written; arguments are those of `check_chunk`.
+    """Refuse a chunk that has changed since it was written; other arguments as in `check_chunk`.
 
     Parameters
     ----------
@@ -264,8 +264,8 @@ def check_content(layout: Layout, key: str, name: str, index: int, raw: bytes) -
         With the shot that is damaged.
     """
     if not _is_intact(raw):
-        thing = f"its {name}" if name in layout.of_each_shot else key
-        problem = f"{thing} is damaged (its content does not match its checksum)"
+        damaged = f"its {name}" if name in layout.of_each_shot else key
+        problem = f"{damaged} is damaged (its content does not match its checksum)"
         raise _damage_error(layout, name, index, problem)
 
 
@@ -285,7 +285,7 @@ def _label(layout: Layout, index: int) -> str:
 
 
 def _settled(look: Callable[[], str]) -> str:
-    """Look again at what is damaged: it may be a shot that is being written at this moment."""
+    """Repeat a check that fails, because the shot may be being written at this moment."""
     problem = look()
     for _ in range(_READS - 1):
         if problem:
@@ -296,7 +296,7 @@ def _settled(look: Callable[[], str]) -> str:
 def _shot_problem(
     layout: Layout, index: int, names: tuple[str, ...], every_byte: bool = False
 ) -> str:
-    """Say what is wrong with a shot that has ended; empty if nothing is."""
+    """Describe the damage to a shot that has ended; empty if there is none."""
     try:
         report = _report(layout.root, index)
     except (OSError, ValueError, TypeError, struct.error) as error:
@@ -326,7 +326,7 @@ def _shot_problem(
 
 
 def _chunk_problem(layout: Layout, key: str, every_byte: bool) -> str:
-    """Say what is wrong with a chunk that belongs to no single shot; empty if nothing is."""
+    """Describe the damage to a chunk that belongs to no single shot; empty if there is none."""
     file = layout.root / key
     try:
         checksum = stored_checksum(file)
@@ -343,14 +343,14 @@ def _chunk_problem(layout: Layout, key: str, every_byte: bool) -> str:
 
 @dataclass(frozen=True)
 class Damage:
-    """What is damaged in a store.
+    """Damage to a store.
 
     Attributes
     ----------
     shots : dict of int to str
         Shots that have ended and cannot be trusted, with the reason.
     files : tuple of str
-        What is wrong with files that belong to no single shot.
+        Descriptions of damage to files that belong to no single shot.
     """
 
     shots: dict[int, str] = field(default_factory=dict)
@@ -364,7 +364,7 @@ def find_damage(layout: Layout, *, every_byte: bool = False) -> Damage:
     ----------
     layout : Layout
     every_byte : bool, optional
-        Read all files. Otherwise only reports are read, and of chunks the checksums they hold.
+        Read all files. Otherwise only reports and the checksums of chunks are read.
 
     Returns
     -------
@@ -388,16 +388,17 @@ def _description_problem(layout: Layout, name: str) -> str:
     file = layout.root / name / "zarr.json"
     expected = dict(layout.arrays[name])
     try:
-        found = json.loads(small_text(file, "metadata of an array"))
+        metadata = json.loads(small_text(file, "metadata of an array"))
         # A process that was killed while the store grew may have changed the length.
-        found["shape"] = [*expected["shape"][:1], *found["shape"][1:]]
-        return "" if _comparable(found) == _comparable(expected) else f"{name}/zarr.json is damaged"
+        metadata["shape"] = [*expected["shape"][:1], *metadata["shape"][1:]]
+        is_intact = _comparable(metadata) == _comparable(expected)
+        return "" if is_intact else f"{name}/zarr.json is damaged"
     except (OSError, ValueError, KeyError, TypeError):
         return f"{name}/zarr.json is damaged or missing"
 
 
 def _comparable(description: Mapping[str, Any]) -> str:
-    """Return a description as text, without what may be left out where there is nothing."""
+    """Return a description as text, without empty entries, which are optional."""
     filled = {key: value for key, value in description.items() if value not in (None, {}, [])}
     return json.dumps(filled, sort_keys=True)
 

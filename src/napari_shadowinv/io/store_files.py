@@ -1,4 +1,4 @@
-"""The files of a Zarr store, each looked at before it is opened: `CheckedStore`.
+"""Files of a Zarr store, each checked before it is opened: `CheckedStore`.
 
 Zarr itself would wait for ever for a pipe behind a link, and ask for as much memory as the first
 bytes of a chunk name, damaged or not.
@@ -28,7 +28,7 @@ _TEXTS, _BLOSC = "vlen-utf8", "blosc"
 
 
 class _Chunk(NamedTuple):
-    """What each chunk of an array unfolds to."""
+    """Size and codecs of each chunk of an array."""
 
     values: int
     value_bytes: int
@@ -36,13 +36,13 @@ class _Chunk(NamedTuple):
 
 
 class CheckedStore(LocalStore):
-    """A folder that is only read, whatever Zarr asks for, and never more of it than is there."""
+    """Folder that Zarr may only read, and only as far as its files really reach."""
 
     def __init__(self, root: Path, *, read_only: bool = True) -> None:
         super().__init__(root, read_only=True)
         self._chunks: dict[str, _Chunk] = {}
         self._layout: tuple[Layout | None] | None = None
-        # Tells what is read now from what was read before the store grew, where dask keeps either.
+        # Distinguishes this store from the shorter one before it grew, where dask keeps both.
         self._opened = time.time_ns()
 
     async def get(
@@ -68,15 +68,15 @@ class CheckedStore(LocalStore):
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
     ) -> list[Buffer | None]:
-        wanted = list(key_ranges)
-        for key, _ in wanted:
+        ranges = list(key_ranges)
+        for key, _ in ranges:
             self._check(key)
-        return await super().get_partial_values(prototype, wanted)
+        return await super().get_partial_values(prototype, ranges)
 
     def _intact(
         self, key: str, buffer: Buffer | None, byte_range: ByteRequest | None
     ) -> Buffer | None:
-        """Return what was read of a chunk once it has matched its checksum."""
+        """Return the bytes read from a chunk once they have matched its checksum."""
         name, is_chunk, place = key.partition(_CHUNKS)
         if buffer is not None and is_chunk and byte_range is None:
             layout = self._sealed_layout()
@@ -103,7 +103,7 @@ class CheckedStore(LocalStore):
             check_size(path, path.stat().st_size)
 
     def _sealed_layout(self) -> Layout | None:
-        """Return how the store's chunks are noted; None without checksums."""
+        """Return the layout of the store's checksums, or None without checksums."""
         if self._layout is None:
             file = self.root / _METADATA
             document = _json(file) if file.exists() else {}
@@ -112,9 +112,9 @@ class CheckedStore(LocalStore):
         return self._layout[0]
 
     def _metadata(self, name: str) -> dict[str, Any]:
-        """The description of an array: the folder's own copy counts, where there is one."""
-        whole = _json(self.root / _METADATA).get("consolidated_metadata") or {"metadata": {}}
-        return whole["metadata"].get(name) or _json(self.root / name / _METADATA)
+        """Return the description of an array, from the folder's own copy where there is one."""
+        consolidated = _json(self.root / _METADATA).get("consolidated_metadata") or {"metadata": {}}
+        return consolidated["metadata"].get(name) or _json(self.root / name / _METADATA)
 
     def _check_chunk(self, path: Path, name: str) -> None:
         if name not in self._chunks:
@@ -131,7 +131,7 @@ class CheckedStore(LocalStore):
 
 
 def describes_arrays(path: Path) -> bool:
-    """Tell whether a store's folder has its own copy of what its arrays are like."""
+    """Return whether a store's folder has its own copy of the descriptions of its arrays."""
     file = path / _METADATA
     return file.exists() and bool(_json(file).get("consolidated_metadata"))
 

@@ -1,6 +1,6 @@
 """A store that grows by one shot at a time while its run goes on: `GrowingStore`.
 
-It is opened once. What a shot costs does not depend on how many there are already.
+It is opened once. The cost of a shot does not depend on how many there are already.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from napari_shadowinv.io.store_layout import lengthen
 
 @dataclass(frozen=True)
 class _OpenWriter(ShotWriter):
-    """A writer that need not open the store for each shot."""
+    """Writer that does not open the store for each shot."""
 
     opened: dict[str, Any]
 
@@ -43,12 +43,12 @@ class _OpenWriter(ShotWriter):
 
 
 class GrowingStore:
-    """A store as the one process sees it that writes it; of each shot it keeps the name."""
+    """Store that this process alone writes; it remembers the name and status of each shot."""
 
     def __init__(self, store: StackStore, attributes: Mapping[str, Any]) -> None:
         self.path = store.path
-        self._told = attributes  # of a store that has grown so
-        # Its own, as they grow: others in this process may hold those of a certain length.
+        self._attributes = attributes  # of a store that has grown so
+        # Not the cached arrays, as these grow: other code in this process needs a fixed length.
         arrays = open_to_write(store.path)
         count = len(store.names)
         self._writer = _OpenWriter(store.path, store.attributes["store_id"], count, arrays)
@@ -57,7 +57,7 @@ class GrowingStore:
         }
         self._numbers = {name: index for index, name in enumerate(store.names)}
         self._statuses = bytearray(store.statuses().astype(np.uint8).tobytes())
-        self._counts = [self._statuses.count(one) for one in range(len(STATUS_NAMES))]
+        self._counts = [self._statuses.count(status) for status in range(len(STATUS_NAMES))]
 
     def __len__(self) -> int:
         return len(self._statuses)
@@ -80,7 +80,7 @@ class GrowingStore:
         return self._statuses[index]
 
     def report(self, index: int) -> dict[str, Any]:
-        """Return how a shot went that has ended before."""
+        """Return the report of a shot that has ended."""
         text = str(self._writer.opened["report"][index])
         return dict(json.loads(text or "{}"))
 
@@ -88,7 +88,7 @@ class GrowingStore:
         """Make room for one more shot, pending, and return its number."""
         index = len(self)
         values = {"shot": np.array([index]), "name": np.array([name], dtype=object)}
-        lengthen(self.path, self._writer.opened, index + 1, values, self._told)
+        lengthen(self.path, self._writer.opened, index + 1, values, self._attributes)
         self._numbers[name] = index
         self._statuses.append(PENDING)
         self._counts[PENDING] += 1
@@ -97,19 +97,19 @@ class GrowingStore:
     def reopen(self, index: int) -> None:
         """Mark a shot as pending that is to be done again, and forget its fields."""
         self._writer.reopen(index)
-        self._note(index, PENDING)
+        self._set_status(index, PENDING)
 
     def write(self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
         """As `ShotWriter.write`; the shot's numbers are there as soon as it is done."""
         self._gather(index, report)
         self._writer.write(index, arrays, report)
-        self._note(index, DONE)
+        self._set_status(index, DONE)
 
     def fail(self, index: int, report: Mapping[str, Any]) -> None:
         """As `ShotWriter.fail`."""
         self._gather(index, report)
         self._writer.fail(index, report)
-        self._note(index, FAILED)
+        self._set_status(index, FAILED)
 
     def _gather(self, index: int, report: Mapping[str, Any]) -> None:
         try:
@@ -121,7 +121,7 @@ class GrowingStore:
         except OSError as error:
             raise store_error(self.path, error) from error
 
-    def _note(self, index: int, status: int) -> None:
+    def _set_status(self, index: int, status: int) -> None:
         self._counts[self._statuses[index]] -= 1
         self._counts[status] += 1
         self._statuses[index] = status

@@ -1,4 +1,4 @@
-"""How a store of many shots is laid out: made by `create_store`, made longer by `grow_store`.
+"""Layout of a store of many shots: `create_store` creates it, `grow_store` makes it longer.
 
 The folder's own ``zarr.json`` holds a copy of every array's shape, and who opens the store goes
 by that copy. So a store changes its length in one moment: when that one file is replaced.
@@ -41,7 +41,7 @@ _SMALL = 64  # values that are not worth compressing
 
 @dataclass(frozen=True)
 class Variable:
-    """What a store shall hold under one name."""
+    """Array of a store to create."""
 
     dims: tuple[str, ...]
     dtype: Any
@@ -55,7 +55,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Contents:
-    """What a store shall hold: arrays, the length of each dimension, facts about all shots."""
+    """Content of a store to create: arrays, lengths of dimensions, attributes of all shots."""
 
     sizes: Mapping[str, int]
     variables: Mapping[str, Variable]
@@ -64,7 +64,7 @@ class Contents:
 
 
 def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> StackStore:
-    """Make a store, all its shots pending; it appears whole or not at all."""
+    """Create a store with all its shots pending; it appears completely or not at all."""
     if path.exists() and not overwrite:
         raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")
     sweep(path.parent)
@@ -104,14 +104,14 @@ def grow_store(
 ) -> StackStore:
     """Make room for more shots, pending; a process killed meanwhile leaves the store unchanged.
 
-    The coordinates, `values`, are those of all `length` shots.
+    The coordinates, `values`, are of all `length` shots.
     """
     try:
         arrays = open_to_write(path)
     except OSError as error:
         raise store_error(path, error) from error
     before = arrays["status"].shape[0]
-    new = {name: one[before:] for name, one in values.items()}
+    new = {name: array[before:] for name, array in values.items()}
     lengthen(path, arrays, length, new, attributes)
     return StackStore(path)
 
@@ -123,7 +123,7 @@ def lengthen(
     values: Mapping[str, AnyArray],
     attributes: Mapping[str, Any],
 ) -> None:
-    """Grow a store whose arrays are open; the coordinates, `values`, are those of new shots."""
+    """Grow a store whose arrays are open; the coordinates, `values`, are of the new shots."""
     longer = [name for name, array in arrays.items() if is_along_shots(array)]
     file = path / "zarr.json"
     try:
@@ -164,12 +164,12 @@ def _write_template(path: Path, contents: Contents) -> None:
             "coordinates": " ".join(extra),
         },
     )
-    own = _own_variables(contents.sizes["shot"], contents.attributes)
-    arrays = {**contents.coordinates, **contents.variables, **own}
+    shot_variables = _shot_variables(contents.sizes["shot"], contents.attributes)
+    arrays = {**contents.coordinates, **contents.variables, **shot_variables}
     for name, variable in arrays.items():
         _create_array(group, name, variable, contents.sizes)
     with warnings.catch_warnings():
-        # That other programs may not know it: they read the arrays' own metadata then.
+        # The warning is that other programs may not know this: they read the arrays' own metadata.
         warnings.simplefilter("ignore")
         zarr.consolidate_metadata(path)
     file = path / "zarr.json"
@@ -179,8 +179,8 @@ def _write_template(path: Path, contents: Contents) -> None:
     file.write_text(json.dumps(seal(document), indent=2), encoding="utf-8")
 
 
-def _own_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Variable]:
-    """What every store says about its shots."""
+def _shot_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Variable]:
+    """Return the variables that every store has for its shots."""
     status = {
         "units": "1",
         "long_name": "Status of the shot",
@@ -188,16 +188,16 @@ def _own_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Varia
         "flag_meanings": " ".join(STATUS_NAMES),
     }
     report = {"units": "1", "long_name": "Report, or reason for failure (JSON)"}
-    own = {
+    variables = {
         "status": Variable(("shot",), np.dtype("int8"), status),
         "report": Variable(("shot",), str, report),
     }
     for name, (kind, labels) in summary_of(attributes).items():
         dtype = str if kind is str else np.dtype(kind)
-        kept = object if kind is str else kind
-        nothing: AnyArray = np.full(shots, nothing_yet(kind), dtype=kept)
-        own[name] = Variable(("shot",), dtype, labels, nothing)
-    return own
+        numpy_dtype = object if kind is str else kind
+        nothing: AnyArray = np.full(shots, nothing_yet(kind), dtype=numpy_dtype)
+        variables[name] = Variable(("shot",), dtype, labels, nothing)
+    return variables
 
 
 def _create_array(group: Any, name: str, variable: Variable, sizes: Mapping[str, int]) -> None:
@@ -207,7 +207,7 @@ def _create_array(group: Any, name: str, variable: Variable, sizes: Mapping[str,
     chunks = _chunks(variable, shape)
     is_text = variable.dtype is str
     is_float = not is_text and np.dtype(variable.dtype).kind == "f"
-    # Bytes that change slowly side by side: that is what makes fields compressible.
+    # Fields compress well once their slowly changing bytes are next to each other.
     fields = BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")
     is_plain = is_text or np.prod(chunks) <= _SMALL
     array = group.create_array(
@@ -226,8 +226,8 @@ def _create_array(group: Any, name: str, variable: Variable, sizes: Mapping[str,
 
 
 def _chunks(variable: Variable, shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Shape of what is one file."""
+    """Return the shape of a chunk, which is one file."""
     if not variable.along_shots:
         return tuple(max(1, length) for length in shape)
-    # What is known at once in few files, with room for shots to come; else one for each shot.
+    # Values of the start are in few files, with room for new shots; others in a file for each shot.
     return (1 if variable.values is None else _TOGETHER, *shape[1:])

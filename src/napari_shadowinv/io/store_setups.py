@@ -1,4 +1,4 @@
-"""Setups of the shots of a store, where each may have its own.
+"""Setups of the shots of a store, which may differ.
 
 - the setup of each shot, and where its pixels are in metres: `with_own_setups`, `with_places`
 - a number of each setup: `of_each_setup`; a field in SI units: `field_in_si`
@@ -24,7 +24,7 @@ _NO_TEXT = np.array([], object)
 
 
 def with_own_setups(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Add the setup of each shot, read when it is asked for, if shots have their own."""
+    """Add the setup of each shot, read lazily, if shots have different ones."""
     if OWN_SETUPS not in dataset.attrs or "setup" not in dataset.attrs:
         return dataset
     texts = dataset["report"].data.map_blocks(_setups_of_block, dtype=object, meta=_NO_TEXT)
@@ -32,7 +32,7 @@ def with_own_setups(dataset: xarray.Dataset) -> xarray.Dataset:
 
 
 def with_places(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Add where the pixels of each shot are in metres, by the shot's own setup."""
+    """Add the coordinates of each shot's pixels in metres, by the shot's own setup."""
     sizes = of_each_setup(dataset, _pixel_size)[:, np.newaxis]
     places = {
         f"{name}_si": (("shot", name), sizes * dataset[name].values, place_label(name))
@@ -46,12 +46,13 @@ def _pixel_size(setup: Any) -> float:
 
 
 def _setups_of_block(reports: AnyArray) -> AnyArray:
-    made = (json.loads(str(text) or "{}").get("provenance", {}) for text in reports)
-    return np.array([json.dumps(one["setup"]) if "setup" in one else "" for one in made], object)
+    provenances = (json.loads(str(text) or "{}").get("provenance", {}) for text in reports)
+    setups = (provenance.get("setup") for provenance in provenances)
+    return np.array(["" if setup is None else json.dumps(setup) for setup in setups], object)
 
 
 def of_each_setup(dataset: xarray.Dataset, measure: Callable[[Any], float]) -> Any:
-    """A number of the setup of each shot, NaN until it is done; None if all share one setup."""
+    """Return a number of each shot's setup, NaN until it is done; None if all share one setup."""
     if "setup" not in dataset:
         return None
     return dataset["setup"].data.map_blocks(_measured, measure, dtype=np.float64)
@@ -60,12 +61,12 @@ def of_each_setup(dataset: xarray.Dataset, measure: Callable[[Any], float]) -> A
 def _measured(texts: AnyArray, measure: Callable[[Any], float]) -> FloatArray:
     from napari_shadowinv.physics.setup import setup_from_dict
 
-    found = (measure(setup_from_dict(json.loads(text))) if text else np.nan for text in texts)
-    return np.array(list(found))
+    measures = (measure(setup_from_dict(json.loads(text))) if text else np.nan for text in texts)
+    return np.array(list(measures))
 
 
 def field_in_si(dataset: xarray.Dataset, origin: str, name: str, setup: Any) -> Any:
-    """A field of all shots in SI units, by the setup of each or by one for all; not read yet."""
+    """Return a field of all shots in SI units, lazily, by one setup for each or for all."""
     data = dataset[origin].data
     if "setup" not in dataset:
         return data.map_blocks(_field_of_block, None, name, setup, dtype=np.float64)
@@ -78,9 +79,9 @@ def field_in_si(dataset: xarray.Dataset, origin: str, name: str, setup: Any) -> 
 def _field_of_block(block: AnyArray, texts: AnyArray | None, name: str, setup: Any) -> FloatArray:
     from napari_shadowinv.physics.setup import setup_from_dict
 
-    own = [setup] * len(block)
+    setups = [setup] * len(block)
     if texts is not None:
-        # What is not done yet is NaN with any setup.
-        own = [setup_from_dict(json.loads(text)) if text else setup for text in texts.flat]
-    pairs = zip(own, block, strict=True)
-    return np.stack([one.field_in_si(name, values) for one, values in pairs])
+        # A shot that is not done yet is NaN with any setup.
+        setups = [setup_from_dict(json.loads(text)) if text else setup for text in texts.flat]
+    pairs = zip(setups, block, strict=True)
+    return np.stack([shot_setup.field_in_si(name, values) for shot_setup, values in pairs])

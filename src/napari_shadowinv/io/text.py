@@ -1,7 +1,7 @@
 """Images as text, one row of pixels per line: `read_text`.
 
 Numbers are separated by spaces, tabs or commas, with a decimal point. Lines that begin with
-``#`` or ``%`` are comments; they may tell the geometry as ``key = value``, ``key: value`` or
+``#`` or ``%`` are comments; they may contain the geometry as ``key = value``, ``key: value`` or
 ``key value``:
 
 ===========================  ==========================================================
@@ -18,10 +18,10 @@ key                          meaning
 A unit may follow the value (``1.4 cm``) or end the key (``bin_um``).
 
 PRadReader, which prepares radiographs for other codes, writes several images one below the other
-and tells their shapes in the order of the blocks: ``flux2D (rows, columns)``, the shot;
+and lists their shapes in the order of the blocks: ``flux2D (rows, columns)``, the shot;
 ``flux2D_ref``, the undisturbed beam; in some versions ``mask``, 0 where a pixel can be used.
-Without that block, ``x-mask 20 % - 80 %`` and ``y-mask`` tell which share of the rows (x) and of
-the columns (y) can be used.
+Without that block, ``x-mask 20 % - 80 %`` and ``y-mask`` give the share of the rows (x) and of
+the columns (y) that can be used.
 """
 
 from __future__ import annotations
@@ -64,19 +64,19 @@ _SELECTED = re.compile(r"^[#%]\s*([xy])-mask\s+([\d.]+)\s*%?\s*-\s*([\d.]+)")
 
 
 def read_text(path: Path) -> tuple[FloatArray, dict[str, Any]]:
-    """Read an image with its ``geometry`` (m, MeV), and ``source`` and ``mask`` where there are."""
+    """Read an image with its ``geometry`` (m, MeV), and ``source`` and ``mask`` if present."""
     # Once to find mistakes, once to keep: a bad file never fills the memory.
     height = 0
     width: int | None = None
-    told: dict[str, float] = {}
+    geometry: dict[str, float] = {}
     blocks: dict[str, tuple[int, int]] = {}
     selected: dict[str, tuple[float, float]] = {}
     for number, line in _lines(path):
         if line[0] in "#%":
-            told |= _geometry_of(path, number, line)
+            geometry |= _geometry_of(path, number, line)
             if block := _BLOCK.match(line):
-                told_first = next(iter(blocks.values()), (0, 0))
-                blocks[block[1]] = (int(block[2]), int(block[3])) if block[2] else told_first
+                first_shape = next(iter(blocks.values()), (0, 0))
+                blocks[block[1]] = (int(block[2]), int(block[3])) if block[2] else first_shape
             if part := _SELECTED.match(line):
                 selected[part[1]] = float(part[2]), float(part[3])
         else:
@@ -87,24 +87,24 @@ def read_text(path: Path) -> tuple[FloatArray, dict[str, Any]]:
     width = width or 0
     if "flux2D" in blocks:
         if selected and "mask" not in blocks and height == 3 * blocks["flux2D"][0]:
-            # Some versions write the mask without telling its shape.
+            # Some versions write the mask without its shape.
             blocks["mask"] = blocks["flux2D"]
         _check_blocks(path, blocks, (height, width))
     check_size(path, 8 * height * width)
     image = _filled(path, height, width)
-    metadata: dict[str, Any] = {"bits": 64, "geometry": _complete(told)}
+    metadata: dict[str, Any] = {"bits": 64, "geometry": _complete(geometry)}
     if "flux2D" not in blocks:
         return image, metadata
     image, parts = _split(path, image, blocks, selected)
     return image, {**metadata, **parts}
 
 
-def _check_blocks(path: Path, blocks: dict[str, tuple[int, int]], found: tuple[int, int]) -> None:
+def _check_blocks(path: Path, blocks: dict[str, tuple[int, int]], shape: tuple[int, int]) -> None:
     rows = sum(height for height, _ in blocks.values())
-    if len(set(blocks.values())) > 1 or found != (rows, blocks["flux2D"][1]):
-        told = ", ".join(f"{name} {shape}" for name, shape in blocks.items())
+    if len(set(blocks.values())) > 1 or shape != (rows, blocks["flux2D"][1]):
+        shapes = ", ".join(f"{name} {block}" for name, block in blocks.items())
         raise FileFormatError(
-            f"{path} holds {found[0]} rows of {found[1]} numbers, but its header gives {told}: "
+            f"{path} holds {shape[0]} rows of {shape[1]} numbers, but its header gives {shapes}: "
             "expected blocks of the same shape, one below the other, as listed in the header; "
             "write the file again"
         )
@@ -156,7 +156,7 @@ def _filled(path: Path, height: int, width: int) -> FloatArray:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Lines that are not blank, with their numbers from 1."""
+    """Yield the lines that are not blank, with their numbers from 1."""
     with path.open("rb") as file:
         for number in itertools.count(1):
             raw = file.readline(_LONGEST_LINE)
@@ -188,9 +188,9 @@ def _row(path: Path, number: int, line: str, width: int | None) -> FloatArray:
         return np.fromiter(map(float, words), dtype=np.float64, count=len(words))
     except ValueError:
         word = next(word for word in words if not _is_number(word)).strip()
-        shown = word if len(word) <= 30 else f"{word[:30]}…"
+        excerpt = word if len(word) <= 30 else f"{word[:30]}…"
         raise FileFormatError(
-            f"{path}, line {number} has {shown!r}: expected numbers with a decimal point, "
+            f"{path}, line {number} has {excerpt!r}: expected numbers with a decimal point, "
             "separated by spaces or commas; start lines of text with #"
         ) from None
 
@@ -204,7 +204,7 @@ def _is_number(word: str) -> bool:
 
 
 def _geometry_of(path: Path, number: int, line: str) -> dict[str, float]:
-    """The geometry that a comment states, in m and MeV: one entry or none."""
+    """Return the geometry that a comment states, in m and MeV: one entry or none."""
     entry = _ENTRY.match(line) if len(line) <= _LONGEST_ENTRY else None
     if entry is None:
         return {}
@@ -228,11 +228,11 @@ def _geometry_of(path: Path, number: int, line: str) -> dict[str, float]:
     )
 
 
-def _complete(told: dict[str, float]) -> dict[str, float]:
-    whole = told.pop("source_image_distance", None)
-    near, far = told.get("source_object_distance"), told.get("object_image_distance")
-    if whole is not None and near is not None and far is None:
-        told["object_image_distance"] = whole - near
-    elif whole is not None and far is not None and near is None:
-        told["source_object_distance"] = whole - far
-    return told
+def _complete(geometry: dict[str, float]) -> dict[str, float]:
+    total = geometry.pop("source_image_distance", None)
+    near, far = geometry.get("source_object_distance"), geometry.get("object_image_distance")
+    if total is not None and near is not None and far is None:
+        geometry["object_image_distance"] = total - near
+    elif total is not None and far is not None and near is None:
+        geometry["source_object_distance"] = total - far
+    return geometry

@@ -46,7 +46,7 @@ def write(
         sites; for a fit ``.shadowinv``, or ``.h5`` for its field alone. For an image: ``.tif``
         (float32), ``.npy``, ``.png`` (16 bits, its largest value white).
     result : Inversion, Uncertainty, Fit, xarray.Dataset, or ndarray of shape (H, W)
-        What to write.
+        Result or image to write.
     setup : Setup, optional
         Adds SI units; pradformat needs it. A dataset and a fit bring their own.
     overwrite : bool
