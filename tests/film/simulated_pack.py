@@ -178,8 +178,8 @@ class Scene:
 
     def beam(self, y: Array, x: Array, energy: float) -> Array:
         """Protons per pixel of the object over their mean where the first film shows it."""
-        given = _beam(self.shape, y, x, self._widening(energy))
-        return given / _beam(self.shape, *self._grid(), self._widening(energy)).mean()
+        fluence = _beam(self.shape, y, x, self._widening(energy))
+        return fluence / _beam(self.shape, *self._grid(), self._widening(energy)).mean()
 
     def _widening(self, energy: float) -> float:
         return (energy / self.energies[0]) ** -0.08 if self.beam_varies else 1.0
@@ -202,7 +202,7 @@ class Scene:
             (np.arange(RAYS * (length + 2 * AROUND)) + 0.5) / RAYS - AROUND - 0.5
             for length in self.shape
         ]
-        y, x = (np.ascontiguousarray(one.ravel()) for one in np.meshgrid(*axes, indexing="ij"))
+        y, x = (np.ascontiguousarray(grid.ravel()) for grid in np.meshgrid(*axes, indexing="ij"))
         by, bx = LIGHT * self.b_field(y, x)
         return np.stack([y, x]), np.stack([bx, -by]), self.e_field(y, x)
 
@@ -252,9 +252,9 @@ class Scene:
 
     def fluence(self, layer: int, energy: float | None = None) -> Array:
         """Protons per m² and MeV on a film, shape (H, W); default: at the film's own energy."""
-        own = float(self.energies[layer]) if energy is None else energy
-        each = np.array([self.spectrum(own)])
-        return self.landed(layer, np.array([own]), each) / PITCH**2
+        film_energy = float(self.energies[layer]) if energy is None else energy
+        each = np.array([self.spectrum(film_energy)])
+        return self.landed(layer, np.array([film_energy]), each) / PITCH**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,8 +397,8 @@ def simulate(
         dose = np.maximum(scene.landed(k, *shares, place), 0) / PITCH**2
         pen = _figures(shape, f"{k + 1}", f"{seed % 100}") if handwriting else []
         hole = _notch(shape, place) if notch else (0.0, 0.0, 0.0, 0.0)
-        seen = _counted(dose, per_proton / PITCH**2, rng) if noise else dose
-        scan = _scan(shape, place, seen, pen, hole, rng if noise else None)
+        noisy_dose = _counted(dose, per_proton / PITCH**2, rng) if noise else dose
+        scan = _scan(shape, place, noisy_dose, pen, hole, rng if noise else None)
         _write(folder / f"film_{k + 1:02d}.tif", scan)
         fractions.append(shares)
         doses.append(dose)
@@ -482,11 +482,11 @@ def _fractions(
     edges = np.append(np.concatenate(parts), FASTEST)
     step = response.energies[1] - response.energies[0]
     fluence = scene.spectrum(response.energies) * step
-    left = fluence * response.doses[layer]
+    deposited = fluence * response.doses[layer]
     part = np.searchsorted(edges, response.energies, side="right") - 1
-    total = np.bincount(part, left, len(edges))
+    total = np.bincount(part, deposited, len(edges))
     # The same dose as by all of them, where the dose is left.
-    mean = np.bincount(part, left * response.energies, len(edges))
+    mean = np.bincount(part, deposited * response.energies, len(edges))
     used = total > 1e-7 * total.sum()
     doses = response.doses[layer]
     usual = np.exp(-response.energies / TEMPERATURE) * doses
@@ -650,8 +650,8 @@ def _write_table(path: Path, first: int) -> None:
     rows = list(zip(CALIBRATED, *table(), strict=True))[first:]
     for number, (dose, *row) in enumerate(rows, 1):
         cells = np.stack(row, axis=1).ravel()
-        told = ",".join(f"{cell:.2f}" for cell in cells)
-        lines.append(f"{number},{dose:.9g},{np.log10(dose):.9f},{told}")
+        values = ",".join(f"{cell:.2f}" for cell in cells)
+        lines.append(f"{number},{dose:.9g},{np.log10(dose):.9f},{values}")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

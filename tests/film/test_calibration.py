@@ -61,37 +61,37 @@ def test_synthetic_film_gives_back_its_dose(table: Path, channel: str) -> None:
     calibration = Calibration.from_csv(table)
     low, high = calibration.dose_range(channel)
     truth = np.geomspace(low, high, 60).reshape(6, 10)
-    found = dose(synthetic_film(calibration, truth), calibration, channel=channel)
-    np.testing.assert_allclose(found.dose, truth, rtol=1e-9)
-    assert not found.outside.any()
+    film_dose = dose(synthetic_film(calibration, truth), calibration, channel=channel)
+    np.testing.assert_allclose(film_dose.dose, truth, rtol=1e-9)
+    assert not film_dose.outside.any()
 
 
 def test_films_of_the_table_have_their_own_dose(table: Path) -> None:
     calibration = Calibration.from_csv(table)
-    found = dose(calibration.pixels[None], calibration)
-    np.testing.assert_allclose(found.dose, calibration.doses[None])
-    assert not found.outside.any()
+    film_dose = dose(calibration.pixels[None], calibration)
+    np.testing.assert_allclose(film_dose.dose, calibration.doses[None])
+    assert not film_dose.outside.any()
 
 
 def test_gain_of_the_scanner_cancels(table: Path) -> None:
     calibration = Calibration.from_csv(table)
     truth = np.geomspace(0.2, 900, 40).reshape(5, 8)
     scan = synthetic_film(calibration, truth, gain=0.8)
-    found = dose(scan, calibration, background=0.8 * calibration.background)
-    np.testing.assert_allclose(found.dose, truth, rtol=1e-9)
+    film_dose = dose(scan, calibration, background=0.8 * calibration.background)
+    np.testing.assert_allclose(film_dose.dose, truth, rtol=1e-9)
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
 def test_darker_is_more_dose_and_the_range_is_kept(table: Path, channel: str) -> None:
     calibration = Calibration.from_csv(table)
     scan = np.arange(65536, dtype=np.uint16).reshape(256, 256)
-    found = dose(scan, calibration, channel=channel)
-    assert (np.diff(found.dose.ravel()) <= 0).all()
+    film_dose = dose(scan, calibration, channel=channel)
+    assert (np.diff(film_dose.dose.ravel()) <= 0).all()
     low, high = calibration.dose_range(channel)
-    assert found.dose.min() == pytest.approx(low)
-    assert found.dose.max() == pytest.approx(high)
-    inside = ~found.outside.ravel()
-    assert (np.diff(found.dose.ravel()[inside]) < 0).all()
+    assert film_dose.dose.min() == pytest.approx(low)
+    assert film_dose.dose.max() == pytest.approx(high)
+    inside = ~film_dose.outside.ravel()
+    assert (np.diff(film_dose.dose.ravel()[inside]) < 0).all()
     column = calibration.pixels[:, CHANNELS.index(channel)]
     np.testing.assert_array_equal(inside[: int(column.min())], False)
     np.testing.assert_array_equal(inside[int(column.max()) + 1 :], False)
@@ -161,13 +161,13 @@ def test_real_film_has_its_dose_in_the_beam(
     calibration = Calibration.from_csv(folder / "HDV2_3_calibration.csv", dose_range=(0, 2000))
     unexposed = tifffile.imread(folder / "HDV2.tif")
     scan = tifffile.imread(folder / f"{layer}.tif")
-    found = dose(scan, calibration, background=unexposed, channel=channel)
-    assert found.dose.shape == scan.shape[:2]
-    assert np.median(found.dose[beam]) > 5 * np.median(found.dose[beside])
-    assert 5 < np.median(found.dose[beam]) < 500
-    assert not found.outside[beam].any()
+    film_dose = dose(scan, calibration, background=unexposed, channel=channel)
+    assert film_dose.dose.shape == scan.shape[:2]
+    assert np.median(film_dose.dose[beam]) > 5 * np.median(film_dose.dose[beside])
+    assert 5 < np.median(film_dose.dose[beam]) < 500
+    assert not film_dose.outside[beam].any()
     # The scanner's bed is lighter than any film.
-    assert found.outside[:10, :10].all()
+    assert film_dose.outside[:10, :10].all()
 
 
 @pytest.mark.parametrize(
@@ -200,9 +200,9 @@ def test_real_tables_rise(shared_data: Path, name: str) -> None:
 def test_all_channels_together_give_back_the_dose(table: Path) -> None:
     calibration = Calibration.from_csv(table)
     truth = np.geomspace(2, 900, 60).reshape(6, 10)
-    found = combined_dose(synthetic_film(calibration, truth), calibration)
-    np.testing.assert_allclose(found.dose, truth, rtol=1e-9)
-    assert not found.outside.any()
+    combined = combined_dose(synthetic_film(calibration, truth), calibration)
+    np.testing.assert_allclose(combined.dose, truth, rtol=1e-9)
+    assert not combined.outside.any()
 
 
 def test_errors_of_noisy_films_are_as_told(table: Path) -> None:
@@ -215,12 +215,12 @@ def test_errors_of_noisy_films_are_as_told(table: Path) -> None:
     truth = np.repeat([[5.0, 15.0, 40.0, 150.0, 800.0]], 4000, axis=0)
     film = synthetic_film(calibration, truth)
     film *= 1 + 0.01 * np.random.default_rng(0).normal(size=film.shape)
-    found = combined_dose(film, calibration)
-    assert not found.outside.any()
-    scatter = np.log(found.dose / truth).std(axis=0)
-    told = np.sqrt((found.error**2).mean(axis=0))
+    combined = combined_dose(film, calibration)
+    assert not combined.outside.any()
+    scatter = np.log(combined.dose / truth).std(axis=0)
+    estimated = np.sqrt((combined.error**2).mean(axis=0))
     # Told by three channels that differ by chance, they are up to a fifth too large.
-    assert ((told / scatter > 0.95) & (told / scatter < 1.3)).all()
+    assert ((estimated / scatter > 0.95) & (estimated / scatter < 1.3)).all()
     best = np.min([calibration.log_error(truth[0], channel) for channel in CHANNELS], axis=0)
     assert (scatter < best).all()
 
@@ -229,9 +229,9 @@ def test_a_channel_that_is_black_does_not_count(table: Path) -> None:
     calibration = Calibration.from_csv(table)
     film = synthetic_film(calibration, np.full((4, 4), 800.0))
     film[..., 0] = 10
-    found = combined_dose(film, calibration)
-    np.testing.assert_allclose(found.dose, 800, rtol=1e-9)
-    assert not found.outside.any()
+    combined = combined_dose(film, calibration)
+    np.testing.assert_allclose(combined.dose, 800, rtol=1e-9)
+    assert not combined.outside.any()
     assert combined_dose(np.full((2, 2, 3), 5.0), calibration).outside.all()
     with pytest.raises(InputError, match="in red, green and blue"):
         combined_dose(film[..., 0], calibration)
@@ -241,7 +241,7 @@ def test_channels_that_differ_make_the_error(table: Path) -> None:
     calibration = Calibration.from_csv(table)
     film = synthetic_film(calibration, np.full((4, 4), 100.0))
     film[..., 2] = synthetic_film(calibration, np.full((4, 4), 200.0))[..., 2]
-    found = combined_dose(film, calibration)
+    combined = combined_dose(film, calibration)
     alone = combined_dose(synthetic_film(calibration, np.full((4, 4), 100.0)), calibration)
-    assert (found.error > 1.5 * alone.error).all()
-    assert ((found.dose > 100) & (found.dose < 200)).all()
+    assert (combined.error > 1.5 * alone.error).all()
+    assert ((combined.dose > 100) & (combined.dose < 200)).all()

@@ -37,8 +37,8 @@ def test_gel_holds_roots() -> None:
     psl = ge_luminescence([[0, 1, 2, 100]], **SETTINGS).psl
     np.testing.assert_allclose(psl / psl[0, 1], [[0, 1, 4, 10_000]], rtol=1e-13)
     # As a script of LLNL's has it for 16 bits and latitude 5, with rounded numbers.
-    one = ge_luminescence([[40_000]], resolution=50, sensitivity=4000).psl[0, 0]
-    assert one == pytest.approx(0.000023284 * 40_000**2 / 100_000 * 0.25 * 316.2, rel=1e-4)
+    luminescence = ge_luminescence([[40_000]], resolution=50, sensitivity=4000).psl[0, 0]
+    assert luminescence == pytest.approx(0.000023284 * 40_000**2 / 100_000 * 0.25 * 316.2, rel=1e-4)
 
 
 @pytest.mark.parametrize("convert", BOTH)

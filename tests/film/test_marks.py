@@ -31,7 +31,7 @@ def film(calibration: Calibration) -> FloatArray:
     doses = 3 + 400 * np.exp(-((y - 60) ** 2 + (x - 150) ** 2) / 2 / 40**2)
     doses += np.where(np.hypot(y - 100, x - 200) < 50, 150, 0)
     planes = np.stack(
-        [40_000 / 10 ** calibration.optical_density(doses, one) for one in ("red", "green", "blue")]
+        [40_000 / 10 ** calibration.optical_density(doses, c) for c in ("red", "green", "blue")]
     )
     noise = 1 + 0.012 * np.random.default_rng(0).normal(size=planes.shape)
     return np.moveaxis(planes * noise, 0, -1)
@@ -96,12 +96,12 @@ def test_burnt_edges_follow_the_burn() -> None:
     depth = np.arange(SHAPE[0])[:, None]
     burn = np.where(depth < 14, 40.0, 0.0) + 80 * np.exp(-depth / 4.0)
     doses = beam() + burn
-    found = burnt_edges(doses)
+    burnt = burnt_edges(doses)
     excess = doses / (doses - burn) > 1.3
-    assert found[excess & (depth >= 3)].all()
-    assert not found[30:].any()
-    np.testing.assert_array_equal(burnt_edges(doses.T), found.T)
-    np.testing.assert_array_equal(burnt_edges(doses[::-1]), found[::-1])
+    assert burnt[excess & (depth >= 3)].all()
+    assert not burnt[30:].any()
+    np.testing.assert_array_equal(burnt_edges(doses.T), burnt.T)
+    np.testing.assert_array_equal(burnt_edges(doses[::-1]), burnt[::-1])
 
 
 def test_burnt_edges_are_not_seen_in_a_beam() -> None:
@@ -115,8 +115,8 @@ def test_burnt_edges_of_real_films_are_masked(shared_data: Path, letter: str) ->
     scan = tifffile.imread(folder / f"RCF_18{letter}.tif")
     red = straightened(scan, find_films(scan)[0], shape=(296, 590))[..., 0]
     calibration = Calibration.from_csv(folder / "EBT3_2_calibration.csv")
-    known, doses = calibration.curve("red")
-    dose = np.exp(np.interp(np.log10(calibration.background[0] / red), known, np.log(doses)))
+    densities, doses = calibration.curve("red")
+    dose = np.exp(np.interp(np.log10(calibration.background[0] / red), densities, np.log(doses)))
     burnt = burnt_edges(dose)
     # Below and beside the beam the dose is level; between the writing, nothing else disturbs it.
     for turns in (1, 2):

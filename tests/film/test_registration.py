@@ -21,8 +21,8 @@ def film(shift: tuple[float, float], turn: float = 0.0, noise: int | None = None
     y, x = y - (SHAPE[0] - 1) / 2 - shift[0], x - (SHAPE[1] - 1) / 2 - shift[1]
     c, s = np.cos(turn), np.sin(turn)
     at = [c * y + s * x + 129.5, -s * y + c * x + 159.5]
-    seen = ndimage.map_coordinates(LARGE + FINE, at, order=3)
-    return seen + 0.05 * np.random.default_rng(noise).normal(size=SHAPE) * (noise is not None)
+    image = ndimage.map_coordinates(LARGE + FINE, at, order=3)
+    return image + 0.05 * np.random.default_rng(noise).normal(size=SHAPE) * (noise is not None)
 
 
 ALL = np.ones(SHAPE, dtype=bool)
@@ -53,11 +53,11 @@ def test_edges_that_images_agree_with_are_kept() -> None:
 
 
 def test_what_is_masked_does_not_count() -> None:
-    one, other = film((0, 0), noise=1), film((1.5, -2.5), noise=2)
+    first, second = film((0, 0), noise=1), film((1.5, -2.5), noise=2)
     usable = ALL.copy()
     usable[60:100, 30:90] = False
-    marked = np.where(usable, other, 9.0)
-    poses = register([one, marked], [ALL, usable])
+    marked = np.where(usable, second, 9.0)
+    poses = register([first, marked], [ALL, usable])
     np.testing.assert_allclose(poses.shifts[1] - poses.shifts[0], [1.5, -2.5], atol=0.2)
 
 

@@ -73,7 +73,7 @@ def test_faster_protons_come_earlier() -> None:
     setup = ProtonSetup(
         energy=10, source_object_distance=0.01, object_image_distance=0.1, pixel_size=1e-5
     )
-    slow, fast = (setup.model_copy(update={"energy": one}) for one in (5.0, 938.27209))
+    slow, fast = (setup.model_copy(update={"energy": energy}) for energy in (5.0, 938.27209))
     # At an energy like its mass, a proton has √3/2 of the speed of light.
     assert fast.time_of_flight == pytest.approx(0.01 / (0.8660254 * 299792458), rel=1e-6)
     assert slow.time_of_flight > fast.time_of_flight

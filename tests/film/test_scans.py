@@ -58,8 +58,8 @@ def scanned(films: list[Array], shape: tuple[int, int] = (300, 420), seed: int =
 @pytest.mark.parametrize("degrees", [-3.0, 0.0, 0.7, 2.0])
 def test_a_film_is_found_where_it_was_laid(degrees: float) -> None:
     corners = laid((140.25, 200.5), (120.75, 230.25), degrees)
-    (found,) = find_films(scanned([corners]))
-    np.testing.assert_allclose(found, corners, atol=0.02)
+    (film,) = find_films(scanned([corners]))
+    np.testing.assert_allclose(film, corners, atol=0.02)
 
 
 def test_notches_dust_and_writing_do_not_move_a_film() -> None:
@@ -69,16 +69,16 @@ def test_notches_dust_and_writing_do_not_move_a_film() -> None:
     scan[180:204, 290:320] = 64_000  # a corner that was cut off
     scan[150:170, 100:110] = 3_000  # writing
     scan[20:23, 20:23] = scan[280, 300:310] = 9_000  # dust
-    (found,) = find_films(scan)
-    np.testing.assert_allclose(found, corners, atol=0.6)
+    (film,) = find_films(scan)
+    np.testing.assert_allclose(film, corners, atol=0.6)
 
 
 def test_many_films_come_in_the_order_of_reading() -> None:
     middles = [(70.0, 90.0), (64.0, 300.0), (215.0, 110.0), (222.0, 310.0)]
     films = [laid(middle, (90.0, 150.0), turn) for middle, turn in zip(middles, (2, -1, 0, 1))]  # noqa: B905
-    found = find_films(scanned([films[k] for k in (3, 0, 2, 1)]))
-    assert len(found) == 4
-    np.testing.assert_allclose(found, films, atol=0.6)
+    corners = find_films(scanned([films[k] for k in (3, 0, 2, 1)]))
+    assert len(corners) == 4
+    np.testing.assert_allclose(corners, films, atol=0.6)
 
 
 def test_a_film_turned_upright_is_as_it_was() -> None:
@@ -113,13 +113,13 @@ def test_real_films_lie_where_they_were_found_by_hand(shared_data: Path) -> None
     away, slits = [], []
     for number, letter in enumerate("ABCDEFGHIJKLMNOPQ"):
         scan = tifffile.imread(folder / f"RCF_18{letter}.tif")
-        (found,) = find_films(scan)
+        (film,) = find_films(scan)
         by_hand = [float(rows[name][number]) for name in ("Y1", "X1", "Y2", "X2")]
-        away.append(found[:2].ravel() - by_hand)
-        height = np.hypot(*(found[3] - found[0]))
+        away.append(film[:2].ravel() - by_hand)
+        height = np.hypot(*(film[3] - film[0]))
         assert height == pytest.approx(296, abs=3)
         if letter not in "ABCDEFJ":  # torn along the slit, or it is too faint
-            slits.append(slit_of(straightened(scan, found, shape=(296, 590)).mean(axis=-1)))
+            slits.append(slit_of(straightened(scan, film, shape=(296, 590)).mean(axis=-1)))
     assert np.abs(away).max() < 10
     assert np.sqrt(np.mean(np.square(away))) < 3.5
     # What is cut into all films alike lies at the same place of each.

@@ -77,16 +77,16 @@ def test_a_pencil_of_protons_is_deflected_by_the_lorentz_force(
     rays, *_ = scene._rays
     by, bx = (scene.b_field(*rays) * beam).sum(axis=1)
     ey, ex = (scene.e_field(*rays) * beam).sum(axis=1)
-    charge, light, rest = 1.602176634e-19, 299792458.0, 1.67262192e-27
-    gamma = 1 + 1e6 * energy * charge / (rest * light**2)
+    charge, light, mass = 1.602176634e-19, 299792458.0, 1.67262192e-27
+    gamma = 1 + 1e6 * energy * charge / (mass * light**2)
     velocity = light * np.sqrt(1 - gamma**-2)
-    momentum = gamma * rest * velocity
+    momentum = gamma * mass * velocity
     places = {}
     for name, strengths in {"none": (0, 0), "B": (1, 0), "E": (0, 1)}.items():
-        one = replace(
+        scaled_scene = replace(
             scene, b_scale=strengths[0] * scene.b_scale, e_scale=strengths[1] * scene.e_scale
         )
-        landed = one.landed(layer, np.array([energy]), np.array([1.0]), ASKEW, beam)
+        landed = scaled_scene.landed(layer, np.array([energy]), np.array([1.0]), ASKEW, beam)
         places[name] = centroid(landed)
     along = ASKEW.axes * scene.distances[layer] / PITCH
     # Along the beam, z = x × y: F = e v × B.
@@ -108,8 +108,8 @@ def test_displacements_are_those_asked_for_and_end_before_the_edge(scene: Scene)
 
 
 def test_the_magnetic_field_has_no_divergence_and_the_electric_no_curl(truth: Truth) -> None:
-    (dby_dy, _), (_, dbx_dx) = (np.gradient(one) for one in truth.b_field)
-    (_, dey_dx), (dex_dy, _) = (np.gradient(one) for one in truth.e_field)
+    (dby_dy, _), (_, dbx_dx) = (np.gradient(component) for component in truth.b_field)
+    (_, dey_dx), (dex_dy, _) = (np.gradient(component) for component in truth.e_field)
     assert np.abs(dby_dy + dbx_dx).max() < 0.02 * np.abs(dby_dy).max()
     assert np.abs(dey_dx - dex_dy).max() < 0.02 * np.abs(dey_dx).max()
 
@@ -117,8 +117,8 @@ def test_the_magnetic_field_has_no_divergence_and_the_electric_no_curl(truth: Tr
 def test_films_see_all_protons_that_reach_them(truth: Truth) -> None:
     """Without fields, in the middle: spectrum times dose per proton."""
     steel = (Slab(material="Al", thickness=13e-6), Slab(material="Fe", thickness=25e-6))
-    mylar = [(Slab(material="Mylar", thickness=one),) for one in (100e-6, 200e-6)]
-    layers = [PackLayer(film="HDV2", filters=one) for one in (steel, *mylar)]
+    mylar = [(Slab(material="Mylar", thickness=thickness),) for thickness in (100e-6, 200e-6)]
+    layers = [PackLayer(film="HDV2", filters=filters) for filters in (steel, *mylar)]
     response = Response.of(Pack(layers=tuple(layers)), np.linspace(2, 45, 40_001))
     bare = replace(truth, scene=replace(truth.scene, b_scale=0.0, e_scale=0.0))
     for k in range(3):
@@ -163,25 +163,25 @@ def test_a_film_lies_where_its_corners_are(tmp_path: Path) -> None:
 
 def test_scans_tell_the_doses_by_the_table(tmp_path: Path) -> None:
     options = {"handwriting": False, "notch": False, "noise": False}
-    made = simulate(tmp_path, layers=2, shape=SHAPE, rotations=0, shifts=0, b_peak=1.5, **options)
+    pack = simulate(tmp_path, layers=2, shape=SHAPE, rotations=0, shifts=0, b_peak=1.5, **options)
     table = np.genfromtxt(tmp_path / "HDV2.csv", delimiter=",", skip_header=2)
     blank = np.median(tifffile.imread(tmp_path / "unexposed.tif")[40:-40, 40:-40], axis=(0, 1))
-    for k, file in enumerate(made.files):
+    for k, file in enumerate(pack.files):
         film = tifffile.imread(file)[40:-40, 40:-40]
         assert film.shape == (*SHAPE, 3)
         for channel, column in enumerate((3, 5, 7)):
-            known = np.log10(blank[channel] / table[:, column])
-            told = np.log10(blank[channel] / film[..., channel])
-            doses = 10 ** np.interp(told, known, np.log10(table[:, 1]))
-            np.testing.assert_allclose(doses[1:-1, 1:-1], made.dose(k)[1:-1, 1:-1], rtol=5e-3)
+            table_density = np.log10(blank[channel] / table[:, column])
+            film_density = np.log10(blank[channel] / film[..., channel])
+            doses = 10 ** np.interp(film_density, table_density, np.log10(table[:, 1]))
+            np.testing.assert_allclose(doses[1:-1, 1:-1], pack.dose(k)[1:-1, 1:-1], rtol=5e-3)
 
 
 def test_noise_is_that_of_whole_protons_and_of_grain() -> None:
     rng = np.random.default_rng(0)
-    seen = simulated_pack._counted(np.full((300, 400), 40.0), 0.05, rng)
-    assert seen.mean() == pytest.approx(40, rel=1e-3)
+    counts = simulated_pack._counted(np.full((300, 400), 40.0), 0.05, rng)
+    assert counts.mean() == pytest.approx(40, rel=1e-3)
     expected = 40 * 0.05 + (simulated_pack.GRAIN * 40) ** 2
-    assert seen.var() == pytest.approx(expected, rel=0.02)
+    assert counts.var() == pytest.approx(expected, rel=0.02)
 
 
 def test_scans_are_pictures_of_16_bits_with_marks_where_told(truth: Truth) -> None:
@@ -204,11 +204,11 @@ def test_scans_are_pictures_of_16_bits_with_marks_where_told(truth: Truth) -> No
 
 
 def test_the_pack_is_described(truth: Truth) -> None:
-    told = tomllib.loads(truth.pack.read_text(encoding="utf-8"))
+    pack = tomllib.loads(truth.pack.read_text(encoding="utf-8"))
     distances = {"source_object_distance": 0.01, "object_image_distance": 0.1}
-    assert told["setup"] == {"kind": "proton"} | distances
-    files = [told["films"]["HDV2"][name] for name in ("calibration", "unexposed")]
-    files += [layer["file"] for layer in told["layers"]]
+    assert pack["setup"] == {"kind": "proton"} | distances
+    files = [pack["films"]["HDV2"][name] for name in ("calibration", "unexposed")]
+    files += [layer["file"] for layer in pack["layers"]]
     assert len(files) == 5
     assert all((truth.folder / file).is_file() for file in files)
     # 97 µm of base, 12 µm of active layer, and the filters.
@@ -219,8 +219,8 @@ def test_the_pack_is_described(truth: Truth) -> None:
 def test_the_same_seed_makes_the_same_files(truth: Truth, tmp_path: Path) -> None:
     options = {"layers": 3, "shape": SHAPE, "b_peak": 1.5, "e_peak": 1.0}
     again = simulate(tmp_path / "again", seed=4, **options)
-    other = simulate(tmp_path / "other", seed=5, **options)
+    reseeded = simulate(tmp_path / "other", seed=5, **options)
     for file in sorted(truth.folder.iterdir()):
         assert (again.folder / file.name).read_bytes() == file.read_bytes(), file.name
-    for one, different in zip(truth.files, other.files, strict=True):
-        assert one.read_bytes() != different.read_bytes()
+    for first_file, other_file in zip(truth.files, reseeded.files, strict=True):
+        assert first_file.read_bytes() != other_file.read_bytes()

@@ -25,11 +25,11 @@ TABLE = """
 def test_a_table_is_read_in_its_units(tmp_path: Path) -> None:
     path = tmp_path / "table.txt"
     path.write_text(TABLE)
-    found = Stopping.from_srim(path)
-    assert found.density == 2000
-    np.testing.assert_array_equal(found.energies, [0.1, 1, 10])
+    stopping = Stopping.from_srim(path)
+    assert stopping.density == 2000
+    np.testing.assert_array_equal(stopping.energies, [0.1, 1, 10])
     # 1 MeV/(mg/cm²) in 2000 mg/cm³ is 2000 MeV/cm.
-    np.testing.assert_allclose(found.losses, 2e5 * np.array([0.401, 0.2001, 0.02501]))
+    np.testing.assert_allclose(stopping.losses, 2e5 * np.array([0.401, 0.2001, 0.02501]))
 
 
 @pytest.mark.parametrize(
@@ -61,8 +61,8 @@ def test_the_depth_of_a_loss_in_proportion_to_velocity() -> None:
     """dE/dx = k √E stops after 2 √E / k."""
     energies = np.geomspace(0.01, 100, 50)
     stopping = Stopping(energies, 3000 * np.sqrt(energies), 1000.0)
-    given = np.array([0.02, 1.0, 50.0])
-    np.testing.assert_allclose(stopping.depth(given), 2 * np.sqrt(given) / 3000, rtol=1e-4)
+    probes = np.array([0.02, 1.0, 50.0])
+    np.testing.assert_allclose(stopping.depth(probes), 2 * np.sqrt(probes) / 3000, rtol=1e-4)
 
 
 def test_slabs_one_after_the_other_are_one_slab() -> None:

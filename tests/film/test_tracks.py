@@ -8,8 +8,8 @@ SIDE = 1e-3
 
 
 def tracks_at(y: np.ndarray, x: np.ndarray, size: tuple[float, float] = (SIDE, SIDE)) -> Tracks:
-    one = np.ones(len(y))
-    return Tracks(y, x, one, one, one, size)
+    ones = np.ones(len(y))
+    return Tracks(y, x, ones, ones, ones, size)
 
 
 def test_every_track_is_counted_where_it_lies() -> None:

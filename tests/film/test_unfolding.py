@@ -15,7 +15,7 @@ SHAPE = (6, 7)
 @pytest.fixture(scope="module")
 def response() -> Response:
     filters = ["40 um Al", *["150 um Mylar"] * 3, "300 um Mylar", *["250 um Fe"] * 3]
-    layers = [{"film": "HDV2", "filters": one} for one in filters]
+    layers = [{"film": "HDV2", "filters": stack} for stack in filters]
     return Response.of(Pack.model_validate({"layers": layers}))
 
 
@@ -36,10 +36,10 @@ def test_a_falling_spectrum_comes_back(
 ) -> None:
     spectrum = falling(response, temperature)
     doses = doses_of(response, spectrum)
-    found = unfold(doses, np.full(doses.shape, 0.01), response)
+    spectra = unfold(doses, np.full(doses.shape, 0.01), response)
     truth = np.interp([band.peak for band in response.bands], response.energies, spectrum)
-    np.testing.assert_allclose(found.fluence[:, 2, 3], truth, rtol=within)
-    np.testing.assert_allclose(found.fluence, found.fluence[:, :1, :1] * np.ones(SHAPE))
+    np.testing.assert_allclose(spectra.fluence[:, 2, 3], truth, rtol=within)
+    np.testing.assert_allclose(spectra.fluence, spectra.fluence[:, :1, :1] * np.ones(SHAPE))
 
 
 def test_each_layer_shows_protons_of_the_energy_that_is_told(response: Response) -> None:
@@ -47,61 +47,62 @@ def test_each_layer_shows_protons_of_the_energy_that_is_told(response: Response)
     # What a magnetic and an electric field add in a pixel, to the first order.
     for power in (0.5, 1.0):
         bent = spectrum * (1 + 0.3 * (response.energies / 3) ** -power)
-        doses = np.stack([doses_of(response, one)[:, 0, 0] for one in (spectrum, bent)], axis=1)
+        doses = np.stack([doses_of(response, s)[:, 0, 0] for s in (spectrum, bent)], axis=1)
         doses = np.repeat(doses[:, None], 5, axis=1)
-        found = unfold(doses, np.full(doses.shape, 0.01), response)
-        seen = found.fluence[:, 0, 1] / found.fluence[:, 0, 0] - 1
-        np.testing.assert_allclose(seen, 0.3 * (found.energies / 3) ** -power, rtol=0.06)
+        spectra = unfold(doses, np.full(doses.shape, 0.01), response)
+        excess = spectra.fluence[:, 0, 1] / spectra.fluence[:, 0, 0] - 1
+        np.testing.assert_allclose(excess, 0.3 * (spectra.energies / 3) ** -power, rtol=0.06)
 
 
 def test_the_last_film_shows_faster_protons_than_stop_in_it(response: Response) -> None:
     doses = doses_of(response, falling(response, 10.0))
-    found = unfold(doses, np.full(doses.shape, 0.01), response)
+    spectra = unfold(doses, np.full(doses.shape, 0.01), response)
     peaks = np.array([band.peak for band in response.bands])
-    np.testing.assert_allclose(found.energies[:-2], peaks[:-2], rtol=0.03)
-    assert found.energies[-1] > 1.03 * peaks[-1]
+    np.testing.assert_allclose(spectra.energies[:-2], peaks[:-2], rtol=0.03)
+    assert spectra.energies[-1] > 1.03 * peaks[-1]
 
 
 def test_errors_are_those_of_noisy_doses(response: Response) -> None:
     doses = doses_of(response, falling(response, 15.0))[:, :1, :1] * np.ones((1, 50, 60))
     noise = 1 + 0.03 * np.random.default_rng(0).normal(size=doses.shape)
     errors = np.full(doses.shape, 0.03)
-    found = unfold(doses * noise, errors, response, curvature=10)
+    spectra = unfold(doses * noise, errors, response, curvature=10)
     truth = unfold(doses, errors, response, curvature=10).fluence
-    away = (found.fluence - truth) / found.error
+    away = (spectra.fluence - truth) / spectra.error
     np.testing.assert_allclose(away.std(axis=(1, 2)), 1, atol=0.15)
     assert abs(away.mean(axis=(1, 2))).max() < 0.15
 
 
 def test_nothing_is_negative(response: Response) -> None:
     doses = np.random.default_rng(1).uniform(0, 10, (8, *SHAPE))
-    found = unfold(doses, np.full(doses.shape, 0.05), response)
-    assert (found.fluence >= 0).all()
-    assert (found.error > 0).all()
+    spectra = unfold(doses, np.full(doses.shape, 0.05), response)
+    assert (spectra.fluence >= 0).all()
+    assert (spectra.error > 0).all()
 
 
 def test_a_film_that_tells_nothing_is_bridged(response: Response) -> None:
     doses = doses_of(response, falling(response, 15.0))
     errors = np.full(doses.shape, 0.01)
     errors[3, 2, 2] = np.inf
-    found = unfold(doses, errors, response)
-    assert found.fluence[3, 2, 2] == pytest.approx(found.fluence[3, 0, 0], rel=0.02)
-    assert found.error[3, 2, 2] > 3 * found.error[3, 0, 0]
+    spectra = unfold(doses, errors, response)
+    assert spectra.fluence[3, 2, 2] == pytest.approx(spectra.fluence[3, 0, 0], rel=0.02)
+    assert spectra.error[3, 2, 2] > 3 * spectra.error[3, 0, 0]
 
 
 def test_a_bridged_film_keeps_its_bend(response: Response) -> None:
     spectrum = falling(response, 8.0)
     bent = spectrum * (1 + 0.3 * (response.energies / 3) ** -0.75)
     # A pixel whose protons are displaced, among 99 plain ones that set the usual spectrum.
-    doses = np.stack([doses_of(response, one)[:, 0, 0] for one in [bent] + 99 * [spectrum]], axis=1)
+    pixels = [bent] + 99 * [spectrum]
+    doses = np.stack([doses_of(response, s)[:, 0, 0] for s in pixels], axis=1)
     doses = doses.reshape(len(doses), 10, 10)
     errors = np.full(doses.shape, 0.01)
     for film in range(1, len(doses) - 1):
         bridged = errors.copy()
         bridged[film, 0, 0] = np.inf
-        found = unfold(doses, bridged, response)
-        seen = found.fluence[film, 0, 0] / found.fluence[film, 5, 5] - 1
-        assert seen == pytest.approx(0.3 * (found.energies[film] / 3) ** -0.75, rel=0.06)
+        spectra = unfold(doses, bridged, response)
+        excess = spectra.fluence[film, 0, 0] / spectra.fluence[film, 5, 5] - 1
+        assert excess == pytest.approx(0.3 * (spectra.energies[film] / 3) ** -0.75, rel=0.06)
 
 
 def test_twice_the_dose_is_twice_the_fluence(response: Response) -> None:
@@ -109,8 +110,8 @@ def test_twice_the_dose_is_twice_the_fluence(response: Response) -> None:
         np.random.default_rng(2).uniform(5, 10, (8, *SHAPE)) * np.arange(9, 1, -1)[:, None, None]
     )
     errors = np.full(doses.shape, 0.02)
-    one, two = unfold(doses, errors, response), unfold(2 * doses, errors, response)
-    np.testing.assert_allclose(two.fluence, 2 * one.fluence, rtol=1e-6)
+    spectra, doubled = unfold(doses, errors, response), unfold(2 * doses, errors, response)
+    np.testing.assert_allclose(doubled.fluence, 2 * spectra.fluence, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

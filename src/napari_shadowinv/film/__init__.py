@@ -3,8 +3,8 @@
 - films on a scan: `find_films`, `straightened`, `read_corners`, `write_corners`
 - pixels without marks and burns: `usable_pixels`, `burnt_edges`
 - doses: `Calibration`, `dose`, `combined_dose`, `net_optical_density`
-- packs, and what each film sees of protons of which energy: `Pack`, `Response`
-- how the films of a pack lie on each other: `register`, `poses_by_fiducials`, `moved_corners`,
+- packs, and the response of each film to protons of each energy: `Pack`, `Response`
+- alignment of the films of a pack: `register`, `poses_by_fiducials`, `moved_corners`,
   `check_orientation`
 - fluences at each energy from the doses of all films: `unfold`
 - CR-39: `Tracks`, `TrackImage`

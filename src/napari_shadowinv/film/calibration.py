@@ -1,15 +1,15 @@
-"""Radiochromic film: from the scan to the dose that the beam left.
+"""Radiochromic film: from the scan to the dose of the beam.
 
 - a table of doses and the pixels that they gave: `Calibration`, `Calibration.from_csv`
-- how much darker than unexposed film: `net_optical_density`
-- the dose in every pixel, and where the table does not reach: by one channel `dose`, by all three
+- darkening against unexposed film: `net_optical_density`
+- the dose in every pixel, and where it is outside the table: by one channel `dose`, by all three
   with its error `combined_dose`
 
 Film darkens with dose; the net optical density log10(unexposed / exposed) does not depend
 on the scanner's gain, so a table can serve scans of another day if unexposed film was
 scanned with them. Fluence is proportional to dose as long as the particles of a layer lose
-about the same energy in it. Doses are in Gy; a `channel` is "red", the default, which tells
-small doses best, "green" or "blue".
+about the same energy in it. Doses are in Gy; a `channel` is "red", the default, which is the most
+sensitive to small doses, "green" or "blue".
 
 References
 ----------
@@ -43,7 +43,7 @@ __all__ = [
 ]
 
 _CHANNELS = ("red", "green", "blue")
-_TYPICAL_SPREAD = 0.02  # of a pixel, where the table does not tell
+_TYPICAL_SPREAD = 0.02  # of a pixel, where the table has none
 _LEAST_SPREAD = 1e-4  # of the optical density
 
 
@@ -117,11 +117,11 @@ class Calibration:
                 f"the calibration's spreads have shape {spreads.shape}: expected that of its "
                 f"pixels, {pixels.shape}"
             )
-        known = {"doses": doses, "pixels": pixels, "background": background, "spreads": spreads}
-        for name, values in known.items():
+        columns = {"doses": doses, "pixels": pixels, "background": background, "spreads": spreads}
+        for name, values in columns.items():
             if not (np.isfinite(values) & (values > 0)).all():
                 raise InputError(f"a calibration's {name} must be positive numbers; correct them")
-            # Frozen, but what was given may have been lists.
+            # Frozen, but the arguments may have been lists.
             object.__setattr__(self, name, values)
 
     @classmethod
@@ -137,10 +137,10 @@ class Calibration:
         Parameters
         ----------
         path : str or Path
-            Comma-separated values. The first line names the columns: one holds "dose" but not
+            Comma-separated values. The first line names the columns: one contains "dose" but not
             "log", others begin with "red", "green" and "blue"; a column behind one of these whose
-            name begins with "std" holds its spread. The rest is ignored. A second line may tell
-            units.
+            name begins with "std" holds its spread. Other columns are ignored. A second line may
+            contain units.
         background : array_like, shape (3,), optional
             Pixel of unexposed film.
         dose_range : tuple of float
@@ -151,7 +151,7 @@ class Calibration:
         ------
         FileFormatError
             If the file is missing, has no such columns, or a row holds anything but numbers;
-            the message tells the line.
+            the message names the line.
         """
         table = _rows(path)
         strange = ~(np.isfinite(table).all(axis=1) & (table[:, 0] >= 0))
@@ -194,36 +194,36 @@ class Calibration:
         return density, 10 ** (np.add.reduceat(logarithms, blocks[:-1]) / count)
 
     def dose_range(self, channel: str = "red") -> tuple[float, float]:
-        """Return the smallest and the largest dose that a channel can tell."""
+        """Return the smallest and the largest dose that a channel can measure."""
         doses = self.curve(channel)[1]
         return float(doses[0]), float(doses[-1])
 
     def log_error(self, doses: ArrayLike, channel: str = "red") -> FloatArray:
-        """Return the standard deviation of the logarithm of doses that one pixel tells."""
+        """Return the standard deviation of the logarithm of a dose measured in one pixel."""
         column = _channel(channel)
-        density, known = self.curve(channel)
+        density, table_doses = self.curve(channel)
         order = np.argsort(self.doses, kind="stable")
         spread = (self.spreads[order, column] / self.pixels[order, column]) / np.log(10)
-        spread = np.interp(np.log(known), np.log(self.doses[order]), spread)
-        # How fast the dose grows with the density, over two films that are not neighbours.
-        slope = np.gradient(np.log(known), density)
+        spread = np.interp(np.log(table_doses), np.log(self.doses[order]), spread)
+        # Growth of the dose with the density, over two films that are not neighbours.
+        slope = np.gradient(np.log(table_doses), density)
         error = np.maximum(spread, _LEAST_SPREAD) * slope
-        return np.asarray(np.interp(np.log(np.asarray(doses, float)), np.log(known), error))
+        return np.asarray(np.interp(np.log(np.asarray(doses, float)), np.log(table_doses), error))
 
     def optical_density(self, doses: ArrayLike, channel: str = "red") -> FloatArray:
-        """Return the net optical density that doses give, held at the range's ends.
+        """Return the net optical density of doses, constant beyond the range's ends.
 
         It is linear in the logarithm of the dose between films; `dose` is its inverse.
         """
-        density, known = self.curve(channel)
+        density, table_doses = self.curve(channel)
         logarithms = np.log10(np.asarray(doses, float))
-        return np.asarray(np.interp(logarithms, np.log10(known), density))
+        return np.asarray(np.interp(logarithms, np.log10(table_doses), density))
 
 
 def net_optical_density(
     scan: ArrayLike, background: float | Sequence[float] | ArrayLike, channel: str = "red"
 ) -> FloatArray:
-    """Return how much darker a film is than unexposed film: log10(unexposed / exposed).
+    """Return the net optical density of a film, log10(unexposed / exposed).
 
     Parameters
     ----------
@@ -291,8 +291,8 @@ def unexposed_pixel(scan: ArrayLike) -> FloatArray:
 
 
 def _median_of_middle(plane: FloatArray) -> float:
-    top, left = (length // 4 for length in plane.shape)
-    return float(np.median(plane[top : len(plane) - top, left : plane.shape[1] - left]))
+    y_top, x_left = (length // 4 for length in plane.shape)
+    return float(np.median(plane[y_top : len(plane) - y_top, x_left : plane.shape[1] - x_left]))
 
 
 def _channel(channel: str) -> int:
@@ -337,11 +337,11 @@ def dose(
         )
     unexposed = calibration.background if background is None else background
     density = net_optical_density(scan, unexposed, channel)
-    known, doses = calibration.curve(channel)
+    densities, doses = calibration.curve(channel)
     # Rounding of the logarithms must not put the films of the table themselves outside.
     slack = 1e-12
-    outside = (density < known[0] - slack) | (density > known[-1] + slack)
-    return DoseMap(10 ** np.interp(density, known, np.log10(doses)), outside)
+    outside = (density < densities[0] - slack) | (density > densities[-1] + slack)
+    return DoseMap(10 ** np.interp(density, densities, np.log10(doses)), outside)
 
 
 class CombinedDose(NamedTuple):
@@ -369,7 +369,7 @@ def combined_dose(
     *,
     background: Sequence[float] | ArrayLike | None = None,
 ) -> CombinedDose:
-    """Return the dose in every pixel by the channels that tell it best.
+    """Return the dose in every pixel by a weighted mean of the three channels.
 
     The logarithms of the doses by the three channels are averaged, each weighted by one over the
     square of its error: the spread of its pixels over how fast they darken. So red counts most
@@ -396,14 +396,15 @@ def combined_dose(
     squares, counted, outside = np.zeros(shape), np.zeros(shape), np.ones(shape, bool)
     ends = []
     for channel in _CHANNELS:
-        one = dose(values, calibration, background=background, channel=channel)
-        logarithm = np.log(one.dose)
-        weight = np.where(one.outside, 0.0, calibration.log_error(one.dose, channel) ** -2)
+        channel_dose = dose(values, calibration, background=background, channel=channel)
+        logarithm = np.log(channel_dose.dose)
+        log_error = calibration.log_error(channel_dose.dose, channel)
+        weight = np.where(channel_dose.outside, 0.0, log_error**-2)
         weights += weight
         weighted += weight * logarithm
         squares += weight * logarithm**2
-        counted += ~one.outside
-        outside &= one.outside
+        counted += ~channel_dose.outside
+        outside &= channel_dose.outside
         ends.append(logarithm)
     inside = np.where(outside, 1.0, weights)
     mean = np.where(outside, np.median(ends, axis=0), weighted / inside)
@@ -415,7 +416,7 @@ def combined_dose(
 
 @as_file_errors
 def _rows(path: Path) -> FloatArray:
-    """Dose and red, green and blue pixel of every film, then spreads if all are told."""
+    """Read dose and red, green and blue pixel of every film, then spreads if all are present."""
     text = small_text(path, "a calibration table, comma-separated values", "utf-8-sig")
     lines = list(csv.reader(text.splitlines()))
     columns = _columns(path, [name.strip().lower() for name in lines[0]] if lines else [])
@@ -435,15 +436,15 @@ def _rows(path: Path) -> FloatArray:
 
 
 def _columns(path: Path, names: list[str]) -> list[int]:
-    found = [[at for at, name in enumerate(names) if "dose" in name and "log" not in name]]
+    matches = [[at for at, name in enumerate(names) if "dose" in name and "log" not in name]]
     for colour in ("red", "green", "blue"):
-        found.append([at for at, name in enumerate(names) if name.startswith(colour)])
-    if not all(found):
+        matches.append([at for at, name in enumerate(names) if name.startswith(colour)])
+    if not all(matches):
         raise FileFormatError(
             f"{path} has the columns {', '.join(map(repr, names)) or 'none'}: expected one with "
             "'dose', and columns whose names begin with 'red', 'green' and 'blue'"
         )
-    columns = [candidates[0] for candidates in found]
-    beside = [at + 1 for at in columns[1:]]
-    told = all(at < len(names) and names[at].startswith("std") for at in beside)
-    return columns + beside if told else columns
+    columns = [candidates[0] for candidates in matches]
+    spread_columns = [at + 1 for at in columns[1:]]
+    has_spreads = all(at < len(names) and names[at].startswith("std") for at in spread_columns)
+    return columns + spread_columns if has_spreads else columns

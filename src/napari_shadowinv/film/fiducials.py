@@ -1,11 +1,12 @@
-"""Films laid on each other by marks that go through all of them: `poses_by_fiducials`.
+"""Alignment of films by marks that go through all of them: `poses_by_fiducials`.
 
-Holes that were pierced through the assembled pack, or the ends of a cut, lie at the same place of
-each film, whatever the beam did.
+Holes pierced through the assembled pack, or the ends of a cut, are at the same place on each film,
+independent of the beam.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -19,7 +20,7 @@ from napari_shadowinv.film.scans import upright
 __all__ = ["poses_by_fiducials"]
 
 _LEAST_ERROR = 0.3  # px: as marks are read off a scan
-_ODD = 10.0  # px: further from where the other marks tell, a mark is that of another name
+_MAX_MISFIT_PX = 10.0  # further from its place by the other marks, a mark has a wrong name
 _ROUNDS = 50
 
 Points = Mapping[str, ArrayLike]
@@ -28,10 +29,10 @@ Points = Mapping[str, ArrayLike]
 def poses_by_fiducials(
     points: Sequence[Points], corners: ArrayLike, scales: ArrayLike, names: Sequence[str]
 ) -> Poses:
-    """Find how films lie on each other by marks that are at the same place of each.
+    """Find the poses of films by marks that are at the same place on each.
 
-    One mark on a film tells its shift, two or more its turn, too. A film without marks lies as its
-    edges do. Films are laid on the mean of all, so that marks on one film alone tell nothing.
+    One mark on a film determines its shift, two or more also its turn. A film without marks is
+    aligned by its edges. Films are aligned to the mean of all, so a mark on one film has no effect.
 
     Parameters
     ----------
@@ -42,49 +43,52 @@ def poses_by_fiducials(
     scales : array_like, shape (n,)
         Px of each film in a px of the images, which magnify with the depth in the pack.
     names : sequence of str
-        What messages call the films.
+        Names of the films for messages.
 
     Raises
     ------
     InputError
-        If no mark is on two films, or one is far from where the others of its film tell.
+        If no mark is on two films, or one disagrees with the other marks of its film.
     """
-    there = [
+    film_marks = [
         {name: _on_film(np.asarray(place, np.float64), film) for name, place in marks.items()}
         for marks, film in zip(points, np.asarray(corners, np.float64), strict=True)
     ]
-    shared = {name for marks in there for name in marks if sum(name in one for one in there) > 1}
+    counts = Counter(name for marks in film_marks for name in marks)
+    shared = {name for name, count in counts.items() if count > 1}
     if not shared:
         raise InputError(
             "fiducials: no mark is on two films or more: give the marks that go through the pack "
             "the same name on each film"
         )
-    there = [{name: one[name] for name in sorted(shared & one.keys())} for one in there]
-    count = len(there)
+    film_marks = [
+        {name: marks[name] for name in sorted(shared & marks.keys())} for marks in film_marks
+    ]
+    count = len(film_marks)
     shifts, turns = np.zeros((count, 2)), np.zeros(count)
-    marked = [k for k in range(count) if there[k]]
+    marked = [k for k in range(count) if film_marks[k]]
     for _ in range(_ROUNDS):
-        common = _means(there, shifts, turns)
+        common = _means(film_marks, shifts, turns)
         for k in marked:
-            shifts[k], turns[k] = _rigid(there[k], common)
-        # Where all lie together, the edges of all tell.
+            shifts[k], turns[k] = _rigid(film_marks[k], common)
+        # The edges of all films determine their common position.
         shifts[marked] -= shifts[marked].mean(axis=0)
         turns[marked] -= turns[marked].mean()
-    common = _means(there, shifts, turns)
-    misfits = [_misfit(there[k], common, shifts[k], turns[k]) for k in range(count)]
+    common = _means(film_marks, shifts, turns)
+    misfits = [_misfit(film_marks[k], common, shifts[k], turns[k]) for k in range(count)]
     for name, misfit in zip(names, misfits, strict=True):
-        if misfit.size and misfit.max() > _ODD:
+        if misfit.size and misfit.max() > _MAX_MISFIT_PX:
             raise InputError(
                 f"fiducials: a mark on {name} is {misfit.max():.0f} px from where the marks of all "
                 "films tell: correct its name or its place"
             )
-    # What the marks' coordinates tell beyond their common places and each film's pose.
-    poses = [len(one) and min(3, 1 + len(one)) for one in there]
-    spare = 2 * sum(map(len, there)) - 2 * len(shared) - sum(poses) + max(poses)
+    # Degrees of freedom left by the marks' common places and each film's pose.
+    poses = [len(marks) and min(3, 1 + len(marks)) for marks in film_marks]
+    spare = 2 * sum(map(len, film_marks)) - 2 * len(shared) - sum(poses) + max(poses)
     every = np.concatenate(misfits)
     closure = float(np.sqrt((every**2).sum() / spare)) if spare > 0 else float("nan")
     error = float(np.fmax(_LEAST_ERROR, closure))
-    errors = np.array([error / np.sqrt(len(one)) if one else EDGES for one in there])
+    errors = np.array([error / np.sqrt(len(marks)) if marks else EDGES for marks in film_marks])
     return Poses(
         shifts / np.asarray(scales, np.float64)[:, None],
         turns,
@@ -95,7 +99,7 @@ def poses_by_fiducials(
 
 
 def _on_film(place: FloatArray, corners: FloatArray) -> FloatArray:
-    """Px down and right from the film's middle."""
+    """Return px down and right from the film's middle."""
     axes, middle, _ = upright(corners)
     return np.asarray((place - middle) @ axes.T)
 
@@ -106,28 +110,27 @@ def _rotation(turn: float) -> FloatArray:
 
 
 def _means(
-    there: list[dict[str, FloatArray]], shifts: FloatArray, turns: FloatArray
+    film_marks: list[dict[str, FloatArray]], shifts: FloatArray, turns: FloatArray
 ) -> dict[str, FloatArray]:
-    """Where each mark is on films that have been laid on each other."""
+    """Return the mean place of each mark on aligned films."""
     brought: dict[str, list[FloatArray]] = {}
-    for marks, shift, turn in zip(there, shifts, turns, strict=True):
+    for marks, shift, turn in zip(film_marks, shifts, turns, strict=True):
         for name, place in marks.items():
             brought.setdefault(name, []).append((place - shift) @ _rotation(turn).T)
     return {name: np.mean(places, axis=0) for name, places in brought.items()}
 
 
 def _rigid(marks: dict[str, FloatArray], common: dict[str, FloatArray]) -> tuple[FloatArray, float]:
-    """Shift and turn that bring the common places onto a film's marks, by least squares."""
+    """Fit the shift and turn from the common places to a film's marks, by least squares."""
     on_film = np.array(list(marks.values()))
     expected = np.array([common[name] for name in marks])
     turn = 0.0
     if len(marks) > 1:
-        one, other = (places - places.mean(axis=0) for places in (expected, on_film))
-        along, across = (
-            (one * other).sum(),
-            (one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]).sum(),
-        )
-        turn = float(np.arctan2(across, along))
+        common_y, common_x = (expected - expected.mean(axis=0)).T
+        film_y, film_x = (on_film - on_film.mean(axis=0)).T
+        along = (expected - expected.mean(axis=0)) * (on_film - on_film.mean(axis=0))
+        across = common_y * film_x - common_x * film_y
+        turn = float(np.arctan2(across.sum(), along.sum()))
     return (on_film - expected @ _rotation(turn)).mean(axis=0), turn
 
 

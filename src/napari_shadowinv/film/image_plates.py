@@ -1,4 +1,4 @@
-"""Image plates: from a scanner's values to the luminescence that the beam left in the plate.
+"""Image plates: from a scanner's values to the luminescence of the plate.
 
 - values on a logarithmic scale, as Fuji's scanners write them: `fuji_luminescence`
 - roots, as GE's scanners write them to ``.gel``: `ge_luminescence`
@@ -136,7 +136,7 @@ def ge_luminescence(
 
 
 def _scale(scan: ArrayLike, bits: int) -> tuple[FloatArray, BoolArray]:
-    """Values as shares of the scale, and where it ends."""
+    """Return values as shares of the scale, and the saturated pixels."""
     values = np.asarray(scan, dtype=np.float64)
     if not 1 <= bits <= 32:
         raise InputError(f"bits is {bits}: expected the depth of the scan, 8 or 16")
@@ -152,7 +152,7 @@ def _scale(scan: ArrayLike, bits: int) -> tuple[FloatArray, BoolArray]:
 
 
 def _factor(resolution: float, sensitivity: float, latitude: float) -> float:
-    """Luminescence at the end of the scale."""
+    """Return the luminescence at the end of the scale."""
     settings = {"resolution": resolution, "sensitivity": sensitivity, "latitude": latitude}
     for name, value in settings.items():
         if not 0 < value < np.inf:
@@ -161,10 +161,10 @@ def _factor(resolution: float, sensitivity: float, latitude: float) -> float:
 
 
 def fading(minutes: float, plate: str) -> float:
-    """Return the share of the luminescence that is left; divide by it to correct a scan.
+    """Return the remaining share of the luminescence; divide by it to correct a scan.
 
-    A sum of two exponentials fitted to measurements (Boutoux et al.). Those of others differ:
-    for MS after an hour Bonnet et al. have 0.78 where this has 0.86.
+    It is a sum of two exponentials fitted to measurements (Boutoux et al.). Other measurements
+    differ: for MS after an hour Bonnet et al. have 0.78, this function 0.86.
 
     Parameters
     ----------

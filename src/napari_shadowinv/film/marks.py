@@ -19,12 +19,16 @@ from napari_shadowinv.film.scans import checked_scan
 
 __all__ = ["burnt_edges", "usable_pixels"]
 
-_EVERY = 8  # px: of what is smooth, every so many are looked at
-_AROUND, _FAR_AROUND = 13, 25  # of these, for what is usual and how much that scatters
+_SAMPLE_STEP_PX = 8  # between the samples of the smooth background
+_BACKGROUND_SAMPLES = 13  # side of the median that gives the background
+_SCATTER_SAMPLES = 25  # side of the median that gives its scatter
 _NORMAL_MAD = 1.4826
-_UNUSUAL, _LEAST = 6.0, 0.04  # times the scatter, and in optical density
-_BLUR = 1.0  # px
-_SMALLEST, _GAPS, _MARGIN = 4, 3, 2  # px: marks have an area, close gaps, and are widened
+_MIN_SCATTERS = 6.0  # by which a mark differs from the background
+_MIN_DENSITY = 0.04  # by which it differs, too, in optical density
+_BLUR_PX = 1.0
+_MIN_MARK_PX = 4  # area
+_GAP_PX = 3  # that is closed
+_MARGIN_PX = 2  # by which marks are widened
 
 # Burnt edges, measured on real EBT3: 1.6 to 40 times the dose, over in 8 to 38 px.
 _MAX_BURNT_DEPTH_PX = 40
@@ -44,12 +48,12 @@ def usable_pixels(
     background: Sequence[float] | ArrayLike | None = None,
     rim: int = 6,
 ) -> BoolArray:
-    """Return where a film tells its dose.
+    """Return the pixels whose dose can be trusted.
 
-    Exposed film is as dark in blue as follows from how dark it is in red. Ink, scratches, notches,
-    dust and burnt edges are not: there the blue differs from what it is around them. A scratch
-    that only takes some of the active layer away looks like less dose, and a grey mark on film that
-    is nearly black like more.
+    The darkening of exposed film in blue follows from its darkening in red. At ink, scratches,
+    notches, dust and burnt edges, the blue differs from its surroundings. A scratch that only
+    removes part of the active layer looks like less dose, a grey mark on nearly black film like
+    more.
 
     Parameters
     ----------
@@ -83,19 +87,20 @@ def usable_pixels(
         net_optical_density(np.maximum(values, 1), unexposed, channel)
         for channel in ("red", "blue")
     )
-    odd = ndimage.gaussian_filter(blue - _usual_blue(calibration, unexposed, red), _BLUR)
-    few = odd[_EVERY // 2 :: _EVERY, _EVERY // 2 :: _EVERY]
-    usual = ndimage.median_filter(few, _AROUND, mode="nearest")
-    scatter = ndimage.median_filter(np.abs(few - usual), _FAR_AROUND, mode="nearest")
-    least = _UNUSUAL * _NORMAL_MAD * scatter
-    marked = np.abs(odd - _in_full(usual, odd)) > np.maximum(_in_full(least, odd), _LEAST)
+    excess = ndimage.gaussian_filter(blue - _expected_blue(calibration, unexposed, red), _BLUR_PX)
+    first = _SAMPLE_STEP_PX // 2
+    samples = excess[first::_SAMPLE_STEP_PX, first::_SAMPLE_STEP_PX]
+    usual = ndimage.median_filter(samples, _BACKGROUND_SAMPLES, mode="nearest")
+    scatter = ndimage.median_filter(np.abs(samples - usual), _SCATTER_SAMPLES, mode="nearest")
+    least = np.maximum(_resampled(_MIN_SCATTERS * _NORMAL_MAD * scatter, excess), _MIN_DENSITY)
+    marked = np.abs(excess - _resampled(usual, excess)) > least
     labels, count = ndimage.label(marked)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    marked &= sizes[labels] >= _SMALLEST
-    disc = ndimage.iterate_structure(ndimage.generate_binary_structure(2, 1), _GAPS)
-    wide = np.pad(marked, 2 * _GAPS)
-    closed = ndimage.binary_closing(wide, disc)[2 * _GAPS : -2 * _GAPS, 2 * _GAPS : -2 * _GAPS]
-    usable = ~ndimage.binary_dilation(closed, iterations=_MARGIN)
+    marked &= sizes[labels] >= _MIN_MARK_PX
+    disc = ndimage.iterate_structure(ndimage.generate_binary_structure(2, 1), _GAP_PX)
+    border = 2 * _GAP_PX
+    closed = ndimage.binary_closing(np.pad(marked, border), disc)[border:-border, border:-border]
+    usable = ~ndimage.binary_dilation(closed, iterations=_MARGIN_PX)
     if rim > 0:
         inner = np.zeros_like(usable)
         inner[rim:-rim, rim:-rim] = True
@@ -121,14 +126,14 @@ def burnt_edges(dose: ArrayLike) -> BoolArray:
     logarithm = np.log(np.asarray(dose, np.float64))
     burnt = np.zeros(logarithm.shape, dtype=bool)
     for turns in range(4):
-        # A view: what is marked on it is marked on the film.
+        # A view: marks on it are marks on the film.
         side = np.rot90(burnt, turns)
         side |= _burnt_top(np.rot90(logarithm, turns))
     return burnt
 
 
 def _burnt_top(logarithm: FloatArray) -> BoolArray:
-    """Burnt pixels along the upper side."""
+    """Mark the burnt pixels along the upper side."""
     height = len(logarithm)
     reach = min(_MAX_BURNT_DEPTH_PX, height // 6)
     burnt = np.zeros(logarithm.shape, dtype=bool)
@@ -147,16 +152,17 @@ def _burnt_top(logarithm: FloatArray) -> BoolArray:
         return burnt
     # Under a bright beam the fall is hidden: there the burn is as deep as elsewhere on this side.
     ends = np.where(ends > 0, ends, np.median(ends[ends > 0]))
-    ends = ndimage.maximum_filter1d(ends + _CUT_PX + _FALL_PX + _MARGIN, _ALONG_PX)
+    ends = ndimage.maximum_filter1d(ends + _CUT_PX + _FALL_PX + _MARGIN_PX, _ALONG_PX)
     return np.asarray(np.arange(height)[:, None] < ends)
 
 
-def _usual_blue(calibration: Calibration, unexposed: FloatArray, red: FloatArray) -> FloatArray:
-    """How dark exposed film is in blue where it is so dark in red."""
+def _expected_blue(calibration: Calibration, unexposed: FloatArray, red: FloatArray) -> FloatArray:
+    """Return the density of exposed film in blue by its density in red."""
     table = np.log10(unexposed / calibration.pixels[np.argsort(calibration.doses)])
     return np.asarray(np.interp(red, np.maximum.accumulate(table[:, 0]), table[:, 2]))
 
 
-def _in_full(few: FloatArray, like: FloatArray) -> FloatArray:
-    places = np.mgrid[: like.shape[0], : like.shape[1]] / _EVERY - 0.5
-    return np.asarray(ndimage.map_coordinates(few, places, order=1, mode="nearest"))
+def _resampled(samples: FloatArray, image: FloatArray) -> FloatArray:
+    """Interpolate samples to the pixels of an image."""
+    places = np.mgrid[: image.shape[0], : image.shape[1]] / _SAMPLE_STEP_PX - 0.5
+    return np.asarray(ndimage.map_coordinates(samples, places, order=1, mode="nearest"))

@@ -1,6 +1,6 @@
-"""A pack of films and filters, the one that is hit first at the top.
+"""Pack of films and filters, the first to be hit at the top.
 
-What a pack is made of: `Pack`, `PackLayer`, `FilmType`, `Slab`, `Material`.
+Its parts: `Pack`, `PackLayer`, `FilmType`, `Slab`, `Material`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 
 
 class Material(CheckedModel):
-    """What stops protons: by a table of SRIM's, or else by Bethe's formula."""
+    """Material with its stopping of protons, by a table from SRIM or by Bethe's formula."""
 
     model_config = _CONFIG
     density: float | None = Field(
@@ -55,7 +55,7 @@ class Material(CheckedModel):
         return self
 
     def stopping(self) -> Stopping:
-        """How protons lose energy in it."""
+        """Return the stopping of protons in it."""
         if self.table is not None:
             return Stopping.from_srim(self.table)
         assert self.density is not None
@@ -64,31 +64,31 @@ class Material(CheckedModel):
         return Stopping.by_bethe(self.density, self.charge_per_mass, self.excitation)
 
 
-def _matter(density: float, charge_per_mass: float, excitation: float) -> Material:
+def _material(density: float, charge_per_mass: float, excitation: float) -> Material:
     return Material(density=density, charge_per_mass=charge_per_mass, excitation=excitation)
 
 
-# Densities, Z/A and excitation energies of elements and polymers: ICRU Report 49. Of active layers,
-# density and composition are those of their makers, and the excitation follows by Bragg's rule.
+# Densities, Z/A and excitation energies of elements and polymers: ICRU Report 49. Density and
+# composition of active layers are from their maker, their excitation follows from Bragg's rule.
 MATERIALS = {
-    "Al": _matter(2699, 0.48181, 166.0),
-    "Fe": _matter(7874, 0.46557, 286.0),
-    "Cu": _matter(8960, 0.45636, 322.0),
-    "Ta": _matter(16654, 0.40343, 718.0),
-    "Ti": _matter(4540, 0.45961, 233.0),
-    "Au": _matter(19320, 0.40108, 790.0),
-    "Mylar": _matter(1400, 0.52037, 78.7),
-    "polyester": _matter(1350, 0.52037, 78.7),
-    "polystyrene": _matter(1060, 0.53768, 68.7),
-    "Kapton": _matter(1420, 0.51264, 79.6),
-    "CR-39": _matter(1310, 0.52697, 73.1),
-    "EBT active": _matter(1200, 0.5450, 69.6),
-    "HD active": _matter(1080, 0.5453, 66.6),
+    "Al": _material(2699, 0.48181, 166.0),
+    "Fe": _material(7874, 0.46557, 286.0),
+    "Cu": _material(8960, 0.45636, 322.0),
+    "Ta": _material(16654, 0.40343, 718.0),
+    "Ti": _material(4540, 0.45961, 233.0),
+    "Au": _material(19320, 0.40108, 790.0),
+    "Mylar": _material(1400, 0.52037, 78.7),
+    "polyester": _material(1350, 0.52037, 78.7),
+    "polystyrene": _material(1060, 0.53768, 68.7),
+    "Kapton": _material(1420, 0.51264, 79.6),
+    "CR-39": _material(1310, 0.52697, 73.1),
+    "EBT active": _material(1200, 0.5450, 69.6),
+    "HD active": _material(1080, 0.5453, 66.6),
 }
 
 
 class Slab(CheckedModel):
-    """One material, so thick; from a text such as ``13 um Al``, too."""
+    """Layer of one material, also from a text such as ``13 um Al``."""
 
     model_config = _CONFIG
     material: str
@@ -110,7 +110,7 @@ _SLAB = re.compile(r"(?P<number>\d+\.?\d*)\s*(?P<unit>um|µm|μm|mm)\s+(?P<mater
 
 
 def _listed(value: Any) -> Any:
-    """The slabs of a text that separates them by semicolons."""
+    """Split a text with slabs separated by semicolons."""
     return [part for part in value.split(";") if part.strip()] if isinstance(value, str) else value
 
 
@@ -118,7 +118,7 @@ Slabs = Annotated[tuple[Slab, ...], BeforeValidator(_listed)]
 
 
 class FilmType(CheckedModel):
-    """A kind of film, in the order in which protons cross it, and how it darkens."""
+    """Type of film: its layers in the order in which protons cross them, and its calibration."""
 
     model_config = _CONFIG
     before: Slabs = Field(default=(), title="Before", description="In front of the active layer.")
@@ -151,7 +151,7 @@ FILM_TYPES = {
 
 
 class PackLayer(CheckedModel):
-    """A film of the pack, and the filters in front of it."""
+    """Film of the pack, and the filters in front of it."""
 
     model_config = _CONFIG
     film: str = Field(title="Film", description="Its type.")
@@ -178,10 +178,10 @@ class PackLayer(CheckedModel):
 
 
 class Pack(CheckedModel):
-    """Films and filters, the first in front; what their types and materials are.
+    """Films and filters, the first in front, with their types and materials.
 
-    Types and materials that are given take the place of those known by their names; what a type
-    leaves out is taken from the known one.
+    A type or material of the pack replaces the built-in one of its name; a type inherits the fields
+    that it leaves out from the built-in one.
     """
 
     model_config = _CONFIG
@@ -254,20 +254,20 @@ class Pack(CheckedModel):
         films = values.get("films") if isinstance(values, Mapping) else None
         if not isinstance(films, Mapping):
             return values
-        whole = {
-            name: {**FILM_TYPES[name].model_dump(), **given}
-            if name in FILM_TYPES and isinstance(given, Mapping)
-            else given
-            for name, given in films.items()
+        complete = {
+            name: {**FILM_TYPES[name].model_dump(), **film}
+            if name in FILM_TYPES and isinstance(film, Mapping)
+            else film
+            for name, film in films.items()
         }
-        return {**values, "films": whole}
+        return {**values, "films": complete}
 
     @model_validator(mode="after")
     def _has_all_parts(self) -> Pack:
         for number, layer in enumerate(self.layers, 1):
-            _check_known(layer.film, self.kinds, f"layer {number} is a film of type", "films")
+            _check_known(layer.film, self.film_types, f"layer {number} is a film of type", "films")
             for slab in self._slabs(layer):
-                _check_known(slab.material, self._matter, f"layer {number} has", "materials")
+                _check_known(slab.material, self._all_materials, f"layer {number} has", "materials")
         if self.setup is not None and "energy" in self.setup:
             raise ValueError("the setup has an energy: leave it out, films see one each")
         if self.setup is not None:
@@ -277,12 +277,12 @@ class Pack(CheckedModel):
         return self
 
     @property
-    def kinds(self) -> dict[str, FilmType]:
-        """Types of films by name, those known and those given."""
+    def film_types(self) -> dict[str, FilmType]:
+        """Types of films by name, built-in ones and the pack's."""
         return FILM_TYPES | dict(self.films)
 
     @property
-    def _matter(self) -> dict[str, Material]:
+    def _all_materials(self) -> dict[str, Material]:
         return MATERIALS | dict(self.materials)
 
     def _slabs(self, layer: PackLayer) -> tuple[Slab, ...]:
@@ -291,39 +291,41 @@ class Pack(CheckedModel):
 
     @property
     def files(self) -> list[Path]:
-        """All files that it names."""
-        named = [self.scan, self.corners, self.fiducials]
-        named += [file for layer in self.layers for file in (layer.file, layer.mask)]
-        named += [file for one in self.films.values() for file in (one.calibration, one.unexposed)]
-        named += [matter.table for matter in self.materials.values()]
-        return [file for file in named if file is not None]
+        """All files that the pack refers to."""
+        files: list[Path | None] = [self.scan, self.corners, self.fiducials]
+        files += [file for layer in self.layers for file in (layer.file, layer.mask)]
+        for film in self.films.values():
+            files += [film.calibration, film.unexposed]
+        files += [material.table for material in self.materials.values()]
+        return [file for file in files if file is not None]
 
     def film(self, layer: PackLayer) -> FilmType:
-        """The type of a layer's film."""
-        return self.kinds[layer.film]
+        """Return the type of a layer's film."""
+        return self.film_types[layer.film]
 
     def is_mirrored(self, layer: PackLayer) -> bool:
-        """Whether the scan of a layer shows its film mirrored, as seen from the source."""
+        """Return whether the scan of a layer is mirrored against the view from the source."""
         return layer.mirrored != (self.seen_from == "detector")
 
     def setups(self, energies: ArrayLike, pixel_size: float | None) -> tuple[Setup, ...]:
-        """Setup of each layer, on common pixels at the object; none if the pack has no setup.
+        """Return the setup of each layer, on common pixels at the object; empty without a setup.
 
         Parameters
         ----------
         energies : array_like, shape (n,)
             In MeV.
         pixel_size : float or None
-            Of the scans in m, where the setup does not tell that of the first film.
+            Of the scans in m, where the setup has no pixel size of the first film.
         """
         if self.setup is None:
             return ()
         size = {} if pixel_size is None else {"detector_pixel_size": pixel_size}
-        given = {"kind": "proton", **(size if "pixel_size" not in self.setup else {}), **self.setup}
-        known = np.asarray(energies, np.float64)
-        if given["kind"] != "proton" or given.get("species", "proton") != "proton":
+        size = {} if "pixel_size" in self.setup else size
+        values = {"kind": "proton", **size, **self.setup}
+        in_mev = np.asarray(energies, np.float64)
+        if values["kind"] != "proton" or values.get("species", "proton") != "proton":
             raise InputError("the pack's setup is not one of protons, whose stopping is known")
-        first = setup_from_dict({**given, "energy": float(known[0])}, "setup")
+        first = setup_from_dict({**values, "energy": float(in_mev[0])}, "setup")
         common = {"pixel_size": first.object_pixel_size, "detector_pixel_size": None}
         return tuple(
             first.model_copy(
@@ -333,27 +335,27 @@ class Pack(CheckedModel):
                     "object_image_distance": first.object_image_distance + float(depth),
                 }
             )
-            for energy, depth in zip(known, self.depths(), strict=True)
+            for energy, depth in zip(in_mev, self.depths(), strict=True)
         )
 
     def depths(self) -> FloatArray:
-        """Return how far behind the first film's active layer each film's is, in m."""
-        surface, found = 0.0, []
+        """Return the distance of each film's active layer from the first film's, in m."""
+        surface, middles = 0.0, []
         for layer in self.layers:
             film = self.film(layer)
             surface += sum(slab.thickness for slab in (*layer.filters, *film.before))
-            found.append(surface + film.active.thickness / 2)
+            middles.append(surface + film.active.thickness / 2)
             surface += sum(slab.thickness for slab in (film.active, *film.behind))
-        return np.array(found) - found[0]
+        return np.array(middles) - middles[0]
 
     def stoppings(self) -> dict[str, Stopping]:
-        """How protons lose energy in each material that it has."""
+        """Return the stopping of protons in each material of the pack."""
         names = {slab.material for layer in self.layers for slab in self._slabs(layer)}
-        return {name: self._matter[name].stopping() for name in sorted(names)}
+        return {name: self._all_materials[name].stopping() for name in sorted(names)}
 
 
 def _check_known(name: str, known: Mapping[str, Any], who: str, table: str) -> None:
     if name not in known:
-        meant = nearest(name, list(known))
-        hint = f"did you mean '{meant}'?" if meant else f"known are {', '.join(known)}"
+        match = nearest(name, list(known))
+        hint = f"did you mean '{match}'?" if match else f"known are {', '.join(known)}"
         raise ValueError(f"{who} '{name}': {hint} Others are described under [{table}]")

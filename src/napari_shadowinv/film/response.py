@@ -1,4 +1,4 @@
-"""What the films of a pack see of protons of each energy: `Response`."""
+"""Response of the films of a pack to protons of each energy: `Response`."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _BAND = 0.5  # of the peak
 
 @dataclass(frozen=True)
 class Band:
-    """Which protons a film sees best, in MeV.
+    """Energies to which a film is most sensitive, in MeV.
 
     Attributes
     ----------
     peak : float
-        Those that lose most energy in it: they stop there.
+        Energy of the protons that lose most energy in the film: they stop there.
     low, high : float
-        Around the peak: where they lose half as much.
+        Energies around the peak at which they lose half as much.
     """
 
     peak: float
@@ -40,14 +40,14 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """The energy that one proton loses in the active layer of each film.
+    """Energy that one proton loses in the active layer of each film.
 
     Attributes
     ----------
     energies : ndarray, shape (n,)
         Of protons in front of the pack, in MeV, increasing.
     deposits : ndarray, shape (layers, n)
-        What they lose in each active layer, in MeV.
+        Energy that they lose in each active layer, in MeV.
     doses : ndarray, shape (layers, n)
         Dose in Gy by one proton per m².
     """
@@ -58,7 +58,7 @@ class Response:
 
     @classmethod
     def of(cls, pack: Pack, energies: ArrayLike | None = None) -> Response:
-        """Work it out for a pack.
+        """Compute the response of a pack.
 
         Parameters
         ----------
@@ -69,10 +69,10 @@ class Response:
         Raises
         ------
         InputError
-            If an energy is above what a stopping table tells.
+            If an energy is above the range of a stopping table.
         """
         stoppings = pack.stoppings()
-        last = min(_LAST, *(one.energies[-1] for one in stoppings.values()))
+        last = min(_LAST, *(stopping.energies[-1] for stopping in stoppings.values()))
         inside = np.geomspace(_FIRST, last, _STEPS) if energies is None else np.asarray(energies)
         first = np.array(inside, dtype=np.float64)
         deposits, doses = [], []
@@ -89,14 +89,14 @@ class Response:
 
     @property
     def bands(self) -> tuple[Band, ...]:
-        """The band of each film.
+        """Band of each film.
 
         Raises
         ------
         InputError
             If no proton of these energies reaches a film.
         """
-        found = []
+        bands = []
         for number, deposit in enumerate(self.deposits, 1):
             top = int(np.argmax(deposit))
             if not deposit[top] > 0:
@@ -110,8 +110,8 @@ class Response:
             gaps = np.flatnonzero(np.diff(above[above >= top]) > 1)
             last = above[above >= top][gaps[0]] if gaps.size else above[-1]
             low, peak, high = (float(self.energies[k]) for k in (first, top, last))
-            found.append(Band(peak, low, high))
-        return tuple(found)
+            bands.append(Band(peak, low, high))
+        return tuple(bands)
 
 
 def _behind(
@@ -123,17 +123,17 @@ def _behind(
 
 
 def check_increasing(bands: Sequence[Band]) -> None:
-    """Reject a pack whose films do not see faster and faster protons."""
-    for number, (one, other) in enumerate(pairwise(bands), 1):
-        if other.peak <= one.peak:
+    """Refuse a pack whose films do not see faster and faster protons."""
+    for number, (slower, faster) in enumerate(pairwise(bands), 1):
+        if faster.peak <= slower.peak:
             raise InputError(
-                f"film {number + 1} sees {other.peak:.3g} MeV, film {number} {one.peak:.3g} MeV: "
-                "expected films in the order in which protons reach them"
+                f"film {number + 1} sees {faster.peak:.3g} MeV, film {number} {slower.peak:.3g} "
+                "MeV: expected films in the order in which protons reach them"
             )
 
 
 def relative_strengths(energies: ArrayLike) -> FloatArray:
-    """Return how far a magnetic field displaces protons of each energy (MeV), as to the first."""
-    known = np.asarray(energies, np.float64)
-    momenta = np.sqrt(known * (known + 2 * PROTON_MASS))
+    """Return the displacement by a magnetic field at each energy (MeV) over that at the first."""
+    in_mev = np.asarray(energies, np.float64)
+    momenta = np.sqrt(in_mev * (in_mev + 2 * PROTON_MASS))
     return np.asarray(momenta[0] / momenta)

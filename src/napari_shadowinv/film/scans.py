@@ -1,6 +1,6 @@
 """Films on the bed of a scanner.
 
-- where they are: `find_films`
+- their corners: `find_films`
 - one of them cut out and turned upright: `straightened`
 - corners from a table and to one: `read_corners`, `write_corners`
 
@@ -29,10 +29,12 @@ _BED = 99.0  # percentile of the brightness
 _SMALLEST = 0.02  # of the scan's area, or `least_side` squared
 _DUST = 2  # px
 _ENDS = 0.08  # of a side, at its ends, do not count for its place: corners are cut and bent
-_NEAR = 0.04  # of the film's size: how far from a side its border may be
+_MAX_OFFSET = 0.04  # of the film's size, from a side to its border
 _ROUNDS, _OUTLIERS = 8, 2.5
-_ACROSS, _BLURRED, _STEP = 6.0, 2.0, 0.5  # px from a side that are searched, and that it blurs
-_FINEST = 0.1  # px: a point of a side that is closer to its line is no outlier
+_REACH_PX = 6.0  # of the search from a side
+_BLUR_PX = 2.0  # of a side
+_STEP_PX = 0.5
+_MIN_OUTLIER_PX = 0.1  # a point of a side that is closer to its line is no outlier
 _Line = tuple[float, float]  # offset and slope
 
 _HEADER = ["film", "y1", "x1", "y2", "x2", "y3", "x3", "y4", "x4"]
@@ -64,19 +66,19 @@ def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[Floa
     area = _SMALLEST * height * width if least_side is None else least_side**2
     labels, count = ndimage.label(inside)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    wanted = [number for number in range(1, count + 1) if sizes[number] >= area]
-    if not wanted:
+    film_labels = [number for number in range(1, count + 1) if sizes[number] >= area]
+    if not film_labels:
         raise InputError(
             "no film was found on the scan: expected films darker than a bright bed around them; "
             "give their corners"
         )
     slices = ndimage.find_objects(labels)
-    found = []
-    for number in wanted:
-        top, left = (one.start for one in slices[number - 1])
+    corners = []
+    for number in film_labels:
+        y_top, x_left = (part.start for part in slices[number - 1])
         film = ndimage.binary_fill_holes(labels[slices[number - 1]] == number)
-        found.append(_sharpened(values, _rectangle(film) + np.array([top, left])))
-    return _in_reading_order(found)
+        corners.append(_sharpened(values, _rectangle(film) + np.array([y_top, x_left])))
+    return _in_reading_order(corners)
 
 
 def straightened(
@@ -93,14 +95,14 @@ def straightened(
     scan : array_like, shape (H, W) or (H, W, C)
     corners : array_like, shape (4, 2)
     shape : tuple of int, optional
-        Of what is returned. Default: that of the film.
+        Of the returned image. Default: the film's.
     scale : float, default 1
-        Side of its pixels in those of the scan.
+        Side of its pixels in px of the scan.
 
     Returns
     -------
     ndarray of float64
-        Cubic between the scan's pixels, within their range; beyond its edge as there.
+        Cubic between the scan's pixels, within their range; constant beyond its edge.
     """
     values = np.asarray(scan)
     places = checked_corners(corners)
@@ -120,7 +122,7 @@ def straightened(
 
 
 def common_shape(sizes: ArrayLike) -> tuple[int, int]:
-    """Return the shape that films of sizes (n, 2) are given when they are straightened."""
+    """Return the common shape for straightened films of sizes (n, 2)."""
     height, width = np.median(np.asarray(sizes, np.float64), axis=0)
     return round(height), round(width)
 
@@ -163,7 +165,7 @@ def _darker_than_bed(values: AnyArray) -> BoolArray:
 
 
 def _rectangle(film: BoolArray) -> FloatArray:
-    """The corners of lines along the four sides of a region."""
+    """Return the corners of lines along the four sides of a region."""
     from scipy.spatial import ConvexHull
 
     rim = film & ~ndimage.binary_erosion(film)
@@ -185,30 +187,30 @@ def _rectangle(film: BoolArray) -> FloatArray:
 
 
 def _axes_of_smallest_box(hull: FloatArray) -> FloatArray:
-    """Unit vectors (down, right) along the sides of the smallest rectangle around some points."""
-    best, found = np.inf, np.eye(2)
+    """Return unit vectors (down, right) along the sides of the smallest box around points."""
+    best, box_axes = np.inf, np.eye(2)
     for step in np.diff(hull, axis=0, append=hull[:1]):
         along = step / np.hypot(*step)
         axes = np.stack([along, [-along[1], along[0]]])
         area = np.ptp(hull @ axes.T, axis=0).prod()
         if area < best:
-            best, found = area, axes
-    down = found[np.argmax(np.abs(found[:, 0]))]
+            best, box_axes = area, axes
+    down = box_axes[np.argmax(np.abs(box_axes[:, 0]))]
     down = down * np.sign(down[0])
     return np.stack([down, [-down[1], down[0]]])
 
 
 def _side(turned: FloatArray, axis: int, edge: float, low: FloatArray, high: FloatArray) -> _Line:
-    """Offset and slope of the line along a side, which most of its pixels agree on."""
+    """Fit offset and slope of the line along most of a side's pixels."""
     size = (high - low)[1 - axis]
     along, across = turned[:, 1 - axis], turned[:, axis]
     inner = np.abs(along - (low + high)[1 - axis] / 2) < (0.5 - _ENDS) * size
-    near = np.abs(across - edge) < _NEAR * max(high - low)
+    near = np.abs(across - edge) < _MAX_OFFSET * max(high - low)
     return _line(along[inner & near], across[inner & near], 0.5)
 
 
 def _line(along: FloatArray, across: FloatArray, usual: float) -> _Line:
-    """The line that most points agree on; those closer than `usual` are no outliers."""
+    """Fit a line to most points; points closer than `usual` are no outliers."""
     used = np.ones(along.size, bool)
     slope = offset = 0.0
     for _ in range(_ROUNDS):
@@ -219,19 +221,19 @@ def _line(along: FloatArray, across: FloatArray, usual: float) -> _Line:
 
 
 def _meetings(lines: Sequence[_Line]) -> FloatArray:
-    """The corners of a film, from its top, bottom, left and right side."""
-    top, bottom, left, right = lines
+    """Return the corners of a film, from its upper, lower, left and right side."""
+    upper, lower, x_low, x_high = lines
     corners = []
-    for (a, b), (c, d) in ((top, left), (top, right), (bottom, right), (bottom, left)):
+    for (a, b), (c, d) in ((upper, x_low), (upper, x_high), (lower, x_high), (lower, x_low)):
         y = (a + b * c) / (1 - b * d)
         corners.append((y, c + d * y))
     return np.array(corners)
 
 
 def _sharpened(scan: AnyArray, corners: FloatArray) -> FloatArray:
-    """Corners to a part of a pixel, from how much of each pixel at the sides is film.
+    """Refine corners to a part of a pixel, by the share of film in each pixel at the sides.
 
-    The border of a mask lies in steps of a pixel, which only a film that is turned averages out.
+    The border of a mask has steps of a pixel, which average out only along a tilted side.
     """
     axes, middle, size = upright(corners)
     darkest = scan.min(axis=-1).astype(np.float64)
@@ -242,38 +244,38 @@ def _sharpened(scan: AnyArray, corners: FloatArray) -> FloatArray:
         along = np.arange(count) - (count - 1) / 2
         for sign in (-1, 1):
 
-            def seen(across: FloatArray) -> FloatArray:
-                """The scan on lines across the side, from inside outwards."""
+            def sample(across: FloatArray) -> FloatArray:
+                """Interpolate the scan on lines across the side, from inside outwards."""
                 places = np.empty((*across.shape, 2))
                 places[..., axis] = sign * (half + across)  # noqa: B023
                 places[..., 1 - axis] = along[:, None]  # noqa: B023
                 at = np.moveaxis(places @ axes + middle, -1, 0)
                 return np.asarray(ndimage.map_coordinates(darkest, at, order=1, mode="nearest"))
 
-            edge, clear = _edge(seen, count)
+            edge, clear = _edge(sample, count)
             if clear.mean() < 0.5:
                 return corners
-            offset, slope = _line(along[clear], edge[clear], _FINEST)
+            offset, slope = _line(along[clear], edge[clear], _MIN_OUTLIER_PX)
             lines.append((sign * (half + offset), sign * slope))
     return np.asarray(middle + _meetings(lines) @ axes)
 
 
-def _edge(seen: Callable[[FloatArray], FloatArray], count: int) -> tuple[FloatArray, BoolArray]:
-    """Where lines cross the edge from film to bed, and which of them do so clearly."""
-    across = np.tile(np.arange(-_ACROSS, _ACROSS + _STEP, _STEP), (count, 1))
-    values = seen(across)
+def _edge(sample: Callable[[FloatArray], FloatArray], count: int) -> tuple[FloatArray, BoolArray]:
+    """Return where lines cross the edge from film to bed, and which of them do so clearly."""
+    across = np.tile(np.arange(-_REACH_PX, _REACH_PX + _STEP_PX, _STEP_PX), (count, 1))
+    values = sample(across)
     bed, film = values[:, -1], values[:, 0]
     inside = values < ((bed + film) / 2)[:, None]
     last = inside.shape[1] - 1 - np.argmax(inside[:, ::-1], axis=1)
     clear = (film < _DARKER * bed) & inside.any(axis=1) & (last < inside.shape[1] - 1)
-    about = across[0, last] + _STEP / 2
-    # Pixels are means over their squares: what they lack to the bed tells the edge exactly.
-    near = np.arange(-_BLURRED, _BLURRED + _STEP, _STEP)
-    values = seen(about[:, None] + near)
+    about = across[0, last] + _STEP_PX / 2
+    # Pixels are means over their squares: their deficit against the bed gives the edge exactly.
+    near = np.arange(-_BLUR_PX, _BLUR_PX + _STEP_PX, _STEP_PX)
+    values = sample(about[:, None] + near)
     bed, film = values[:, -1:], values[:, :1]
     clear &= film[:, 0] < _DARKER * bed[:, 0]
     shares = np.divide(bed - values, bed - film, out=np.zeros_like(values), where=clear[:, None])
-    return about - _BLURRED + np.trapezoid(shares, dx=_STEP, axis=1), clear
+    return about - _BLUR_PX + np.trapezoid(shares, dx=_STEP_PX, axis=1), clear
 
 
 def upright(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -290,7 +292,7 @@ def upright(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _in_reading_order(films: Sequence[FloatArray]) -> list[FloatArray]:
-    """Row by row: films whose middles are within half a height of each other make a row."""
+    """Sort films row by row; films whose middles differ by less than half a height form a row."""
     ordered = sorted(films, key=lambda film: film[:, 0].mean())
     rows: list[list[FloatArray]] = []
     for film in ordered:
@@ -299,7 +301,7 @@ def _in_reading_order(films: Sequence[FloatArray]) -> list[FloatArray]:
             rows[-1].append(film)
         else:
             rows.append([film])
-    return [film for row in rows for film in sorted(row, key=lambda one: one[:, 1].mean())]
+    return [film for row in rows for film in sorted(row, key=lambda film: film[:, 1].mean())]
 
 
 @as_file_errors
@@ -311,7 +313,7 @@ def _corners_in(path: Path) -> dict[str, FloatArray]:
         raise FileFormatError(
             f"{path} has the columns {', '.join(names) or 'none'}: expected {', '.join(_HEADER)}"
         )
-    found: dict[str, FloatArray] = {}
+    corners: dict[str, FloatArray] = {}
     for number, cells in enumerate(lines[1:], 2):
         try:
             values = np.array([float(cell) for cell in cells[1:]]).reshape(4, 2)
@@ -320,8 +322,8 @@ def _corners_in(path: Path) -> dict[str, FloatArray]:
                 f"{path}, line {number} has {', '.join(cells)[:80]}: expected a film and eight "
                 "numbers"
             ) from None
-        found[cells[0].strip()] = checked_corners(values)
-    return found
+        corners[cells[0].strip()] = checked_corners(values)
+    return corners
 
 
 def read_corners(path: str | Path) -> dict[str, FloatArray]:

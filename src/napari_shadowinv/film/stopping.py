@@ -1,8 +1,8 @@
-"""How protons lose energy in matter.
+"""Energy loss of protons in matter.
 
 - by a table in SRIM's format: `Stopping.from_srim`
 - by Bethe's formula, for matter of known density and composition: `Stopping.by_bethe`
-- the energy behind a slab, and how deep protons get: `Stopping.behind`, `Stopping.depth`
+- the energy behind a slab, and the range of protons: `Stopping.behind`, `Stopping.depth`
 
 Protons slow down continuously and straight ahead; they neither straggle nor scatter. Energies are
 in MeV, lengths in m.
@@ -45,7 +45,7 @@ _MASS_UNIT = "MeV / (mg/cm2)"
 
 @dataclass(frozen=True, eq=False)
 class Stopping:
-    """What protons lose on their way through a material.
+    """Energy loss of protons on their way through a material.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Stopping:
 
     @classmethod
     def by_bethe(cls, density: float, charge_per_mass: float, excitation: float) -> Stopping:
-        """Return what Bethe's formula gives, to about 5 % from 1 MeV and 2 % from 10 MeV on.
+        """Compute losses by Bethe's formula, to about 5 % from 1 MeV and 2 % from 10 MeV on.
 
         Parameters
         ----------
@@ -102,7 +102,7 @@ class Stopping:
 
     @cached_property
     def _depths(self) -> tuple[FloatArray, FloatArray]:
-        """Energies close together, and how deep protons of them get."""
+        """Closely spaced energies, and the range of protons at each."""
         energies = np.geomspace(self.energies[0], self.energies[-1], _STEPS)
         per_loss = 1 / self.loss(energies)
         steps = 0.5 * (per_loss[1:] + per_loss[:-1]) * np.diff(energies)
@@ -113,35 +113,36 @@ class Stopping:
     def loss(self, energy: ArrayLike) -> FloatArray:
         """Return the energy lost per length, in MeV/m."""
         logarithms = np.log(np.asarray(energy, float))
-        known = np.log(self.energies), np.log(self.losses)
-        return np.asarray(np.exp(np.interp(logarithms, *known)))
+        table = np.log(self.energies), np.log(self.losses)
+        return np.asarray(np.exp(np.interp(logarithms, *table)))
 
     def depth(self, energy: ArrayLike) -> FloatArray:
-        """Return how deep protons of an energy get, in m."""
+        """Return the range of protons of an energy, in m."""
         energies, depths = self._depths
         return np.asarray(np.interp(np.asarray(energy, float), energies, depths, left=0.0))
 
     def behind(self, energy: ArrayLike, thickness: float) -> FloatArray:
-        """Return the energy of protons behind a slab; 0 of those that get stuck in it.
+        """Return the energy of protons behind a slab; 0 if they stop in it.
 
         Raises
         ------
         InputError
-            If an energy is above those of the table.
+            If an energy is above the table's range.
         """
-        given = np.asarray(energy, float)
-        if given.size and given.max() > self.energies[-1] * (1 + 1e-9):
+        energies = np.asarray(energy, float)
+        if energies.size and energies.max() > self.energies[-1] * (1 + 1e-9):
             raise InputError(
-                f"protons of {given.max():.4g} MeV are faster than those of the stopping table, "
+                f"protons of {energies.max():.4g} MeV are faster than those of the stopping table, "
                 f"which ends at {self.energies[-1]:.4g} MeV: give a table that goes further"
             )
-        energies, depths = self._depths
-        left = self.depth(given) - thickness
-        return np.asarray(np.where(left > depths[0], np.interp(left, depths, energies), 0.0))
+        table_energies, depths = self._depths
+        remaining = self.depth(energies) - thickness
+        behind = np.interp(remaining, depths, table_energies)
+        return np.asarray(np.where(remaining > depths[0], behind, 0.0))
 
 
 def _mass_loss(energies: FloatArray, charge_per_mass: float, excitation: float) -> FloatArray:
-    """Bethe's formula without corrections for shells and density, in MeV cm²/g."""
+    """Return the loss by Bethe's formula without shell and density corrections, in MeV cm²/g."""
     gamma = 1 + energies / PROTON_MASS
     squared = 1 - 1 / gamma**2
     ratio = _ELECTRON / PROTON_MASS
@@ -154,7 +155,7 @@ def _mass_loss(energies: FloatArray, charge_per_mass: float, excitation: float) 
 def _from_srim(path: Path) -> Stopping:
     text = small_text(path, "a table of stopping and ranges by SRIM", "latin-1")
     density, unit = _DENSITY.search(text), _STOPPING_UNIT.search(text)
-    rows = [found.groups() for line in text.splitlines() if (found := _ROW.match(line))]
+    rows = [match.groups() for line in text.splitlines() if (match := _ROW.match(line))]
     if density is None or unit is None or len(rows) < 2:
         raise FileFormatError(
             f"{path} has no density, unit or rows of energies and stopping: expected a table of "

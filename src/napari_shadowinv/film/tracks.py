@@ -1,7 +1,7 @@
 """Etched tracks in CR-39, one by one, and the image that they make.
 
 - the tracks of a scan, and those within ranges of their properties: `Tracks`, `Tracks.selected`
-- how many lie in each bin: `Tracks.image`, `TrackImage`
+- the number of tracks in each bin: `Tracks.image`, `TrackImage`
 
 Etching widens the trail of a charged particle to a pit, whose diameter depends on the particle and
 its energy; pits of high contrast or eccentricity are often noise. Which ranges count has to be
@@ -104,16 +104,16 @@ class Tracks:
         1
         """
         ranges = {"diameter": diameter, "contrast": contrast, "eccentricity": eccentricity}
-        kept = np.ones(len(self), bool)
-        for name, wanted in ranges.items():
-            if wanted is not None:
-                kept &= _within(getattr(self, name), name, wanted)
+        is_inside = np.ones(len(self), bool)
+        for name, limits in ranges.items():
+            if limits is not None:
+                is_inside &= _within(getattr(self, name), name, limits)
         return Tracks(
-            self.y[kept],
-            self.x[kept],
-            self.diameter[kept],
-            self.contrast[kept],
-            self.eccentricity[kept],
+            self.y[is_inside],
+            self.x[is_inside],
+            self.diameter[is_inside],
+            self.contrast[is_inside],
+            self.eccentricity[is_inside],
             self.size,
         )
 
@@ -123,13 +123,13 @@ class Tracks:
         Parameters
         ----------
         bin : float, optional
-            Side of a bin in µm. Default: the smallest of which a whole number lies along the
+            Side of a bin in µm. Default: the smallest with a whole number of bins along the
             shorter side, at most 300 along the longer one, and 50 tracks in each on average.
 
         Returns
         -------
         TrackImage
-            What is left of the area at its right and lower edge is no whole bin, and cut off.
+            Incomplete bins at the right and lower edge are cut off.
 
         Raises
         ------
@@ -158,27 +158,27 @@ class Tracks:
         inside &= (row <= height + _ON_THE_EDGE) & (column <= width + _ON_THE_EDGE)
         rows = np.clip(row[inside].astype(np.int64), 0, height - 1)
         columns = np.clip(column[inside].astype(np.int64), 0, width - 1)
-        found = np.bincount(rows * width + columns, minlength=height * width)
-        counts = found.reshape(height, width).astype(np.uint32)
+        hits = np.bincount(rows * width + columns, minlength=height * width)
+        counts = hits.reshape(height, width).astype(np.uint32)
         return TrackImage(counts, np.sqrt(np.maximum(counts, 1.0)), float(side * _MICRONS))
 
     def _usual_bin(self) -> float:
         height, width = self.size
         filled = np.sqrt(_TRACKS_PER_BIN * height * width / len(self))
-        wanted = max(filled, max(self.size) / _BINS_PER_SIDE)
-        # A whole number of them along the shorter side, so that little is cut off.
-        return min(self.size) / max(2, int(min(self.size) / wanted + _ON_THE_EDGE))
+        target = max(filled, max(self.size) / _BINS_PER_SIDE)
+        # A whole number of bins along the shorter side, so that little is cut off.
+        return min(self.size) / max(2, int(min(self.size) / target + _ON_THE_EDGE))
 
 
-def _within(values: AnyArray, name: str, wanted: tuple[float | None, float | None]) -> BoolArray:
+def _within(values: AnyArray, name: str, limits: tuple[float | None, float | None]) -> BoolArray:
     try:
-        low, high = wanted
+        low, high = limits
         ends = (-np.inf if low is None else float(low), np.inf if high is None else float(high))
     except (TypeError, ValueError):
         ends = (np.nan, np.nan)
     if not ends[0] <= ends[1]:
         raise InputError(
-            f"{name} is {wanted!r}: expected its smallest and its largest value, such as (4, 12), "
+            f"{name} is {limits!r}: expected its smallest and its largest value, such as (4, 12), "
             "with None for no limit"
         )
     return np.asarray((values >= ends[0]) & (values <= ends[1]))

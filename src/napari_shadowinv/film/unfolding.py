@@ -1,7 +1,7 @@
 """From the doses of a pack's films to the fluence of protons at each energy: `unfold`.
 
 Protons that stop in a film have left dose in all films before it. The doses of a pixel in all
-films together tell the spectrum there.
+films together determine the spectrum there.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class Spectra(NamedTuple):
     Attributes
     ----------
     energies : ndarray, shape (n,)
-        In MeV, of the protons that a layer's fluence shows: how far fields displace these is the
-        mean over all that contribute.
+        In MeV, of the protons in a layer's fluence image: fields displace them by the mean
+        displacement of all protons that contribute.
     fluence : ndarray of float64, shape (n, H, W)
-        Protons per m² and MeV where those of each film stop.
+        Protons per m² and MeV at the energies that stop in each film.
     error : ndarray of float64, shape (n, H, W)
         Its standard deviation.
     """
@@ -46,10 +46,10 @@ class Spectra(NamedTuple):
 
 
 class _Basis(NamedTuple):
-    """Spectra as shares of the usual one at the films' energies, and the doses that they leave.
+    """Basis spectra, as shares of the usual one at the films' energies, and their doses.
 
-    Shares are linear in how far fields displace the protons. So the unfolded images are those of
-    one energy each, to the first order of the displacement.
+    Shares are linear in the displacement of the protons by fields. So each unfolded image belongs
+    to one energy, to the first order of the displacement.
     """
 
     peaks: FloatArray  # (n,), MeV
@@ -57,11 +57,11 @@ class _Basis(NamedTuple):
     kernel: FloatArray  # (n, m), dose in each film by the usual spectrum in each step of energy
     energies: FloatArray  # (m,)
     matrix: FloatArray  # (n, n), dose in film k by share j
-    bends: FloatArray  # (n - 2, n), how much shares are not linear
+    bends: FloatArray  # (n - 2, n), deviation of shares from linear
 
     @classmethod
     def of(cls, response: Response, usual: FloatArray, slope: float) -> _Basis:
-        """For a usual spectrum at the films' energies, which falls to 1/e in `slope` MeV beyond."""
+        """Return the basis of a usual spectrum at the films' energies; its tail is `slope` MeV."""
         peaks = np.array([band.peak for band in response.bands])
         energies = response.energies
         logarithm = np.interp(energies, peaks, np.log(usual))
@@ -83,7 +83,7 @@ class _Basis(NamedTuple):
         return cls(peaks, usual, kernel, energies, kernel @ np.array(shares).T, bends)
 
     def seen_energies(self, per_error: FloatArray, curvature: float) -> FloatArray:
-        """Energies whose displacement is the mean over what each unfolded share is made of."""
+        """Return energies with the mean displacement of the protons in each unfolded share."""
         weighed = per_error[:, None] * self.matrix
         normal = weighed.T @ weighed + self.bends.T @ self.bends / curvature**2
         unfolded = np.linalg.solve(normal, weighed.T * per_error) @ self.kernel
@@ -92,7 +92,7 @@ class _Basis(NamedTuple):
 
 
 def _displacement(energies: FloatArray) -> FloatArray:
-    """How far fields displace protons, up to a factor."""
+    """Return the displacement of protons by fields, up to a factor."""
     return np.asarray(energies**-_DISPLACED)
 
 
@@ -107,17 +107,17 @@ def unfold(
 ) -> Spectra:
     """Return the spectrum in every pixel that explains the doses of all films.
 
-    The fluences are the least squares of doses over their errors that are not negative; where they
-    do not tell, the spectrum over that of the mean doses is as straight as its curvature allows.
-    That of the mean doses falls exponentially from film to film, and so beyond the last.
+    The fluences minimise the squared errors of the doses without being negative; where doses are
+    unknown, the spectrum relative to the usual one is as straight as its curvature allows. The
+    usual spectrum, of the mean doses, falls exponentially from film to film and beyond the last.
 
     Parameters
     ----------
     doses : array_like, shape (n, H, W)
         In Gy, the films in the order of the pack, on the same pixels.
     errors : array_like, shape (n, H, W)
-        Standard deviations as shares of the doses; infinite where a dose is not known. A dose
-        of exactly zero has no error by which it could count, and counts as unknown.
+        Standard deviations as shares of the doses; infinite where a dose is unknown. A dose
+        of exactly zero has no error to weight it by, and counts as unknown.
     response : Response
         Of the pack.
     curvature : float, default 1
@@ -132,21 +132,21 @@ def unfold(
     InversionCancelled
         If `should_stop` returned true.
     """
-    given, shares = np.asarray(doses, np.float64), np.asarray(errors, np.float64)
+    film_doses, shares = np.asarray(doses, np.float64), np.asarray(errors, np.float64)
     count = len(response.doses)
-    if given.ndim != 3 or len(given) != count or shares.shape != given.shape:
+    if film_doses.ndim != 3 or len(film_doses) != count or shares.shape != film_doses.shape:
         raise InputError(
-            f"doses have shape {given.shape}, errors {shares.shape}: expected both as "
+            f"doses have shape {film_doses.shape}, errors {shares.shape}: expected both as "
             f"({count}, height, width), a plane for each film of the pack"
         )
     if not curvature > 0:
         raise InputError(f"curvature is {curvature:g}: expected a number above 0")
-    known = np.isfinite(shares) & np.isfinite(given)
-    if (given[known] < 0).any():
+    is_known = np.isfinite(shares) & np.isfinite(film_doses)
+    if (film_doses[is_known] < 0).any():
         raise InputError("doses are negative: expected those of films against unexposed film")
     report = Reporter(on_progress, should_stop)
-    flat = np.where(known, given, 0.0).reshape(count, -1).T
-    absolute = np.where(known, shares * given, 0.0).reshape(count, -1).T
+    flat = np.where(is_known, film_doses, 0.0).reshape(count, -1).T
+    absolute = np.where(is_known, shares * film_doses, 0.0).reshape(count, -1).T
     per_error = np.divide(1.0, absolute, out=np.zeros_like(absolute), where=absolute > 0)
     mean = flat.sum(axis=0) / np.maximum((per_error > 0).sum(axis=0), 1)
     basis = _usual_basis(mean, response)
@@ -155,16 +155,16 @@ def unfold(
     for first in range(0, len(flat), _PART):
         report("unfold", first, len(flat))
         part = slice(first, first + _PART)
-        found = _unfolded(flat[part], per_error[part], basis.matrix, bends)
-        fluence[part], variance[part] = found
-    planes = (count, *given.shape[1:])
+        spectra = _unfolded(flat[part], per_error[part], basis.matrix, bends)
+        fluence[part], variance[part] = spectra
+    planes = (count, *film_doses.shape[1:])
     scaled = [(values * basis.usual).T.reshape(planes) for values in (fluence, np.sqrt(variance))]
     typical = np.sqrt((per_error**2).mean(axis=0))
     return Spectra(basis.seen_energies(typical, curvature), *scaled)
 
 
 def _usual_basis(mean: FloatArray, response: Response) -> _Basis:
-    """For the spectrum of the mean doses, which goes on as it falls at its end."""
+    """Return the basis of the spectrum of the mean doses, extrapolated by its fall at the end."""
     check_increasing(response.bands)
     peaks = np.array([band.peak for band in response.bands])
     slope = _FIRST_SLOPE * peaks[-1]
@@ -174,9 +174,9 @@ def _usual_basis(mean: FloatArray, response: Response) -> _Basis:
         if len(usual) > 1:
             falls = max(np.log(usual[-2] / usual[-1]), 1e-9)
             shortest, longest = _FASTEST * peaks[-1], _SLOWEST * peaks[-1]
-            told = np.clip((peaks[-1] - peaks[-2]) / falls, shortest, longest)
+            measured_slope = np.clip((peaks[-1] - peaks[-2]) / falls, shortest, longest)
             # Half way, because a slower fall beyond the last film makes the next one faster.
-            slope = float(np.sqrt(slope * told))
+            slope = float(np.sqrt(slope * measured_slope))
         before, basis = basis.usual, _Basis.of(response, usual, slope)
         if (np.abs(usual / before - 1) < 1e-4).all():
             break
@@ -184,43 +184,43 @@ def _usual_basis(mean: FloatArray, response: Response) -> _Basis:
 
 
 def _one_by_one(mean: FloatArray, matrix: FloatArray) -> FloatArray:
-    """The spectrum from the last film to the first; positive."""
-    found = np.zeros(len(mean))
-    seen = np.flatnonzero(mean > 0)
-    for k in seen[::-1]:
-        left = mean[k] - matrix[k, k + 1 :] @ found[k + 1 :]
-        # A part of its own, even if the others explain all of it.
-        found[k] = max(left, 0.05 * mean[k]) / matrix[k, k]
-    if not seen.size:
+    """Unfold the spectrum from the last film to the first; it is positive."""
+    spectrum = np.zeros(len(mean))
+    dosed = np.flatnonzero(mean > 0)
+    for k in dosed[::-1]:
+        remaining = mean[k] - matrix[k, k + 1 :] @ spectrum[k + 1 :]
+        # Each film contributes, even if the others explain all of its dose.
+        spectrum[k] = max(remaining, 0.05 * mean[k]) / matrix[k, k]
+    if not dosed.size:
         return np.ones(len(mean))
-    # A film that tells nothing is as those beside it.
-    return np.exp(np.interp(np.arange(len(mean)), seen, np.log(found[seen])))
+    # A film without dose is interpolated from its neighbours.
+    return np.exp(np.interp(np.arange(len(mean)), dosed, np.log(spectrum[dosed])))
 
 
 def _unfolded(
     doses: FloatArray, per_error: FloatArray, matrix: FloatArray, bends: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Spectra in units of the usual one, and their variances."""
+    """Return spectra in units of the usual one, and their variances."""
     weighed = per_error[:, :, None] * matrix
     sides = per_error * doses
-    # The bends are those of a spectrum as strong as the pixel's own.
+    # The bends refer to a spectrum as strong as the pixel's own.
     strength = _strength(doses, per_error > 0, matrix)
     ties = bends / strength[:, None, None]
     normal = weighed.transpose(0, 2, 1) @ weighed + ties.transpose(0, 2, 1) @ ties
     normal += 1e-12 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(matrix.shape[1])
     inverse = np.linalg.inv(normal)
-    found = (inverse @ (weighed.transpose(0, 2, 1) @ sides[:, :, None]))[:, :, 0]
+    shares = (inverse @ (weighed.transpose(0, 2, 1) @ sides[:, :, None]))[:, :, 0]
     nothing = np.zeros(len(bends))
-    for k in np.flatnonzero((found < 0).any(axis=1)):
-        found[k] = nnls(np.concatenate([weighed[k], ties[k]]), np.append(sides[k], nothing))[0]
-    return found, np.diagonal(inverse, axis1=1, axis2=2)
+    for k in np.flatnonzero((shares < 0).any(axis=1)):
+        shares[k] = nnls(np.concatenate([weighed[k], ties[k]]), np.append(sides[k], nothing))[0]
+    return shares, np.diagonal(inverse, axis1=1, axis2=2)
 
 
-def _strength(doses: FloatArray, known: BoolArray, matrix: FloatArray) -> FloatArray:
-    """How much stronger than the usual spectrum each pixel's is."""
+def _strength(doses: FloatArray, usable: BoolArray, matrix: FloatArray) -> FloatArray:
+    """Return the strength of each pixel's spectrum relative to the usual one."""
     expected = matrix.sum(axis=1)
-    ratio = np.where(known, doses / expected, np.nan)
+    ratio = np.where(usable, doses / expected, np.nan)
     strength = np.ones(len(doses))
-    some = known.any(axis=1)
+    some = usable.any(axis=1)
     strength[some] = np.nanmedian(ratio[some], axis=1)
     return np.where(np.isfinite(strength) & (strength > 0), strength, 1.0)

@@ -211,7 +211,7 @@ def _find_single_film(file: Path, scan: Scan) -> FloatArray:
 
 def _calibration(pack: Pack, kind: str) -> tuple[Calibration, FloatArray, int | None]:
     """Return the calibration of a type of film, its unexposed pixel, and the bits of its scan."""
-    film = pack.kinds[kind]
+    film = pack.film_types[kind]
     if film.calibration is None:
         raise InputError(
             f"films of type '{kind}' have no calibration: give [films.{kind}] with calibration = "
