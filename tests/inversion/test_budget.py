@@ -44,7 +44,7 @@ def pair():
     return phantoms.ellipse_pair((80, 120))
 
 
-PHANTOMS = {one.__name__: one for one in (focusing, strong, pair)}
+PHANTOMS = {phantom.__name__: phantom for phantom in (focusing, strong, pair)}
 
 
 @pytest.fixture(scope="module", params=PHANTOMS)
@@ -66,12 +66,12 @@ STRUCTURES |= {"opposite_pair": 0.5}
 def every_image(request):
     name, shape, setup = request.param, (SIDE, SIDE), phantoms.paper_setup()
     if name in PHANTOMS:
-        found = PHANTOMS[name]()
+        phantom = PHANTOMS[name]()
     elif name in STRUCTURES:
-        found = getattr(phantoms, name)(shape, setup, STRUCTURES[name])
+        phantom = getattr(phantoms, name)(shape, setup, STRUCTURES[name])
     else:
-        found, _ = phantoms.coaxial_line(shape, setup, 20.0)
-    return synthetic_image(found.displacement)
+        phantom, _ = phantoms.coaxial_line(shape, setup, 20.0)
+    return synthetic_image(phantom.displacement)
 
 
 def rms(displacement):
@@ -90,40 +90,41 @@ def repeats(image, noise, count):
     rng = np.random.default_rng(3)
     options = InversionOptions(n_sites=image.size // 4, negative="clip")
     plan = plan_sites(np.ones(image.shape), options)
-    found = [invert(noise(image, rng), plan=plan, options=options) for _ in range(count)]
-    return found, np.array([one.displacement for one in found])
+    inversions = [invert(noise(image, rng), plan=plan, options=options) for _ in range(count)]
+    return inversions, np.array([inversion.displacement for inversion in inversions])
 
 
 @pytest.mark.parametrize("noise", [gaussian, counting])
 def test_noise_is_the_scatter_of_repeats(every_image, noise):
-    """As 16 repeats have it, within 30 %, told by each from its own pixels."""
-    found, moves = repeats(every_image, noise, count=16)
+    """As 16 repeats have it, within 30 %, estimated by each from its own pixels."""
+    inversions, moves = repeats(every_image, noise, count=16)
     scatter = np.sqrt(moves.var(axis=0, ddof=1).sum(axis=0).mean())
-    for one in found[::3]:
-        assert one.errors.noise.rms == pytest.approx(scatter, rel=0.3)
+    for inversion in inversions[::3]:
+        assert inversion.errors.noise.rms == pytest.approx(scatter, rel=0.3)
 
 
 @pytest.mark.parametrize("noise", [gaussian, counting])
 def test_noise_at_the_peak_is_the_scatter_there(image, noise):
-    found, moves = repeats(image, noise, count=50)
+    inversions, moves = repeats(image, noise, count=50)
     place = np.unravel_index(np.hypot(*moves.mean(axis=0)).argmax(), image.shape)
     at_peak = np.hypot(*moves[:, :, *place].T).std(ddof=1)
-    told = np.mean([one.errors.noise.at_peak for one in found])
-    assert told == pytest.approx(at_peak, rel=0.4)  # which 50 repeats tell to 10 %, at one pixel
+    estimated = np.mean([inversion.errors.noise.at_peak for inversion in inversions])
+    # At one pixel, 50 repeats determine the scatter to 10 %.
+    assert estimated == pytest.approx(at_peak, rel=0.4)
 
 
 def test_given_noise_is_used_and_scales(image):
-    told = {
-        name: invert(7 * image, options=InversionOptions(n_sites=600, **given)).errors.noise.rms
-        for name, given in {
+    noise_errors = {
+        name: invert(7 * image, options=InversionOptions(n_sites=600, **choices)).errors.noise.rms
+        for name, choices in {
             "weak": {"noise_level": 0.07},
             "strong": {"noise_level": 0.21},
             "counts": {"quantum": 0.01},
         }.items()
     }
-    assert told["strong"] == pytest.approx(3 * told["weak"])
+    assert noise_errors["strong"] == pytest.approx(3 * noise_errors["weak"])
     # On average a pixel of 7 units scatters by √(0.01 · 7) = 0.26; most are near the mean.
-    assert told["counts"] == pytest.approx(told["weak"] * 0.2646 / 0.07, rel=0.25)
+    assert noise_errors["counts"] == pytest.approx(noise_errors["weak"] * 0.2646 / 0.07, rel=0.25)
 
 
 def test_discretisation_is_what_many_more_sites_change(every_image):
@@ -150,7 +151,7 @@ def test_the_solvers_part_is_what_a_better_solution_changes(image):
 def test_an_unmeasured_beam_is_told_by_what_other_beams_do(image):
     """Beams that are drawn here, in another way, with the same spectrum."""
     options = InversionOptions(n_sites=900, beam_variation=0.02, beam_scale=0.2)
-    here = invert(image, options=options)
+    unchanged = invert(image, options=options)
     rng = np.random.default_rng(4)
     length = 0.2 * min(image.shape)
     moved = []
@@ -160,10 +161,11 @@ def test_an_unmeasured_beam_is_told_by_what_other_beams_do(image):
         smooth = smooth[: image.shape[0], : image.shape[1]]
         smooth -= smooth.mean()
         beam = 1 + 0.02 * smooth / smooth.std()
-        moved.append(invert(image, source=beam, options=options).displacement - here.displacement)
-    true = float(np.sqrt(np.mean([rms(one) ** 2 for one in moved])))
-    assert here.errors.beam.rms == pytest.approx(true, rel=0.35)
-    assert here.errors.beam.rms > 10 * here.errors.noise.rms
+        inversion = invert(image, source=beam, options=options)
+        moved.append(inversion.displacement - unchanged.displacement)
+    true = float(np.sqrt(np.mean([rms(change) ** 2 for change in moved])))
+    assert unchanged.errors.beam.rms == pytest.approx(true, rel=0.35)
+    assert unchanged.errors.beam.rms > 10 * unchanged.errors.noise.rms
 
 
 def test_a_recorded_beam_has_a_sensitivity_and_no_error(image):
@@ -209,11 +211,11 @@ def test_the_total_holds_the_error_by_another_beam(source):
         beam = smooth_beam((SIDE, SIDE), variation, seed)
         shot = rng.poisson(2000 * synthetic_image(blob.displacement, beam))
         reference = rng.poisson(2000, (SIDE, SIDE)) if source == "recorded" else None
-        found = invert(shot, source=reference, options=InversionOptions(n_sites=1500))
-        errors.append(rms(found.displacement - blob.displacement))
-        totals.append(found.errors.total.rms)
+        inversion = invert(shot, source=reference, options=InversionOptions(n_sites=1500))
+        errors.append(rms(inversion.displacement - blob.displacement))
+        totals.append(inversion.errors.total.rms)
         if variation >= 0.05 and source == "recorded":
-            assert "beam" in {caution.code for caution in found.report.warnings}
+            assert "beam" in {caution.code for caution in inversion.report.warnings}
     ratio = np.array(errors) / totals
     assert (ratio < 2.5).all()
     if source == "recorded":
@@ -251,11 +253,11 @@ def test_accuracy_decides_on_the_sites_and_is_kept(image):
     finest = invert(image, options=InversionOptions(n_sites=4 * image.size))
     counts = []
     for accuracy in (0.1, 0.02, 0.005):
-        found = invert(image, options=InversionOptions(accuracy=accuracy))
-        counts.append(found.report.n_sites)
-        off = rms(found.displacement - finest.displacement) / rms(finest.displacement)
+        inversion = invert(image, options=InversionOptions(accuracy=accuracy))
+        counts.append(inversion.report.n_sites)
+        off = rms(inversion.displacement - finest.displacement) / rms(finest.displacement)
         assert off < 1.5 * accuracy
-        assert found.report.sites_reason
+        assert inversion.report.sites_reason
     assert counts == sorted(counts)
     assert image.size // 16 < counts[0] <= counts[2] <= image.size
 
@@ -278,7 +280,7 @@ def test_noise_needs_fewer_sites():
     clean = synthetic_image(pair().displacement)
     noisy = clean + 0.2 * np.random.default_rng(5).normal(size=clean.shape)
     options = InversionOptions(accuracy=1e-3, negative="clip")
-    reports = [invert(one, options=options).report for one in (clean, noisy)]
+    reports = [invert(shot, options=options).report for shot in (clean, noisy)]
     assert reports[1].n_sites < reports[0].n_sites
     assert "noise" in reports[1].sites_reason
 
@@ -289,33 +291,33 @@ def test_a_pattern_that_few_sites_miss_gets_more():
     y, x = np.indices(broad.shape)
     fine = broad * (1 + 0.4 * np.cos(np.pi * x / 3) * np.cos(np.pi * y / 3))
     options = InversionOptions(accuracy=0.2)
-    plain, patterned = (invert(one, options=options).report for one in (broad, fine))
+    plain, patterned = (invert(shot, options=options).report for shot in (broad, fine))
     assert plain.n_sites < patterned.n_sites
     assert "missed structures" in patterned.sites_reason
     assert patterned.warnings == ()
 
 
 def test_what_is_given_is_used_and_the_paper_has_a_site_a_pixel(image):
-    given = invert(image, options=InversionOptions(n_sites=300, accuracy=1e-6)).report
-    assert (given.n_sites, given.sites_reason) == (300, "as given")
+    report = invert(image, options=InversionOptions(n_sites=300, accuracy=1e-6)).report
+    assert (report.n_sites, report.sites_reason) == (300, "as given")
     small = image[:20, :24]
     assert invert(small, options=InversionOptions.paper(max_iterations=3)).report.n_sites == 480
 
 
 def test_the_number_of_a_plan_is_used_and_else_that_of_the_options(image):
     beam = np.ones(image.shape)
-    given = plan_sites(beam, InversionOptions(n_sites=1500))
-    assert invert(image, plan=given).report.n_sites == 1500
-    assert invert(image, plan=given).report.sites_reason == "as given"
-    usual = plan_sites(beam)
+    numbered_plan = plan_sites(beam, InversionOptions(n_sites=1500))
+    assert invert(image, plan=numbered_plan).report.n_sites == 1500
+    assert invert(image, plan=numbered_plan).report.sites_reason == "as given"
+    default_plan = plan_sites(beam)
     few = InversionOptions(n_sites=700)
-    found = invert(image, plan=usual, options=few)
-    assert found.report.n_sites == 700
+    coarse = invert(image, plan=default_plan, options=few)
+    assert coarse.report.n_sites == 700
     alone = invert(image, source=beam, options=few)
-    np.testing.assert_array_equal(found.sites, alone.sites)
-    np.testing.assert_allclose(found.displacement, alone.displacement, atol=1e-3)
+    np.testing.assert_array_equal(coarse.sites, alone.sites)
+    np.testing.assert_allclose(coarse.displacement, alone.displacement, atol=1e-3)
     with pytest.raises(InputError, match="700 sites that differ"):
-        invert(image, plan=given, start=found)
+        invert(image, plan=numbered_plan, start=coarse)
 
 
 def test_an_accuracy_out_of_reach_is_told():
@@ -355,12 +357,12 @@ def test_noise_that_was_smoothed_is_not_passed_off_as_measured():
     smooth = LowPassFilter(width=1.5)
     plain = run(Recipe(options=options), image)
     filtered = run(Recipe(options=options, steps=(smooth,)), image)
-    known = options.model_copy(update={"quantum": 1.0})
-    given = run(Recipe(options=known, steps=(smooth,)), image)
-    assert given.errors.noise.rms == pytest.approx(plain.errors.noise.rms, rel=0.2)
+    stated_options = options.model_copy(update={"quantum": 1.0})
+    stated = run(Recipe(options=stated_options, steps=(smooth,)), image)
+    assert stated.errors.noise.rms == pytest.approx(plain.errors.noise.rms, rel=0.2)
     assert 1 / 1.6 < filtered.errors.noise.rms / plain.errors.noise.rms < 1.6
     assert "noise, correlated over 1." in dict(filtered.error_rows)["errors"]
-    assert "noise" not in dict(filtered.error_rows) | dict(given.error_rows)
+    assert "noise" not in dict(filtered.error_rows) | dict(stated.error_rows)
 
 
 @pytest.mark.parametrize("blur", [0.7, 1.0, 2.0])
@@ -371,11 +373,11 @@ def test_correlated_noise_is_the_scatter_of_repeats(blur):
         noise = gaussian_filter(rng.normal(size=image.shape), blur, mode="wrap")
         return image + 0.05 * noise / noise.std()
 
-    found, moves = repeats(clean, correlated, count=20)
+    inversions, moves = repeats(clean, correlated, count=20)
     scatter = np.sqrt(moves.var(axis=0, ddof=1).sum(axis=0).mean())
-    ratios = np.array([one.errors.noise.rms for one in found]) / scatter
+    ratios = np.array([inversion.errors.noise.rms for inversion in inversions]) / scatter
     assert 1 / 1.5 < np.median(ratios) < 1.5
-    lengths = [one.errors.noise_correlation for one in found]
+    lengths = [inversion.errors.noise_correlation for inversion in inversions]
     assert np.median(lengths) == pytest.approx(blur, rel=0.3)
 
 
@@ -415,14 +417,14 @@ def test_noise_error_does_not_depend_on_the_unit_of_the_image(image):
 
 
 def test_a_dataset_keeps_the_errors_and_has_them_in_si(image, proton_setup: ProtonSetup):
-    found = invert(image, options=InversionOptions(n_sites=900))
-    dataset = found.to_dataset(proton_setup)
-    assert Inversion.from_dataset(dataset).errors == found.errors
+    inversion = invert(image, options=InversionOptions(n_sites=900))
+    dataset = inversion.to_dataset(proton_setup)
+    assert Inversion.from_dataset(dataset).errors == inversion.errors
     in_si = json.loads(dataset.attrs["errors_si"])
     strongest = np.sqrt((dataset[in_si["field"]] ** 2).sum("component")).max().item()
     assert in_si["peak"] == pytest.approx(strongest)
     assert in_si["unit"] == dataset[in_si["field"]].attrs["units"]
-    of_px = found.errors.noise.at_peak / found.errors.peak
+    of_px = inversion.errors.noise.at_peak / inversion.errors.peak
     assert in_si["noise"][1] == pytest.approx(of_px * strongest)
 
 
@@ -441,18 +443,18 @@ def test_the_first_shots_decide_for_a_stack(tmp_path):
     easy = synthetic_image(phantoms.gaussian_blob((64, 64), 30.0, 14.0).displacement)
     hard = synthetic_image(phantoms.gaussian_blob((64, 64), 40.0, 4.0).displacement)
     options = InversionOptions(accuracy=0.03)
-    alone = [invert(one, options=options).report.n_sites for one in (easy, hard)]
+    alone = [invert(shot, options=options).report.n_sites for shot in (easy, hard)]
     assert alone[0] < alone[1]
     out = tmp_path / "stack.shadowinv.zarr"
     shots = tmp_path / "shots"
     shots.mkdir()
     for number in range(4):
         np.save(shots / f"{number}.npy", easy)
-    asked = {"options": options, "variables": ("displacement", "sites")}
-    store = run_stack(str(shots / "*.npy"), out, **asked)
+    choices = {"options": options, "variables": ("displacement", "sites")}
+    store = run_stack(str(shots / "*.npy"), out, **choices)
     assert store.sizes["site"] == alone[0]
     np.save(shots / "4.npy", hard)
-    store = run_stack(str(shots / "*.npy"), out, **asked)
+    store = run_stack(str(shots / "*.npy"), out, **choices)
     assert store.sizes == {**store.sizes, "shot": 5, "site": alone[0]}
     assert (store.discretisation_error.values[:4] < store.discretisation_error.values[4]).all()
     reasons = {json.loads(str(text))["sites_reason"] for text in store.report.values}
@@ -474,16 +476,16 @@ def test_every_way_to_an_inversion_knows_whether_the_beam_was_measured(tmp_path)
     recorded = run(uniform, image, source=np.ones(image.shape)).errors
     assert recorded.beam is None
     assert recorded.beam_sensitivity.rms > 0
-    for given, is_measured in (({}, False), ({"source": np.ones(image.shape)}, True)):
+    for beam, is_measured in (({}, False), ({"source": np.ones(image.shape)}, True)):
         out = tmp_path / f"{is_measured}.shadowinv.zarr"
-        store = run_stack(image[None], out, options=options, **given)
+        store = run_stack(image[None], out, options=options, **beam)
         (report,) = (json.loads(str(text)) for text in store.report.values)
         assert (report["errors"]["beam"] is None) == is_measured
 
 
 def test_threads_change_neither_the_answer_nor_its_errors(image):
     noisy = counting(image, np.random.default_rng(6))
-    one, two = (invert(noisy, options=InversionOptions(threads=count)) for count in (1, 2))
-    np.testing.assert_array_equal(one.displacement, two.displacement)
-    assert one.errors == two.errors
-    assert one.report.sites_reason == two.report.sites_reason
+    serial, parallel = (invert(noisy, options=InversionOptions(threads=count)) for count in (1, 2))
+    np.testing.assert_array_equal(serial.displacement, parallel.displacement)
+    assert serial.errors == parallel.errors
+    assert serial.report.sites_reason == parallel.report.sites_reason

@@ -30,16 +30,16 @@ def test_an_empty_cache_means_to_compile(tmp_path):
 
 
 def test_it_is_told_and_can_be_cancelled_and_is_done_once(monkeypatch):
-    told = []
+    progress = []
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
-    ensure_compiled(told.append)
-    assert [news.stage for news in told] == ["compile"]
+    ensure_compiled(progress.append)
+    assert [news.stage for news in progress] == ["compile"]
     with pytest.raises(InversionCancelled):
         ensure_compiled(should_stop=lambda: True)
     monkeypatch.undo()
     assert is_compiled()
-    ensure_compiled(told.append)
-    assert len(told) == 1
+    ensure_compiled(progress.append)
+    assert len(progress) == 1
 
 
 def test_a_first_inversion_has_the_help_of_a_second_process_which_ends_with_it(monkeypatch):
@@ -185,23 +185,23 @@ class TestReadOnlyInstallation:
         return folder
 
     def test_compiled_code_of_the_package_is_used(self, printed, temporary):
-        kept, hits, folder = printed(temporary)
-        own = temporary / f"napari-shadowinv-{os.getuid()}"
-        assert (kept, hits) == ("True", "1")
-        assert Path(folder).parent == own
-        assert stat.S_IMODE(own.stat().st_mode) == 0o700
+        is_kept, hits, folder = printed(temporary)
+        cache_folder = temporary / f"napari-shadowinv-{os.getuid()}"
+        assert (is_kept, hits) == ("True", "1")
+        assert Path(folder).parent == cache_folder
+        assert stat.S_IMODE(cache_folder.stat().st_mode) == 0o700
 
     def test_a_folder_that_is_a_link_is_not_used(self, printed, temporary):
-        own, other = temporary / f"napari-shadowinv-{os.getuid()}", temporary / "other"
-        other.mkdir(mode=0o700)
-        own.symlink_to(other)
+        cache_folder, target = temporary / f"napari-shadowinv-{os.getuid()}", temporary / "other"
+        target.mkdir(mode=0o700)
+        cache_folder.symlink_to(target)
         # Compiled anew, which ends as well.
         assert printed(temporary) == ["False", "0", "None"]
-        assert list(other.iterdir()) == []
+        assert list(target.iterdir()) == []
 
     def test_a_folder_that_others_can_write_to_is_not_used(self, printed, temporary):
-        own = temporary / f"napari-shadowinv-{os.getuid()}"
-        own.mkdir()
-        own.chmod(0o770)
+        cache_folder = temporary / f"napari-shadowinv-{os.getuid()}"
+        cache_folder.mkdir()
+        cache_folder.chmod(0o770)
         assert printed(temporary) == ["False", "0", "None"]
-        assert list(own.iterdir()) == []
+        assert list(cache_folder.iterdir()) == []

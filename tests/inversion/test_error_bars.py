@@ -69,17 +69,15 @@ def test_error_bars_of_one_shot_are_the_scatter_of_many(phantom, clean, plan, sh
     """And about two thirds of them hold the truth, as one standard deviation should."""
     rng = np.random.default_rng(11)
     shots = [shot(clean, rng) for _ in range(30)]
-    others = [invert(other, plan=plan, options=OPTIONS) for other in shots]
+    inversions = [invert(noisy, plan=plan, options=OPTIONS) for noisy in shots]
     true = phantom.potential - border_mean(phantom.potential)
+    potentials = [inversion.potential for inversion in inversions]
+    displacements = [inversion.displacement for inversion in inversions]
     for method, n in (("linear", 200), ("resolve", 20)):
-        found = uncertainty(shots[0], n, plan=plan, noise=noise, method=method, options=OPTIONS)
+        result = uncertainty(shots[0], n, plan=plan, noise=noise, method=method, options=OPTIONS)
         for std, fields, truth in (
-            (found.potential_std, [other.potential for other in others], true),
-            (
-                found.displacement_std,
-                [other.displacement for other in others],
-                phantom.displacement,
-            ),
+            (result.potential_std, potentials, true),
+            (result.displacement_std, displacements, phantom.displacement),
         ):
             assert np.median(std / np.std(fields, axis=0, ddof=1)) == pytest.approx(1, abs=0.25)
             covered = np.mean([np.abs(field - truth) < std for field in fields])
@@ -95,18 +93,18 @@ def test_error_bars_of_correlated_noise_are_the_scatter_of_many():
         noise = ndimage.gaussian_filter(rng.normal(size=clean.shape), 1.2, mode="wrap")
         return clean + 0.03 * noise / noise.std()
 
-    found = uncertainty(shot(), 60, plan=sites, noise=0.03, options=OPTIONS)
-    assert "correlated over 1." in found.noise
-    others = [invert(shot(), plan=sites, options=OPTIONS).displacement for _ in range(20)]
-    ratio = found.displacement_std / np.std(others, axis=0, ddof=1)
+    result = uncertainty(shot(), 60, plan=sites, noise=0.03, options=OPTIONS)
+    assert "correlated over 1." in result.noise
+    displacements = [invert(shot(), plan=sites, options=OPTIONS).displacement for _ in range(20)]
+    ratio = result.displacement_std / np.std(displacements, axis=0, ddof=1)
     # Without correlation, they would be four times as small.
     assert np.median(ratio) == pytest.approx(1, abs=0.35)
 
 
 def test_the_inversion_is_that_of_the_image(counts, plan):
-    found = uncertainty(counts, 2, plan=plan)
+    result = uncertainty(counts, 2, plan=plan)
     alone = invert(counts, plan=plan)
-    np.testing.assert_array_equal(found.inversion.potential, alone.potential)
+    np.testing.assert_array_equal(result.inversion.potential, alone.potential)
     without_plan = uncertainty(counts, 2)
     np.testing.assert_array_equal(without_plan.inversion.potential, invert(counts).potential)
 
@@ -131,22 +129,22 @@ def test_gain_says_how_many_units_a_quantum_makes(counts, plan):
 
 def test_an_array_gives_each_pixel_its_own_noise(clean, plan):
     everywhere = np.full(SHAPE, 0.05)
-    found = uncertainty(clean, 3, plan=plan, noise=everywhere, options=OPTIONS)
-    same = uncertainty(clean, 3, plan=plan, noise=0.05, options=OPTIONS)
-    np.testing.assert_array_equal(found.potential_std, same.potential_std)
+    by_array = uncertainty(clean, 3, plan=plan, noise=everywhere, options=OPTIONS)
+    by_number = uncertainty(clean, 3, plan=plan, noise=0.05, options=OPTIONS)
+    np.testing.assert_array_equal(by_array.potential_std, by_number.potential_std)
     right_only = np.where(np.arange(SHAPE[1]) < 24, 0.0, everywhere)
     lopsided = uncertainty(clean, 3, plan=plan, noise=right_only, options=OPTIONS)
-    left, right = lopsided.displacement_std[:, :, :16], lopsided.displacement_std[:, :, 32:]
-    assert np.median(left) < 0.5 * np.median(right)
+    noiseless, noisy = lopsided.displacement_std[:, :, :16], lopsided.displacement_std[:, :, 32:]
+    assert np.median(noiseless) < 0.5 * np.median(noisy)
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.2])
 def test_solving_samples_loosely_does_not_change_the_error_bars(monkeypatch, clean, plan, noise):
-    asked = {"plan": plan, "noise": noise, "method": "resolve"}
-    loose = uncertainty(clean, 6, **asked, options=OPTIONS)
+    choices = {"plan": plan, "noise": noise, "method": "resolve"}
+    loose = uncertainty(clean, 6, **choices, options=OPTIONS)
     monkeypatch.setattr(_sampling, "_SAMPLE_SHARE", 0.0)
     strict = OPTIONS.model_copy(update={"tolerance": 1e-6})
-    exact = uncertainty(clean, 6, **asked, options=strict)
+    exact = uncertainty(clean, 6, **choices, options=strict)
     assert loose.tolerance > 1e-3 > exact.tolerance
     assert sum(loose.iterations) < sum(exact.iterations)
     for name in ("potential_std", "displacement_std"):
@@ -156,43 +154,43 @@ def test_solving_samples_loosely_does_not_change_the_error_bars(monkeypatch, cle
 
 
 def test_samples_start_from_the_images_weights(counts, plan):
-    found = uncertainty(counts, 5, plan=plan)
-    assert all(found.converged)
-    assert max(found.iterations) < found.inversion.report.iterations
+    result = uncertainty(counts, 5, plan=plan)
+    assert all(result.converged)
+    assert max(result.iterations) < result.inversion.report.iterations
 
 
 def test_neither_threads_nor_later_samples_change_a_bit(counts, plan):
-    one, three = (
+    serial, parallel = (
         uncertainty(counts, 2 * WIDTH + 3, plan=plan, options=InversionOptions(threads=threads))
         for threads in (1, 3)
     )
     for name in ("potential_mean", "potential_std", "displacement_mean", "displacement_std"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
+        np.testing.assert_array_equal(getattr(serial, name), getattr(parallel, name))
     fewer = uncertainty(counts, 3, plan=plan)
-    assert fewer.residuals == one.residuals
-    other = uncertainty(counts, 3, plan=plan, options=InversionOptions(seed=1))
-    assert not np.allclose(other.potential_std, fewer.potential_std, rtol=1e-3)
+    assert fewer.residuals == serial.residuals
+    reseeded = uncertainty(counts, 3, plan=plan, options=InversionOptions(seed=1))
+    assert not np.allclose(reseeded.potential_std, fewer.potential_std, rtol=1e-3)
 
 
 def test_the_linear_response_to_little_noise_is_that_of_solving_again(clean, plan):
-    asked = {
+    choices = {
         "plan": plan,
         "noise": 0.005,
         "options": OPTIONS.model_copy(update={"tolerance": 1e-7}),
     }
-    linear = uncertainty(clean, 5, **asked)
-    solved = uncertainty(clean, 5, **asked, method="resolve")
+    linear = uncertainty(clean, 5, **choices)
+    solved = uncertainty(clean, 5, **choices, method="resolve")
     assert linear.nonlinearity < 0.05
     assert solved.nonlinearity == 0
     for name in ("potential_std", "displacement_std"):
-        one, other = getattr(linear, name), getattr(solved, name)
-        assert np.linalg.norm(one - other) < 0.05 * np.linalg.norm(other)
+        linear_bars, solved_bars = getattr(linear, name), getattr(solved, name)
+        assert np.linalg.norm(linear_bars - solved_bars) < 0.05 * np.linalg.norm(solved_bars)
 
 
 def test_noise_too_strong_for_a_linear_response_is_told(clean, plan):
-    found = uncertainty(clean, 5, plan=plan, noise=1.5, options=OPTIONS)
-    assert found.nonlinearity > 0.3
-    assert "method='resolve'" in found.warnings[0].text
+    result = uncertainty(clean, 5, plan=plan, noise=1.5, options=OPTIONS)
+    assert result.nonlinearity > 0.3
+    assert "method='resolve'" in result.warnings[0].text
 
 
 def test_each_sample_is_zero_in_the_mean_over_the_border(counts, plan):
@@ -213,31 +211,31 @@ def test_what_masked_pixels_hold_does_not_matter(counts):
 
 
 def test_samples_below_zero_are_clipped_but_such_an_image_is_refused(clean):
-    found = uncertainty(clean, 2, noise=0.5)
-    assert all(found.converged)
+    result = uncertainty(clean, 2, noise=0.5)
+    assert all(result.converged)
     with pytest.raises(InputError, match="negative pixels"):
         uncertainty(clean - 1.0, 2, noise=0.5)
 
 
 def test_samples_that_do_not_converge_are_counted(clean):
     options = InversionOptions(max_iterations=1, negative="clip")
-    found = uncertainty(clean, 2, noise=0.5, options=options)
-    assert found.converged == (False, False)
-    assert found.warnings[0].text.startswith("2 of 2 samples that were solved did not converge")
+    result = uncertainty(clean, 2, noise=0.5, options=options)
+    assert result.converged == (False, False)
+    assert result.warnings[0].text.startswith("2 of 2 samples that were solved did not converge")
 
 
 def test_progress_comes_from_the_callers_thread_and_counts_the_samples(counts):
-    seen, threads = [], set()
+    steps, threads = [], set()
 
     def listen(progress):
-        seen.append(progress)
+        steps.append(progress)
         threads.add(threading.get_ident())
 
     uncertainty(counts, 3, on_progress=listen)
-    stages = list(dict.fromkeys(progress.stage for progress in seen))
+    stages = list(dict.fromkeys(progress.stage for progress in steps))
     assert stages == ["prepare", "sites", "transport", "read-out", "samples"]
     assert threads == {threading.get_ident()}
-    assert (seen[-1].step, seen[-1].total) == (3, 3)
+    assert (steps[-1].step, steps[-1].total) == (3, 3)
 
 
 def test_cancelling_among_the_samples_ends_them(counts, plan):
@@ -265,7 +263,7 @@ def test_cancelling_while_samples_are_prepared_waits_for_nothing(monkeypatch, co
         begun.set()
         assert go_on.wait(60)
 
-    monkeypatch.setattr(error_bars, "Responding", prepared)
+    monkeypatch.setattr(error_bars, "LinearResampling", prepared)
     with pytest.raises(InversionCancelled, match="samples"):
         uncertainty(counts, 3, plan=plan, should_stop=begun.is_set)
     assert not go_on.is_set()

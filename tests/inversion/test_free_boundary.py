@@ -70,19 +70,19 @@ def test_an_isolated_object_comes_out_as_with_a_closed_boundary():
 
 def test_the_flux_through_each_side_is_that_of_the_true_rays(across, plan):
     image, _ = across
-    known = FREE.model_copy(update={"flux": "known"})
-    report = invert(image, plan=plan, options=known).report
+    known_flux = FREE.model_copy(update={"flux": "known"})
+    report = invert(image, plan=plan, options=known_flux).report
     field = shot(ACROSS)[1]
     margin = Margin(np.ones(field.shape[1:]), AROUND)
     of_image = np.zeros(margin.beam.shape)
     margin.within(of_image)[:] = 1
-    left, entered = edge_flux(
+    flux_left, entered = edge_flux(
         synthetic_image(field, of_image), synthetic_image(field, 1 - of_image), margin
     )
-    assert max(left.values()) > 0.001
+    assert max(flux_left.values()) > 0.001
     for side in ("top", "bottom", "left", "right"):
         net = report.flux_left[side] - report.flux_entered[side]
-        assert net == pytest.approx(left[side] - entered[side], abs=2e-4)
+        assert net == pytest.approx(flux_left[side] - entered[side], abs=2e-4)
     gone = sum(report.flux_left.values()) - sum(report.flux_entered.values())
     assert image.sum() == pytest.approx(SIDE**2 * (1 - gone), rel=2e-4)
 

@@ -114,10 +114,10 @@ def test_flips_and_transpose_commute_with_the_inversion(image, turn, turn_vector
 
 def test_translation_moves_the_field_by_as_much():
     blob = {"amplitude": 40.0, "sigma": (6.0, 8.0)}
-    here = gaussian_blob((70, 80), center=(30.0, 35.0), **blob)
-    there = gaussian_blob((70, 80), center=(35.0, 42.0), **blob)
-    first = invert(synthetic_image(here.displacement)).displacement
-    second = invert(synthetic_image(there.displacement)).displacement
+    unmoved = gaussian_blob((70, 80), center=(30.0, 35.0), **blob)
+    moved = gaussian_blob((70, 80), center=(35.0, 42.0), **blob)
+    first = invert(synthetic_image(unmoved.displacement)).displacement
+    second = invert(synthetic_image(moved.displacement)).displacement
     assert relative_error(second[:, 5:, 7:], first[:, :-5, :-7]) < 0.012
 
 
@@ -220,8 +220,8 @@ def test_masked_handwriting_does_not_poison_the_field(phantom, image):
 def test_what_masked_pixels_hold_does_not_matter(image):
     ink = handwriting(SHAPE)
     inversions = [
-        invert(np.where(ink, value, image), source=np.where(ink, other, 1.0), mask=~ink)
-        for value, other in ((0.0, 1.0), (np.nan, -5.0), (1e9, np.inf))
+        invert(np.where(ink, value, image), source=np.where(ink, source_value, 1.0), mask=~ink)
+        for value, source_value in ((0.0, 1.0), (np.nan, -5.0), (1e9, np.inf))
     ]
     for inversion in inversions[1:]:
         np.testing.assert_array_equal(inversion.potential, inversions[0].potential)
@@ -301,19 +301,19 @@ def test_a_start_does_not_need_the_very_plan_but_its_sites(image):
     before = invert(image * source, source=source)
     again = invert(image * source, source=3 * source, start=before)
     assert again.report.iterations == 0
-    other = InversionOptions(seed=1)
-    for others in ({"options": other}, {"options": InversionOptions(n_sites=900)}):
+    reseeded = InversionOptions(seed=1)
+    for choices in ({"options": reseeded}, {"options": InversionOptions(n_sites=900)}):
         with pytest.raises(InputError, match="start has 4,800 sites that differ from the"):
-            invert(image * source, source=source, start=before, **others)
+            invert(image * source, source=source, start=before, **choices)
 
 
 def test_threads_do_not_change_a_bit(image):
-    one, many = (
+    serial, parallel = (
         invert(image, options=InversionOptions(n_sites=20000, threads=threads))
         for threads in (1, 4)
     )
     for name in ("potential", "displacement", "weights", "site_displacement", "reprojection"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
+        np.testing.assert_array_equal(getattr(serial, name), getattr(parallel, name))
 
 
 def processor_ticks() -> dict[str, int]:
@@ -368,12 +368,12 @@ def test_progress_covers_all_stages_and_cancelling_ends_each(image):
     invert(image, on_progress=lambda progress: stages.append(progress.stage))
     assert list(dict.fromkeys(stages)) == ["prepare", "sites", "transport", "read-out"]
     for stage in ("prepare", "sites", "transport", "read-out"):
-        seen = []
+        steps = []
         with pytest.raises(InversionCancelled):
             invert(
                 image,
-                on_progress=lambda progress, seen=seen: seen.append(progress.stage),
-                should_stop=lambda stage=stage, seen=seen: stage in seen,
+                on_progress=lambda progress, seen=steps: seen.append(progress.stage),
+                should_stop=lambda stage=stage, seen=steps: stage in seen,
             )
 
 
@@ -505,12 +505,12 @@ def test_units_of_image_and_source_change_nothing(boundary, of_image, of_source)
     options = InversionOptions(boundary=boundary)
     source = 1 + 0.2 * np.cos(np.arange(60) / 9) * np.ones((48, 1))
     expected = invert(_lens(), source=source, options=options)
-    found = invert(of_image * _lens(), source=of_source * source, options=options)
-    assert found.report.converged
-    np.testing.assert_allclose(found.displacement, expected.displacement, atol=1e-9)
+    inversion = invert(of_image * _lens(), source=of_source * source, options=options)
+    assert inversion.report.converged
+    np.testing.assert_allclose(inversion.displacement, expected.displacement, atol=1e-9)
     for name in ("image", "source", "reprojection", "site_mass", "site_flux"):
         np.testing.assert_allclose(
-            getattr(found, name) / of_source, getattr(expected, name), rtol=1e-6, atol=1e-9
+            getattr(inversion, name) / of_source, getattr(expected, name), rtol=1e-6, atol=1e-9
         )
 
 

@@ -46,11 +46,11 @@ def test_without_a_source_it_is_uniform_and_keeps_the_images_units():
 def test_clipping_counts_and_keeps_the_input():
     image = np.ones((10, 10))
     image[0, :4] = -5
-    kept = image.copy()
+    original = image.copy()
     prepared = prepare(image, None, InversionOptions(negative="clip"))
     assert prepared.clipped_pixels == 4
     assert prepared.image.min() == 0
-    np.testing.assert_array_equal(image, kept)
+    np.testing.assert_array_equal(image, original)
 
 
 def test_integer_images_are_taken_as_they_are():

@@ -13,7 +13,7 @@ from napari_shadowinv.geometry.linear_surface import WIDTH, with_gradients
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.inversion import _sampling
 from napari_shadowinv.inversion._drawing import noise_of
-from napari_shadowinv.inversion._sampling import Resolving, Responding, Scatter
+from napari_shadowinv.inversion._sampling import FullResampling, LinearResampling, Scatter
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.readout import read_dual
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
@@ -42,7 +42,7 @@ def case(request, image):
     options = InversionOptions(n_sites=1000, negative="clip", **KINDS[request.param])
     plan = plan_sites(np.ones(SHAPE), options, mask=mask)
     draw, _ = noise_of(image, NOISE, None, mask)
-    samples = Resolving(plan, invert(image, plan=plan, options=options).weights, draw, options)
+    samples = FullResampling(plan, invert(image, plan=plan, options=options).weights, draw, options)
     clean = prepare(image, plan.source, options, mask).floored_image
     return samples, clean
 
@@ -69,25 +69,25 @@ def test_moments_are_those_of_samples_read_out_one_by_one(case):
     """To rounding and the tolerance of the linear system; sampling errs by a tenth and more."""
     samples, clean = case
     seeds = np.random.SeedSequence(0).spawn(WIDTH + 3)
-    responding = Responding(samples, clean, 2)
+    response = LinearResampling(samples, clean, 2)
     blocks = seeds[:WIDTH], seeds[WIDTH:]
-    scatter = responding.scatter(blocks[0], Reporter()) + responding.scatter(blocks[1], Reporter())
+    scatter = response.scatter(blocks[0], Reporter()) + response.scatter(blocks[1], Reporter())
     each = np.array([alone(samples, clean, seed) for seed in seeds])
     assert scatter.count == len(each)
     size = each.std(axis=(0, 2, 3))[:, None, None]
     np.testing.assert_allclose(scatter.mean / size, each.mean(axis=0) / size, atol=1e-7)
     np.testing.assert_allclose(scatter.std / size, each.std(axis=0, ddof=1) / size, atol=1e-7)
-    np.testing.assert_allclose(responding.changes(seeds[:3]) / size, each[:3] / size, atol=1e-7)
+    np.testing.assert_allclose(response.changes(seeds[:3]) / size, each[:3] / size, atol=1e-7)
 
 
 def test_a_sample_is_the_same_in_any_block(case):
     samples, clean = case
     seeds = np.random.SeedSequence(0).spawn(WIDTH)
-    one, other = Responding(samples, clean, 1), Responding(samples, clean, 3)
-    together = one.changes(seeds)
-    np.testing.assert_array_equal(other.changes(seeds[5:]), together[5:])
+    serial, parallel = LinearResampling(samples, clean, 1), LinearResampling(samples, clean, 3)
+    together = serial.changes(seeds)
+    np.testing.assert_array_equal(parallel.changes(seeds[5:]), together[5:])
     np.testing.assert_array_equal(
-        other.scatter(seeds[:1], Reporter()).sums, one.scatter(seeds[:1], Reporter()).sums
+        parallel.scatter(seeds[:1], Reporter()).sums, serial.scatter(seeds[:1], Reporter()).sums
     )
 
 
@@ -95,12 +95,12 @@ def test_too_many_sites_for_factors_are_left_to_the_multigrid(monkeypatch, image
     options = InversionOptions(n_sites=1000, negative="clip")
     factorised = uncertainty(image, WIDTH + 2, noise=NOISE, options=options)
     monkeypatch.setattr(_sampling, "_MOST_FACTORISED", 0)
-    found = uncertainty(image, WIDTH + 2, noise=NOISE, options=options)
-    assert not np.array_equal(found.potential_std, factorised.potential_std)
+    iterative = uncertainty(image, WIDTH + 2, noise=NOISE, options=options)
+    assert not np.array_equal(iterative.potential_std, factorised.potential_std)
     for name in ("potential_std", "displacement_std"):
-        one, other = getattr(found, name), getattr(factorised, name)
+        bars, exact_bars = getattr(iterative, name), getattr(factorised, name)
         # a residual of 2 % was allowed
-        assert np.linalg.norm(one - other) < 0.02 * np.linalg.norm(other)
+        assert np.linalg.norm(bars - exact_bars) < 0.02 * np.linalg.norm(exact_bars)
 
 
 def test_the_scatter_of_samples_is_that_of_all_at_once():

@@ -43,13 +43,13 @@ def traced(field: Field, beyond: int = 0) -> Array:
     cells = np.indices((RAYS * total, RAYS * total))
     y, x = (cells + rng.random(cells.shape)) / RAYS - 0.5
     dy, dx = field(y - beyond, x - beyond)
-    found, _, _ = np.histogram2d(
+    counts, _, _ = np.histogram2d(
         (y + dy - beyond).ravel(),
         (x + dx - beyond).ravel(),
         bins=SIDE,
         range=[(-0.5, SIDE - 0.5)] * 2,
     )
-    return found / RAYS**2
+    return counts / RAYS**2
 
 
 def gaussian(strength: float, height: float = 10.0, width: float = 10.0) -> Field:
@@ -96,8 +96,8 @@ def signs(image: Array, **options: object) -> list[str]:
     choices = {"negative": "clip", **options}
     report = invert(image, options=InversionOptions.model_validate(choices)).report
     assert report.converged
-    known = (MISFIT, NOTHING, FOLDS, CUT_OFF)
-    return [caution.code for caution in report.warnings if caution.code in known]
+    codes = (MISFIT, NOTHING, FOLDS, CUT_OFF)
+    return [caution.code for caution in report.warnings if caution.code in codes]
 
 
 def noisy(image: Array, share: float, seed: int = 1) -> Array:
@@ -124,12 +124,13 @@ def test_the_report_tells_the_residual_of_the_pixels_that_were_used():
     expected = np.sqrt((off**2).mean()) / inversion.image[30:].mean()
     assert inversion.report.image_residual == pytest.approx(expected)
     assert inversion.to_dataset().attrs["image_residual"] == pytest.approx(expected)
-    told = f"{100 * expected:.3g} %"
-    assert dict(inversion_rows(inversion, None))["image residual"].startswith(f"{told} of the mean")
+    percent = f"{100 * expected:.3g} %"
+    residual = dict(inversion_rows(inversion, None))["image residual"]
+    assert residual.startswith(f"{percent} of the mean")
     titles = [
         axes.get_title(loc) for axes in report_figure(inversion).axes for loc in ("left", "center")
     ]
-    assert f"Residual: {told} rms" in titles
+    assert f"Residual: {percent} rms" in titles
 
 
 def test_a_file_that_does_not_tell_the_residual_is_still_read(inversion: Inversion):
@@ -158,18 +159,18 @@ def test_a_pattern_as_fine_as_the_pixels_does_not_fit(pattern, contrast):
         "stripes": x % 2,
         "wide chequerboard": (y // 2 + x // 2) % 2,
     }[pattern]
-    found = invert(np.where(odd == 1, float(contrast), 1.0))
-    assert found.report.converged
-    assert found.report.image_residual > 0.15
-    assert found.report.warnings[0].code == MISFIT
-    assert NOTHING not in codes_of(found)
+    inversion = invert(np.where(odd == 1, float(contrast), 1.0))
+    assert inversion.report.converged
+    assert inversion.report.image_residual > 0.15
+    assert inversion.report.warnings[0].code == MISFIT
+    assert NOTHING not in codes_of(inversion)
 
 
 def test_too_few_sites_do_not_fit_and_the_advice_is_more():
     image = traced(gaussian(0.6))
-    found = invert(image, options=InversionOptions(n_sites=100)).report
-    assert found.warnings[0].code == MISFIT
-    assert "use more sites" in found.warnings[0].text
+    report = invert(image, options=InversionOptions(n_sites=100)).report
+    assert report.warnings[0].code == MISFIT
+    assert "use more sites" in report.warnings[0].text
     assert signs(image, n_sites=5000) == []
 
 
@@ -260,11 +261,11 @@ def test_mark_caustics_takes_regions_as_wide_as_the_sites():
 def test_caustics_that_have_just_formed_are_right_and_get_no_warning(strength, shape):
     field = gaussian(strength, *shape)
     image = traced(field)
-    found = invert(image)
+    inversion = invert(image)
     true = np.array(field(*np.indices((SIDE, SIDE)).astype(float)))
-    assert found.caustic.mean() > 0.01
-    assert np.linalg.norm(found.displacement - true) < 0.05 * np.linalg.norm(true)
-    assert found.report.warnings == ()
+    assert inversion.caustic.mean() > 0.01
+    assert np.linalg.norm(inversion.displacement - true) < 0.05 * np.linalg.norm(true)
+    assert inversion.report.warnings == ()
 
 
 @pytest.mark.parametrize(
@@ -280,10 +281,10 @@ def test_caustics_that_have_just_formed_are_right_and_get_no_warning(strength, s
 )
 def test_deep_folds_are_wrong_and_get_a_warning(strength, shape, share):
     field = gaussian(strength, *shape)
-    found = invert(noisy(traced(field), share), options=InversionOptions(negative="clip"))
+    inversion = invert(noisy(traced(field), share), options=InversionOptions(negative="clip"))
     true = np.array(field(*np.indices((SIDE, SIDE)).astype(float)))
-    assert np.linalg.norm(found.displacement - true) > 0.07 * np.linalg.norm(true)
-    assert found.report.warnings[0].code == FOLDS
+    assert np.linalg.norm(inversion.displacement - true) > 0.07 * np.linalg.norm(true)
+    assert inversion.report.warnings[0].code == FOLDS
 
 
 def test_hot_pixels_are_no_folds():
@@ -307,10 +308,10 @@ def test_hot_pixels_are_no_folds():
 )
 def test_a_field_that_goes_on_beyond_the_edge_gets_a_warning(field, share):
     image = noisy(traced(field, beyond=30), share)
-    found = invert(image, options=InversionOptions(negative="clip"))
+    inversion = invert(image, options=InversionOptions(negative="clip"))
     true = np.array(field(*np.indices((SIDE, SIDE)).astype(float)))
-    assert np.linalg.norm(found.displacement - true) > 0.3 * np.linalg.norm(true)
-    assert CUT_OFF in codes_of(found)
+    assert np.linalg.norm(inversion.displacement - true) > 0.3 * np.linalg.norm(true)
+    assert CUT_OFF in codes_of(inversion)
 
 
 def test_an_object_that_the_edge_cuts_in_half_gets_a_warning():
@@ -411,8 +412,8 @@ def test_the_headline_and_errors_leave_masked_pixels_out():
     image = synthetic_image(blob.displacement)
     mask = np.ones(image.shape, bool)
     mask[30:44, 40:56] = False
-    found = invert(image, mask=mask)
-    outside = np.hypot(*found.displacement)[mask].max()
-    assert found.errors.peak == outside
-    peak = float(found.headline.text.rsplit("|d| ", 1)[1].split(" ±")[0])
+    inversion = invert(image, mask=mask)
+    outside = np.hypot(*inversion.displacement)[mask].max()
+    assert inversion.errors.peak == outside
+    peak = float(inversion.headline.text.rsplit("|d| ", 1)[1].split(" ±")[0])
     assert peak == pytest.approx(outside, rel=0.05)

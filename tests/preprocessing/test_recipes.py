@@ -61,13 +61,13 @@ NEAR = paper_setup().model_copy(update={"pixel_size": 6.5e-6})
 
 def test_an_isotropic_estimate_is_the_function_in_its_experiment() -> None:
     image = 1 + np.random.default_rng(0).random((30, 40))
-    placed = preprocessing.IsotropicEstimate().placed(NEAR, image.shape)
+    estimate = preprocessing.IsotropicEstimate().placed(NEAR, image.shape)
     expected = preprocessing.isotropic_source(image, NEAR)
-    np.testing.assert_array_equal(placed.source(image, None), expected)
-    assert pickle.loads(pickle.dumps(placed)) == placed
+    np.testing.assert_array_equal(estimate.source(image, None), expected)
+    assert pickle.loads(pickle.dumps(estimate)) == estimate
     # Another experiment is another estimate, also for what keeps the last one.
     nearer_setup = NEAR.model_copy(update={"source_object_distance": 2.6e-3})
-    assert preprocessing.IsotropicEstimate().placed(nearer_setup, image.shape) != placed
+    assert preprocessing.IsotropicEstimate().placed(nearer_setup, image.shape) != estimate
     # Of a part, with the axis in the middle of the whole.
     shifted = np.array([[1.0, 0, 10], [0, 1, 4], [0, 0, 1]])
     part = (

@@ -1,4 +1,4 @@
-"""Noise on top of an image, drawn again and again: `noise_of`."""
+"""Random samples of an image with noise: `noise_of`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MOST_QUANTA = 1e18  # numpy draws no larger Poisson numbers
 def noise_of(
     image: ArrayLike, noise: object, gain: float | None, mask: ArrayLike | None
 ) -> tuple[Draw, str]:
-    """Return what draws a noisy image, and what to call it; the image itself is checked later."""
+    """Return a function that draws a noisy image, and a text that describes the noise."""
     values = np.asarray(unpack_array(image, "image")[0])
     if values.dtype.kind not in "buif":
         raise InputError(f"image has values of type {values.dtype}, expected real numbers")

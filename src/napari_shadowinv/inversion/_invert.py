@@ -26,7 +26,7 @@ from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared, margin_around, prepare
 from napari_shadowinv.inversion.readout import read_out
 from napari_shadowinv.inversion.result import Inversion, Report
-from napari_shadowinv.inversion.trust import doubts, image_residual, is_coarse, mark_caustics
+from napari_shadowinv.inversion.trust import find_cautions, image_residual, is_coarse, mark_caustics
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean
@@ -59,10 +59,10 @@ def plan_sites(
     source : array_like, shape (H, W)
         The undisturbed beam.
     options : InversionOptions, optional
-        Those of the solver and the read-out do not matter.
+        Options of the solver and the read-out have no effect.
     measured : bool, optional
-        Whether the source was recorded. If it is an estimate, the errors of an inversion tell
-        what another beam would do.
+        Whether the source was recorded. If it is an estimate, the errors of an inversion include
+        the effect of another beam.
     mask, on_progress, should_stop
         As of `invert`.
 
@@ -83,18 +83,18 @@ def plan_sites(
     plan = _planned(source, options, mask, measured)
     if options.is_adaptive:
         return plan
-    heard = plan.levels.heard_by(Reporter(on_progress, should_stop))
-    return replace(plan, levels=heard.made(options.threads))
+    levels = plan.levels.with_reporter(Reporter(on_progress, should_stop))
+    return replace(plan, levels=levels.made(options.threads))
 
 
 def _planned(
     source: ArrayLike, options: InversionOptions, mask: ArrayLike | None, measured: bool
 ) -> SitePlan:
-    """Plan sites, of which no level has been made."""
-    ground = _ground(source, options, mask)
+    """Plan sites without computing any level."""
+    domain = _site_domain(source, options, mask)
     plan = plan_levels(
-        ground.beam if ground.margin is None else ground.margin.beam,
-        ground.n_sites,
+        domain.beam if domain.margin is None else domain.margin.beam,
+        domain.n_sites,
         lloyd_iterations=options.lloyd_iterations,
         lloyd_tolerance=options.lloyd_tolerance,
         seed=options.seed,
@@ -102,10 +102,10 @@ def _planned(
     )
     return replace(
         plan,
-        source=ground.beam * ground.unit,
-        mask=ground.mask,
-        margin=ground.margin,
-        unit=ground.unit,
+        source=domain.beam * domain.unit,
+        mask=domain.mask,
+        margin=domain.margin,
+        unit=domain.unit,
         measured=measured,
     )
 
@@ -113,15 +113,15 @@ def _planned(
 def count_sites(
     source: ArrayLike, options: InversionOptions, *, mask: ArrayLike | None = None
 ) -> int:
-    """Return how many sites `plan_sites` places at most, those in a margin included."""
+    """Return the largest number of sites that `plan_sites` places, including a margin."""
     if options.boundary != "free":
         height, width = np.shape(source)
         return normalise.number_of_sites((height, width), options)
-    return _ground(source, options, mask).n_sites
+    return _site_domain(source, options, mask).n_sites
 
 
-class _Ground(NamedTuple):
-    """What sites are to be spread over, in units of a power of two, and how many."""
+class _SiteDomain(NamedTuple):
+    """Beam that sites are spread over, in units of a power of two, and their number."""
 
     beam: FloatArray
     unit: float
@@ -130,7 +130,9 @@ class _Ground(NamedTuple):
     n_sites: int
 
 
-def _ground(source: ArrayLike, options: InversionOptions, mask: ArrayLike | None) -> _Ground:
+def _site_domain(
+    source: ArrayLike, options: InversionOptions, mask: ArrayLike | None
+) -> _SiteDomain:
     usable = None if mask is None else normalise.checked_mask(mask, np.shape(source))
     check_memory(np.shape(source), normalise.bytes_per_pixel(options), "an inversion")
     beam = normalise.checked_source(source, usable)
@@ -140,9 +142,10 @@ def _ground(source: ArrayLike, options: InversionOptions, mask: ArrayLike | None
     unit = normalise.power_of_two(beam)
     beam = beam / unit
     if options.boundary != "free":
-        return _Ground(beam, unit, usable, None, n_sites)
+        return _SiteDomain(beam, unit, usable, None, n_sites)
     margin = Margin.around(beam, margin_around(beam.shape, options), usable)
-    return _Ground(beam, unit, usable, margin, round(n_sites * margin.beam.sum() / beam.sum()))
+    n_sites = round(n_sites * margin.beam.sum() / beam.sum())
+    return _SiteDomain(beam, unit, usable, margin, n_sites)
 
 
 @contextmanager
@@ -180,8 +183,8 @@ def invert(
     options : InversionOptions, optional
         The defaults suit most images.
     plan : SitePlan, optional
-        Sites prepared by `plan_sites`, in place of `source` and `mask`. A number of sites that it
-        was made with is used, whatever the options say of it.
+        Sites prepared by `plan_sites`, instead of `source` and `mask`. If it was made with a number
+        of sites, this number overrides the options.
     start : Inversion, optional
         Inversion of a similar image (the previous shot, another filter) on the same sites. The
         solver starts from its weights and, if the images are similar, needs only a few
@@ -240,7 +243,7 @@ def invert(
     with _timed("sites", seconds):
         if plan is None:
             plan = _planned(prepared.source, options, mask, source is not None)
-        levels = plan.levels.heard_by(report)
+        levels = plan.levels.with_reporter(report)
     with _timed("transport", seconds):
         if plan.margin is not None and options.flux == "fit":
             image_flux = fitted_flux(levels, prepared.floored_image, plan.margin, options, report)
@@ -249,10 +252,10 @@ def invert(
         noise = ImageNoise(prepared.in_units(), options)
         budget = Budget(plan, prepared, noise, options)
         if not options.is_adaptive and not levels.is_complete:
-            levels = levels.up_to(_ground(plan.source, options, plan.mask).n_sites)
+            levels = levels.up_to(_site_domain(plan.source, options, plan.mask).n_sites)
         if start is not None:
-            others = options.is_adaptive and not levels.is_complete
-            levels = _up_to(start, levels, plan.margin_width, others=others)
+            may_differ = options.is_adaptive and not levels.is_complete
+            levels = _up_to(start, levels, plan.margin_width, may_differ=may_differ)
     adaptive = options.is_adaptive and not levels.is_complete and start is None
     solutions: list[LevelSolution] = []
     coarse = 0
@@ -320,7 +323,7 @@ def invert(
 def _reason(
     levels: Levels, budget: Budget, adaptive: bool, start: Inversion | None, coarse: int
 ) -> str:
-    """Say why there are so many sites."""
+    """Return the reason for the number of sites."""
     if start is not None:
         return "as many as in the inversion that it started from"
     if not adaptive:
@@ -335,11 +338,13 @@ def _reason(
 
 
 def _unmasked(image: ArrayLike, usable: BoolArray | None) -> ArrayLike:
-    """Return the values of an image whose masked pixels a plan leaves out, too."""
+    """Return the values of an image, refusing masked pixels that a plan uses."""
     values: ArrayLike
-    values, seen = unpack_array(image, "image")
-    if seen is not None:
-        missing = ~seen if usable is None or usable.shape != seen.shape else ~seen & usable
+    values, unmasked = unpack_array(image, "image")
+    if unmasked is not None:
+        missing = ~unmasked
+        if usable is not None and usable.shape == unmasked.shape:
+            missing &= usable
         if missing.any():
             raise InputError(
                 f"image has {int(missing.sum())} masked pixels that the plan uses: make the plan "
@@ -367,7 +372,7 @@ def _check_boundary(plan: SitePlan, options: InversionOptions) -> None:
 
 @dataclass(frozen=True)
 class _Fields:
-    """What is read off the weights, at the image's pixels."""
+    """Fields read from the weights, at the image's pixels."""
 
     potential: FloatArray
     displacement: FloatArray
@@ -388,7 +393,7 @@ def _read_fields(
     options: InversionOptions,
     report: Reporter,
 ) -> _Fields:
-    def tell(share: float, first: int, last: int) -> None:
+    def report_share(share: float, first: int, last: int) -> None:
         report("read-out", round(first + share * (last - first)), _STEPS)
 
     def reprojected(source: FloatArray, first: int, last: int) -> FloatArray:
@@ -396,14 +401,16 @@ def _read_fields(
             displacement,
             source,
             threads=options.threads,
-            on_progress=lambda news: tell(news.step / (news.total or 1), first, last),
+            on_progress=lambda news: report_share(news.step / (news.total or 1), first, last),
         )
 
-    tell(0, 0, _READ)
-    potential, displacement = read_out(solution, options, lambda share: tell(share, 0, _READ))
+    report_share(0, 0, _READ)
+    potential, displacement = read_out(
+        solution, options, lambda share: report_share(share, 0, _READ)
+    )
     source = prepared.source / prepared.unit
-    left: dict[str, float] = {}
-    entered: dict[str, float] = {}
+    flux_left: dict[str, float] = {}
+    flux_entered: dict[str, float] = {}
     if plan.margin is None:
         reprojection = reprojected(source, _READ, _STEPS)
     else:
@@ -412,30 +419,30 @@ def _read_fields(
         from_image = reprojected(of_image, _READ, halfway)
         from_margin = reprojected(of_margin, halfway, _STEPS)
         reprojection = plan.within(from_image + from_margin)
-        left, entered = edge_flux(from_image, from_margin, plan.margin)
+        flux_left, flux_entered = edge_flux(from_image, from_margin, plan.margin)
     inner = plan.within(potential)
     return _Fields(
         np.ascontiguousarray(inner - border_mean(inner)),
         np.ascontiguousarray(plan.within(displacement)),
         np.ascontiguousarray(reprojection),
-        left,
-        entered,
+        flux_left,
+        flux_entered,
     )
 
 
-def _up_to(start: Inversion, levels: Levels, margin_width: int, *, others: bool) -> Levels:
-    """Return the levels up to that of an inversion to start from, if its sites are the same.
+def _up_to(start: Inversion, levels: Levels, margin_width: int, *, may_differ: bool) -> Levels:
+    """Return the levels up to the one of an inversion to start from, if its sites are the same.
 
-    `others` tells whether there may be other levels than those that are counted.
+    With `may_differ`, the inversion may have a level between those of the plan.
     """
-    found = start.sites + margin_width
-    if len(found) in levels.counts or (others and len(found) <= levels.counts[-1]):
-        up_to = levels.up_to(len(found))
+    start_sites = start.sites + margin_width
+    if len(start_sites) in levels.counts or (may_differ and len(start_sites) <= levels.counts[-1]):
+        up_to = levels.up_to(len(start_sites))
         level = up_to[-1]
-        if np.abs(found - level.sites).max() <= 1e-3 * level.spacing:
+        if np.abs(start_sites - level.sites).max() <= 1e-3 * level.spacing:
             return up_to
     raise InputError(
-        f"start has {len(found):,} sites that differ from the {levels.counts[-1]:,} sites of "
+        f"start has {len(start_sites):,} sites that differ from the {levels.counts[-1]:,} sites of "
         "this inversion: compute both with the same plan, source, mask and options"
     )
 
@@ -453,10 +460,10 @@ def _report(
         f"not converged: flux residual {finest.residual:.2g} per cell, tolerance "
         f"{options.tolerance:.2g}; {finest.reason}"
     )
-    found: tuple[Caution, ...] = (Caution("not-converged", text),)
+    cautions: tuple[Caution, ...] = (Caution("not-converged", text),)
     if finest.converged:
         moves, n_sites = fields.displacement, len(finest.weights)
-        found = doubts(
+        cautions = find_cautions(
             prepared,
             noise,
             moves,
@@ -480,7 +487,7 @@ def _report(
             for solution in solutions
         ),
         seconds=seconds,
-        warnings=(*found, *prepared.warnings),
+        warnings=(*cautions, *prepared.warnings),
         flux_scale=prepared.flux_scale,
         flux_left=fields.flux_left,
         flux_entered=fields.flux_entered,

@@ -1,4 +1,4 @@
-"""`read_dual` as a linear map: for many weights of one level, whose geometry is worked out once.
+"""`read_dual` as a linear map, for many weights of one level with a geometry computed once.
 
 - potential and displacement at every pixel, and sums over many samples of them: `LinearReadout`
 """
@@ -31,15 +31,15 @@ def _add_rows(
     width = corners.shape[1]
     potential = np.empty((3, width, WIDTH))  # of three rows, in turns
     for row in range(start, stop + 2):
-        here = potential[row % 3]
+        current = potential[row % 3]
         for column in range(width):
             for s in range(WIDTH):
-                here[column, s] = 0.0
+                current[column, s] = 0.0
             for k in range(3):
                 corner = corners[row, column, k]
                 of_value, of_y, of_x = weights[row, column, k]
                 for s in range(WIDTH):
-                    here[column, s] += (
+                    current[column, s] += (
                         of_value * values[corner, 0, s]
                         + of_y * values[corner, 1, s]
                         + of_x * values[corner, 2, s]
@@ -47,7 +47,7 @@ def _add_rows(
         y = row - 2
         if y < start:
             continue
-        above, level, below = potential[y % 3], potential[(y + 1) % 3], here
+        above, level, below = potential[y % 3], potential[(y + 1) % 3], current
         for x in range(width - 2):
             p = p2 = dy = dy2 = dx = dx2 = 0.0
             for s in range(WIDTH):
@@ -69,15 +69,15 @@ def _add_rows(
 
 
 class LinearReadout:
-    """The read-out of a level at the pixels of a plan's image."""
+    """Read-out of a level at the pixels of a plan's image."""
 
     def __init__(self, plan: SitePlan, level: Level, threads: int | None = None) -> None:
         n = len(level.sites)
         self._triangulation = level.triangulation
         # One pixel more at each side; beyond the level's border the potential is its mirror image.
         beyond = [
-            np.clip(np.arange(-1, size + 1) + plan.margin_width, 0, whole - 1)
-            for size, whole in zip(plan.source.shape, level.shape, strict=True)
+            np.clip(np.arange(-1, size + 1) + plan.margin_width, 0, padded_size - 1)
+            for size, padded_size in zip(plan.source.shape, level.shape, strict=True)
         ]
         pixels = np.stack(np.meshgrid(*beyond, indexing="ij"), axis=-1)
         mirrored = level.mirrored()
@@ -96,9 +96,9 @@ class LinearReadout:
     def at_sites(self, weights: FloatArray) -> FloatArray:
         """Return the potential's values and gradients, (n, 3, WIDTH), for weights (n, WIDTH)."""
         # Half the weights are the potential.
-        found = with_gradients(self._triangulation, 0.5 * weights)
-        found[:, 0] -= self._border_mean @ found.reshape(-1, WIDTH)
-        return found
+        at_sites = with_gradients(self._triangulation, 0.5 * weights)
+        at_sites[:, 0] -= self._border_mean @ at_sites.reshape(-1, WIDTH)
+        return at_sites
 
     def add(
         self, values: FloatArray, sums: FloatArray, squares: FloatArray, start: int, rows: int

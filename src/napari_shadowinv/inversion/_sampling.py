@@ -1,4 +1,7 @@
-"""Noisy copies of an image, each inverted: `Resolving` solves anew, `Responding` is linear.
+"""Inversion of noisy copies of an image, solved anew or by the linear response.
+
+- solve the transport of each copy: `FullResampling`
+- apply the linear response of the image's own transport: `LinearResampling`
 
 The linear response of the solved transport to a small change of the image costs one linear system
 with a matrix that all samples share; to solve the transport again costs a few, each with its own.
@@ -31,7 +34,7 @@ from napari_shadowinv.transport.objective import TransportObjective
 from napari_shadowinv.transport.sites import SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target, solve
 
-__all__ = ["Resolving", "Responding", "Sample", "Scatter", "Seed"]
+__all__ = ["FullResampling", "LinearResampling", "Sample", "Scatter", "Seed"]
 
 Seed = np.random.SeedSequence
 
@@ -39,7 +42,7 @@ _SAMPLE_SHARE = 0.2  # of the noise's flux errors that a sample may leave unsolv
 _LOOSEST_TOLERANCE = 0.1
 _MOST_FACTORISED = 300_000  # sites; their factors take 0.2 GB and two seconds
 _LINEAR_TOLERANCE = 0.02
-_ROWS = 64  # read out between two looks at whether to stop
+_ROWS = 64  # read out between two calls of `should_stop`
 
 
 class Sample(NamedTuple):
@@ -50,8 +53,8 @@ class Sample(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Resolving:
-    """Solves the transport of each sample on the finest level of a plan, from given weights."""
+class FullResampling:
+    """Solution of the transport of each sample on a plan's finest level, from start weights."""
 
     plan: SitePlan
     start: FloatArray
@@ -59,7 +62,7 @@ class Resolving:
     options: InversionOptions
 
     def sample(self, seeds: list[Seed], report: Reporter) -> Sample:
-        """Invert the noisy image of one seed, without what the image alone needs (caustics, …)."""
+        """Invert the noisy image of one seed, without caustics and other results."""
         (seed,) = seeds
         image = self.image(seed)
         plan = self.plan
@@ -71,10 +74,10 @@ class Resolving:
         )
         return Sample(np.stack([potential - border_mean(potential), *displacement]), solution)
 
-    def to_tolerance_of_noise(self, seed: Seed) -> Resolving:
-        """Ask of the solver no more than what matters beside the flux errors that noise makes."""
-        # What it leaves unsolved is white, and moves the field far less than the flux that it
-        # did move: where a fifth is left in the worst cell, a sample's field is within 3 % of
+    def to_tolerance_of_noise(self, seed: Seed) -> FullResampling:
+        """Loosen the tolerance to a share of the flux errors by noise."""
+        # The remaining error is white, and moves the field far less than the flux that the solver
+        # has moved: where a fifth remains in the worst cell, a sample's field is within 3 % of
         # its change, and the deviation of many within 0.2 %.
         level = self.plan.levels[-1]
         objective = TransportObjective(
@@ -99,9 +102,9 @@ class Resolving:
 
 @dataclass(frozen=True)
 class Scatter:
-    """Sums over samples of (potential, displacement), (3, H, W), as far as they differ from one."""
+    """Sums over samples of changes of (potential, displacement), (3, H, W)."""
 
-    # About a field that is as near as noise leaves it, nothing is lost by sums of squares.
+    # Changes are relative to the image's field, so sums of squares lose no digits.
     count: int
     sums: FloatArray
     squares: FloatArray
@@ -125,10 +128,10 @@ class Scatter:
         return np.sqrt(np.maximum(variance, 0))
 
 
-class Responding:
-    """The linear response of an inversion to what samples change in the image."""
+class LinearResampling:
+    """Linear response of an inversion to the changes of the image in its samples."""
 
-    def __init__(self, samples: Resolving, image: FloatArray, threads: int | None) -> None:
+    def __init__(self, samples: FullResampling, image: FloatArray, threads: int | None) -> None:
         self._samples, self._image = samples, image
         plan, level = samples.plan, samples.plan.levels[-1]
         objective = Target.of(image, plan.margin, samples.options).objective(level)
@@ -137,13 +140,13 @@ class Responding:
         self._network = diagram.laplacian(), objective.ground(samples.start)
         self._factors = None
         if len(level.sites) <= _MOST_FACTORISED:
-            with suppress(RuntimeError):  # too hard for factors; the multigrid says if it is, too
+            with suppress(RuntimeError):  # the multigrid reports it if it fails as well
                 self._factors = FactorisedLaplacian(*self._network)
         self._readout = LinearReadout(plan, level, threads)
         self._solvers = threading.local()  # each has vectors of its own
 
     def scatter(self, seeds: list[Seed], report: Reporter) -> Scatter:
-        """Sum the changes that up to `WIDTH` noisy images make, in order."""
+        """Sum the changes by up to `WIDTH` noisy images, in order."""
         values = self._at_sites(seeds, report)
         sums, squares = np.zeros((2, 3, *self._image.shape))
         for start in range(0, len(self._image), _ROWS):
@@ -152,9 +155,9 @@ class Responding:
         return Scatter(len(seeds), sums, squares)
 
     def changes(self, seeds: list[Seed]) -> FloatArray:
-        """Return what up to `WIDTH` images change in potential and displacement, (k, 3, H, W)."""
+        """Return changes of potential and displacement by up to `WIDTH` images, (k, 3, H, W)."""
         values = self._at_sites(seeds, Reporter())
-        return np.array([self._readout.field(values[..., one]) for one in range(len(seeds))])
+        return np.array([self._readout.field(values[..., k]) for k in range(len(seeds))])
 
     def _at_sites(self, seeds: list[Seed], report: Reporter) -> FloatArray:
         plan = self._samples.plan
@@ -169,12 +172,12 @@ class Responding:
     def _solve(self, right: FloatArray, report: Reporter) -> FloatArray:
         if self._factors is not None:
             return self._factors.solve(right)
-        if not hasattr(self._solvers, "one"):
-            self._solvers.one = LaplacianSolver(*self._network)
+        if not hasattr(self._solvers, "multigrid"):
+            self._solvers.multigrid = LaplacianSolver(*self._network)
         weights = np.zeros_like(right)
         for sample in np.flatnonzero(right.any(axis=0)):
             report("samples", 0)
-            weights[:, sample], _, _ = self._solvers.one.solve(
+            weights[:, sample], _, _ = self._solvers.multigrid.solve(
                 right[:, sample].copy(), _LINEAR_TOLERANCE
             )
         return weights

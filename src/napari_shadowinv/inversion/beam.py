@@ -1,10 +1,9 @@
 """The beam of a shot against its source, where there is no object: `beam_difference`.
 
-A reference of another exposure, or a beam that is not as flat as was assumed, differs from the
-beam of the shot on large scales. An object has finer structure. The frame along the image's edge
-is divided into tiles an eighth of the shorter side wide; in tiles without an object the ratio of
-image to source is a plane but for noise, and its differences between such tiles are those of the
-beams.
+A reference of another exposure, or a beam that is less flat than assumed, differs from the beam of
+the shot on large scales. An object has finer structure. The frame along the image's edge is divided
+into tiles an eighth of the shorter side wide; in tiles without an object the ratio of image to
+source is a plane plus noise, and its differences between such tiles are differences of the beams.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ def beam_difference(prepared: Prepared, noise: ImageNoise) -> float:
         return 0.0
     means, by_noise = means / middle, by_noise / middle**2
     quiet = ~is_used | _is_quiet(ratio / middle, means, by_noise)
-    # An object fades into tiles that seem quiet beside it.
+    # An object fades into neighbouring tiles that seem quiet.
     quiet = ndimage.binary_erosion(quiet, np.ones((3, 3)), border_value=1) & is_used
     quiet[1:-1, 1:-1] = False
     count = int(quiet.sum())
@@ -83,7 +82,7 @@ def beam_difference(prepared: Prepared, noise: ImageNoise) -> float:
 def _cell_ratios(
     prepared: Prepared, noise: ImageNoise, cell: int, rows: int, columns: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Image over source and the variance of it by noise, shape (rows, columns, 4, 4)."""
+    """Return image over source and its variance by noise, shape (rows, columns, 4, 4)."""
 
     def sums(values: FloatArray | BoolArray) -> FloatArray:
         side = cell * _CELLS
@@ -101,7 +100,7 @@ def _cell_ratios(
 
 
 def _is_quiet(ratio: FloatArray, means: FloatArray, variance: FloatArray) -> BoolArray:
-    """Return which tiles hold a plane and noise only."""
+    """Return which tiles contain only a plane and noise."""
     residual = ratio - means[..., None, None]
     for slope in np.indices((_CELLS, _CELLS)) - (_CELLS - 1) / 2:
         share = (residual * slope).sum(axis=(2, 3), keepdims=True) / (slope**2).sum()

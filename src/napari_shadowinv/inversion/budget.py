@@ -1,11 +1,11 @@
 """The error budget of an inversion, and the number of sites that it needs.
 
 - the errors of a result: `Errors`, of which each is an `ErrorEstimate`
-- computed while levels are solved, and asked whether more sites are needed: `Budget`
+- their computation from the solved levels, and the number of sites still needed: `Budget`
 
-Between two levels, one with four times the sites of the other, the displacement changes by what the
-coarser one got wrong. Changes fall by nearly the same rate from level to level, and as each is of
-finer waves than the one before, their squares add.
+Between two levels, one with four times the sites of the other, the displacement changes by the
+error of the coarser one. Changes fall by nearly the same rate from level to level, and as each is
+of finer waves than the one before, their squares add.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ __all__ = ["ASSUMED_VARIATION", "Budget", "ErrorEstimate", "Errors"]
 
 _PLACES = 48  # along the longer side, where levels are compared
 _USUAL_RATE, _RATES = 0.35, (0.25, 0.7)  # of the change between levels to the one before
-_WHOLE = 3.0  # times the sites of the level before: a whole step
+_MIN_STEP = 3.0  # times the sites of the level before, for a full step
 _SAFETY = 1.3
-_SOLVED = 0.1  # largest residual of a level that tells anything
+_MAX_RESIDUAL = 0.1  # of a level, for its error to be estimated
 _SHARE_OF_NOISE, _MUCH_NOISE = 0.2, 0.8
 _MAX_BEAM_AT_PEAK, _MAX_BEAM_RMS = 0.1, 0.25  # without a warning, of the displacement
 
-_RESPONDING = 4500  # sites, at most, whose linear response is worked out
+_MAX_RESPONSE_SITES = 4500  # of a level whose linear response is computed
 _NOISE_SAMPLES, _BEAM_SAMPLES, _WAVES = 16, 8, 16
 _NEAR = 2.5  # site spacings
 _LEAST_NOISE = 0.1  # of the mean square, where correlation takes waves away
@@ -68,9 +68,9 @@ class ErrorEstimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Errors:
-    """The error budget of an inversion: standard errors of the displacement, in px.
+    """Error budget of an inversion: standard errors of the displacement, in px.
 
-    It does not contain the effects of a blurred image, of crossing rays, or of a field that the
+    It does not include the effects of a blurred image, of crossing rays, or of a field that the
     image's edge cuts off.
 
     Attributes
@@ -82,7 +82,7 @@ class Errors:
     noise : ErrorEstimate
         Scatter by the noise of image and source.
     solver : ErrorEstimate
-        Effect of the flux that the solver left in wrong cells.
+        Effect of the solver's remaining flux errors in the cells.
     beam : ErrorEstimate or None
         Effect of a beam that differs from the source by `beam_variation`; None if the source was
         recorded, no variation was stated, and none was seen.
@@ -91,11 +91,11 @@ class Errors:
     beam_variation : float
         Relative r.m.s. difference of beam and source that `beam` stands for.
     beam_basis : str
-        Where that number is from: 'assumed' for an estimated source, 'stated' by the user, 'seen'
-        in the image outside the object.
+        Origin of that number: 'assumed' for an estimated source, 'stated' by the user, 'seen' in
+        the image outside the object.
     noise_correlation : float
-        Standard deviation of the Gaussian blur that correlates noise as much as it was measured to
-        be, px; 0 for white noise.
+        Standard deviation of the Gaussian blur with the measured correlation of the noise, px; 0
+        for white noise.
     """
 
     peak: float
@@ -111,13 +111,13 @@ class Errors:
 
     @property
     def total(self) -> ErrorEstimate:
-        """All contributions, added in squares."""
+        """Sum of all contributions in squares."""
         parts = np.array(list(self._contributions.values()))
         return _roots(*(parts**2).sum(axis=0))
 
     @property
     def of_peak(self) -> PeakError | None:
-        """The total at the peak as a share of it, and its largest contribution; None for no peak.
+        """Total at the peak as a share of it, and its largest contribution; None without a peak.
 
         This is the error in every headline.
         """
@@ -151,7 +151,7 @@ class Errors:
         )
 
     def scaled(self, factor: float) -> Errors:
-        """Return the budget in another unit, of which a displacement of 1 px is `factor`."""
+        """Return the budget in another unit; 1 px of displacement is `factor` of it."""
         lengths = {
             field.name: _times(getattr(self, field.name), factor)
             for field in dataclasses.fields(self)
@@ -215,7 +215,7 @@ class Errors:
 
 
 class Budget:
-    """Computation of errors from the levels that are solved so far."""
+    """Computation of errors from the levels solved so far."""
 
     def __init__(
         self,
@@ -237,9 +237,9 @@ class Budget:
         return Target.of(self._prepared.floored_image, self._plan.margin, self.options)
 
     def needed(self, solutions: Sequence[LevelSolution]) -> float:
-        """Return how many times as many sites are needed.
+        """Return the factor by which more sites are needed.
 
-        Their error shall be within the accuracy, or small beside what noise does.
+        Their error must be within the accuracy, or small against the error by noise.
         """
         solved = _solved(solutions)
         if len(solved) < 2:
@@ -247,12 +247,13 @@ class Budget:
         rms = float(np.sqrt(np.mean(np.sum(self._move(solved[-1]) ** 2, axis=0))))
         squares, power = self._change(solved)
         error = float(np.sqrt(squares.mean()))
-        told = f"their discretisation error is about {_percent(error, rms)} of the displacement"
+        share = _percent(error, rms)
+        text = f"their discretisation error is about {share} of the displacement"
         allowed = self.options.accuracy * rms
         if error <= allowed:
-            self.reason = f"{told}, below the accuracy of {100 * self.options.accuracy:.2g} %"
+            self.reason = f"{text}, below the accuracy of {100 * self.options.accuracy:.2g} %"
             return 0.0
-        # About, in a uniform beam; where that is small enough, it need not be known better.
+        # An estimate for a uniform beam; the exact value is needed only where this is large.
         noise, _ = self._noise.displacements(self._noise.typical)
         if error < _MUCH_NOISE * noise:
             response = self._response(solved)
@@ -260,13 +261,13 @@ class Budget:
             by_noise = _with_finer(_mean_square(moves), finer)
             noise = math.sqrt(float((by_noise * response.shares).sum()))
         if error < _SHARE_OF_NOISE * noise:
-            self.reason = f"{told}, below a fifth of what the noise does ({_percent(noise, rms)})"
+            self.reason = f"{text}, below a fifth of what the noise does ({_percent(noise, rms)})"
             return 0.0
         excess = error / max(allowed, _SHARE_OF_NOISE * noise)
         return float(_SAFETY * excess ** (1 / power))
 
     def errors(self, solutions: Sequence[LevelSolution], displacement: FloatArray) -> Errors:
-        """Return the errors of the last solution, whose displacement was read out, (2, H, W)."""
+        """Return the errors of the last solution with its displacement, (2, H, W)."""
         solved = _solved(solutions)
         mask = self._prepared.mask
         variation, basis = self._beam_variation
@@ -298,7 +299,7 @@ class Budget:
             rms=float(np.sqrt(np.mean(length[mask] ** 2))),
             discretisation=discretisation,
             noise=estimate(*self._noisy_moves(response, solved[-1].level.spacing)),
-            solver=estimate(response.to(self._left_by_solver(response, solved[-1]))),
+            solver=estimate(response.to(self._solver_gap(response, solved[-1]))),
             beam=_times(by_percent, times) if variation else None,
             beam_sensitivity=by_percent,
             beam_variation=variation,
@@ -313,32 +314,32 @@ class Budget:
 
     @cached_property
     def _beam_variation(self) -> tuple[float, str]:
-        """Relative difference of beam and source, and where it is from."""
+        """Relative difference of beam and source, and its origin."""
         stated = self.options.beam_variation
         expected = 0.0 if self._plan.measured else ASSUMED_VARIATION
-        seen = self.beam_difference
-        if seen > (expected if stated is None else stated):
-            return seen, "seen"
+        observed = self.beam_difference
+        if observed > (expected if stated is None else stated):
+            return observed, "seen"
         return (expected, "assumed") if stated is None else (stated, "stated")
 
     def _move(self, solution: LevelSolution) -> FloatArray:
-        """Displacement at the places, shape (2, n), as it is read out."""
+        """Return the displacement at the places, shape (2, n), as in the read-out."""
         if solution not in self._moves:
             places = self._places.T + self._plan.margin_width
-            steps = np.concatenate([places + one for one in ((1, 0), (-1, 0), (0, 1), (0, -1))])
-            down, up, right, left = np.split(solution.surface(steps), 4)
-            self._moves[solution] = np.stack([up - down, left - right]) / 2
+            steps = np.concatenate([places + step for step in ((1, 0), (-1, 0), (0, 1), (0, -1))])
+            y_high, y_low, x_high, x_low = np.split(solution.surface(steps), 4)
+            self._moves[solution] = np.stack([y_low - y_high, x_low - x_high]) / 2
         return self._moves[solution]
 
     def _change(self, solved: Sequence[LevelSolution]) -> tuple[FloatArray, float]:
-        """Square of the discretisation error at each place, about, and the power of its fall.
+        """Estimate the squared discretisation error at each place, and the power of its fall.
 
-        It falls as that power of the number of sites.
+        It falls with this power of the number of sites.
         """
         times = len(solved[-1].weights) / len(solved[-2].weights)
-        # With less than four times the sites, the rate is that of the levels before.
-        whole = solved if times > _WHOLE or len(solved) < 3 else solved[:-1]
-        moves = [self._move(one) for one in whole[-3:]]
+        # With less than four times the sites, the rate of the levels before is used.
+        full_steps = solved if times > _MIN_STEP or len(solved) < 3 else solved[:-1]
+        moves = [self._move(solution) for solution in full_steps[-3:]]
         changes = [float(((fine - coarse) ** 2).mean()) for coarse, fine in pairwise(moves)]
         rate = _USUAL_RATE
         if len(changes) > 1 and changes[0] > 0:
@@ -348,18 +349,18 @@ class Budget:
         return last / (times ** (2 * power) - 1), power
 
     def _response(self, solved: Sequence[LevelSolution]) -> LinearResponse:
-        few = [one for one in solved if len(one.weights) <= _RESPONDING]
+        few = [candidate for candidate in solved if len(candidate.weights) <= _MAX_RESPONSE_SITES]
         solution = few[-1] if few else self._coarser(solved[-1])
         if solution not in self._responses:
             self._responses[solution] = LinearResponse(solution, self._target, self._plan)
         return self._responses[solution]
 
     def _coarser(self, solution: LevelSolution) -> LevelSolution:
-        """The same answer with fewer sites."""
-        for known in self._responses:
-            return known
+        """Return the same solution with fewer sites."""
+        for earlier in self._responses:
+            return earlier
         levels = self._plan.levels
-        few = sum(count <= _RESPONDING for count in levels.counts)
+        few = sum(count <= _MAX_RESPONSE_SITES for count in levels.counts)
         level = levels[max(few - 1, 0)]
         objective = self._target.objective(level)
         weights, _ = with_full_cells(objective, 2 * solution.surface(level.sites))
@@ -368,36 +369,36 @@ class Budget:
     def _noisy_moves(
         self, response: LinearResponse, spacing: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Displacements by noise, and the mean square of what only sites so close feel."""
+        """Return displacements by noise, and the mean square that only this spacing resolves."""
         if response not in self._by_noise:
             rng = np.random.default_rng(self.options.seed)
             mean = self._prepared.source[self._prepared.mask].mean() / self._prepared.unit
             brightness = response.flux / (response.area * mean)
             variance = self._noise.variance(brightness) * mean**2 * response.area
             variance *= self._noise.clumping
-            drawn = np.sqrt(variance) * rng.normal(size=(_NOISE_SAMPLES, len(variance)))
-            self._by_noise[response] = response.to(drawn), variance
+            noise = np.sqrt(variance) * rng.normal(size=(_NOISE_SAMPLES, len(variance)))
+            self._by_noise[response] = response.to(noise), variance
         moves, variance = self._by_noise[response]
         return moves, response.finer(variance, spacing, self._noise.grain)
 
     def _beams(self, response: LinearResponse) -> FloatArray:
-        """Flux that cells gain from beams that differ from the source by 1 (r.m.s.)."""
+        """Return the flux that cells gain from beams that differ from the source by 1 (r.m.s.)."""
         rng = np.random.default_rng(self.options.seed)
         mass, sites = response.level.mass, response.level.sites
         length = self.options.beam_scale * min(self._prepared.mask.shape)
-        drawn = np.empty((_BEAM_SAMPLES, len(mass)))
-        for sample in drawn:
+        samples = np.empty((_BEAM_SAMPLES, len(mass)))
+        for sample in samples:
             waves = rng.normal(size=(2, _WAVES)) / length
             phases = rng.uniform(0, 2 * np.pi, _WAVES)
             sample[:] = np.cos((sites @ waves + phases).astype(np.float32)).sum(axis=1)
             sample -= (mass * sample).sum() / mass.sum()
             sample /= np.sqrt((mass * sample**2).sum() / mass.sum())
-        return mass * drawn
+        return mass * samples
 
-    def _left_by_solver(self, response: LinearResponse, solution: LevelSolution) -> FloatArray:
-        """What the solver has put into wrong cells."""
+    def _solver_gap(self, response: LinearResponse, solution: LevelSolution) -> FloatArray:
+        """Return the solver's remaining flux error in each cell."""
         gap = solution.flux - solution.level.mass
-        # Which of the few sites each of the many is near is looked up by squares.
+        # The nearest of the few sites is looked up by squares.
         size = response.spacing
         height, width = (int(side / size) + 1 for side in solution.level.shape)
         middles = (np.indices((height, width)).reshape(2, -1).T + 0.5) * size - 0.5
@@ -414,7 +415,7 @@ def _times(value: float | ErrorEstimate, factor: float) -> Any:
 
 
 def _mean_square(moves: FloatArray) -> FloatArray:
-    """Mean square length over the samples, (t, k, 2), at each triangle."""
+    """Return the mean square length over the samples, (t, k, 2), at each triangle."""
     return np.asarray(np.einsum("tkc,tkc->t", moves, moves) / moves.shape[1])
 
 
@@ -424,14 +425,14 @@ def _with_finer(squares: FloatArray, finer: FloatArray) -> FloatArray:
 
 
 def _solved(solutions: Sequence[LevelSolution]) -> list[LevelSolution]:
-    """The last solution, after those of coarser levels that lead to it."""
-    found = [one for one in solutions[:-1] if one.residual < _SOLVED]
+    """Return the last solution, after the coarser ones that lead to it."""
+    coarser = [solution for solution in solutions[:-1] if solution.residual < _MAX_RESIDUAL]
     last = solutions[-1]
-    return [*(one for one in found if len(one.weights) < len(last.weights)), last]
+    return [*(solution for solution in coarser if len(solution.weights) < len(last.weights)), last]
 
 
 def _places(prepared: Prepared) -> FloatArray:
-    """Pixels of a grid inside the image and its mask, shape (2, n)."""
+    """Return pixels of a grid inside the image and its mask, shape (2, n)."""
     shape = prepared.mask.shape
     stride = _stride(shape)
     rows, columns = (np.arange(1 + (n - 2) % stride // 2, n - 1, stride) for n in shape)

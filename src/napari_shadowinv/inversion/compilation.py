@@ -1,7 +1,7 @@
 """The compiler's work, done once after an installation.
 
-- do it before an inversion that somebody waits for: `ensure_compiled`
-- the second process's part of it: `compile_rest`
+- compile before an inversion that a user waits for: `ensure_compiled`
+- the share of a second process: `compile_rest`
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _NODES = 300  # enough for a multigrid
 def ensure_compiled(
     on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
 ) -> None:
-    """Compile all kernels, as else the first inversion would, unless an earlier run has."""
+    """Compile all kernels before the first inversion, unless an earlier run has."""
     if is_compiled():
         return
     from napari_shadowinv.inversion import invert
@@ -32,7 +32,7 @@ def ensure_compiled(
 
 
 def compile_rest() -> None:
-    """Compile what an inversion does with a triangulation once it is there, last things first."""
+    """Compile the kernels that an inversion uses after its triangulation, the last ones first."""
     from scipy.spatial import Delaunay
 
     from napari_shadowinv.geometry.density import Density

@@ -1,4 +1,4 @@
-"""Signs that a field goes on beyond the edge of its image: `inner_sides`, `turned_back`."""
+"""Signs that a field continues beyond the edge of its image: `inner_sides`, `turned_back`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MAX_MASKED = 0.2  # of a side
 
 @dataclass(frozen=True)
 class Sides:
-    """A displacement along the four sides of an image, px.
+    """Displacement along the four sides of an image, px.
 
     `outwards` is its component across the edge, a twentieth of the shorter side (`depth` px) inside
     it; `along` the component along the edge, at the edge.

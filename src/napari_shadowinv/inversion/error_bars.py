@@ -3,10 +3,10 @@
 - error bars for the potential and the displacement at every pixel: `uncertainty`
 - result: `Uncertainty`
 
-The noise is added to the image once more, again and again, and each such sample is inverted
-on the same sites: by the linear response of the image's own transport, or by solving it anew from
-its weights. The scatter of the samples is the scatter that repeated shots of the same object would
-have (the parametric bootstrap).
+Each sample is the image with another draw of noise, and is inverted on the same sites: by the
+linear response of the image's own transport, or by solving the transport anew from its weights. The
+scatter of the samples is the scatter of repeated shots of the same object (the parametric
+bootstrap).
 
 References
 ----------
@@ -40,7 +40,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry.linear_surface import WIDTH
 from napari_shadowinv.inversion._drawing import noise_of
 from napari_shadowinv.inversion._invert import invert, plan_sites
-from napari_shadowinv.inversion._sampling import Resolving, Responding, Scatter, Seed
+from napari_shadowinv.inversion._sampling import FullResampling, LinearResampling, Scatter, Seed
 from napari_shadowinv.inversion.labels import dataset_from_field, label
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, prepare
 from napari_shadowinv.inversion.result import Inversion
@@ -72,18 +72,18 @@ class Uncertainty:
         Of the image itself.
     potential_mean, potential_std : ndarray, shape (H, W)
         Mean and standard deviation of the samples' potentials, px². As each potential is zero
-        in the mean over the border, the deviation is that of the difference to the border.
+        in the mean over the border, the deviation refers to the difference to the border.
     displacement_mean, displacement_std : ndarray, shape (2, H, W)
-        The same of the displacement, px, for each component.
+        The same for the displacement, px, for each component.
     n : int
         Number of samples. The deviations themselves are known to 1 / √(2 (n - 1)): 16 % for 20.
     noise : str
-        The noise that was assumed.
+        Assumed noise.
     method : {"linear", "resolve"}
         How samples were inverted.
     nonlinearity : float
-        Of linear samples: how far they are from solutions, as a share of what the noise changes
-        (r.m.s. over the image); 0 where all were solved.
+        Deviation of linear samples from solved ones, as a share of the change by noise (r.m.s. over
+        the image); 0 where all were solved.
     tolerance : float
         Largest relative flux error of a cell that was allowed in a sample that was solved.
     iterations, residuals, converged : tuple of int, of float, of bool
@@ -122,8 +122,8 @@ class Uncertainty:
         -------
         xarray.Dataset
             As of `Inversion.to_dataset`, with ``potential_mean``, ``displacement_mean`` and a
-            ``…_std`` beside each potential, displacement and field. How the samples were made is
-            a JSON text in the attribute ``uncertainty``.
+            ``…_std`` for each potential, displacement and field. The method of the samples is a
+            JSON text in the attribute ``uncertainty``.
         """
         samples: tuple[str, ...] = ("n", "noise", "method", "nonlinearity", "tolerance")
         samples += ("iterations", "residuals", "converged")
@@ -138,15 +138,15 @@ class Uncertainty:
         # each is its argument times a number, perhaps negative, perhaps with axes exchanged
         deviations = {str(name): np.abs(field.values) for name, field in scatter.items()}
 
-        def beside(name: str, what: str, values: FloatArray) -> tuple[Any, ...]:
+        def statistic(name: str, quantity: str, values: FloatArray) -> tuple[Any, ...]:
             field = dataset[name]
-            long_name = f"{field.attrs['long_name']}, {what} of noisy samples"
+            long_name = f"{field.attrs['long_name']}, {quantity} of noisy samples"
             return field.dims, values, label(field.attrs["units"], long_name)
 
         return dataset.assign(
-            {f"{name}_mean": beside(name, "mean", values) for name, values in means.items()}
+            {f"{name}_mean": statistic(name, "mean", values) for name, values in means.items()}
             | {
-                f"{name}_std": beside(name, "standard deviation", values)
+                f"{name}_std": statistic(name, "standard deviation", values)
                 for name, values in deviations.items()
             }
         )
@@ -168,11 +168,10 @@ def uncertainty(
 ) -> Uncertainty:
     """Estimate the uncertainty of potential and displacement due to image noise.
 
-    Each sample is the image with fresh noise on top, inverted like the image. All have the
-    image's own noise in common, so their scatter is that of one dose of noise: the standard
-    deviation that shots of the same object would show. It is no distance from the truth: what a
-    retrieval gets wrong without noise (an unknown source, an object at the edge, folds behind
-    caustics) is not in it.
+    Each sample is the image with fresh noise on top, inverted like the image. All share the image's
+    own noise, so their scatter is the effect of one dose of noise: the standard deviation that
+    shots of the same object would show. It is no distance from the truth: it does not include
+    errors without noise (an unknown source, an object at the edge, folds behind caustics).
 
     Parameters
     ----------
@@ -212,8 +211,8 @@ def uncertainty(
     Examples
     --------
     >>> counts = np.random.default_rng(0).poisson(400, (24, 24))
-    >>> found = uncertainty(counts, n=4)
-    >>> found.potential_std.shape, found.n, found.converged
+    >>> result = uncertainty(counts, n=4)
+    >>> result.potential_std.shape, result.n, result.converged
     ((24, 24), 4, (True, True, True))
     """
     options = as_model(InversionOptions, options, "options")
@@ -225,7 +224,7 @@ def uncertainty(
     if plan is None:
         image, source, mask = unpack_shot(image, source, mask)
     check_memory(np.shape(image), bytes_per_pixel(options), "an inversion")
-    draw_noise, described = noise_of(image, noise, gain, mask if plan is None else plan.mask)
+    draw_noise, noise_text = noise_of(image, noise, gain, mask if plan is None else plan.mask)
     if plan is None:
         beam = prepare(image, source, options, mask).source
         plan = plan_sites(
@@ -254,23 +253,23 @@ def uncertainty(
     levels = plan.levels.up_to(len(inversion.weights))
     correlation = 0.0 if inversion.errors is None else inversion.errors.noise_correlation
     if correlation and not isinstance(noise, str):
-        described += f", correlated over {correlation:.2g} px"
-    resolving = Resolving(
+        noise_text += f", correlated over {correlation:.2g} px"
+    resampling = FullResampling(
         replace(plan, levels=levels),
         inversion.weights,
         lambda rng: draw_noise(rng, correlation),
         clipping,
     )
-    resolving = resolving.to_tolerance_of_noise(seeds[0])
+    resampling = resampling.to_tolerance_of_noise(seeds[0])
     report = Reporter(on_progress, should_stop)
-    here = np.stack([inversion.potential, *inversion.displacement])
-    went: list[tuple[int, float, bool]] = []
+    image_fields = np.stack([inversion.potential, *inversion.displacement])
+    outcomes: list[tuple[int, float, bool]] = []
 
     def solved(seeds: list[Seed], report: Reporter) -> Iterator[FloatArray]:
-        for sample in _in_order(resolving.sample, [[seed] for seed in seeds], workers, report):
-            found = sample.solution  # which is large, and not kept
-            went.append((found.iterations, found.residual, found.converged))
-            yield sample.field - here
+        for sample in _in_order(resampling.sample, [[seed] for seed in seeds], workers, report):
+            solution = sample.solution  # large, so not stored
+            outcomes.append((solution.iterations, solution.residual, solution.converged))
+            yield sample.field - image_fields
 
     off = 0.0
     if method == "resolve":
@@ -279,13 +278,13 @@ def uncertainty(
         quietly = Reporter(None, should_stop)
         checked = np.array(list(solved(seeds[:_CHECKED], quietly)))
         clean = prepare(image, plan.source, clipping, plan.mask).floored_image
-        responding = _beside(lambda: Responding(resolving, clean, options.threads), quietly)
-        linear = _beside(lambda: responding.changes(seeds[:_CHECKED]), quietly)
+        response = _in_thread(lambda: LinearResampling(resampling, clean, options.threads), quietly)
+        linear = _in_thread(lambda: response.changes(seeds[:_CHECKED]), quietly)
         off = _share(linear[:, 1:] - checked[:, 1:], checked[:, 1:])
         del checked, linear
         blocks = [seeds[start : start + WIDTH] for start in range(0, len(seeds), WIDTH)]
-        scatter = reduce(add, _in_order(responding.scatter, blocks, workers, report))
-    mean, std = here + scatter.mean, scatter.std
+        scatter = reduce(add, _in_order(response.scatter, blocks, workers, report))
+    mean, std = image_fields + scatter.mean, scatter.std
     warnings = inversion.report.warnings
     if off > _LINEAR_ENOUGH:
         text = (
@@ -293,7 +292,7 @@ def uncertainty(
             f"{off:.0%} of what the noise changes; use method='resolve'"
         )
         warnings = (Caution("samples", text), *warnings)
-    iterations, residuals, converged = zip(*went, strict=True)
+    iterations, residuals, converged = zip(*outcomes, strict=True)
     if failed := converged.count(False):
         text = (
             f"{failed} of {len(converged)} samples that were solved did not converge: the "
@@ -307,10 +306,10 @@ def uncertainty(
         displacement_mean=mean[1:],
         displacement_std=std[1:],
         n=int(n),
-        noise=described,
+        noise=noise_text,
         method=method,
         nonlinearity=off,
-        tolerance=resolving.options.tolerance,
+        tolerance=resampling.options.tolerance,
         iterations=iterations,
         residuals=residuals,
         converged=converged,
@@ -319,13 +318,13 @@ def uncertainty(
 
 
 def _share(part: FloatArray, whole: FloatArray) -> float:
-    """Length of one vector relative to another."""
+    """Return the length of one vector relative to another."""
     length = float(np.linalg.norm(whole))
     return float(np.linalg.norm(part)) / length if length > 0 else 0.0
 
 
 def _workers(options: InversionOptions, n_sites: int, n_pixels: int) -> int:
-    """Samples to work on at once: one a thread, as far as they fit in half of the memory."""
+    """Return the number of parallel samples: one a thread, within half of the memory."""
     threads = available_threads(options.threads)
     memory = physical_memory()
     if memory is None:
@@ -334,14 +333,14 @@ def _workers(options: InversionOptions, n_sites: int, n_pixels: int) -> int:
     return max(1, min(threads, memory // 2 // needed))
 
 
-def _beside(work: Callable[[], Result], report: Reporter) -> Result:
-    """Work in another thread, which is left alone with what it is at if this one is to stop."""
+def _in_thread(work: Callable[[], Result], report: Reporter) -> Result:
+    """Work in another thread, and abandon it if this one is asked to stop."""
     pool = ThreadPoolExecutor(1)
     try:
-        found = pool.submit(work)
-        while not wait([found], timeout=_POLL_SECONDS).done:
+        future = pool.submit(work)
+        while not wait([future], timeout=_POLL_SECONDS).done:
             report("samples", 0)
-        return found.result()
+        return future.result()
     finally:
         pool.shutdown(wait=False)
 
@@ -352,8 +351,8 @@ def _in_order(
     workers: int,
     report: Reporter,
 ) -> Iterator[Result]:
-    """Work on a few blocks of seeds at once and give their results in the order of the seeds."""
-    # Only this thread reports and asks whether to stop: what listens need not expect others.
+    """Work on a few blocks of seeds at once and yield their results in the order of the seeds."""
+    # Only this thread reports and asks whether to stop: callbacks are called from no other.
     abandoned = Event()
     waiting: deque[Future[Result]] = deque()
     sizes = deque(map(len, blocks))
@@ -362,7 +361,7 @@ def _in_order(
         try:
             for number, block in enumerate(blocks):
                 waiting.append(pool.submit(work, block, Reporter(None, abandoned.is_set)))
-                # One more than are worked on is ready to be begun.
+                # One more is queued than the workers can start.
                 while len(waiting) > (workers if number + 1 < len(blocks) else 0):
                     while not wait([waiting[0]], timeout=_POLL_SECONDS).done:
                         report("samples", done, total)

@@ -1,13 +1,14 @@
-"""Names, units and dimensions of what a result holds; fields as labelled datasets.
+"""Names, units and dimensions of a result's variables; fields as labelled datasets.
 
 - label a field, with units: `dataset_from_field`
 - the names, dimensions and units alone: `variable_labels`
 - the setup that a dataset was made with: `setup_from_dataset`
-- whether it is a fit's or a film pack's: `is_fit`, `is_pack`; what a fit of one field has:
+- the kind of a result, a fit or a film pack: `is_fit`, `is_pack`; variables of a fit of one field:
   `fit_labels`
 - the labels of files of earlier versions: `update_labels`
 
-Units are spelled as pint parses them, because napari hands those of an xarray's coordinates to it.
+Units are spelled as pint parses them, because napari passes the units of an xarray's coordinates on
+to it.
 For pint ``px`` is a length, 1/96 inch, and ``flux`` a femtolux.
 """
 
@@ -61,7 +62,7 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
 }
 
 UNCERTAINTY = (_VECTORS, PIXEL, "Standard deviation of the displacement")
-"""What a fit has beside potential and displacement."""
+"""Variable of a fit in addition to potential and displacement."""
 
 BEAM_UNCERTAINTY = (_VECTORS, "px", "Standard deviation of the displacement by the beam")
 """Another variable of a fit."""
@@ -103,8 +104,10 @@ def dataset_from_field(
 def variable_labels(
     setup: Setup | None = None,
 ) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
-    """Dimensions, ``units`` and ``long_name`` of every variable of a result by its name."""
-    labels = {name: (dims, label(*told)) for name, (dims, *told) in VARIABLES.items()}
+    """Return dimensions, ``units`` and ``long_name`` of every variable of a result by its name."""
+    labels = {
+        name: (dims, label(unit, long_name)) for name, (dims, unit, long_name) in VARIABLES.items()
+    }
     for field in () if setup is None else _vectors_first(setup):
         dims = _VECTORS if field.is_vector else _PLANE
         labels[field.name] = dims, label(field.unit, field.long_name)
@@ -114,17 +117,17 @@ def variable_labels(
 def fit_labels(
     field: str, setup: Setup | None = None
 ) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
-    """Dimensions, ``units`` and ``long_name`` of every variable of a fitted field by its name."""
-    known = variable_labels(setup)
-    dims, *told = UNCERTAINTY
-    found = {name: known[name] for name in ("potential", "displacement")}
-    found["displacement_uncertainty"] = dims, label(*told)
-    in_si = {name: one for name, one in known.items() if name not in VARIABLES}
-    return found | {name: one for name, one in in_si.items() if belongs(name, field)}
+    """Return dimensions, ``units`` and ``long_name`` of every variable of a fitted field."""
+    result_labels = variable_labels(setup)
+    dims, *unit_and_name = UNCERTAINTY
+    labels = {name: result_labels[name] for name in ("potential", "displacement")}
+    labels["displacement_uncertainty"] = dims, label(*unit_and_name)
+    in_si = [name for name in result_labels if name not in VARIABLES]
+    return labels | {name: result_labels[name] for name in in_si if belongs(name, field)}
 
 
 def belongs(variable: object, field: str) -> bool:
-    """Tell whether a variable makes sense for a field: ∫E dz of a magnetic one does not."""
+    """Return whether a variable makes sense for a field: ∫E dz of a magnetic one does not."""
     return _ASSUMES.get(str(variable), field) == field
 
 
@@ -139,12 +142,15 @@ def numbers_of(dataset: xarray.Dataset, name: str) -> AnyArray:
 def setup_from_dataset(dataset: xarray.Dataset) -> Setup | None:
     """Return the setup that a dataset of `Inversion.to_dataset` was made with, if there was one.
 
-    Of a stack whose shots have their own setups, that of the first; of one of its shots, its own.
+    Where shots of a stack have different setups, a dataset of one shot returns the shot's setup and
+    a dataset of all returns the first one.
     """
     from napari_shadowinv.physics.setup import setup_from_dict
 
-    own = dataset.get("setup")  # of each shot, in a stack of which one is chosen
-    text = dataset.attrs.get("setup", "") if own is None or own.ndim else str(own.values)
+    shot_setup = dataset.get("setup")  # of each shot, in a stack of which one is chosen
+    text = dataset.attrs.get("setup", "")
+    if shot_setup is not None and not shot_setup.ndim:
+        text = str(shot_setup.values)
     with as_input_errors("the dataset's setup"):
         return setup_from_dict(json.loads(text), "the dataset's setup") if text else None
 
@@ -154,12 +160,12 @@ SETUPS_LABEL = {"units": "1", "long_name": "Setup of the shot (JSON)"}
 
 
 def is_fit(attributes: Mapping[Any, Any]) -> bool:
-    """Tell whether the attributes of a dataset are those of a fit."""
+    """Return whether the attributes of a dataset belong to a fit."""
     return bool(attributes.get("format") == FIT_FORMAT)
 
 
 def is_pack(attributes: Mapping[Any, Any]) -> bool:
-    """Tell whether the attributes of a dataset are those of a film pack."""
+    """Return whether the attributes of a dataset belong to a film pack."""
     return bool(attributes.get("format") == PACK_FORMAT)
 
 
@@ -205,8 +211,8 @@ def display_unit(units: str) -> str:
 def update_labels(dataset: xarray.Dataset) -> xarray.Dataset:
     """Return the dataset of a file with today's units and coordinates.
 
-    Earlier versions wrote pixel indices in ``px`` as y and x, with the places in metres beside
-    them, as y_si and x_si.
+    Earlier versions wrote pixel indices in ``px`` as y and x, and the coordinates in metres as y_si
+    and x_si.
     """
     for variable in dataset.variables.values():
         if variable.attrs.get("units") in _EARLIER_UNITS:

@@ -1,7 +1,7 @@
-"""The machine code of the kernels, which is kept from one run to the next.
+"""Machine code of the kernels, cached from one run to the next.
 
-- whether it is there: `is_compiled`; where: `code_folder`
-- how often the compiler is waited for: `how_often`
+- whether it is cached: `is_compiled`; its folder: `code_folder`
+- how often compilation delays a run, in words: `how_often`
 - share its work between two processes: `compiling_together`
 """
 
@@ -22,7 +22,7 @@ _REST = "from napari_shadowinv.inversion.compilation import compile_rest; compil
 
 @contextmanager
 def compiling_together() -> Iterator[None]:
-    """Have another process compile what this one needs last, which loads what is there by then."""
+    """Let another process compile the kernels that this one needs last, for it to load then."""
     if is_compiled():
         yield
         return
@@ -34,8 +34,8 @@ def compiling_together() -> Iterator[None]:
         return
     import numba
 
-    found: Any = numba.config
-    environment = os.environ | ({"NUMBA_CACHE_DIR": found.CACHE_DIR} if found.CACHE_DIR else {})
+    config: Any = numba.config
+    environment = os.environ | ({"NUMBA_CACHE_DIR": config.CACHE_DIR} if config.CACHE_DIR else {})
     helper = subprocess.Popen(
         [executable, "-c", _REST],
         env=environment,
@@ -47,12 +47,12 @@ def compiling_together() -> Iterator[None]:
     try:
         yield
     finally:
-        helper.terminate()  # what it has not done by now is done
+        helper.terminate()  # this process has compiled the rest by now
         helper.wait()
 
 
 def how_often() -> str:
-    """Return how often the compiler is waited for, in words."""
+    """Return how often compilation delays a run, in words."""
     from napari_shadowinv.geometry._kernel import is_code_cached
 
     if is_code_cached():
@@ -61,17 +61,17 @@ def how_often() -> str:
 
 
 def is_compiled() -> bool:
-    """Return whether this process has the machine code, or an earlier one has left it."""
+    """Return whether the machine code is loaded, or cached by an earlier process."""
     from napari_shadowinv.geometry._flips import build
 
     if build.signatures:  # type: ignore[attr-defined]
         return True
-    kept = code_folder()
-    return kept is not None and any(kept.glob("_flips.build-*.nbi"))
+    folder = code_folder()
+    return folder is not None and any(folder.glob("_flips.build-*.nbi"))
 
 
 def code_folder() -> Path | None:
-    """Return the folder of the triangulation's machine code; None where none can be kept."""
+    """Return the folder of the triangulation's machine code; None where nothing can be cached."""
     from napari_shadowinv.geometry._flips import build
     from napari_shadowinv.geometry._kernel import is_code_cached
 

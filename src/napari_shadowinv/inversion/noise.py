@@ -1,6 +1,6 @@
-"""The noise of an image, from differences between neighbouring pixels: `ImageNoise`.
+"""Noise of an image, from differences between neighbouring pixels: `ImageNoise`.
 
-Structures that the beam's path makes are smooth over a few pixels, noise is not: in
+Structures from the beam's path are smooth over a few pixels, noise is not: in
 (a - b - c + d) / 2 over four neighbours a smooth image cancels, and white noise keeps its
 variance. A filter, a scintillator or an image plate correlates the noise of neighbouring pixels;
 then such a difference over k pixels grows with k until the pixels are independent, in all parts
@@ -57,7 +57,7 @@ _GRAIN_PER_BLUR = 3.51 / math.exp(-0.5772 / 2)
 
 
 class ImageNoise:
-    """The noise of an image, and of its source, as shares of the source's mean.
+    """Noise of an image, and of its source, as shares of the source's mean.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class ImageNoise:
         self.typical = _clipped(differences) * math.sqrt(inflation)
         # The source's mean, in units of the recorded image.
         quantum = prepared.flux_scale * prepared.unit * mean
-        # Of the variance: what is constant, in proportion to the brightness, and to its square.
+        # Terms of the variance: constant, in proportion to the brightness, and to its square.
         self._terms = np.zeros(3)
         level, counts = (None, None) if options is None else (options.noise_level, options.quantum)
         if level is not None:
@@ -110,21 +110,21 @@ class ImageNoise:
         return _GRAIN_PER_BLUR * self.correlation_length
 
     def variance(self, brightness: FloatArray) -> FloatArray:
-        """Return the variance of pixels that are so bright, in units of the source's mean."""
+        """Return the variance of pixels by their brightness, in units of the source's mean."""
         constant, linear, square = self._terms
         return np.asarray(constant + brightness * (linear + square * brightness))
 
     def displacements(self, level: float) -> tuple[float, float]:
-        """R.m.s. displacement of so much noise, px, and the most that chance leaves likely."""
+        """Return the r.m.s. displacement by a level of noise, px, and its likely maximum."""
         mean, deviation = _response(self.shape)
-        # Of the mean, 1 / 2π for each power of e in the waves is from those that noise lacks.
+        # The waves that correlated noise lacks contribute 1 / 2π of the mean per power of e.
         mean = max(mean - math.log(max(self.grain, 1.0)) / (2 * math.pi), deviation)
         level *= math.sqrt(self.clumping)
         return level * math.sqrt(mean), level * math.sqrt(mean + _DEVIATIONS * deviation)
 
 
 def _finest(values: FloatArray, used: BoolArray) -> FloatArray:
-    """Absolute differences of neighbouring pixels in which smooth structure cancels."""
+    """Return absolute differences of neighbouring pixels in which smooth structure cancels."""
     finest = (values[1:, 1:] - values[1:, :-1] - values[:-1, 1:] + values[:-1, :-1]) / 2
     return np.abs(finest[used]) if used.any() else np.zeros(1)
 
@@ -134,13 +134,13 @@ def _rms(values: FloatArray) -> float:
 
 
 def _clipped(differences: FloatArray) -> float:
-    """Standard deviation without what noise does not explain."""
+    """Return the standard deviation, with differences clipped that noise does not explain."""
     limit = _CLIPPED_AT * _NORMAL_MAD * float(np.median(differences))
     return _rms(np.minimum(differences, limit)) if limit > 0 else _rms(differences)
 
 
 def _correlation(excess: FloatArray, mask: BoolArray) -> tuple[float, float]:
-    """Variance of a pixel over that of the finest differences, and the clumping."""
+    """Return the variance of a pixel relative to the finest differences, and the clumping."""
     side = _TILE_PX if min(excess.shape) >= _MIN_SIDE_PX else _SMALL_TILE_PX
     lags = [lag for lag in _LAGS_PX if lag < side]
     if _MIN_TILES * side + lags[-1] > min(excess.shape):
@@ -206,7 +206,7 @@ def _quiet_tiles(tiles: FloatArray, used: BoolArray, side: int, lag: int) -> Flo
 def _tiles(
     excess: FloatArray, mask: BoolArray, side: int, lag: int
 ) -> tuple[FloatArray, BoolArray]:
-    """Tiles on a grid, each with the pixels at a lag, and which are usable."""
+    """Return tiles on a grid, each with the pixels at a lag, and which are usable."""
     size = side + lag
     steps = [max(side, -(-(n - size) // _MAX_TILES)) for n in excess.shape]
     places = np.s_[:: steps[0], :: steps[1]]
@@ -224,30 +224,30 @@ def _without_hot_pixels(tiles: FloatArray) -> FloatArray:
 
 
 def _difference_variance(tiles: FloatArray, side: int, lag: int) -> FloatArray:
-    """Mean square of (a - b - c + d) / 2 over pixels that are so far apart, for each tile."""
-    here, there = slice(0, side), slice(lag, side + lag)
-    down = tiles[..., here, :] - tiles[..., there, :]
-    return np.asarray(((down[..., here] - down[..., there]) ** 2).mean(axis=(-2, -1)) / 4)
+    """Return the mean square of (a - b - c + d) / 2 over pixels at a lag, for each tile."""
+    near, far = slice(0, side), slice(lag, side + lag)
+    down = tiles[..., near, :] - tiles[..., far, :]
+    return np.asarray(((down[..., near] - down[..., far]) ** 2).mean(axis=(-2, -1)) / 4)
 
 
 def _around(values: FloatArray) -> FloatArray:
-    """Mean of tiles and their neighbours, so that tiles are hardly chosen by their noise."""
+    """Average tiles with their neighbours, so that noise hardly affects the choice of tiles."""
     cross = ndimage.generate_binary_structure(2, 1).astype(np.float64)
     sums, counts = (ndimage.convolve(v, cross, mode="constant") for v in (values, values**0))
     return np.asarray(sums / counts)
 
 
 def _terms(bright: FloatArray, differences: FloatArray) -> FloatArray:
-    """Fit what detectors have: noise of reading, of counting, and of uneven response."""
+    """Fit the noise terms of detectors: read-out, counting, and uneven response."""
     step = -(-len(bright) // _SAMPLES)
     bright, differences = bright[::step], differences[::step]
     order = order_by_value(bright)
     parts = np.array_split(order, min(_BINS, max(1, len(order) // 20)))
-    found = [(float(bright[part].mean()), _clipped(differences[part]) ** 2) for part in parts]
-    places, variances = np.array(found).T
+    bins = [(float(bright[part].mean()), _clipped(differences[part]) ** 2) for part in parts]
+    places, variances = np.array(bins).T
     if not variances.any():
         return np.zeros(3)
-    # Relative deviations count: of bins on bright lines, whose structure looks like noise, little.
+    # Relative deviations: bins on bright lines, whose structure looks like noise, count little.
     weights = 1 / np.maximum(variances, 1e-6 * variances.max())
     powers = np.stack([np.ones_like(places), places, places**2], axis=1)
     return np.asarray(nnls(weights[:, None] * powers, weights * variances)[0])
@@ -255,7 +255,7 @@ def _terms(bright: FloatArray, differences: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _response(shape: tuple[int, int]) -> tuple[float, float]:
-    """Mean and standard deviation of the mean square displacement by white noise of 1, px²."""
+    """Return mean and standard deviation of the mean square displacement by unit noise, px²."""
     wave_y, wave_x = (np.pi * np.arange(length) / length for length in shape)
     square = wave_y[:, None] ** 2 + wave_x**2
     square[0, 0] = np.inf

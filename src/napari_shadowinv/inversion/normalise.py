@@ -29,12 +29,12 @@ _NOTABLE_FLUX_CHANGE = 0.05
 _NOTABLE_RAISED = 1e-3  # share of the pixels
 _NOTABLE_MASK = 0.2  # of the pixels
 _DIMMEST, _BRIGHTEST = 1e-301, 1e301  # sums of a whole image stay within double precision
-_ALIKE = 1e-6  # of the mean: what rounding to 32 bits leaves of a difference
+_MAX_ROUNDING = 1e-6  # of the mean: difference by rounding to 32 bits
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """An image and a source, shape (H, W), of the same flux unless the image's is known."""
+    """Image and source, shape (H, W), of the same flux unless the image's is known."""
 
     image: FloatArray  # clipped where asked for, scaled to the flux of the source; 0 where masked
     source: FloatArray  # 0 where masked
@@ -44,11 +44,11 @@ class Prepared:
     mask: BoolArray  # the pixels that are used
     clipped_pixels: int
     floored_pixels: int  # the clipped ones included
-    flux_scale: float  # what the image was divided by
+    flux_scale: float  # divisor of the image
     warnings: tuple[Caution, ...]
 
     def in_units(self) -> Prepared:
-        """Return the same with image and source in units of `unit`, too."""
+        """Return the same with image and source also in units of `unit`."""
         return replace(self, image=self.image / self.unit, source=self.source / self.unit)
 
 
@@ -78,8 +78,9 @@ def prepare(
         beam = np.where(usable, values.sum() / usable.sum(), 0.0)
     else:
         beam = checked_source(source, usable)
-        ones, others = (array[usable] / array[usable].mean() for array in (beam, values))
-        if np.abs(ones - others).max() <= _ALIKE and np.ptp(ones) > 2 * _ALIKE:
+        relative_beam, relative_image = (a[usable] / a[usable].mean() for a in (beam, values))
+        is_same = np.abs(relative_beam - relative_image).max() <= _MAX_ROUNDING
+        if is_same and np.ptp(relative_beam) > 2 * _MAX_ROUNDING:
             raise InputError(
                 "the source is the image itself, so the deflection would be zero: give an image "
                 "of the beam without the object, or an estimate of it"
@@ -116,9 +117,9 @@ def prepare(
 def floored_by(
     source: FloatArray, options: InversionOptions, mask: BoolArray | None
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return what makes the `floored_image` of `prepare` of images of one source, in its mask.
+    """Return a function from an image to the `floored_image` of `prepare`, for one source and mask.
 
-    They are not checked again, and clipped; what does not depend on them is worked out once.
+    It clips images instead of checking them; quantities of the source are computed once.
     """
     usable = np.ones(source.shape, bool) if mask is None else mask
     beam = checked_source(source, usable)
@@ -136,7 +137,7 @@ def floored_by(
 
 
 def _positive(values: FloatArray) -> FloatArray:
-    """Clip an image that has something left then."""
+    """Clip an image, refusing one without positive pixels."""
     values = np.maximum(values, 0)
     if not values.any():
         raise InputError(
@@ -197,11 +198,11 @@ def _warnings(
 
 
 def checked_source(source: ArrayLike, mask: BoolArray | None = None) -> FloatArray:
-    """Return a source as floats, 0 where masked, or raise an `InputError` that says why not."""
-    found = _plane(source, "source").shape
-    if mask is not None and found != mask.shape:
-        raise InputError(f"source has shape {found}, image {mask.shape}: they must match")
-    beam = _finite_image(source, "source", np.ones(found, bool) if mask is None else mask)
+    """Return a source as floats, 0 where masked, or raise an `InputError`."""
+    shape = _plane(source, "source").shape
+    if mask is not None and shape != mask.shape:
+        raise InputError(f"source has shape {shape}, image {mask.shape}: they must match")
+    beam = _finite_image(source, "source", np.ones(shape, bool) if mask is None else mask)
     if (beam < 0).any():
         raise InputError(
             f"source has {int((beam < 0).sum())} negative pixels, expected none: "
@@ -223,7 +224,7 @@ def _check_range(values: FloatArray, name: str) -> None:
 
 
 def checked_mask(mask: ArrayLike, shape: tuple[int, ...]) -> BoolArray:
-    """Return a mask as booleans, or raise an `InputError` that says what is wrong with it."""
+    """Return a mask as booleans, or raise an `InputError`."""
     usable = np.asarray(mask)
     if usable.shape != shape:
         raise InputError(f"mask has shape {usable.shape}, image {shape}: they must match")
@@ -278,14 +279,14 @@ def margin_around(shape: tuple[int, ...], options: InversionOptions) -> int:
 
 
 def bytes_per_pixel(options: InversionOptions) -> float:
-    """Return the memory that an inversion needs for each pixel, besides that of the sites."""
+    """Return the memory of an inversion per pixel, without its sites."""
     return _BYTES_PER_PIXEL_FREE if options.boundary == "free" else _BYTES_PER_PIXEL
 
 
 def number_of_sites(shape: tuple[int, int], options: InversionOptions) -> int:
-    """Return the most sites to use for an image; an `InputError` if they do not fit in memory."""
-    wanted = options.n_sites
-    n_sites = min(shape[0] * shape[1], MAX_DEFAULT_SITES) if wanted is None else wanted
+    """Return the maximum number of sites; an `InputError` if they do not fit in memory."""
+    stated = options.n_sites
+    n_sites = min(shape[0] * shape[1], MAX_DEFAULT_SITES) if stated is None else stated
     memory = physical_memory()
     if memory is not None and n_sites * _BYTES_PER_SITE > memory:
         raise InputError(

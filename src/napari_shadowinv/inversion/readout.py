@@ -1,8 +1,8 @@
 """From the weights of the sites to the potential and displacement at every pixel.
 
-- by the way that the options name: `read_out`
+- by the method of the options: `read_out`
 - from the dual variables, without any integration: `read_dual` (default)
-- the paper's way, from the cells' centroids: `read_centroids`
+- by the paper's method, from the cells' centroids: `read_centroids`
 
 Each returns the potential, shape (H, W), px², zero in the mean over the border; and the
 displacement, shape (2, H, W), px. With a margin these cover it too.
@@ -35,7 +35,7 @@ _TILE = 32, BLOCK // 32  # pixels that share one walk
 def read_out(
     solution: LevelSolution, options: InversionOptions, on_share: OnShare | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Read a solution by the options' way; `on_share` is told what share is done, 0 to 1."""
+    """Read a solution by the options' method; `on_share` receives the progress, 0 to 1."""
     if options.readout == "centroid":
         moves, integration = solution.displacement, options.integration
         return read_centroids(solution.level, moves, options.threads, integration=integration)
@@ -45,7 +45,7 @@ def read_out(
 def read_dual(
     surface: CloughTocher, shape: tuple[int, int], on_share: OnShare | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Read the potential off the surface through the sites, and differentiate it."""
+    """Read the potential from the surface through the sites, and differentiate it."""
     height, width = shape
     potential = np.empty((height, width))
     rows = np.arange(_TILE[0], dtype=np.float64)

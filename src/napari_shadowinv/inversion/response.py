@@ -1,9 +1,9 @@
-"""What small changes of flux do to the field: `LinearResponse`.
+"""Linear response of the field to small changes of flux: `LinearResponse`.
 
 Around a solved transport the weights answer a change of flux linearly, by the Hessian that
 Newton's step has: H δw = δS - δT, and the displacement by -½ ∇δw. A level of a few thousand sites
-is enough for noise, whose displacement is mostly of long waves (its spectrum falls as 1/k²); what
-finer waves add, 1 / 2π of the noise's variance for each power of e, is told without solving.
+is enough for noise, whose displacement is mostly of long waves (its spectrum falls as 1/k²); the
+contribution of finer waves, 1 / 2π of the noise's variance for each power of e, needs no solving.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from napari_shadowinv.transport.solvers import LevelSolution, Target
 
 __all__ = ["LinearResponse"]
 
-_FELT = 2.5  # a level feels what is so many times finer than its spacing, within 5 %
-_SLIVER = 0.3  # double area by the longest side's square; of an equilateral triangle 0.87
+_RESOLUTION = 2.5  # spacing over the finest wave that a level resolves within 5 %
+_MIN_ROUNDNESS = 0.3  # double area by the longest side's square; of an equilateral triangle 0.87
 
 
 class LinearResponse:
-    """The response of one level's solution.
+    """Response of one level's solution.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class LinearResponse:
     spacing : float
         Distance between its sites, px.
     flux, area : ndarray, shape (n,)
-        What each cell holds of the image, and its pixels.
+        The image's flux in each cell, and its area in pixels.
     """
 
     def __init__(self, solution: LevelSolution, target: Target, plan: SitePlan) -> None:
@@ -53,7 +53,7 @@ class LinearResponse:
         self._factors = FactorisedLaplacian(diagram.laplacian(), ground)
 
     def to(self, changes: FloatArray) -> FloatArray:
-        """Return each triangle's displacement (t, k, 2), px, by fluxes that cells gain (k, n)."""
+        """Return each triangle's displacement (t, k, 2), px, by flux changes of cells (k, n)."""
         potential = -0.5 * self._factors.solve(changes.T)
         corners, slopes = self._slopes
         return np.asarray(-np.swapaxes(potential[corners], 1, 2) @ slopes)
@@ -61,12 +61,12 @@ class LinearResponse:
     def finer(self, variance: FloatArray, spacing: float, grain: float = 0.0) -> FloatArray:
         """Return each triangle's mean square displacement, px², by waves too fine for this level.
 
-        Those are meant that sites with such a spacing feel. `variance` is that of the flux in each
-        cell, of noise that is independent between pixels, or above a `grain`, px. The result is
-        negative if this level feels finer waves than such noise has.
+        Only waves count that sites with this `spacing` resolve. `variance` is the variance of the
+        flux in each cell, by noise that is independent between pixels, or above a `grain`, px. The
+        result is negative if this level resolves finer waves than the noise has.
         """
-        felt = self.spacing / _FELT
-        powers = math.log(felt / max(min(felt, max(spacing, 1.0)), grain))
+        finest = self.spacing / _RESOLUTION
+        powers = math.log(finest / max(min(finest, max(spacing, 1.0)), grain))
         of_cell = variance * self.area / self.flux**2
         corners, _ = self._slopes
         return np.asarray(of_cell[corners].mean(axis=1) * powers / (2 * np.pi))
@@ -79,7 +79,7 @@ class LinearResponse:
 
     @cached_property
     def shares(self) -> FloatArray:
-        """What share of the used image each triangle is."""
+        """Area of each triangle as a share of the used image."""
         corners, _ = self._slopes
         a, b, c = np.moveaxis(self.level.sites[corners], 1, 0)
         double = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
@@ -90,15 +90,15 @@ class LinearResponse:
     def _slopes(self) -> tuple[Indices, FloatArray]:
         """Corners of the triangles between sites, and the gradient by each corner's value."""
         corners, edges, double = _triangles(self.level.triangulation)
-        # Along the border lie slivers, on which three values tell no gradient.
+        # Slivers along the border are too thin for a gradient by three values.
         longest = (edges**2).sum(axis=2).max(axis=1)
-        good = np.abs(double) > _SLIVER * longest
-        corners, edges, double = corners[good], edges[good], double[good]
+        is_round = np.abs(double) > _MIN_ROUNDNESS * longest
+        corners, edges, double = corners[is_round], edges[is_round], double[is_round]
         return corners, _normals(edges) / double[:, None, None]
 
 
 def _triangles(triangulation: RegularTriangulation) -> tuple[Indices, FloatArray, FloatArray]:
-    """Corners of the triangles between sites, the edges opposite to them, and double areas."""
+    """Return corners of the triangles between sites, opposite edges, and double areas."""
     corners = triangulation.vertices
     corners = corners[(corners < len(triangulation.sites)).all(axis=1)]
     points = triangulation.sites[corners]
@@ -111,7 +111,7 @@ def _normals(edges: FloatArray) -> FloatArray:
 
 
 def _within(places: FloatArray, plan: SitePlan) -> BoolArray:
-    """Which places are within the image and its mask."""
+    """Return which places are within the image and its mask."""
     height, width = plan.source.shape
     rows, columns = np.rint(places).astype(np.int64).T
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)

@@ -71,13 +71,13 @@ class Report:
         With a free boundary the flux that crossed each side of the image (top, bottom, left,
         right), as a share of the source's flux in the image; else empty.
     sites_reason : str
-        Why there are so many sites.
+        Reason for the number of sites.
     errors : Errors or None
-        How uncertain the displacement is, and why; None if the solver did not converge, and in
-        reports of older versions.
+        Error budget of the displacement; None if the solver did not converge, and in reports of
+        older versions.
     image_residual : float
-        How far the re-projection is from the image: r.m.s. difference over the used pixels,
-        as a share of the image's mean there. NaN in reports of older versions.
+        Difference of re-projection and image, r.m.s. over the used pixels, as a share of the
+        image's mean there. NaN in reports of older versions.
     """
 
     converged: bool
@@ -101,7 +101,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Inversion:
-    """The deflection potential of one shot, and how far it can be trusted.
+    """Deflection potential of one shot, with its errors and warnings.
 
     Lengths are object-plane pixels; arrays are ``[y, x]``, vectors in axis order
     (y, x); a pixel's centre is at its integer index.
@@ -124,10 +124,10 @@ class Inversion:
     site_mass : ndarray, shape (n,)
         Flux of the source in each site's cell.
     site_flux : ndarray, shape (n,)
-        Flux of the image in each site's power cell: that of the source but for the residual,
+        Flux of the image in each site's power cell. It differs from `site_mass` by the residual,
         ``max(abs(site_flux / site_mass - 1))``.
     site_displacement : ndarray, shape (n, 2)
-        Centroid of each site's cell in the image minus that in the source, px.
+        Centroid of each site's cell in the image minus its centroid in the source, px.
     reprojection : ndarray, shape (H, W)
         The source as displaced by the retrieved field.
     residual : ndarray, shape (H, W)
@@ -141,7 +141,7 @@ class Inversion:
     options : InversionOptions
         The options used.
     provenance : Provenance or None
-        How it was made and from what, if by a recipe.
+        Recipe and input files, if it was made by a recipe.
     """
 
     image: FloatArray
@@ -163,12 +163,12 @@ class Inversion:
 
     @property
     def errors(self) -> Errors | None:
-        """The error budget of its displacement; see `Report`."""
+        """Error budget of the displacement; see `Report`."""
         return self.report.errors
 
     @property
     def error_rows(self) -> list[tuple[str, str]]:
-        """The error budget in words: names and texts."""
+        """Error budget in words: names and texts."""
         if self.errors is None:
             return []
         rows = self.errors.rows(self.options)
@@ -176,21 +176,21 @@ class Inversion:
         smoothing = [step.title for step in steps if step.smooths]
         is_stated = (self.options.noise_level, self.options.quantum) != (None, None)
         if smoothing and not is_stated and not self.errors.noise_correlation:
-            told = (
+            caveat = (
                 f"measured after {', '.join(smoothing)}, where most of it cannot be seen: its "
                 "error is larger than told; give the noise_level or quantum of the recorded image"
             )
-            rows.append(("noise", told))
+            rows.append(("noise", caveat))
         return rows
 
     @property
     def setup(self) -> Setup | None:
-        """The geometry of its pixels, as far as the provenance tells."""
+        """Geometry of the pixels, if the provenance contains it."""
         return None if self.provenance is None else self.provenance.setup
 
     @property
     def headline(self) -> Headline:
-        """The warnings and the peak of the main field in one line, as every face shows it."""
+        """Warnings and the peak of the main field in one line."""
         return self.headline_in(self.setup)
 
     def headline_in(self, setup: Setup | None) -> Headline:
@@ -300,7 +300,7 @@ class Inversion:
         ----------
         setup : Setup, optional
             Adds the potential and the line-integrated fields in SI units, and coordinates in
-            metres. Default: that of the provenance.
+            metres. Default: the provenance's.
         attributes : mapping of str to str, optional
             Further attributes.
 
@@ -308,8 +308,8 @@ class Inversion:
         -------
         xarray.Dataset
             Dimensions y, x, component ("y", "x") and site. Each variable has ``units`` and
-            ``long_name``; options, report (with the errors in px) and setup are JSON texts in the
-            attributes, and ``errors_si`` those of the setup's main field.
+            ``long_name``; options, report (with the errors in px), setup and ``errors_si`` (the
+            errors of the setup's main field) are JSON texts in the attributes.
         """
         history = {
             "format": FORMAT,
@@ -322,7 +322,7 @@ class Inversion:
             setup = self.setup if setup is None else setup
         if self.errors is not None and setup is not None:
             field = setup.main_field
-            (unit,) = (one.unit for one in setup.si_fields if one.name == field.name)
+            (unit,) = (si_field.unit for si_field in setup.si_fields if si_field.name == field.name)
             factor = np.abs(setup.field_in_si(field.name, np.ones((2, 1, 1)))).max()
             in_si = dataclasses.asdict(self.errors.scaled(float(factor)))
             history["errors_si"] = json.dumps({"field": field.name, "unit": unit, **in_si})
@@ -339,7 +339,7 @@ class Inversion:
 
     @classmethod
     def from_dataset(cls, dataset: xarray.Dataset) -> Inversion:
-        """Rebuild an inversion from what `to_dataset` returned.
+        """Rebuild an inversion from the dataset of `to_dataset`.
 
         Raises
         ------
@@ -360,14 +360,14 @@ class Inversion:
     def _from_parts(cls, dataset: xarray.Dataset) -> Inversion:
         arrays: dict[str, Any] = {name: numbers_of(dataset, name) for name in VARIABLES}
         content = json.loads(dataset.attrs["report"])
-        known = {field.name for field in dataclasses.fields(Report)} & content.keys()
-        report = Report(**{name: _tuples(content[name]) for name in known})
+        names = {field.name for field in dataclasses.fields(Report)} & content.keys()
+        report = Report(**{name: _tuples(content[name]) for name in names})
         report = replace(report, warnings=tuple(map(Caution.from_json, report.warnings)))
         if content.get("errors"):
             report = replace(report, errors=Errors.of(content["errors"]))
         if math.isnan(report.image_residual):  # a file of an older version
-            told = image_residual(arrays["image"], arrays["reprojection"], arrays["mask"])
-            report = replace(report, image_residual=told)
+            residual = image_residual(arrays["image"], arrays["reprojection"], arrays["mask"])
+            report = replace(report, image_residual=residual)
         return cls(
             **arrays,
             report=report,

@@ -1,12 +1,12 @@
-"""Signs in an answer that it must not be trusted, though the solver converged.
+"""Signs that a solution must not be trusted, although the solver converged.
 
-- how far the re-projection is from the image: `image_residual`
-- whether more sites would bring it closer: `is_coarse`
-- what the user should know, in sentences: `doubts`
+- the difference of re-projection and image: `image_residual`
+- whether more sites would reduce it: `is_coarse`
+- the cautions about a solution: `find_cautions`
 
-Each sign was chosen to stay away from images whose field is known to come out well and to appear
-where it does not; `docs/trust.md` lists them with what to do. The limits, and what was
-measured on either side of them (200 × 200 px and the reference images):
+Each sign was chosen to be absent in images whose field is known to be right and to appear where it
+is wrong; `docs/trust.md` lists them with advice. The limits, and the measurements on either side of
+them (200 × 200 px and the reference images):
 
 - **The picture does not fit.** Away from bright lines, where pixels are too coarse for any
   re-projection, the residual of a noisy image has no pattern: its correlation between pixels up
@@ -14,17 +14,17 @@ measured on either side of them (200 × 200 px and the reference images):
   Chequerboards and stripes of 1 to 4 pixels (2:1 to 1000:1) have 0.8 to 1.0, too few sites for
   an image 0.6 to 0.7; the limit is 0.5. Clean images can pass it with residuals of a few
   tenths of a per cent, so a residual of at least 5 % is asked for, too: those images have 0.1 to
-  3 %, patterns 14 to 100 %. Dark and bright pixels at random are not told from noise.
+  3 %, patterns 14 to 100 %. Random dark and bright pixels are indistinguishable from noise.
 - **Too few sites for the image.** Over squares of 16 px the mean square of the residual, over that
   of the noise, is at most 1.3 in 98 % of the squares with one site per pixel, and 1.2 to 1.4 with
   a quarter of them for the toroids of 97 and 194 MG µm with noise; 2.6 to 4 where bright rims look
-  grainy (four toroids, donut). The limit is 2.25; 4 % of the local brightness are not seen.
+  grainy (four toroids, donut). The limit is 2.25; 4 % of the local brightness are invisible.
 - **No deflection.** White noise of relative deviation s displaces by ∇∇⁻² of itself: the mean
   square is s² Σ 1/k² / N over all N - 1 waves of the image. Pure noise gave 0.83 to 1.24 times
   that displacement, as it should with the scatter of so few long waves; fields whose own
   displacement is twice the noise's gave 2.0 to 2.2 times. The limit is five deviations of the
   mean square: 1.4 times on a square image, more on a long one.
-- **Deep folds.** The answer squeezes what lies between two caustics into a strip. At its rim the
+- **Deep folds.** The solution squeezes the area between two caustics into a strip. At its rim the
   Jacobian grows smoothly where caustics have only just formed and jumps where the fold is deep.
   The share of the strip's pixels below 0.7 that are below 0.4 is at most 0.70 up to 1.1 times the
   strength at which caustics begin (0.47 to 0.66 for the phantoms, the toroid of 194 MG µm and the
@@ -33,14 +33,14 @@ measured on either side of them (200 × 200 px and the reference images):
   strength the jump of a ring is at 0.6 to 1, hence the same with 0.85 and 0.6. A crescent has
   shallow tips: around its widest place, within twice the half-width, the shares are up to 0.79
   and 0.83 without deep folds, 0.86 to 0.95 and 0.87 to 0.98 with.
-- **The field goes on beyond a closed edge.** What a closed edge keeps from leaving must turn
+- **The field continues beyond a closed edge.** Rays that a closed edge keeps from leaving must turn
   back. A twentieth of the side inside the edge the mean displacement towards it or away from it
   is 0.08 to 0.20 of the r.m.s. displacement for fields that fall like 1/r or r^-½ or not at all,
   on all sides or two. The lesser of mean and median of the sides is at most 0.05 for contained
   fields and 0.055 for real plumes; with noise, 8 and more times its noise against 3. An object
   that the edge cuts in half has 0.87 to 1 of its peak along the edge, real plumes up to 0.72; a
-  jet is as strong at the edge as elsewhere, but nothing crosses the edge. A dipole's field, and
-  an object of which the edge cuts off less than half, are not told from a plume.
+  jet is as strong at the edge as elsewhere, but nothing crosses the edge. A dipole's field, and an
+  object cut off by less than half, are indistinguishable from a plume.
 """
 
 from __future__ import annotations
@@ -60,26 +60,27 @@ if TYPE_CHECKING:
     from napari_shadowinv.inversion.normalise import Prepared
     from napari_shadowinv.options import InversionOptions
 
-__all__ = ["doubts", "image_residual", "is_coarse"]
+__all__ = ["find_cautions", "image_residual", "is_coarse"]
 
-_BRIGHT = 3.0  # times the source: there a bright line is, which pixels are too coarse for
+_BRIGHT = 3.0  # times the source: a bright line, too fine for the pixels
 _LAGS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 4), (4, 0))
 _PATTERN = 0.5
 _NOTABLE_RESIDUAL = 0.05
 # More sites would follow the image better where its residual is larger than the noise by this:
-_ABOVE_NOISE = 1.5**2  # mean square in a square of the image, of the noise and what nobody sees
+_ABOVE_NOISE = 1.5**2  # mean square in a square of the image, of noise and invisible residual
 _INVISIBLE, _LEAST_VARIANCE = 0.04, 1e-12  # of the brightness; so that nothing divides by zero
-_SQUARE, _LEAST_OF_SQUARE = 16, 0.5  # px, and what share of it must count
-_OF_SQUARES = 0.98  # of them must be below
+_SQUARE_PX = 16
+_MIN_SHARE_OF_SQUARE = 0.5  # of its pixels that count
+_SQUARES_BELOW = 0.98  # share of the squares
 
 _ROUNDING = 1e-6  # px, where image and source are the same
 
-_CAUSTIC = 0.2  # Jacobian; not the option, which is the user's taste
-# Two Jacobians, and what share may be below the first: of all strips, where one is widest.
+_CAUSTIC = 0.2  # Jacobian; independent of the user's option
+# Two Jacobians, and the largest shares below the first: of all strips, and where one is widest.
 _STRIPS = ((0.4, 0.7, 0.72, 0.84), (0.6, 0.85, 0.8, 0.87))
 _LEAST_STRIP = 0.003  # of the pixels
 _LEAST_CAUSTIC = 0.01  # of a strip
-_ENOUGH_PIXELS = 300  # of a side, to see how wide a strip is
+_ENOUGH_PIXELS = 300  # of a side, to resolve the width of a strip
 
 _BAND_DEVIATIONS = 5.0
 _AT_EDGE = 0.8  # of the peak
@@ -96,12 +97,12 @@ _NEAR_MASK = 0.02  # of the shorter side
 
 
 def image_residual(image: FloatArray, reprojection: FloatArray, mask: BoolArray) -> float:
-    """R.m.s. difference of a re-projection from its image over the mean, inside the mask."""
+    """Return the r.m.s. difference of re-projection and image over the mean, inside the mask."""
     difference = (image - reprojection)[mask]
     return float(np.sqrt(np.mean(difference**2)) / image[mask].mean())
 
 
-def doubts(
+def find_cautions(
     prepared: Prepared,
     noise: ImageNoise,
     displacement: FloatArray,
@@ -112,18 +113,18 @@ def doubts(
     *,
     beam_difference: float = 0.0,
 ) -> tuple[Caution, ...]:
-    """Return the reasons to doubt a converged answer; empty if there are none.
+    """Return the reasons to doubt a converged solution; empty if there are none.
 
-    Contrast at the edge is an object that is cut off only if it is well above the relative
+    Contrast at the edge counts as a cut object only if it is well above the relative
     `beam_difference` of image and source outside the object.
     """
     square = np.einsum("cyx,cyx->yx", displacement, displacement)
     rms = float(np.sqrt(square[prepared.mask].mean()))
     misfit = _misfit(prepared, reprojection, n_sites)
     # Where the finest structure is a pattern, it is no measure of noise.
-    nothing = "" if misfit else _nothing_found(noise, rms)
-    if nothing:
-        return (Caution("no-deflection", nothing),)
+    no_deflection = "" if misfit else _no_deflection(noise, rms)
+    if no_deflection:
+        return (Caution("no-deflection", no_deflection),)
     texts = {
         "misfit": misfit,
         "folds": _deep_folds(jacobian, prepared.mask),
@@ -138,9 +139,9 @@ def doubts(
 
 
 def is_coarse(prepared: Prepared, reprojection: FloatArray, noise: ImageNoise) -> bool:
-    """Whether the re-projection misses structures of the image that its noise does not hide.
+    """Return whether the re-projection misses structures that noise does not hide.
 
-    Somewhere, in squares away from bright lines, their residual is larger than the noise.
+    That is the case if the residual exceeds the noise in some squares away from bright lines.
     """
     residual, counted = _apart_from_lines(prepared, reprojection)
     mean = prepared.source[prepared.mask].mean()
@@ -148,22 +149,23 @@ def is_coarse(prepared: Prepared, reprojection: FloatArray, noise: ImageNoise) -
     hidden = noise.variance(brightness) + (_INVISIBLE * brightness) ** 2 + _LEAST_VARIANCE
     excess = _in_squares(np.where(counted, (residual / mean) ** 2 / hidden, 0.0))
     share = _in_squares(counted.astype(float))
-    known = share > _LEAST_OF_SQUARE
-    if not known.any():
+    is_measured = share > _MIN_SHARE_OF_SQUARE
+    if not is_measured.any():
         return False
-    return bool(np.quantile(excess[known] / share[known], _OF_SQUARES) > _ABOVE_NOISE)
+    ratio = np.quantile(excess[is_measured] / share[is_measured], _SQUARES_BELOW)
+    return bool(ratio > _ABOVE_NOISE)
 
 
 def _in_squares(values: FloatArray) -> FloatArray:
-    """Mean over squares of pixels; what is left at the ends is left out."""
-    side = min(_SQUARE, *values.shape)
+    """Return means over squares of pixels; incomplete squares are left out."""
+    side = min(_SQUARE_PX, *values.shape)
     rows, columns = (length // side for length in values.shape)
-    whole = values[: rows * side, : columns * side]
-    return np.asarray(whole.reshape(rows, side, columns, side).mean(axis=(1, 3)))
+    cropped = values[: rows * side, : columns * side]
+    return np.asarray(cropped.reshape(rows, side, columns, side).mean(axis=(1, 3)))
 
 
 def _apart_from_lines(prepared: Prepared, reprojection: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Image minus re-projection, 0 where it does not count, and where it does."""
+    """Return image minus re-projection, 0 at bright lines, and the mask of the other pixels."""
     mean = prepared.source[prepared.mask].mean()
     bright = ndimage.uniform_filter(prepared.image, 3) > _BRIGHT * np.maximum(prepared.source, mean)
     counted = prepared.mask & ~bright
@@ -171,7 +173,7 @@ def _apart_from_lines(prepared: Prepared, reprojection: FloatArray) -> tuple[Flo
 
 
 def _misfit(prepared: Prepared, reprojection: FloatArray, n_sites: int) -> str:
-    """The re-projection misses a pattern in the image."""
+    """Describe a pattern in the image that the re-projection misses."""
     mask, mean = prepared.mask, prepared.source[prepared.mask].mean()
     residual, counted = _apart_from_lines(prepared, reprojection)
     share = float(np.sqrt((residual**2).sum() / max(counted.sum(), 1)) / mean)
@@ -194,17 +196,17 @@ def _misfit(prepared: Prepared, reprojection: FloatArray, n_sites: int) -> str:
 
 
 def _correlation(values: FloatArray, down: int, right: int) -> float:
-    """Correlation of pixels with those so many rows and columns further."""
+    """Return the correlation of pixels with pixels `down` rows and `right` columns further."""
     height, width = values.shape
-    left = max(-right, 0)
-    first = values[: height - down, left : width - max(right, 0)]
-    second = values[down:, left + right : width - max(right, 0) + right]
-    # Not by BLAS, whose threads are not ours to start.
+    x_start = max(-right, 0)
+    first = values[: height - down, x_start : width - max(right, 0)]
+    second = values[down:, x_start + right : width - max(right, 0) + right]
+    # Not by BLAS, which would start threads of its own.
     return float((first * second).sum() / (values**2).sum())
 
 
-def _nothing_found(noise: ImageNoise, rms: float) -> str:
-    """Noise alone would have displaced as much."""
+def _no_deflection(noise: ImageNoise, rms: float) -> str:
+    """Describe a displacement that noise alone explains."""
     usual, most = noise.displacements(noise.typical)
     if rms > max(most, _ROUNDING):
         return ""
@@ -262,7 +264,7 @@ def mark_caustics(
 
 
 def _deep_folds(jacobian: FloatArray, mask: BoolArray) -> str:
-    """Caustics far beyond their beginning, told by the rim of the strip between them."""
+    """Describe caustics far beyond their onset, by the rim of the strip between them."""
     if not (jacobian < _CAUSTIC)[mask].any():
         return ""
     step = max(1, min(mask.shape) // _ENOUGH_PIXELS)
@@ -283,7 +285,7 @@ def _deep_folds(jacobian: FloatArray, mask: BoolArray) -> str:
 
 
 def _strips(jacobian: FloatArray, outer: float, least: float) -> tuple[AnyArray, AnyArray]:
-    """Label where the Jacobian is below `outer`; say which labels are strips with caustics."""
+    """Label regions with the Jacobian below `outer`; return also the labels with caustics."""
     labels, count = ndimage.label(jacobian < outer)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     caustics = np.bincount(labels[jacobian < _CAUSTIC], minlength=count + 1)
@@ -291,18 +293,18 @@ def _strips(jacobian: FloatArray, outer: float, least: float) -> tuple[AnyArray,
 
 
 def _share_of_strips(jacobian: FloatArray, inner: float, outer: float, least: float) -> float:
-    """Of all strips: pixels below `inner` among those below `outer`."""
-    labels, found = _strips(jacobian, outer, least)
-    strips = jacobian[np.isin(labels, found)]
+    """Return the share of pixels below `inner` in all strips below `outer`."""
+    labels, strip_labels = _strips(jacobian, outer, least)
+    strips = jacobian[np.isin(labels, strip_labels)]
     return float((strips < inner).sum() / max(strips.size, 1))
 
 
 def _share_where_widest(jacobian: FloatArray, inner: float, outer: float, least: float) -> float:
-    """The same around the widest place of a strip: the tips of a crescent are shallow."""
-    labels, found = _strips(jacobian, inner, least)
+    """Return the share around the widest place of a strip: the tips of a crescent are shallow."""
+    labels, strip_labels = _strips(jacobian, inner, least)
     boxes = ndimage.find_objects(labels)
     largest = 0.0
-    for label in found:
+    for label in strip_labels:
         box = boxes[label - 1]
         depth = ndimage.distance_transform_edt(np.pad(labels[box] == label, 1))
         row, column = np.unravel_index(depth.argmax(), depth.shape)
@@ -314,7 +316,7 @@ def _share_where_widest(jacobian: FloatArray, inner: float, outer: float, least:
 
 
 def _cut_off(displacement: FloatArray, mask: BoolArray, noise: ImageNoise, rms: float) -> str:
-    """The field does not end at the closed edge."""
+    """Describe a field that reaches the closed edge."""
     sides = inner_sides(displacement, mask)
     if sides is None:
         return ""
@@ -340,13 +342,13 @@ def _cut_off(displacement: FloatArray, mask: BoolArray, noise: ImageNoise, rms: 
 
 
 def _is_strongest_at_edge(outwards: FloatArray, along: FloatArray, peak: float) -> bool:
-    """Whether it is, and not just the same all the way to the edge, as that of a jet."""
+    """Return whether the field peaks at the edge and crosses it, unlike a jet along it."""
     crossing = np.nanmean(outwards**2) > _CROSSING**2 * np.nanmean(along**2)
     return bool(crossing and np.nanmax(np.abs(along)) > _AT_EDGE * peak)
 
 
 def _cut_by_edge(prepared: Prepared, noise: ImageNoise, beam_difference: float) -> str:
-    """The image's contrast is as strong at one edge as anywhere, and the opposite edge is calm."""
+    """Describe an object cut by an edge: strong contrast there, a calm opposite edge."""
     mask = prepared.mask
     mean = prepared.source[mask].mean()
     width = _CONTRAST_BLUR * min(mask.shape)
@@ -384,7 +386,7 @@ def _cut_by_edge(prepared: Prepared, noise: ImageNoise, beam_difference: float) 
 
 
 def _peak_at_mask(displacement: FloatArray, mask: BoolArray) -> str:
-    """The field's peak lies beside masked pixels, or the field is stronger under them."""
+    """Describe a peak of the field next to masked pixels or under them."""
     if mask.all():
         return ""
     holes = ndimage.binary_opening(~mask, np.ones((_MIN_HOLE_PX, _MIN_HOLE_PX)))

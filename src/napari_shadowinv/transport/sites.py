@@ -145,7 +145,7 @@ class Levels(Sequence[Level]):
         counts = (*(level_count for level_count in self.counts if level_count < count), count)
         return Levels(counts, self._make, self._made, self._report)
 
-    def heard_by(self, report: Reporter | None) -> Levels:
+    def with_reporter(self, report: Reporter | None) -> Levels:
         """Return the same levels with another report for those still to be computed."""
         return Levels(self.counts, self._make, self._made, report)
 
@@ -170,7 +170,7 @@ class Levels(Sequence[Level]):
             yield lambda counts: None
             return
         abandoned = Event()
-        quiet = self.heard_by(Reporter(None, abandoned.is_set))
+        quiet = self.with_reporter(Reporter(None, abandoned.is_set))
         pool = ThreadPoolExecutor(1)
 
         def begin(counts: Sequence[int]) -> None:
