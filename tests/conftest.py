@@ -84,7 +84,7 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
         "levels": ((4, 10, 0.1), (17, 21, 1 / 3000)),
         "seconds": {"prepare": 0.1, "sites": 0.2, "transport": 1.0, "read-out": 0.1},
         "warnings": (Caution("negative-pixels", "1 negative pixel was set to zero"),),
-        "sites_reason": "as given",
+        "sites_reason": "as requested",
         "errors": Errors(
             peak=float(np.hypot(*blob.displacement).max()),
             rms=float(np.sqrt((blob.displacement**2).sum(axis=0).mean())),

@@ -23,7 +23,8 @@ SOURCE = Path(__file__).parents[1] / "src"
 PACKAGE = "napari_shadowinv"
 # From the ground up: a room imports only rooms of the lines above its own.
 ROOMS = (
-    ("errors", "_typing", "cautions", "facts"),
+    ("errors", "_typing", "cautions"),
+    ("facts",),
     ("_system",),
     ("options",),
     ("geometry",),

@@ -12,7 +12,7 @@ from enum import StrEnum
 
 from napari_shadowinv.cautions import Caution
 
-__all__ = ["Fact", "Headline", "Level", "caution_facts", "time_fact"]
+__all__ = ["Fact", "Headline", "Level", "caution_facts", "error_fact", "time_fact"]
 
 
 class Level(StrEnum):
@@ -67,6 +67,12 @@ class Fact:
 def caution_facts(cautions: Iterable[Caution]) -> list[Fact]:
     """Return cautions as facts."""
     return [Fact(each.code, "Warning", each.text, Level.DOUBTFUL) for each in cautions]
+
+
+def error_fact(name: str, text: str) -> Fact:
+    """Return a contribution to the error budget."""
+    key = name if name.startswith("error") else f"error_{name}"
+    return Fact(key.replace(" ", "_"), name.capitalize(), text)
 
 
 def time_fact(seconds: Mapping[str, float]) -> Fact:

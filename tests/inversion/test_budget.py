@@ -299,7 +299,7 @@ def test_a_pattern_that_few_sites_miss_gets_more():
 
 def test_what_is_given_is_used_and_the_paper_has_a_site_a_pixel(image):
     report = invert(image, options=InversionOptions(n_sites=300, accuracy=1e-6)).report
-    assert (report.n_sites, report.sites_reason) == (300, "as given")
+    assert (report.n_sites, report.sites_reason) == (300, "as requested")
     small = image[:20, :24]
     assert invert(small, options=InversionOptions.paper(max_iterations=3)).report.n_sites == 480
 
@@ -308,7 +308,7 @@ def test_the_number_of_a_plan_is_used_and_else_that_of_the_options(image):
     beam = np.ones(image.shape)
     numbered_plan = plan_sites(beam, InversionOptions(n_sites=1500))
     assert invert(image, plan=numbered_plan).report.n_sites == 1500
-    assert invert(image, plan=numbered_plan).report.sites_reason == "as given"
+    assert invert(image, plan=numbered_plan).report.sites_reason == "as requested"
     default_plan = plan_sites(beam)
     few = InversionOptions(n_sites=700)
     coarse = invert(image, plan=default_plan, options=few)

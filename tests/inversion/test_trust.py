@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from napari_shadowinv.cli._summary import inversion_rows
 from napari_shadowinv.inversion import Inversion, Report, invert
 from napari_shadowinv.inversion.edges import inner_sides, turned_back
 from napari_shadowinv.inversion.trust import image_residual, mark_caustics
@@ -125,8 +124,8 @@ def test_the_report_tells_the_residual_of_the_pixels_that_were_used():
     assert inversion.report.image_residual == pytest.approx(expected)
     assert inversion.to_dataset().attrs["image_residual"] == pytest.approx(expected)
     percent = f"{100 * expected:.3g} %"
-    residual = dict(inversion_rows(inversion, None))["image residual"]
-    assert residual.startswith(f"{percent} of the mean")
+    residual = next(fact for fact in inversion.facts if fact.key == "image_residual")
+    assert residual.text.startswith(f"{percent} of the mean")
     titles = [
         axes.get_title(loc) for axes in report_figure(inversion).axes for loc in ("left", "center")
     ]

@@ -99,7 +99,7 @@ def test_a_batch_is_written_and_told_of(night, folder):
     noise = np.median([report["errors"]["noise"][0] for report in reports])
     status = flat(shadowinv("status", "n.shadowinv.zarr").output)
     for text in flat(result.output), status:
-        assert "100; as given" in text
+        assert "100; as requested" in text
         assert f"noise {noise:.2g} px" in text
 
 

@@ -258,7 +258,7 @@ def _site_rows(store: StackStore) -> Rows:
         return []
     counts = sorted({report["n_sites"] for report in reports})
     least, most = f"{counts[0]:,}", f"{counts[-1]:,}"
-    reasons = dict.fromkeys(report.get("sites_reason") or "as given" for report in reports)
+    reasons = dict.fromkeys(report.get("sites_reason") or "as requested" for report in reports)
     reason = next(iter(reasons)) if len(reasons) == 1 else "for different reasons"
     rows = [("sites", f"{least if least == most else f'{least} to {most}'}; {reason}")]
     errors = [report["errors"] for report in reports if report.get("errors")]

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from napari_shadowinv.cli._summary import (
-    closing_rows,
+    fact_rows,
     headline_row,
-    inversion_rows,
     setup_text,
     two_columns,
+    written_rows,
 )
 
 if TYPE_CHECKING:
@@ -73,10 +73,10 @@ def demo_table(
     rows = [
         headline_row(inversion, setup),
         ("setup", setup_text(setup, shape=inversion.image.shape)),
-        *inversion_rows(inversion, setup),
+        *fact_rows(inversion.facts_in(setup)),
         ("error", _errors_text(fields, "Retrieved")),
         ("error of Poisson", _errors_text(fields, "Poisson")),
-        *closing_rows(inversion.report, written),
+        *written_rows(written),
     ]
     return two_columns("Demo", rows)
 

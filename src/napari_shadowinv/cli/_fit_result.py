@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from napari_shadowinv.cli._summary import Rows, options_text, size_text, two_columns
+from napari_shadowinv.cli._summary import (
+    Rows,
+    fact_rows,
+    options_text,
+    setup_text,
+    size_text,
+    two_columns,
+)
 from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
     is_interrupted,
@@ -25,7 +32,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv._typing import FloatArray
     from napari_shadowinv.cli._static_result import StaticChecks
-    from napari_shadowinv.fitting import Fit, FittedField
+    from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.pipeline import FitShot
     from napari_shadowinv.preprocessing import FitProvenance, Recipe
@@ -180,60 +187,10 @@ def _provenance_rows(provenance: FitProvenance) -> Rows:
 
 
 def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:
-    """Return the verdict, the fit of each image, and the fields; `names` are of the images."""
-    from napari_shadowinv.cli._summary import setup_text
-    from napari_shadowinv.fitting import Verdict
-
-    determined = fit.verdict is Verdict.DETERMINED
-    rows = [
-        ("verdict", str(fit.verdict)),
-        ("because" if determined else "warning", fit.explanation),
-        *[("warning", caution.text) for caution in fit.warnings],
-        *[(f"image {k + 1}", _image_text(fit, k, names)) for k in range(len(fit.images))],
+    """Return the size and setup of the images, and the facts; `names` are of the images."""
+    setup = fit.setups[0] if fit.setups else None
+    return [
+        *fact_rows(fit.facts(names)),
         ("size", size_text(fit.images[0])),
-        ("setup", setup_text(fit.setups[0] if fit.setups else None, shape=fit.images[0].shape)),
-        *[(f"field {field.name}", _field_text(fit, field)) for field in fit.fields],
+        ("setup", setup_text(setup, shape=fit.images[0].shape)),
     ]
-    rows += fit.error_rows
-    best, *alternatives = fit.basins
-    rows += [
-        (
-            "alternative",
-            f"{solution.start}: objective {solution.objective / best.objective - 1:+.2%}, "
-            f"displacement {solution.distance:.2%} away",
-        )
-        for solution in alternatives
-    ]
-    if fit.folded:
-        rows.append(("crossed rays", f"{fit.folded:.1%} of the pixels"))
-    if not fit.report.converged:
-        rows.append(
-            ("warning", f"not converged in {fit.report.iterations} steps: allow more (--steps)")
-        )
-    stages = ", ".join(f"{stage} {value:.2f}" for stage, value in fit.report.seconds.items())
-    return [*rows, ("time", f"{sum(fit.report.seconds.values()):.2f} s ({stages})")]
-
-
-def _image_text(fit: Fit, k: int, names: Sequence[str]) -> str:
-    parts = [names[k]] if names and names[k] else []
-    parts += [fit.setups[k].probe] if fit.setups else []
-    strengths = ", ".join(f"{strength:.3g}" for strength in fit.strengths[k])
-    parts += [f"χ² {fit.chi2[k]:.3g}", f"strength {strengths}", f"gain {fit.gains[k]:.4g}"]
-    if k and fit.options.align != "none":
-        dy, dx = fit.frames[k][[0, 3]]
-        parts.append(f"shifted by y {dy:+.3g}, x {dx:+.3g} px")
-    return ", ".join(parts)
-
-
-def _field_text(fit: Fit, field: FittedField) -> str:
-    from napari_shadowinv.fitting import FIELDS
-    from napari_shadowinv.physics.units import shown_fields
-
-    (pixels,) = shown_fields([field.displacement], None, mask=fit.used)
-    row, column = pixels.peak
-    peak = f"{fit.peak_text(field, pixels)}, at y = {row}, x = {column} px"
-    if not fit.setups:
-        return peak
-    setup, deflector = fit.setups[0], FIELDS[field.name]
-    (physical,) = shown_fields([field.displacement], setup, deflector, mask=fit.used)
-    return f"{fit.peak_text(field, physical)}; {peak}"

@@ -136,6 +136,7 @@ def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
     from napari_shadowinv.cli._fit_result import fit_file_rows
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.inversion.labels import is_fit, is_pack, setup_from_dataset
+    from napari_shadowinv.physics.units import peak_facts
 
     if is_fit(dataset.attrs):
         return fit_file_rows(dataset)
@@ -153,7 +154,7 @@ def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
     if "options" not in dataset.attrs:
         is_foreign = dataset.attrs.get("format") == "pradformat"
         kind = "pradformat inversion" if is_foreign else "field retrieved by another program"
-        return [("kind", kind), *experiment, *_summary.peak_rows(displacement, setup)]
+        return [("kind", kind), *experiment, *_summary.fact_rows(peak_facts(displacement, setup))]
     inversion = Inversion.from_dataset(dataset)
     return [
         _summary.headline_row(inversion, setup),
@@ -161,8 +162,7 @@ def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
         ("created", str(dataset.attrs["created"])),
         *_origin_rows(inversion.provenance),
         *experiment,
-        *_summary.inversion_rows(inversion, setup),
-        *_summary.closing_rows(inversion.report),
+        *_summary.fact_rows(inversion.facts_in(setup)),
         ("options", _summary.options_text(inversion.options.model_dump())),
     ]
 

@@ -11,10 +11,10 @@ from napari_shadowinv.cli._terminal import plain
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+    from napari_shadowinv._typing import AnyArray
     from napari_shadowinv.cli._rerun import InversionRerun
-    from napari_shadowinv.inversion import Inversion, Report
-    from napari_shadowinv.inversion.budget import Errors
+    from napari_shadowinv.facts import Fact
+    from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Provenance, Radiograph
 
@@ -52,8 +52,8 @@ def summary(inversion: Inversion, shot: Radiograph, written: list[Path]) -> Tabl
         ("image", f"{shot.path}, {size_text(inversion.image)}"),
         *provenance_rows(inversion.provenance),
         ("setup", setup_text(inversion.setup, shot, inversion.image.shape)),
-        *inversion_rows(inversion, inversion.setup),
-        *closing_rows(inversion.report, written),
+        *fact_rows(inversion.facts),
+        *written_rows(written),
     ]
     return two_columns("Inversion", rows)
 
@@ -65,7 +65,8 @@ def rerun_table(again: InversionRerun, written: list[Path]) -> Table:
         ("image", f"{again.shot.path}, {size_text(again.inversion.image)}"),
         *[("changed", text) for text in again.changes or ("nothing",)],
         ("difference", again.difference),
-        *closing_rows(again.inversion.report, written),
+        *fact_rows(again.inversion.facts),
+        *written_rows(written),
     ]
     return two_columns("Rerun", rows)
 
@@ -88,63 +89,14 @@ def provenance_rows(provenance: Provenance | None) -> Rows:
     return rows
 
 
-def inversion_rows(inversion: Inversion, setup: Setup | None) -> Rows:
-    """Return the quality of an inversion, and the strongest point of its field."""
-    report = inversion.report
-    verdict = "converged" if report.converged else "NOT converged"
-    free = {"flux left": report.flux_left, "flux entered": report.flux_entered}
-    return [
-        ("sites", f"{report.n_sites:,}; {report.sites_reason}".removesuffix("; ")),
-        (
-            "flux residual",
-            f"{report.residual:.2g} of a cell, tolerance {report.tolerance:.2g}: {verdict}",
-        ),
-        ("image residual", f"{100 * report.image_residual:.3g} % of the mean (root mean square)"),
-        ("iterations", f"{report.iterations} on {len(report.levels)} levels"),
-        (
-            "floor",
-            f"{report.floor:g} of the mean: {report.floored_pixels} pixels raised, "
-            f"{report.clipped_pixels} clipped",
-        ),
-        ("caustics", f"{inversion.caustic.mean():.2%} of the pixels"),
-        *[
-            (name, ", ".join(f"{side} {share:.2%}" for side, share in shares.items()))
-            for name, shares in free.items()
-            if shares
-        ],
-        *peak_rows(inversion.displacement, setup, mask=inversion.mask, errors=inversion.errors),
-        *inversion.error_rows,
-    ]
+def fact_rows(facts: Iterable[Fact]) -> Rows:
+    """Return facts as rows of a table."""
+    return [(fact.title.lower(), fact.text) for fact in facts]
 
 
-def peak_rows(
-    displacement: FloatArray,
-    setup: Setup | None,
-    *,
-    mask: BoolArray | None = None,
-    errors: Errors | None = None,
-) -> Rows:
-    """Return the strongest point inside the mask, in px and with a setup in SI units."""
-    from napari_shadowinv.physics.units import shown_fields
-
-    error = None if errors is None else errors.of_peak
-    (pixels,) = shown_fields([displacement], None, mask=mask)
-    row, column = pixels.peak
-    rows = [("displacement", f"{pixels.peak_text(error)}, at y = {row}, x = {column} px")]
-    if setup is not None:
-        (field,) = shown_fields([displacement], setup, mask=mask)
-        rows.append(("field", field.peak_text(error)))
-    return rows
-
-
-def closing_rows(report: Report, written: Iterable[Path] = ()) -> Rows:
-    """Return the time, the warnings, and the files."""
-    stages = ", ".join(f"{stage} {value:.2f}" for stage, value in report.seconds.items())
-    return [
-        ("time", f"{sum(report.seconds.values()):.2f} s ({stages})"),
-        *[("warning", caution.text) for caution in report.warnings],
-        *[("written", str(path)) for path in written],
-    ]
+def written_rows(paths: Iterable[Path]) -> Rows:
+    """Return a row for each file that was written."""
+    return [("written", str(path)) for path in paths]
 
 
 def setup_text(

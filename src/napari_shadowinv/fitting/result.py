@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Fact, Level, caution_facts, error_fact, time_fact
 from napari_shadowinv.fitting.beam_error import BeamError
 from napari_shadowinv.fitting.verdict import Verdict
 from napari_shadowinv.inversion.labels import (
@@ -27,9 +28,9 @@ from napari_shadowinv.inversion.labels import (
     label,
     numbers_of,
 )
-from napari_shadowinv.options import FitOptions
+from napari_shadowinv.options import FIELDS, FitOptions
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
-from napari_shadowinv.physics.units import PeakError, ShownField
+from napari_shadowinv.physics.units import PeakError, ShownField, peak_facts, shown_fields
 from napari_shadowinv.preprocessing import FitProvenance
 
 if TYPE_CHECKING:
@@ -280,13 +281,72 @@ class Fit:
             return None
         return Caution("verdict", self.explanation)
 
-    def peak_text(self, field: FittedField, shown: ShownField) -> str:
-        """Return the largest magnitude of a field with its total error, in the unit shown."""
+    def facts(self, names: Sequence[str] = ()) -> tuple[Fact, ...]:
+        """Return the result in words, as every face shows it.
+
+        Parameters
+        ----------
+        names : sequence of str, optional
+            Names of the images. Default: their numbers.
+        """
+        level = Level.SOUND if self.verdict is Verdict.DETERMINED else Level.DOUBTFUL
+        return (
+            Fact("verdict", "Verdict", str(self.verdict), level),
+            Fact("verdict", "Reason", self.explanation, level),
+            *caution_facts(self.warnings),
+            *self._image_facts(names),
+            *(self._field_fact(field) for field in self.fields),
+            *(error_fact(name, text) for name, text in self.error_rows),
+            *self._solution_facts(),
+            time_fact(self.report.seconds),
+        )
+
+    def peak_error(self, field: FittedField, shown: ShownField) -> PeakError | None:
+        """Return the total error of the largest magnitude of a field; None if not known."""
         share = field.error_at(*shown.peak)
         if np.isnan(share):
-            return shown.peak_text()
-        cause = self.report.beam.name if self.report.beam else "noise"
-        return shown.peak_text(PeakError(share, cause))
+            return None
+        return PeakError(share, self.report.beam.name if self.report.beam else "noise")
+
+    def peak_text(self, field: FittedField, shown: ShownField) -> str:
+        """Return the largest magnitude of a field with its total error, in the unit shown."""
+        return shown.peak_text(self.peak_error(field, shown))
+
+    def _image_facts(self, names: Sequence[str]) -> Iterator[Fact]:
+        for k, chi2 in enumerate(self.chi2):
+            parts = [names[k]] if names and names[k] else []
+            parts += [self.setups[k].probe] if self.setups else []
+            strengths = ", ".join(f"{strength:.3g}" for strength in self.strengths[k])
+            parts += [f"χ² {chi2:.3g}", f"strength {strengths}", f"gain {self.gains[k]:.4g}"]
+            if k and self.options.align != "none":
+                dy, dx = self.frames[k][[0, 3]]
+                parts.append(f"shifted by y {dy:+.3g}, x {dx:+.3g} px")
+            yield Fact(f"image_{k + 1}", f"Image {k + 1}", ", ".join(parts))
+
+    def _field_fact(self, field: FittedField) -> Fact:
+        setup, deflector = self.setups[0] if self.setups else None, FIELDS[field.name]
+        (pixels,) = shown_fields([field.displacement], None, mask=self.used)
+        error = self.peak_error(field, pixels)
+        peaks = peak_facts(field.displacement, setup, deflector, mask=self.used, error=error)
+        text = "; ".join(fact.text for fact in peaks)
+        return Fact(f"field_{field.name}", f"Field {field.name}", text)
+
+    def _solution_facts(self) -> Iterator[Fact]:
+        best, *alternatives = self.basins
+        for solution in alternatives:
+            excess = solution.objective / best.objective - 1
+            text = (
+                f"{solution.start}: objective {excess:+.2%}, displacement {solution.distance:.2%} "
+                "away"
+            )
+            yield Fact("alternative", "Alternative", text)
+        if self.folded:
+            yield Fact("crossed_rays", "Crossed rays", f"{self.folded:.1%} of the pixels")
+        if self.report.converged:
+            yield Fact("converged", "Converged", f"in {self.report.iterations} steps")
+        else:
+            text = f"NO, not in {self.report.iterations} steps: allow more (--steps)"
+            yield Fact("converged", "Converged", text, Level.FAILED)
 
     def to_dataset(
         self,

@@ -327,7 +327,7 @@ def _reason(
     if start is not None:
         return "as many as in the inversion that it started from"
     if not adaptive:
-        return "as given"
+        return "as requested"
     if coarse:
         return f"with {coarse:,} the re-projection missed structures of the image"
     if budget.reason:

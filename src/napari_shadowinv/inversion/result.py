@@ -15,7 +15,7 @@ from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Headline, Level, caution_facts, time_fact
+from napari_shadowinv.facts import Fact, Headline, Level, caution_facts, error_fact, time_fact
 from napari_shadowinv.inversion.budget import Errors
 from napari_shadowinv.inversion.labels import (
     FORMAT,
@@ -244,7 +244,7 @@ class Inversion:
                 "Image residual",
                 f"{100 * report.image_residual:.3g} % of the mean (r.m.s.)",
             ),
-            *(Fact(name, name.capitalize(), text) for name, text in self.error_rows),
+            *(error_fact(name, text) for name, text in self.error_rows),
             Fact("caustics", "Caustics", f"{self.caustic.mean():.2%} of the pixels"),
             *(
                 Fact(key, title, ", ".join(f"{side} {share:.2%}" for side, share in flow.items()))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from napari.utils.notifications import show_warning
@@ -14,7 +14,6 @@ from qtpy.QtWidgets import QDoubleSpinBox, QPushButton, QWidget
 from napari_shadowinv._napari.fit_jobs import FinishedFit, FitJob
 from napari_shadowinv._napari.fit_layers import (
     alternative_layers,
-    setup_of_fit,
     start_name,
     verdict_sentence,
 )
@@ -28,12 +27,11 @@ from napari_shadowinv._napari.widgets._forms import (
     section,
     wrapping_label,
 )
-from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel
+from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, fact_rows
 from napari_shadowinv._napari.widgets._plots import ObjectiveCurve
 from napari_shadowinv._napari.widgets._qt import column, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_together
-from napari_shadowinv.fitting import FIELDS, Fit, FittedField, Verdict
-from napari_shadowinv.physics.units import shown_fields
+from napari_shadowinv.fitting import Fit, Verdict
 
 _REDRAW_MS = 500
 _MIN_REDRAW_RATIO = 10  # interval over the time of a drawing
@@ -115,7 +113,7 @@ class FitView(QWidget):
         input_warnings = {text for name, text in job.inputs if name == "Warning"}
         texts = [caution.text for caution in fit.warnings]
         rows = [("Warning", window_text(text)) for text in texts if text not in input_warnings]
-        self.report.show_rows([*rows, *job.inputs, *fit_rows(fit, job.names)])
+        self.report.show_rows([*rows, *job.inputs, *fact_rows(fit.facts(job.names), details=None)])
         self._alternative.show([])
         self._job, self._result = job, finished.result
         self._list_solutions(fit)
@@ -135,7 +133,7 @@ class FitView(QWidget):
             self._result = result
             self._show_verdict(result.content)
             rows = [("Warning", window_text(caution.text)) for caution in result.content.warnings]
-            self.report.show_rows([*rows, *fit_rows(result.content)])
+            self.report.show_rows([*rows, *fact_rows(result.content.facts(), details=None)])
 
     def _show_verdict(self, fit: Fit) -> None:
         is_determined = fit.verdict is Verdict.DETERMINED
@@ -187,34 +185,3 @@ class FitView(QWidget):
         self._redraw_timer.stop()
         if isinstance(outcome.tag, FitJob):
             self.curve.show_steps(list(outcome.tag.progress.history))
-
-
-def fit_rows(fit: Fit, names: Sequence[str] = ()) -> list[tuple[str, str]]:
-    """Return the report of a fit as rows."""
-    rows = []
-    for k, chi2 in enumerate(fit.chi2):
-        facts = [*names[k : k + 1], *([fit.setups[k].probe] if fit.setups else [])]
-        facts.append(f"χ² {chi2:.3g}")
-        if abs(fit.gains[k] - 1) > 1e-6:
-            facts.append(f"gain {fit.gains[k]:.3f}")
-        shift = fit.frames[k][[0, 3]]
-        if shift.any():
-            facts.append(f"shifted by {shift[0]:.2f}, {shift[1]:.2f} px (y, x)")
-        rows.append((f"Image {k + 1}", ", ".join(facts)))
-    report = fit.report
-    rows += [(_peak_name(fit, field), _peak_text(fit, field)) for field in fit.fields]
-    rows += [(name.capitalize(), text) for name, text in fit.error_rows]
-    rows.append(("Rays cross", f"in {fit.folded:.1%} of the pixels"))
-    rows.append(("Converged", "yes" if report.converged else "NO"))
-    rows.append(("Time", f"{sum(report.seconds.values()):.1f} s"))
-    return rows
-
-
-def _peak_name(fit: Fit, field: FittedField) -> str:
-    return "Peak" if len(fit.fields) == 1 else f"Peak of {field.name}"
-
-
-def _peak_text(fit: Fit, field: FittedField) -> str:
-    setup, deflector = setup_of_fit(fit), FIELDS[field.name]
-    (shown_field,) = shown_fields([field.displacement], setup, deflector, mask=fit.used)
-    return fit.peak_text(field, shown_field).removeprefix("peak ")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from napari.utils import progress as activity
@@ -18,12 +18,11 @@ from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, section, wrap
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._napari.widgets._runner import Outcome, Runner, Work
 from napari_shadowinv._system.progress import Progress
-from napari_shadowinv.facts import Headline, Level
-from napari_shadowinv.physics.units import shown_fields
+from napari_shadowinv.cautions import CAUTION_CODES
+from napari_shadowinv.facts import Fact, Headline, Level
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
-    from napari_shadowinv.inversion import Inversion
 
 WIDTH = 330
 
@@ -184,41 +183,16 @@ class RunPanel(QtWidgets.QWidget):
             qt.report_error(outcome.error)
 
 
-def report_rows(inversion: Inversion) -> list[tuple[str, str]]:
-    """Return the report of an inversion as rows; the headline shows the warnings."""
-    report = inversion.report
+def fact_rows(facts: Iterable[Fact], *, details: bool | None = False) -> list[tuple[str, str]]:
+    """Return facts as rows: of the result, of the solver (`details`) or, with None, of both.
+
+    The headline and the verdict already show the warnings.
+    """
     return [
-        ("Converged", "yes" if report.converged else "NO"),
-        ("Image residual", image_residual_text(inversion)),
-        *_error_rows(inversion),
-        ("Caustics", f"{inversion.caustic.mean():.2%} of the pixels"),
+        (fact.title, window_text(fact.text))
+        for fact in facts
+        if details in (fact.is_detail, None) and fact.key not in CAUTION_CODES
     ]
-
-
-def image_residual_text(inversion: Inversion) -> str:
-    return f"{100 * inversion.report.image_residual:.3g} % of the mean, r.m.s."
-
-
-def solver_rows(inversion: Inversion) -> list[tuple[str, str]]:
-    """Return the report of the solver and its timing as rows."""
-    report = inversion.report
-    stages = [(f"  {stage}", f"{seconds:.2f} s") for stage, seconds in report.seconds.items()]
-    return [
-        ("Sites", f"{report.n_sites:,}; {report.sites_reason}".removesuffix("; ")),
-        ("Flux residual", f"{report.residual:.2g} (tolerance {report.tolerance:.2g})"),
-        ("Iterations", f"{report.iterations} on {len(report.levels)} levels"),
-        ("Time", f"{sum(report.seconds.values()):.2f} s"),
-        *stages,
-    ]
-
-
-def _error_rows(inversion: Inversion) -> list[tuple[str, str]]:
-    errors = inversion.errors
-    if errors is None:
-        return []
-    (field,) = shown_fields([inversion.displacement], inversion.setup, mask=inversion.mask)
-    rows = [(name.capitalize(), text) for name, text in inversion.error_rows]
-    return [("Field", field.peak_text(errors.of_peak)), *rows]
 
 
 class ReportTable(QtWidgets.QTableWidget):

@@ -29,9 +29,7 @@ from napari_shadowinv._napari.widgets._panels import (
     LivePanel,
     RunPanel,
     VerdictLine,
-    image_residual_text,
-    report_rows,
-    solver_rows,
+    fact_rows,
 )
 from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, while_alive
 from napari_shadowinv._napari.widgets._results import (
@@ -341,7 +339,8 @@ class InvertShot(InversionInputs, LivePanel):
         self, inversion: Inversion, setup: Setup | None, input_rows: list[tuple[str, str]]
     ) -> None:
         self.verdict.show_headline(inversion.headline_in(setup))
-        self.report.show_rows([*input_rows, *report_rows(inversion)], solver_rows(inversion))
+        facts = inversion.facts_in(setup)
+        self.report.show_rows([*input_rows, *fact_rows(facts)], fact_rows(facts, details=True))
 
     def _show_inversion(self, value: _FinishedInversion, request: _Request) -> None:
         headline = value.inversion.headline
@@ -357,7 +356,8 @@ class InvertShot(InversionInputs, LivePanel):
             self.verdict.show_headline(headline, "Preview: ")
             self._reported = result_of(value.layer_data[0][1])
             self.show_layers(image, value.layer_data, preview=True, fit=moved)
-            self.panel.say(f"Image residual {image_residual_text(value.inversion)}")
+            residual = next(f for f in value.inversion.facts if f.key == "image_residual")
+            self.panel.say(f"{residual.title} {residual.text}")
             return
         self._report(value.inversion, value.inversion.setup, request.origins.rows())
         self._reported = result_of(value.layer_data[0][1])

@@ -1,0 +1,79 @@
+"""A result describes itself once: its facts, and the faces that render them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from napari_shadowinv import FitOptions, InversionOptions, fit, invert, synthetic_image
+from napari_shadowinv._napari.widgets._panels import fact_rows as window_rows
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.cli._summary import fact_rows as table_rows
+from napari_shadowinv.facts import Level
+from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+
+
+@pytest.fixture(scope="module")
+def image():
+    clean = synthetic_image(gaussian_blob((48, 56), 20.0, 8.0).displacement)
+    return clean + np.random.default_rng(0).normal(0, 0.01, clean.shape)
+
+
+@pytest.fixture(scope="module")
+def inversion(image):
+    return invert(image, options=InversionOptions(n_sites=400))
+
+
+def texts_by_key(facts):
+    return {fact.key: fact.text for fact in facts}
+
+
+def test_facts_give_the_numbers_of_the_report(inversion):
+    texts = texts_by_key(inversion.facts)
+    report = inversion.report
+    assert texts["image_residual"].startswith(f"{100 * report.image_residual:.3g} % ")
+    assert texts["sites"].startswith("400; ")
+    assert f"{np.hypot(*inversion.displacement).max():.1f}" in texts["displacement"]
+    assert texts["caustics"] == "0.00% of the pixels"
+    assert texts["time"].startswith(f"{sum(report.seconds.values()):.2f} s")
+    assert "field" not in texts
+
+
+def test_facts_with_a_setup_add_the_field_in_its_unit(inversion):
+    setup = paper_setup()
+    texts = texts_by_key(inversion.facts_in(setup))
+    strength = setup.field_in_si("path_integrated_b", inversion.displacement)
+    assert f"{1e3 * np.hypot(*strength).max():.3g}" in texts["field"]
+    assert "mT·m" in texts["field"]
+
+
+def test_a_caution_is_a_doubtful_fact_and_lack_of_convergence_a_failed_one(image, inversion):
+    doubtful = inversion.with_warnings([Caution("beam", "the beam differs")])
+    (fact,) = [fact for fact in doubtful.facts if fact.key == "beam" and fact.title == "Warning"]
+    assert (fact.text, fact.level) == ("the beam differs", Level.DOUBTFUL)
+    failed = invert(image, options=InversionOptions(n_sites=400, max_iterations=1))
+    levels = {fact.key: fact.level for fact in failed.facts}
+    assert levels["flux_residual"] is Level.FAILED
+    assert levels["image_residual"] is Level.SOUND
+
+
+def test_every_face_shows_the_same_texts(inversion):
+    table = {name: text for name, text in table_rows(inversion.facts) if name != "warning"}
+    window = window_rows(inversion.facts) + window_rows(inversion.facts, details=True)
+    assert {name.lower(): text for name, text in window} == table
+
+
+def test_facts_of_a_fit_name_images_fields_and_the_verdict(image):
+    options = FitOptions(samples=0, steps=20, spacing=0.25)
+    result = fit([image, image[::-1]], strengths=[1, 0.8], noise=0.01, options=options)
+    facts = result.facts(["first.tif", "second.tif"])
+    texts = texts_by_key(facts)
+    assert texts["image_2"].startswith("second.tif, χ² ")
+    assert "strength 0.8" in texts["image_2"]
+    largest = np.hypot(*result.fields[0].displacement).max()
+    assert f"{largest:.3g} px" in texts["field_B"]
+    assert [fact.text for fact in facts if fact.key == "verdict"] == [
+        str(result.verdict),
+        result.explanation,
+    ]
+    assert {fact.level for fact in facts if fact.key == "verdict"} == {Level.DOUBTFUL}
