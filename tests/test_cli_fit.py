@@ -689,8 +689,8 @@ def test_the_peak_of_a_fit_is_that_of_unmasked_pixels(
         setups=(proton_setup, proton_setup),
     )
     write("fit.shadowinv", hidden)
-    told = flat(shadowinv("info", "fit.shadowinv").stdout)
-    (peak,) = re.findall(r"peak \|d\|\s*([\d.]+)", told)
+    output = flat(shadowinv("info", "fit.shadowinv").stdout)
+    (peak,) = re.findall(r"peak \|d\|\s*([\d.]+)", output)
     assert float(peak) == pytest.approx(np.hypot(*field.displacement).max(), rel=0.01)
     # The largest value of the figure's colour scale, and the blank pixels.
     (panel,) = [
@@ -706,10 +706,10 @@ def test_field_of_view_of_a_fit_is_in_its_table(
     make_fit: Callable[..., Fit], proton_setup: ProtonSetup
 ) -> None:
     write("fit.shadowinv", make_fit(setups=(proton_setup, proton_setup)))
-    told = flat(shadowinv("info", "fit.shadowinv").stdout)
+    output = flat(shadowinv("info", "fit.shadowinv").stdout)
     # 64 × 48 px of 1.5 µm, (1.3 + 20) / 1.3.
-    assert "magnification 16.38" in told
-    assert "field of view 96 × 72 µm" in told
+    assert "magnification 16.38" in output
+    assert "field of view 96 × 72 µm" in output
 
 
 def test_setup_warnings_come_before_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -152,7 +152,7 @@ def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[_Job]:
 
 
 def _with_origin(shot: xarray.Dataset) -> xarray.Dataset:
-    """Return a shot with its provenance: its own, or that of the store with its image."""
+    """Return a shot with its own provenance, or else the provenance of its store."""
     report = json.loads(str(shot["report"].values))
     if "provenance" in report:
         return shot.assign_attrs(provenance=json.dumps(report["provenance"]))

@@ -102,7 +102,7 @@ def invert_shot(
 
 
 def warn_of_setups(experiments: Iterable[tuple[Setup | None, tuple[int, int] | None]]) -> None:
-    """Print what is doubtful about setups and the shapes of their images, before work begins."""
+    """Print the doubts about setups and the shapes of their images, before the work begins."""
     from rich.console import Console
 
     from napari_shadowinv.physics.setup import setup_warnings
