@@ -201,7 +201,7 @@ def test_the_table_of_sources_is_as_the_inversions_say():
     by_title["uniform"] = ESTIMATES["uniform"]
     assert len(rows) == 5
     for title, peak, error, residual in rows:
-        beam = source if title.startswith("the one") else by_title[title]().source(image, None)
+        beam = source if title.startswith("supplied") else by_title[title]().source(image, None)
         inversion = invert(image, source=beam)
         strength = 1e3 * np.hypot(*setup.path_integrated_b(inversion.displacement))
         assert strength.max() == pytest.approx(float(peak), abs=0.06), title

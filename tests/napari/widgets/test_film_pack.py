@@ -142,7 +142,7 @@ def test_corners_are_shown_dragged_and_used(
     tool.corners.polygon.data = [moved[2]]
     tool.run_again.click()
     wait(tool)
-    dataset = tool._chosen()[1]
+    dataset = tool._selected()[1]
     assert dataset is not pack_dataset
     table = read_corners(pack_of(dataset).corners)
     np.testing.assert_allclose(table["1"], corners[0], atol=0.006)
@@ -194,7 +194,7 @@ def test_painted_pixels_are_not_used(
     marks.data[spot] = BY_HAND
     tool.run_again.click()
     wait(tool)
-    dataset = tool._chosen()[1]
+    dataset = tool._selected()[1]
     usable = dataset["usable"].values
     assert not usable[spot].any()
     assert usable[0, 30:36, 40:48].all()
@@ -214,7 +214,7 @@ def test_painted_pixels_are_not_used(
     marks.data[spot] = 0
     tool.run_again.click()
     wait(tool)
-    assert tool._chosen()[1]["usable"].values[spot].all()
+    assert tool._selected()[1]["usable"].values[spot].all()
 
 
 def test_cancelling_leaves_nothing(

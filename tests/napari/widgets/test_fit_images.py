@@ -309,7 +309,7 @@ def test_steps_are_done_to_all_images_first(window: Any, tool: Any) -> None:
     assert [setup.object_pixel_size for setup in keywords["setups"]] == pytest.approx([3e-6, 3e-6])
     assert job.frame.scale == pytest.approx((3, 3))
     assert job.frame.translate == pytest.approx((0.75, 0.75))
-    assert "bin" in dict(job.given)["Steps"].lower()
+    assert "bin" in dict(job.inputs)["Steps"].lower()
 
 
 def test_a_stack_has_a_row_for_each_plane(window: Any, open_widget: Any) -> None:
@@ -414,7 +414,7 @@ def test_doubts_of_the_reader_are_told(window: Any, tool: Any) -> None:
     window.layers[1].metadata = metadata_for(
         "shot", "", SETUPS[1], warnings=[Caution("film-scan", "it may be film")]
     )
-    assert ("Warning", "'6.0 MeV': it may be film") in tool.request().given
+    assert ("Warning", "'6.0 MeV': it may be film") in tool.request().inputs
 
 
 def test_images_that_do_not_fit_are_refused(
@@ -606,7 +606,7 @@ def test_other_answers_are_shown_beside_the_best(
     assert answers.itemText(1) == "from near: +2.0 %, differs by 50%"
     count = len(window.layers)
     answers.setCurrentIndex(1)
-    qtbot.waitUntil(lambda: not tool.view._others.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.view._alternative.busy, timeout=PATIENCE)
     field = layer_of(window, "field", "from near")
     assert field.data.shape == SHAPE
     coarse = np.hypot(*SETUPS[0].path_integrated_b(alternative.displacement[0]))
@@ -683,11 +683,11 @@ def test_the_menu_refines_an_inversion_of_a_file(
     window.layers.selection.active = layer_of(window, "arrows")
     in_loop(refine)
     (dock,) = window.window.dock_widgets.values()
-    tool = dock if hasattr(dock, "refining") else dock._magic_widget
+    tool = dock if hasattr(dock, "refine_section") else dock._magic_widget
     assert tool.refine_section.folded.isExpanded()
     assert tool.panel.runner.running
     in_loop(refine)
-    assert messages[-1].startswith("Invert shot is at work")
+    assert messages[-1].startswith("Invert shot is running")
     qtbot.waitUntil(lambda: "Verdict" in tool.fit_view.verdict.text(), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool._refined.busy, timeout=PATIENCE)
     assert layer_of(window, "field", "shot refined").visible

@@ -512,5 +512,5 @@ def test_the_cost_of_a_large_image_is_told_beforehand() -> None:
     sixteen = estimate_cost((4000, 4000), few)
     assert sixteen.seconds == pytest.approx(4 * four.seconds, rel=0.05)
     huge = estimate_cost((100_000, 100_000), few)
-    assert huge.is_too_much
+    assert huge.exceeds_memory
     assert "GB: crop or bin the image" in huge.text

@@ -422,7 +422,7 @@ def test_what_cannot_be_loaded_or_saved_is_one_sentence_and_changes_nothing(
         "mask": ("mask = 'small.png'\n", "mask has shape (9, 9), image (48, 60)"),
         "gone": ("mask = 'gone.png'\n", "gone.png"),
         "crop": ("[[steps]]\nstep = 'crop'\ny = '3:4'\n", "contains 60 × 1 pixels"),
-        "own": ("[source]\nmethod = 'measured'\n", "the shot's own file"),
+        "own": ("[source]\nmethod = 'measured'\n", "the shot's file"),
         "toml": ("steps = [\n", "toml"),
     }
     for name, (text, words) in wrong.items():

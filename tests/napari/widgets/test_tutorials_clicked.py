@@ -312,7 +312,7 @@ def test_no_reference_is_clicked_to_its_end(
     assert tool.image.layer is window.layers["four toroids"]
     check(tool, "Keep earlier results")
     fields = []
-    for title in ("estimate: fitted polynomial", "the one supplied with the shot", "uniform"):
+    for title in ("estimate: fitted polynomial", "supplied with the shot", "uniform"):
         select(tool, title)
         press(tool, "Run")
         wait_for_layers(tool, qtbot)
@@ -407,7 +407,7 @@ def test_film_pack_is_clicked_to_its_end(
     corners = np.array(tool.corners.polygon.data[0])
     corners[0] -= [2, 0]
     tool.corners.polygon.data = [corners]
-    press(tool, "Paint marks")
+    press(tool, "Paint mask")
     marks = window.layers.selection.active
     assert marks.mode == "paint"
     marks.paint((1, 40, 50), marks.selected_label)

@@ -222,4 +222,4 @@ def _is_in_file(recipe: Recipe, image: Any, source: Any) -> bool:
     """Whether a command finds the source: an estimate, a file, or supplied with the shot."""
     if not isinstance(recipe.source, MeasuredSource) or recipe.source.file is not None:
         return True
-    return source.is_own and bool(metadata_of(image).get("path"))
+    return source.is_supplied and bool(metadata_of(image).get("path"))

@@ -131,7 +131,7 @@ class ForwardModel(ToolPanel):
         for name in get_args(Deflector):
             self.deflector.addItem(name, name)
         self.deflector.setToolTip(
-            "<qt>What deflects the beam. Used only to predict the object's image in another "
+            "<qt>Field that deflects the beam. Used only to predict the object's image in another "
             "experiment, when the setup differs from the result's setup.</qt>"
         )
         self.height_px, self.width_px = _side("Height"), _side("Width")

@@ -279,7 +279,7 @@ class InvertStack(InversionInputs, ToolPanel):
         self.failures_title = QLabel("Failed shots")
         self.failures_title.setVisible(False)
         self.failures = FailureTable()
-        self.add(self.shots, *self.beam, *self.how, labelled("Store", self.store))
+        self.add(self.shots, *self.beam, *self.settings, labelled("Store", self.store))
         self.add(labelled("", self.overwrite), labelled("", self.redo_failed), self.engine)
         self.add(self.panel, side_by_side((self.save_result, 1), (self.more_layers, 1)))
         self.add(self.report, self.failures_title, self.failures)
