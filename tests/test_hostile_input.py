@@ -159,8 +159,9 @@ HUGE = np.broadcast_to(np.float64(1), (300_000, 300_000))
         lambda: fit(HUGE),
         lambda: fit([HUGE, HUGE], strengths=[1, 0.6]),
         lambda: run(Recipe(), HUGE),
+        lambda: synthetic_image(np.broadcast_to(HUGE, (2, *HUGE.shape))),
     ],
-    ids=["invert", "plan_sites", "uncertainty", "fit", "fit list", "run"],
+    ids=["invert", "plan_sites", "uncertainty", "fit", "fit list", "run", "forward"],
 )
 def test_image_too_large_for_the_memory_is_refused_first(call: Callable[[], Any]) -> None:
     with pytest.raises(InputError, match="300000 × 300000 pixels needs about"):
@@ -172,6 +173,8 @@ def test_limit_of_memory_can_be_set(monkeypatch: pytest.MonkeyPatch) -> None:
 
     with pytest.raises(InputError, match=r"expected at most 1e-05 GB: .*SHADOWINV_MAX_GB"):
         invert(SHOT)
+    with pytest.raises(InputError, match="an inversion of .* pixels needs about"):
+        invert_stack(SHOT[None])
 
 
 # Files

@@ -1,15 +1,17 @@
-"""Threads that are kept for the kernels."""
+"""Threads that are kept for the kernels, and the memory that a process may use."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from napari_shadowinv._system.machine import in_ranges
+from napari_shadowinv._system import machine
+from napari_shadowinv._system.machine import in_ranges, physical_memory
 
 
 def fill(start, stop, values):
@@ -60,3 +62,28 @@ print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
         [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, check=True, timeout=60
     )
     assert printed.stdout.strip() == "2"
+
+
+@pytest.mark.parametrize(
+    ("membership", "file"),
+    [
+        ("0::/jobs/job_7\n", "jobs/memory.max"),
+        ("0::/jobs/job_7\n", "jobs/job_7/memory.max"),
+        ("0::/\n", "memory.max"),
+        ("4:cpu:/x\n9:memory:/slurm/job_7\n", "memory/slurm/job_7/memory.limit_in_bytes"),
+    ],
+)
+def test_memory_is_that_of_the_control_group(
+    membership: str, file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed = physical_memory()
+    monkeypatch.setattr(machine, "_CGROUPS", tmp_path)
+    monkeypatch.setattr(machine, "_MEMBERSHIP", tmp_path / "membership")
+    assert physical_memory() == installed or installed is None
+    (tmp_path / "membership").write_text(membership)
+    limit = tmp_path / file
+    limit.parent.mkdir(parents=True, exist_ok=True)
+    for text, expected in (("max\n", None), ("1000000\n", 1_000_000), (f"{2**62}\n", None)):
+        limit.write_text(text)
+        if installed is not None:
+            assert physical_memory() == (expected or installed)

@@ -11,17 +11,50 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
+from pathlib import Path
 from typing import Any
+
+_CGROUPS = Path("/sys/fs/cgroup")
+_MEMBERSHIP = Path("/proc/self/cgroup")
 
 
 def physical_memory() -> int | None:
-    """Return the physical memory in bytes, or None where the system does not report it."""
+    """Return the memory in bytes that this process may use, or None where it is not reported.
+
+    That is the machine's, or less in a container or in a job of a batch system.
+    """
     try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
         return None
+    return min([installed, *_group_limits()])
+
+
+def _group_limits() -> Iterator[int]:
+    """Limits of the control groups that this process is in, version 2 and 1."""
+    try:
+        lines = _MEMBERSHIP.read_text().splitlines()
+    except (OSError, UnicodeDecodeError):
+        return
+    for line in lines:
+        _, controllers, name = line.split(":", 2)
+        if controllers not in ("", "memory"):
+            continue
+        root, file = _CGROUPS, "memory.max"
+        if controllers:
+            root, file = _CGROUPS / "memory", "memory.limit_in_bytes"
+        # In a container, its own group is the root of what it sees.
+        for folder in (root, *(root / part for part in _nested(name))):
+            with suppress(OSError, ValueError):
+                yield int((folder / file).read_text())  # "max" for none
+
+
+def _nested(name: str) -> list[Path]:
+    """Return a group's path below the root, and those of the groups around it."""
+    path = Path(name.lstrip("/"))
+    return [path, *path.parents]
 
 
 def available_threads(threads: int | None) -> int:

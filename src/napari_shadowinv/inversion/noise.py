@@ -48,6 +48,7 @@ _MAX_PLATEAU_RISE = 1.35  # of V at the largest lag over the one before
 _MIN_CORRELATION = 0.05
 _CLIP_DEVIATIONS = 5.0
 
+_MIN_FAR_TILES = 12
 _MIN_FAR_RISE = 1.4  # of V at the largest lag over V(1), in most of the quiet tiles
 _MAX_FAR_UNEVENNESS = 0.62  # of its logarithm between tiles: noise has up to 0.6, structure 0.64
 _MAX_FAR_SPREAD = 0.85  # of the logarithm of V: noise has up to 0.75, structure 1 and more
@@ -181,7 +182,7 @@ def _is_correlated_far(excess: FloatArray, mask: BoolArray) -> bool:
     if min(excess.shape) < _MIN_SIDE_PX:
         return False
     tiles = _quiet_tiles(*_tiles(excess, mask, _TILE_PX, lag), _TILE_PX, lag)
-    if len(tiles) < _MIN_TILES:
+    if len(tiles) < _MIN_FAR_TILES:
         return False
     far = _difference_variance(tiles, _TILE_PX, lag)
     rise = far / _difference_variance(tiles, _TILE_PX, 1)

@@ -22,6 +22,7 @@ from scipy.linalg import solveh_banded
 
 from napari_shadowinv._system.arrays import PIXELS, VECTOR, plain_array
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics._deposit import deposit_band
@@ -32,6 +33,7 @@ __all__ = ["jacobian_determinant", "synthetic_image"]
 _MIN_SIDE_PX = 4
 # Fixed, so that sums are formed in the same order whatever the number of threads.
 _N_BANDS = 32
+_BYTES_PER_PIXEL = 72  # displacement, its spline, source and image
 
 
 def synthetic_image(
@@ -152,6 +154,7 @@ def jacobian_determinant(displacement: ArrayLike) -> FloatArray:
 
 def _checked_displacement(displacement: ArrayLike) -> FloatArray:
     plain = plain_array(displacement, "displacement", VECTOR, unit=PIXELS)
+    check_memory(plain.shape[-2:], _BYTES_PER_PIXEL, "an image")
     field = np.asarray(plain, dtype=np.float64)
     if field.ndim != 3 or field.shape[0] != 2:
         raise InputError(

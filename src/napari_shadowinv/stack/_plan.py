@@ -19,10 +19,11 @@ from napari_shadowinv._system.arrays import (
     unpack_array,
     unpack_mask,
 )
+from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
-from napari_shadowinv.inversion.normalise import checked_mask, checked_source
+from napari_shadowinv.inversion.normalise import bytes_per_pixel, checked_mask, checked_source
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.options import FitChoices, InversionOptions
@@ -178,6 +179,8 @@ def _describe_inputs(
     bare = None if source_mask is None else checked_mask(source_mask, stack_shots.shape)
     if recipe.setup is not None:
         check_spacing(shots, "shots", recipe.setup.pixel_sizes)
+    if recipe.fit is None and not recipe.steps:
+        check_memory(stack_shots.shape, bytes_per_pixel(recipe.options), "an inversion")
     blank = np.ones(stack_shots.shape)
     inputs = collect_inputs(
         recipe.model_copy(update={"source": recipe.estimate}),
