@@ -173,7 +173,7 @@ def test_limit_of_memory_can_be_set(monkeypatch: pytest.MonkeyPatch) -> None:
 
     with pytest.raises(InputError, match=r"expected at most 1e-05 GB: .*SHADOWINV_MAX_GB"):
         invert(SHOT)
-    with pytest.raises(InputError, match="an inversion of .* pixels needs about"):
+    with pytest.raises(InputError, match=r"an inversion of .* pixels needs about"):
         invert_stack(SHOT[None])
 
 
