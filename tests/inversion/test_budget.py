@@ -249,6 +249,42 @@ def test_noise_of_pixels_hides_no_difference_of_beams():
     assert compare_beams(np.maximum(shot, 0), np.ones(shape)) == pytest.approx(0.03, rel=0.4)
 
 
+def test_a_calm_object_is_no_difference_of_beams():
+    """Within its rim a wide object is as even as a beam, 10 % darker."""
+    shape = (200, 200)
+    radius = np.hypot(*(np.indices(shape) - 100))
+    darker = 1 - 0.1 / (1 + np.exp((radius - 60) / 1.5))
+    differences = []
+    for seed in range(3):
+        shot = 1000 * smooth_beam(shape, 0.02, seed) * darker
+        shot = np.random.default_rng(seed).poisson(shot)
+        differences.append(compare_beams(shot, np.full(shape, 1000.0)))
+    assert np.mean(differences) == pytest.approx(0.02, rel=0.5)
+
+
+@pytest.mark.parametrize(
+    ("stated", "recorded", "basis"),
+    [
+        (None, True, "seen"),
+        (None, False, "assumed"),
+        (0.01, True, "seen"),
+        (0.01, False, "seen"),
+        (0.1, True, "stated"),
+        (0.1, False, "stated"),
+    ],
+)
+def test_the_larger_difference_of_beams_counts(stated, recorded, basis):
+    """What is seen, 3 %, unless more is stated, or assumed where nothing is stated."""
+    shape = (128, 128)
+    shot = np.random.default_rng(3).poisson(1000 * smooth_beam(shape, 0.03, 3)).astype(float)
+    options = InversionOptions(n_sites=400, beam_variation=stated)
+    plan = plan_sites(np.ones(shape), options, measured=recorded)
+    errors = invert(shot, plan=plan, options=options).errors
+    expected = {"seen": 0.03, "assumed": 0.05, "stated": stated}[basis]
+    assert errors.beam_basis == basis
+    assert errors.beam_variation == pytest.approx(expected, rel=0.4 if basis == "seen" else 1e-9)
+
+
 def test_accuracy_decides_on_the_sites_and_is_kept(image):
     finest = invert(image, options=InversionOptions(n_sites=4 * image.size))
     counts = []
