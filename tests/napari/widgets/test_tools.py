@@ -87,6 +87,9 @@ def test_nothing_is_orange_before_something_is_typed(
     for name, tool in tools.items():
         assert orange_texts(tool) == [], name
     setup = tools["Invert shot"].setup.picker
+    for index in range(setup.choice.count()):
+        setup.choice.setCurrentIndex(index)
+        assert orange_texts(tools["Invert shot"]) == [], setup.choice.currentText()
     setup.set_kind("proton")
     setup.form.editors["energy"].set_value(14.7)
     assert any("source" in text for text in orange_texts(tools["Invert shot"]))
