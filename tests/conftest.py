@@ -1,4 +1,4 @@
-"""A small inversion with a known potential, and what is needed to write about it."""
+"""A small inversion with a known potential, and its inputs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
-# The same examples in each run: a change is to blame for what fails, not the day.
+# The same examples in each run: a failure is due to a change, not to chance.
 settings.register_profile("same each time", derandomize=True)
 settings.load_profile("same each time")
 
@@ -207,7 +207,7 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[tuple[Path, Callable[[str], bool]]]:
-    """A folder on a disk of 400 kB, and what gives the disk another size."""
+    """A folder on a disk of 400 kB, and a function that changes the size of the disk."""
     folder = tmp_path / "disk"
     folder.mkdir()
 
@@ -225,7 +225,7 @@ def small_disk(tmp_path: Path) -> Iterator[tuple[Path, Callable[[str], bool]]]:
 
 @pytest.fixture(scope="session")
 def burner() -> list[Path]:
-    """Reference beam and frames of a real plume: beside the project, or downloaded."""
+    """Reference beam and frames of a real plume, next to the project or downloaded."""
     folder = SHARED_DATA / "burner" / "data"
     if folder.is_dir():
         return [folder / name for name in BURNER_FILES]

@@ -170,7 +170,7 @@ def test_comparison_has_one_scale(inversion: Inversion, proton_setup: ProtonSetu
         comparison_figure({"True": np.zeros((2, 5, 5)), "Other": np.zeros((2, 5, 6))})
 
 
-def test_saved_figure_has_the_page_size_and_replaces_only_if_asked(
+def test_saved_figure_has_page_size_and_replaces_on_request(
     tmp_path: Path, inversion: Inversion, dots_per_inch: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("napari_shadowinv.plotting._figures.DOTS_PER_INCH", dots_per_inch)

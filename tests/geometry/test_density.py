@@ -63,7 +63,7 @@ def test_beyond_the_image_there_is_no_flux():
 
 
 @given(st.lists(st.integers(0, 12), min_size=4, max_size=4))
-def test_edges_through_pixel_corners_and_along_borders_cancel_in_return(ends):
+def test_density_edges_through_corners_cancel_in_return(ends):
     """Walking there and back is nothing, and the ways round a pixel grid close."""
     ya, xa, yb, xb = (end / 2 - 1 for end in ends)
     density = Density.from_image(np.arange(1.0, 17.0).reshape(4, 4))

@@ -63,7 +63,7 @@ def test_surface_and_its_gradient_are_continuous_across_edges(sites):
     across = np.column_stack([-edge[:, 1], edge[:, 0]]) / length[:, None]
 
     def slope(step):
-        """Just beside the edge, to second order in the step."""
+        """Next to the edge, to second order in the step."""
         near, far, twice = (surface(on_edge + k * step * across) for k in (1, 2, 4))
         return 2 * (far - near) / step - (twice - far) / (2 * step)
 
@@ -73,7 +73,7 @@ def test_surface_and_its_gradient_are_continuous_across_edges(sites):
     np.testing.assert_allclose(slope(-3e-7), slope(3e-7), atol=1e-4 * steepness)
 
 
-def test_what_is_remembered_of_triangles_changes_nothing(sites):
+def test_interpolation_cache_changes_nothing(sites):
     rng = np.random.default_rng(7)
     values, gradients = rng.random(300), rng.normal(size=(300, 2))
     surface = CloughTocher(RegularTriangulation(sites), values, gradients)
@@ -107,7 +107,7 @@ def test_fitted_gradients_bend_the_edges_least(sites):
         assert energy(fitted + 1e-3 * change) > least
 
 
-def test_mirror_images_lie_beyond_the_border_at_the_same_distance():
+def test_mirror_images_lie_beyond_the_border_equally_far():
     sites = np.array([[0.0, 5.0], [5.0, 5.0], [9.2, 9.0]])
     points, origin, sense = with_mirror_images(sites, (10, 10), 1.5)
     np.testing.assert_array_equal(points[:3], sites)

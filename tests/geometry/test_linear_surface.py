@@ -32,7 +32,7 @@ def mean_of_triangles(triangulation, values):
     return total / area[:, None]
 
 
-def test_gradients_are_those_of_one_set_of_values_at_a_time(triangulation, values):
+def test_gradients_equal_separate_sets_of_values(triangulation, values):
     surface = with_gradients(triangulation, values)
     np.testing.assert_array_equal(surface[:, 0], values)
     for column in range(WIDTH):
@@ -41,7 +41,7 @@ def test_gradients_are_those_of_one_set_of_values_at_a_time(triangulation, value
         np.testing.assert_allclose(surface[:, 1:, column], fitted, rtol=1e-9, atol=1e-9)
 
 
-def test_weights_of_corners_make_the_surface_also_beyond_the_sites(triangulation, values):
+def test_corner_weights_give_the_surface_also_beyond_the_sites(triangulation, values):
     rng = np.random.default_rng(2)
     gradients = rng.normal(size=(400, 2))
     queries = np.sort(rng.random((5000, 2)) * 24 - 2, axis=0)

@@ -51,7 +51,7 @@ def awkward_sites(kind, rng, shape):
 @pytest.mark.parametrize("kind", ["uniform", "grid", "collinear", "duplicates", "clustered"])
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=100, deadline=None)
-def test_masses_equal_half_plane_clipping_whatever_sites_and_weights(kind, seed):
+def test_masses_equal_half_plane_clipping(kind, seed):
     """Two thousand diagrams, weights over ten orders of magnitude, to 1e-10 of a mean cell."""
     rng = np.random.default_rng(seed)
     for scale in 10.0 ** rng.uniform(-8, 2, 4):
@@ -95,7 +95,7 @@ def test_cells_tile_the_image():
     assert sum(areas) == pytest.approx(50 * 70, rel=1e-12)
 
 
-def test_flux_through_each_border_is_that_of_the_polygons():
+def test_flux_through_each_border_equals_the_polygons():
     """In a uniform image the flux is the length of the border inside the image."""
     rng = np.random.default_rng(4)
     shape = (8, 8)

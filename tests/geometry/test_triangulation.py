@@ -103,7 +103,7 @@ def clipped_cell(i: int, triangulation: RegularTriangulation, bonus: float) -> A
 
 
 def dual_areas(triangulation: RegularTriangulation) -> Array:
-    """Cell areas from the power centres; nan where the cell touches that of a ghost."""
+    """Cell areas from the power centres; nan for cells that touch the cell of a ghost."""
     points, weights = triangulation.points, triangulation.weights
     vertices, neighbors = triangulation.vertices, triangulation.neighbors
     origin = points[vertices[:, 0]]
@@ -350,7 +350,7 @@ def test_lower_hidden_leaves_only_duplicates_out(kind: str, seed: int) -> None:
     places = np.unique(sites, axis=0)
     assert np.count_nonzero(~triangulation.hidden) == len(places)
     assert_triangulation(triangulation)
-    if kind != "clustered":  # there the weights' rounding exceeds what separates the cells
+    if kind != "clustered":  # there the weights' rounding exceeds the distance of the cells
         assert_locally_regular(triangulation)
         assert triangulation.update(raised, stop_when_hidden=True)
 
@@ -528,7 +528,7 @@ def test_bad_weights_are_refused() -> None:
 
 @pytest.mark.parametrize("sorted_first", [False, True])
 def test_more_sites_are_put_in_as_if_they_had_been_there(sorted_first):
-    """Beside the first ones, among them, and at their places; the order of all is that given."""
+    """Next to the first ones, among them, and at their places; the order is kept."""
     rng = np.random.default_rng(7)
     first = rng.uniform(0, 10, (300, 2))
     if sorted_first:

@@ -72,7 +72,7 @@ def test_half_pixel_shift_shares_each_pixel_between_two() -> None:
 
 @pytest.mark.parametrize("shift", [(-0.3, -0.45), (0.3, 0.45), (-1.7, 2.2)])
 def test_any_shift_shares_each_pixel_by_areas(shift: tuple[float, float]) -> None:
-    """The image of a shifted pixel overlaps four pixels; what is outside is lost."""
+    """The image of a shifted pixel overlaps four pixels; the part outside is lost."""
     source = random_source((8, 9))
     field = np.zeros((2, 8, 9))
     field[0], field[1] = shift
@@ -97,7 +97,7 @@ def test_rough_fields_lose_no_flux() -> None:
 
 
 @pytest.mark.parametrize("roughness", [0.1, 0.6, 3.0])
-def test_each_pixel_gets_what_the_landed_tiles_overlap_it(roughness: float) -> None:
+def test_each_pixel_gets_the_overlap_of_the_landed_tiles(roughness: float) -> None:
     """Overlaps of polygons by shapely, with tiles that fold, cross pixels and leave the image."""
     shape = (7, 9)
     source = random_source(shape)
@@ -260,7 +260,7 @@ def test_number_of_threads_changes_no_bit() -> None:
         np.testing.assert_array_equal(single, parallel)
 
 
-def test_each_band_is_told_and_stopping_needs_no_further_one() -> None:
+def test_synthetic_image_reports_each_band_and_stops_at_once() -> None:
     field, steps = folding_field((90, 70)), []
     image = synthetic_image(field, on_progress=lambda news: steps.append(news.step / news.total))
     np.testing.assert_array_equal(image, synthetic_image(field))
@@ -292,7 +292,7 @@ def test_jacobian_of_polynomials_is_exact_up_to_the_border() -> None:
     np.testing.assert_allclose(jacobian_determinant(quadratic), 1 + 0.1 * y)
 
 
-def test_wrong_input_is_told() -> None:
+def test_synthetic_image_refuses_wrong_input() -> None:
     good = np.zeros((2, 6, 7))
     bad = good.copy()
     bad[0, 1, 1] = np.nan

@@ -1,4 +1,4 @@
-"""Phantoms are what their formulas say."""
+"""Phantoms agree with their formulas."""
 
 from __future__ import annotations
 
@@ -216,7 +216,7 @@ def test_coaxial_line_obeys_amperes_law() -> None:
     np.testing.assert_array_equal(phantom.potential[100, 150:], 0)
 
 
-def test_plasma_wave_has_the_plasmas_wavelength_and_lags_on_the_axis() -> None:
+def test_plasma_wave_has_its_wavelength_and_lags_on_the_axis() -> None:
     """Its crests lie a plasma wavelength apart on the axis, and further to +x off it."""
     setup = wakefield_setup()
     wavelength = plasma_wavelength(1.65e25)
@@ -242,7 +242,7 @@ def _wave_density(y: float, z: NDArray[np.float64], xi: float) -> NDArray[np.flo
 
 @pytest.mark.parametrize(("row", "column"), [(120, 200), (111, 217), (150, 160), (97, 230)])
 def test_line_integral_of_the_plasma_wave(row: int, column: int) -> None:
-    """The closed form is what summing the density along the beam gives."""
+    """The closed form equals the sum of the density along the beam."""
     setup = wakefield_setup()
     wave = wakefield((241, 401), setup)
     modulation = setup.relative_density_modulation(wave.potential, 1.65e25) * 1e6
@@ -267,7 +267,7 @@ def test_thin_plasma_is_the_first_order_of_the_exact_root() -> None:
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.05)
 
 
-def test_wrong_input_of_the_papers_structures_is_told() -> None:
+def test_paper_structures_refuse_wrong_input() -> None:
     setup = paper_setup()
     with pytest.raises(InputError, match="strength nan: it must be finite"):
         four_toroids((20, 20), setup, math.nan)
@@ -287,7 +287,7 @@ def test_wrong_input_of_the_papers_structures_is_told() -> None:
         plasma_wavelength(0)
 
 
-def test_wrong_input_is_told() -> None:
+def test_phantoms_refuse_wrong_input() -> None:
     setup = paper_setup()
     with pytest.raises(InputError, match="sigma is 0: it must be positive, in m"):
         toroid((9, 9), setup, 10, 0)

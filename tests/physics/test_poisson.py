@@ -59,7 +59,7 @@ def test_mean_over_the_border_is_zero() -> None:
     assert np.concatenate(edges).mean() == pytest.approx(0, abs=1e-13)
 
 
-def test_wrong_input_is_told() -> None:
+def test_poisson_inversion_refuses_wrong_input() -> None:
     image = np.ones((4, 5))
     with pytest.raises(InputError, match=r"image has shape \(4,\)"):
         poisson_invert(np.ones(4))

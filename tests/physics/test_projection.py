@@ -58,7 +58,7 @@ def test_magnetic_deflection_goes_with_one_over_the_momentum(field: np.ndarray) 
     assert ratio != pytest.approx(math.sqrt(14.7 / 3.0), rel=2e-3)
 
 
-def test_electric_deflection_goes_with_one_over_momentum_and_velocity(field: np.ndarray) -> None:
+def test_electric_deflection_scales_inversely_with_p_and_v(field: np.ndarray) -> None:
     rest_energy = REST["proton"]
     ratio = (
         momentum(14.7, rest_energy)
@@ -87,9 +87,7 @@ def test_electrons_are_deflected_against_protons(field: np.ndarray, deflector: s
 
 
 @pytest.mark.parametrize("deflector", ["magnetic field", "electric field"])
-def test_the_line_integrated_field_is_what_both_have_in_common(
-    field: np.ndarray, deflector: str
-) -> None:
+def test_projection_keeps_the_line_integrated_field(field: np.ndarray, deflector: str) -> None:
     other_setup = ProtonSetup(
         energy=3.0,
         source_object_distance=0.02,
@@ -157,7 +155,7 @@ def test_cubic_fields_are_resampled_exactly_up_to_the_border() -> None:
     np.testing.assert_allclose(transferred_displacement(field, FAST, fine), expected, atol=1e-9)
 
 
-def test_an_exact_field_predicts_the_exact_image_of_another_energy() -> None:
+def test_exact_field_predicts_the_image_of_another_energy() -> None:
     measured = toroid((80, 80), FAST, 40.0, 15e-6).displacement
     expected = synthetic_image(toroid((80, 80), SLOW, 40.0, 15e-6).displacement)
     np.testing.assert_allclose(project(measured, FAST, SLOW), expected, rtol=1e-9)
@@ -178,7 +176,7 @@ def test_source_gives_the_shape_of_the_image() -> None:
         project(np.zeros((2, *SHAPE)), FAST, FAST, source=np.ones((60, 24)))
 
 
-def test_what_cannot_be_transferred_is_said(field: np.ndarray) -> None:
+def test_projection_refuses_impossible_transfers(field: np.ndarray) -> None:
     with pytest.raises(
         InputError, match="kind 'proton', but the image is requested for kind 'optical'"
     ):

@@ -86,7 +86,7 @@ def test_detector_pixels_are_smaller_in_the_object_plane(proton: ProtonSetup) ->
     assert by_detector.potential(2.0) == pytest.approx(proton.potential(2.0))
 
 
-def test_deflection_moves_the_ray_by_the_displacement_on_the_screen(proton: ProtonSetup) -> None:
+def test_deflection_moves_the_ray_by_the_displacement(proton: ProtonSetup) -> None:
     angle = proton.deflection_angle(3.0)
     on_screen = angle * proton.object_image_distance
     assert on_screen / proton.magnification == pytest.approx(3.0 * 1.5e-6)
@@ -116,7 +116,7 @@ def test_velocity_of_the_papers_protons(proton: ProtonSetup) -> None:
     assert proton.velocity / LIGHT_SPEED == pytest.approx(math.sqrt(1 - gamma**-2), rel=1e-8)
 
 
-def test_momentum_is_classical_when_slow_and_that_of_light_when_fast(proton: ProtonSetup) -> None:
+def test_momentum_has_classical_and_ultrarelativistic_limits(proton: ProtonSetup) -> None:
     slow = proton.model_copy(update={"energy": 1e-6})
     mass = SPECIES["proton"].mass
     assert slow.momentum == pytest.approx(math.sqrt(2 * mass * ELECTRONVOLT), rel=1e-8)
@@ -224,7 +224,7 @@ def test_critical_density_at_810_nm(optical: OpticalSetup) -> None:
     assert optical.critical_density * 1e-6 == pytest.approx(1.7e21, rel=1e-2)
 
 
-def test_density_gives_the_refractive_index_that_made_the_potential(optical: OpticalSetup) -> None:
+def test_density_gives_the_refractive_index_of_the_potential(optical: OpticalSetup) -> None:
     """A slab of thin plasma: ln √(1 - n/n_c) times its thickness, there and back."""
     density, thickness = 1e-4 * optical.critical_density, 2e-3
     log_index = 0.5 * math.log(1 - density / optical.critical_density) * thickness
@@ -255,7 +255,7 @@ def test_a_setup_survives_every_file(setup: Setup) -> None:
     assert TypeAdapter(Setup).validate_python(dump) == setup
 
 
-def test_every_field_tells_its_meaning() -> None:
+def test_every_field_has_a_description() -> None:
     for model in SETUPS.values():
         for field in model.model_fields.values():
             assert field.title
@@ -287,7 +287,9 @@ def test_every_field_tells_its_meaning() -> None:
         ({"kind": None}, "'kind' is missing, .*species.*electron.*or 'optical'"),
     ],
 )
-def test_a_wrong_value_is_told_in_one_sentence(change: dict[str, object], message: str) -> None:
+def test_setup_refuses_wrong_values_in_one_sentence(
+    change: dict[str, object], message: str
+) -> None:
     with pytest.raises(InputError, match=message) as caught:
         setup_from_dict({**PROTON, **change}, "setup file shot.toml")
     assert str(caught.value).startswith("setup file shot.toml: ")
@@ -339,7 +341,7 @@ NAMED_IN = {
 }
 
 
-def test_a_kind_of_setup_is_named_where_it_is_defined_and_nowhere_else() -> None:
+def test_setup_kinds_are_named_only_where_they_are_defined() -> None:
     source = Path(napari_shadowinv.__file__).parent
     kinds = re.compile("|".join(model.__name__ for model in SETUPS.values()))
     mentioning = {
@@ -382,7 +384,7 @@ class NeutralSetup(BeamSetup):
         return 2 * self.energy * self.deflection_angle(displacement)
 
 
-def test_a_further_kind_of_setup_tells_all_that_others_need() -> None:
+def test_new_setup_kind_provides_all_that_others_need() -> None:
     setup: Any = NeutralSetup.example()
     displacement = np.ones((2, 4, 5))
     force = setup.path_integrated_force(displacement)

@@ -16,7 +16,7 @@ from napari_shadowinv.physics.units import (
 )
 
 
-def test_peak_is_told_in_both_units(proton_setup: ProtonSetup) -> None:
+def test_peak_text_has_both_units(proton_setup: ProtonSetup) -> None:
     displacement = proton_setup.displacement_from_path_integrated_b(
         np.array([97.0, 0.0]).reshape(2, 1, 1), "MG um"
     )
@@ -60,7 +60,7 @@ def test_a_prefix_is_for_units_without_a_power() -> None:
     assert {"m", "rad", "T m", "V"} == PREFIXED_UNITS
 
 
-def test_what_deflects_is_shown_by_its_own_path_integral(proton_setup: ProtonSetup) -> None:
+def test_each_deflector_has_its_own_path_integral(proton_setup: ProtonSetup) -> None:
     displacement = proton_setup.displacement_from_path_integrated_e(np.full((2, 3, 4), 3e3))
     (field,) = shown_fields([displacement], proton_setup, "electric field")
     assert (field.symbol, field.unit) == ("|∫E dz|", "kV")

@@ -1,4 +1,4 @@
-"""Facts about a pack from its scans to fluences, and sentences for what is wrong with it."""
+"""Facts about a pack from its scans to fluences, and the messages about its faults."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def dataset(truth: Truth):
 
 @pytest.fixture
 def changed(truth: Truth, tmp_path: Path) -> Callable[..., Path]:
-    """The pack with something else in its file, or before it; its scans are those of `truth`."""
+    """The pack with something else in its file, or before it; its scans belong to `truth`."""
 
     def write_pack(*replaced: tuple[str, str], first: str = "") -> Path:
         text = truth.pack.read_text()
@@ -61,7 +61,7 @@ def laid(truth: Truth, dataset, layer: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def on_films(truth: Truth, dataset, plane: Callable[[int], np.ndarray], layer: int) -> np.ndarray:
-    """What is true on a film's pixels, as the dataset's pixels lie on it."""
+    """Return the truth on a film's pixels, as the dataset's pixels lie on it."""
     axes, middle = laid(truth, dataset, layer)
     place = truth.placements[layer]
     scale = truth.scene.magnifications[layer] / truth.scene.magnifications[0]
@@ -80,7 +80,7 @@ def test_places_of_a_packs_pixels_are_in_metres(dataset) -> None:
         np.testing.assert_allclose(dataset[name], pixel * np.arange(dataset.sizes[name]))
 
 
-def test_doses_are_those_that_the_films_saw(truth: Truth, dataset) -> None:
+def test_doses_equal_the_exposure_of_the_films(truth: Truth, dataset) -> None:
     scales = truth.scene.magnifications / truth.scene.magnifications[0]
     for layer in range(COUNT):
         usable = dataset["usable"].values[layer]
@@ -93,7 +93,7 @@ def test_doses_are_those_that_the_films_saw(truth: Truth, dataset) -> None:
         assert (ratio - 1).std() == pytest.approx(np.sqrt((error[usable] ** 2).mean()), rel=0.3)
 
 
-def test_fluences_are_those_of_the_beam(truth: Truth, dataset) -> None:
+def test_fluences_equal_the_beam(truth: Truth, dataset) -> None:
     scene = truth.scene
     scales = scene.magnifications / scene.magnifications[0]
     for layer in range(COUNT - 1):
@@ -227,7 +227,7 @@ def test_films_laid_another_way_round(truth: Truth, dataset, changed, way) -> No
     assert gap.max() < 0.1
 
 
-def test_corners_are_those_of_the_films_on_their_scans(truth: Truth, dataset) -> None:
+def test_corners_lie_on_the_films_of_the_scans(truth: Truth, dataset) -> None:
     assert np.abs(dataset["shift"].values).max() > 0.5
     np.testing.assert_allclose(dataset["corners"], truth.corners, atol=0.1)
 
@@ -318,19 +318,19 @@ def test_films_are_laid_on_each_other_by_fiducials(truth: Truth, changed, tmp_pa
     places = places_of(truth, result)
     assert (np.abs(places - places.mean(axis=0)) < [0.05, 0.05, 5e-4]).all()
     assert (result["shift_error"].values < 0.5).all()
-    # They tell what fields displace from films that slipped.
+    # They distinguish the displacement by fields from films that slipped.
     assert not result["by_images"].values.any()
     assert result.attrs["warnings"] == "[]"
 
 
 def test_deeper_films_are_magnified_about_the_axis(truth: Truth, changed, tmp_path: Path) -> None:
-    """What goes through the pack lies behind each other; rays from the source spread about it."""
+    """Marks through the pack lie behind each other; rays from the source spread about them."""
     write_fiducials(tmp_path / "fiducials.csv", truth, range(COUNT))
     marks = 'fiducials = "fiducials.csv"'
     about_middle = run_film(read_pack(changed(first=marks)))
     scale = (truth.scene.magnifications / truth.scene.magnifications[0])[-1]
     _, _, size = upright(about_middle["corners"].values[0])
-    # So that the last film is shifted by whole px: what is at p about the middle is there at p - s.
+    # So that the last film is shifted by whole px: a point p about the middle is there at p - s.
     shift = np.array([2, -3])
     axis = (size - 1) / 2 + shift / (1 / scale - 1)
     about_axis = run_film(read_pack(changed(first=f"{marks}\naxis = {axis.tolist()}")))
@@ -339,13 +339,13 @@ def test_deeper_films_are_magnified_about_the_axis(truth: Truth, changed, tmp_pa
     np.testing.assert_allclose(first[inner], about_middle["dose"].values[0][inner], rtol=1e-5)
     expected = np.roll(about_middle["dose"].values[-1], -shift, axis=(0, 1))
     np.testing.assert_allclose(last[inner], expected[inner], rtol=1e-5)
-    # Corners are the film's own, whatever it is magnified about: they can be given again.
+    # Corners do not depend on the centre of magnification: they can be given again.
     np.testing.assert_allclose(about_axis["corners"], about_middle["corners"], atol=1e-9)
     with pytest.raises(ValueError, match="axis is given and no setup"):
         Pack.model_validate({"layers": [{"film": "HDV2"}], "axis": [1, 2]})
 
 
-def test_films_without_fiducials_are_told(truth: Truth, changed, tmp_path: Path) -> None:
+def test_films_without_fiducials_are_reported(truth: Truth, changed, tmp_path: Path) -> None:
     write_fiducials(tmp_path / "fiducials.csv", truth, range(COUNT - 1))
     result = run_film(read_pack(changed(first='fiducials = "fiducials.csv"')))
     places = places_of(truth, result)[:-1]
@@ -380,7 +380,7 @@ def test_fiducials_of_a_film_on_its_face(truth: Truth, changed, tmp_path: Path) 
         ("1,new,1,one", "row 13: 'x' is 'one'"),
     ],
 )
-def test_other_fiducials_are_told(
+def test_wrong_fiducials_are_refused(
     truth: Truth, changed, tmp_path: Path, row: str, message: str
 ) -> None:
     write_fiducials(tmp_path / "fiducials.csv", truth, range(COUNT))
@@ -432,7 +432,7 @@ def bright(scan: np.ndarray) -> np.ndarray:
         (lambda scan: scan[::2, ::2], "expected films of one size; correct its corners"),
     ],
 )
-def test_other_scans_are_told(truth: Truth, changed, spoil, message: str) -> None:
+def test_wrong_scans_are_refused(truth: Truth, changed, spoil, message: str) -> None:
     pack = changed()
     scan = spoil(tifffile.imread(truth.files[0]))
     (pack.parent / "film_01.tif").unlink()
@@ -443,7 +443,7 @@ def test_other_scans_are_told(truth: Truth, changed, spoil, message: str) -> Non
         run_film(read_pack(pack))
 
 
-def test_a_film_that_is_too_dark_is_told(truth: Truth, changed) -> None:
+def test_film_that_is_too_dark_is_reported(truth: Truth, changed) -> None:
     table = 'calibration = "HDV2.csv"\ndose_range = [0.0, 300.0]'
     result = run_film(read_pack(changed(('calibration = "HDV2.csv"', table))))
     assert "of the pixels are darker than the calibration covers" in result.attrs["warnings"]
@@ -465,7 +465,7 @@ def test_a_film_that_is_too_dark_is_told(truth: Truth, changed) -> None:
         ("[setup]", "[setups]", "unknown key 'setups', did you mean 'setup'?"),
     ],
 )
-def test_other_packs_are_told(truth: Truth, changed, old: str, new: str, message: str) -> None:
+def test_wrong_packs_are_refused(truth: Truth, changed, old: str, new: str, message: str) -> None:
     with pytest.raises((InputError, FileFormatError), match=re.escape(message)):
         run_film(read_pack(changed((old, new))))
 

@@ -128,7 +128,7 @@ def test_source_and_masks_go_through_the_same_steps(image: FloatArray) -> None:
 
 @pytest.mark.parametrize("steps", MOVES)
 def test_the_matrix_says_where_pixels_came_from(steps: tuple[Step, ...]) -> None:
-    """A plane is exact under linear interpolation, so its values tell where a pixel was."""
+    """A plane is exact under linear interpolation, so its values show where a pixel was."""
     recipe = Recipe(steps=steps, setup=paper_setup())
     matrix = recipe.matrix(SHAPE)
     for axis, plane in enumerate(np.indices(SHAPE, dtype=float)):
@@ -244,8 +244,8 @@ OTHER = {
 }  # fmt: skip
 
 
-def test_what_moves_sites_is_in_their_key(image: FloatArray) -> None:
-    """Of every option, and of no other: the key is what a cache trusts."""
+def test_site_key_has_every_option_that_moves_sites(image: FloatArray) -> None:
+    """Of every such option, and of no other: a cache relies on the key."""
     assert OTHER.keys() == InversionOptions.model_fields.keys()
     mask = np.ones(SHAPE, bool)
     mask[20:, 30:] = False
@@ -264,7 +264,7 @@ def test_what_moves_sites_is_in_their_key(image: FloatArray) -> None:
         assert (base.site_key() == variant.site_key()) == is_same, name
 
 
-def test_a_cache_spares_sites_and_estimates_without_changing_results(image: FloatArray) -> None:
+def test_cache_spares_work_without_changing_results(image: FloatArray) -> None:
     cache = Cache()
     recipe = Recipe(source=PolynomialEstimate(degree=1), options=OPTIONS)
     first = run(recipe, image, cache=cache)
@@ -281,7 +281,7 @@ def test_a_cache_spares_sites_and_estimates_without_changing_results(image: Floa
     assert_same(run(recipe, image, cache=cache), first)
 
 
-def test_the_default_number_of_sites_is_that_of_invert(image: FloatArray) -> None:
+def test_run_and_invert_have_the_same_default_sites(image: FloatArray) -> None:
     for options in (InversionOptions(), InversionOptions(boundary="free", flux="known")):
         assert_same(
             run(Recipe(options=options), image, source=image.mean() + 0 * image),
@@ -302,7 +302,7 @@ def test_the_default_number_of_sites_is_that_of_invert(image: FloatArray) -> Non
         (Recipe(steps=(Bin(factor=30),)), {}, "cannot bin 40×52 pixels by 30"),
     ],
 )
-def test_what_does_not_fit_together_is_refused(
+def test_run_refuses_inputs_that_do_not_match(
     image: FloatArray, recipe: Recipe, given: dict[str, Any], named: str
 ) -> None:
     arguments: dict[str, Any] = {

@@ -58,7 +58,7 @@ def assert_same_fields(one: Fit, other: Fit) -> None:
     np.testing.assert_array_equal(one.reprojection, other.reprojection)
 
 
-def test_it_is_a_fit_of_what_the_steps_make(images: list[FloatArray]) -> None:
+def test_run_fit_equals_a_fit_of_the_prepared_images(images: list[FloatArray]) -> None:
     mask = np.ones(SHAPE, bool)
     mask[10:14, 20:24] = False
     source = np.full(SHAPE, 1.0)
@@ -115,7 +115,7 @@ def test_provenance_is_complete_and_survives_its_file(
     assert provenance.fiducial_rows == ((5, 6, 0.1, 0.2, 0.5),)
 
 
-def test_what_does_not_fit_into_an_attribute_is_not_kept_in_part() -> None:
+def test_provenance_too_large_for_an_attribute_is_omitted() -> None:
     rng = np.random.default_rng(2)
     shots = [
         FitShot(rng.normal(10, 1, (400, 400)), mask=rng.random((400, 400)) > 0.4, strength=(k,))

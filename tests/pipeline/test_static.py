@@ -1,4 +1,4 @@
-"""Whether one static field explains images, by a recipe: order, windows, what is refused."""
+"""Tests of one static field by a recipe: order, windows, refused input."""
 
 from __future__ import annotations
 
@@ -91,9 +91,7 @@ def test_windows_are_one_dataset_against_energy_and_time(windows: FitWindows) ->
     np.testing.assert_allclose(dataset["path_integrated_b"][2], own_field, rtol=1e-9)
 
 
-def test_they_are_kept_in_the_file_of_a_fit_which_reads_as_before(
-    tmp_path: Any, windows: FitWindows
-) -> None:
+def test_windows_are_kept_in_the_file_of_a_fit(tmp_path: Any, windows: FitWindows) -> None:
     first_fit = windows.fits[0]
     write(tmp_path / "fit.shadowinv", windows.added_to(first_fit.to_dataset()))
     dataset = read(tmp_path / "fit.shadowinv")
@@ -146,7 +144,7 @@ def test_windows_that_do_not_exist_are_refused(count: int, size: int, told: str)
         run_windows(RECIPE, shots_of(FACTORS)[:count], size)
 
 
-def test_what_cannot_be_left_out_or_ordered_is_refused() -> None:
+def test_leave_one_out_refuses_too_few_or_unordered_images() -> None:
     with pytest.raises(InputError, match="received 2 images: leaving one out needs 3"):
         run_leave_one_out(RECIPE, shots_of(FACTORS)[:2])
     bare = [FitShot(shot.image) for shot in shots_of(FACTORS)]

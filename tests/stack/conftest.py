@@ -57,7 +57,7 @@ class Night:
 
 @pytest.fixture(scope="session")
 def compiled() -> None:
-    """Compile what an inversion needs, once and not in each worker."""
+    """Compile the kernels of an inversion once, and not in each worker."""
     images, source = make_shots(1)
     plan = plan_sites(source, OPTIONS)
     first = invert(images[0], plan=plan, options=OPTIONS)

@@ -1,4 +1,4 @@
-"""What a store holds, byte by byte."""
+"""The content of a store, byte by byte."""
 
 from __future__ import annotations
 

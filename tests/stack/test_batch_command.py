@@ -78,12 +78,12 @@ def finished(any_night, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def store(folder, finished) -> Path:
-    """A copy of it, beside the same shots."""
+    """A copy of the store, next to the same shots."""
     shutil.copytree(finished, folder / "n.shadowinv.zarr")
     return folder / "n.shadowinv.zarr"
 
 
-def test_a_batch_is_written_and_told_of(night, folder):
+def test_batch_writes_and_reports_shots(night, folder):
     result = batch("--setup", "setup.toml")
     assert result.exit_code == 0
     assert "6 done, 0 failed, 0 pending" in flat(result.output)
@@ -124,7 +124,7 @@ def test_shots_that_fail_are_named_and_the_exit_code_is_one(night, folder):
     assert batch("--redo-failed").exit_code == 0
 
 
-def test_a_store_that_is_there_is_neither_resumed_nor_replaced_unasked(store):
+def test_existing_store_is_neither_resumed_nor_replaced(store):
     before = store.stat().st_mtime_ns
     refused = batch("--setup", "setup.toml")
     assert refused.exit_code == 2
@@ -177,7 +177,7 @@ def test_shots_that_came_since_are_appended_when_it_is_resumed(night, store):
         (["export", "shots", "--format", "csv"], "is not a stack of shots"),
     ],
 )
-def test_mistakes_are_told_in_one_sentence_and_nothing_is_written(folder, arguments, words):
+def test_batch_mistakes_give_a_sentence_and_write_nothing(folder, arguments, words):
     before = sorted(folder.rglob("*"))
     result = shadowinv(*arguments)
     assert result.exit_code == 2
@@ -250,7 +250,7 @@ def test_shots_are_exported_as_tiff(store):
     assert "exists" in again.output
 
 
-def test_an_exported_tiff_tells_the_size_of_its_pixels(store):
+def test_exported_tiff_has_the_size_of_its_pixels(store):
     def pixel_size(path: str) -> float | None:
         with tifffile.TiffFile(path) as tiff:
             tags = tiff.pages[0].aspage().tags
@@ -273,7 +273,7 @@ def test_an_exported_tiff_tells_the_size_of_its_pixels(store):
         assert size == pytest.approx(in_object_plane, rel=1e-6)
 
 
-def test_shots_are_exported_as_pradformat_if_the_setup_is_a_particle_beams(store):
+def test_shots_are_exported_as_pradformat_for_particle_beams(store):
     refused = shadowinv("export", store, "--format", "pradformat")
     assert refused.exit_code == 2
     assert not Path("n").exists()
@@ -434,8 +434,8 @@ def test_masked_pixels_leave_a_film_as_it_is(store):
         np.testing.assert_array_equal(frame, expected)
     # The mask of a fit's images: a pixel counts that one of them shows.
     both = np.stack([mask, np.ones_like(mask)])
-    shown = stack_frames(wild.assign(mask=(("image", "y", "x"), both)), "potential")
-    assert not np.array_equal(next(shown), frames[0])
+    fit_frames = stack_frames(wild.assign(mask=(("image", "y", "x"), both)), "potential")
+    assert not np.array_equal(next(fit_frames), frames[0])
 
 
 def test_a_gif_keeps_the_colours_of_its_scale(store):
@@ -522,7 +522,7 @@ def interrupted(preparation: str, pause: float, *arguments: str) -> tuple[int, s
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals to a process group")
-def test_ctrl_c_while_workers_start_is_told_in_one_sentence(night, folder):
+def test_ctrl_c_while_workers_start_gives_one_sentence(night, folder):
     starting = """
         import distributed
 
@@ -534,7 +534,7 @@ def test_ctrl_c_while_workers_start_is_told_in_one_sentence(night, folder):
         distributed.LocalCluster = Cluster
     """
     before = sorted(folder.rglob("*"))
-    # When the workers are about to import what they need.
+    # When the workers are about to import their modules.
     code, output = interrupted(starting, 0.6, "--workers", "1")
     assert code == 130
     assert output.splitlines() == [

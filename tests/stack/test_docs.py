@@ -1,4 +1,4 @@
-"""What the page about many shots shows must work as it stands there."""
+"""The examples of the page about many shots must work as they stand there."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def folder(night, tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def test_the_python_blocks_make_what_they_promise(folder, night):
+def test_python_blocks_of_the_page_keep_their_promise(folder, night):
     names: dict[str, object] = {}
     blocks = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     for block in blocks:
@@ -40,7 +40,7 @@ def test_the_python_blocks_make_what_they_promise(folder, night):
     assert list(names["store"].status) == [1] * 6  # type: ignore[attr-defined]
 
 
-def test_the_columns_of_a_table_are_those_of_its_model():
+def test_page_lists_the_columns_of_the_model():
     (section,) = re.findall(r"^## Each shot with .*?(?=^## )", PAGE, re.DOTALL | re.MULTILINE)
     listed = re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)
     only_fits = {"strength", "psf", "noise", "shot"}

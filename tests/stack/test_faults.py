@@ -1,4 +1,4 @@
-"""What can go wrong in a night: real schedulers, real worker processes, real signals."""
+"""Faults during a night: real schedulers, real worker processes, real signals."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def cluster(compiled):
 
 @pytest.fixture
 def expected(night, tmp_path) -> dict[str, bytes]:
-    """What is written where nothing goes wrong."""
+    """The content of a store without any fault."""
     store = tmp_path / "expected.shadowinv.zarr"
     night.run(store)
     return content(store)
@@ -130,7 +130,7 @@ DRIVER = """
 """
 
 
-def test_the_client_killed_and_resumed_while_a_second_one_is_refused(night, out, expected, cluster):
+def test_killed_client_resumes_and_a_second_one_is_refused(night, out, expected, cluster):
     np.save(night.folder / "source.npy", night.source)
     (night.folder / "hang.txt").write_text("shot_3")
     arguments = {"reader": hang_once, "scheduler": cluster.scheduler_address}
@@ -216,7 +216,7 @@ def plans_made() -> int:
     return _worker.plan_sites.made
 
 
-def test_a_lazy_stack_on_the_cluster_makes_its_sites_once_in_each_worker(make_night, cluster):
+def test_lazy_stack_plans_sites_once_in_each_worker(make_night, cluster):
     night = make_night(12)
     stack = invert_stack(night.images, source=night.source, options=OPTIONS)
     expected = stack.potential.compute(scheduler="synchronous")
@@ -253,7 +253,7 @@ def test_a_worker_lost_while_it_gets_the_beam(night, out, expected, cluster, mon
     assert content(out) == expected
 
 
-def test_workers_that_die_of_what_all_shots_share_end_the_run_and_blame_no_shot(cluster):
+def test_workers_that_die_before_a_shot_end_the_run(cluster):
     from distributed.scheduler import KilledWorker
 
     class Future:
@@ -445,7 +445,7 @@ class TestLocks:
             pass
         assert list(tmp_path.iterdir()) == []
 
-    def test_another_host_holds_its_lock_while_it_gives_signs_of_life(self, tmp_path, quick):
+    def test_another_host_holds_its_lock_while_it_is_alive(self, tmp_path, quick):
         lock = tmp_path / ".store.lock"
         lock.write_text('{"host": "elsewhere", "pid": 7}')
         with alive(lock):
@@ -466,7 +466,7 @@ class TestLocks:
         with alive(lock, behind=7200), refused, locked(tmp_path / "store"):
             pass
 
-    def test_signs_of_life_are_given_whatever_the_block_does(self, tmp_path, quick):
+    def test_lock_is_renewed_while_it_is_held(self, tmp_path, quick):
         with locked(tmp_path / "store"):
             lock = tmp_path / ".store.lock"
             before = lock.stat().st_mtime_ns

@@ -144,7 +144,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_done_is_refused_before_anything_is_written(
+def test_stack_of_fits_refuses_wrong_input_before_writing(
     images: Any, out: Path, name: str
 ) -> None:
     changes, words = REFUSED[name]
@@ -186,7 +186,7 @@ def test_images_of_one_object_are_fitted_together(folder: Path, out: Path) -> No
     np.testing.assert_allclose(store["x"], np.arange(48) * SETUPS[0].object_pixel_size)
 
 
-def test_a_table_that_changed_is_told_and_grows(folder: Path, out: Path) -> None:
+def test_changed_table_is_refused_and_longer_table_grows(folder: Path, out: Path) -> None:
     recipe = Recipe(fit=CHOICES)
     run_stack("shots.csv", out, recipe=recipe, scheduler="synchronous")
     text = Path("shots.csv").read_text()
@@ -224,7 +224,7 @@ def test_a_shot_with_another_setup_fails_alone(folder: Path, out: Path) -> None:
 # The command
 
 
-def test_the_command_fits_tells_and_exports(folder: Path) -> None:
+def test_batch_command_fits_reports_and_exports(folder: Path) -> None:
     arguments = ("batch", "shots.csv", "--fit", "--recipe", "r.toml", "--scheduler", "threads")
     out = "night.shadowinv.zarr"
     result = shadowinv(*arguments, "--out", out)
@@ -274,7 +274,7 @@ def refused(folder: Path) -> Callable[..., None]:
     return run
 
 
-def test_mistakes_are_told_in_a_sentence(refused: Callable[..., None]) -> None:
+def test_fit_mistakes_give_one_sentence(refused: Callable[..., None]) -> None:
     refused("low*.tif", "--fit", "--tolerance", 1e-3, names=("--tolerance", "[fit.options]"))
     Path("shots.csv").write_text("file,psf\nlow0.tif,1\n")
     refused("shots.csv", "--fit", names=("row 1 does not say which shot", "column 'shot'"))

@@ -35,12 +35,12 @@ def hidden(night):
 
 @pytest.fixture
 def whole(night, tmp_path) -> dict[str, bytes]:
-    """What a run over all shots at once writes."""
+    """The content of a single run over all shots."""
     night.run(tmp_path / "whole.shadowinv.zarr")
     return content(tmp_path / "whole.shadowinv.zarr")
 
 
-def test_later_shots_are_appended_and_the_bytes_are_those_of_one_run(night, out, whole, hidden):
+def test_appended_shots_give_the_bytes_of_a_single_run(night, out, whole, hidden):
     hidden(4, 5)
     night.run(out)
     before = content(out)
@@ -56,14 +56,14 @@ def test_later_shots_are_appended_and_the_bytes_are_those_of_one_run(night, out,
     assert (grown.iterations > 0).all()
     assert content(out) == whole
     assert {name: (out / name).stat().st_mtime_ns for name in before} == stamps
-    # Who had it open sees what was there.
+    # A reader that opened it earlier sees the earlier content.
     np.testing.assert_array_equal(earlier.potential, grown.potential[:4])
     # So do those who go by the arrays' own metadata.
     plain = zarr.open_group(out, mode="r", use_consolidated=False)
     assert {array.shape[0] for name, array in plain.arrays() if name not in "yx"} - {2} == {6}
 
 
-def test_a_store_of_an_older_version_without_image_residuals_still_grows(night, out, hidden):
+def test_store_without_image_residuals_still_grows(night, out, hidden):
     hidden(5)
     night.run(out)
     shutil.rmtree(out / "image_residual")
@@ -79,7 +79,7 @@ def test_a_store_of_an_older_version_without_image_residuals_still_grows(night, 
     assert "image_residual" not in grown
 
 
-def test_a_shot_that_sorts_in_between_goes_to_the_end_and_no_number_changes(night, out, hidden):
+def test_shot_that_sorts_in_between_is_appended(night, out, hidden):
     hidden(1, 3, 4)
     night.run(out)
     hidden(3)
@@ -94,7 +94,7 @@ def test_a_shot_that_sorts_in_between_goes_to_the_end_and_no_number_changes(nigh
     shots = [night.path(index) for index in order]
     alone = night.run(out.with_name("alone.shadowinv.zarr"), shots=shots)
     np.testing.assert_array_equal(grown.potential, alone.potential)
-    # Those of one run keep their order.
+    # Shots of a run keep their order.
     with pytest.raises(InputError, match=r"different order \(shot_1.npy before shot_4.npy\)"):
         night.run(out, shots=[night.path(index) for index in (0, 2, 5, 4, 1, 3)])
 
@@ -203,7 +203,7 @@ def test_killed_at_any_moment_of_growing_it_is_as_before(night, out, whole, hidd
     remaining = [0]
 
     def replace(*paths):
-        """Put a file into its place, but only so many times."""
+        """Move a file to its place, but only a number of times."""
         if not remaining[0]:
             raise Killed
         remaining[0] -= 1
@@ -247,7 +247,7 @@ def test_a_second_run_cannot_grow_it_meanwhile(night, out, hidden):
     assert len(StackStore(out).names) == 5
 
 
-def test_workers_that_knew_it_shorter_write_what_is_new(night, out, whole, hidden):
+def test_workers_of_the_shorter_store_write_new_shots(night, out, whole, hidden):
     from distributed import Client, LocalCluster
 
     with (

@@ -1,4 +1,4 @@
-"""`invert_stack`: lazy, the same whatever the way, sites made once."""
+"""`invert_stack`: lazy, independent of the scheduler, sites computed once."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_each_shot_has_the_variables_of_its_own_inversion(night, optical_setup, 
         assert bool(computed.converged[index]) is inversion.report.converged
 
 
-def test_without_a_source_the_field_is_that_of_a_uniform_beam(night):
+def test_lazy_stack_without_source_has_a_uniform_beam(night):
     stack = invert_stack(night.images, options=OPTIONS)
     alone = invert(night.images[2], options=OPTIONS)
     shot = stack.isel(shot=2).compute()
@@ -81,7 +81,7 @@ def test_masked_pixels_do_not_count(night):
     np.testing.assert_allclose(uniform.potential[1], alone.potential, atol=1e-9)
 
 
-def test_nothing_is_read_before_it_is_needed_and_only_what_is_needed(night):
+def test_lazy_stack_reads_only_computed_shots(night):
     from slow_reading import log_and_read
 
     stack = invert_stack(night.glob, source=night.source, options=OPTIONS, reader=log_and_read)
@@ -123,7 +123,7 @@ def test_threads_that_ask_at_once_get_the_same_plan(night, plans_made):
     assert all(plan is plans[0] for plan in plans)
 
 
-def test_plans_are_told_apart_by_source_mask_and_options_not_by_threads(night, plans_made):
+def test_plans_depend_on_source_mask_and_options(night, plans_made):
     mask = np.ones(night.source.shape, bool)
     mask[0, 0] = False
     beams = [
@@ -183,7 +183,7 @@ def test_a_source_for_each_shot(night, plans_made):
         invert_stack(night.images, source=sources[:2], options=OPTIONS)
 
 
-def test_a_warm_start_gives_the_same_answer_within_the_tolerance_with_fewer_steps(night):
+def test_warm_start_agrees_within_tolerance_in_fewer_steps(night):
     alike = np.stack([night.images[1] * (1 + 0.001 * i * np.eye(24, 28)) for i in range(6)])
     options = InversionOptions(n_sites=600, tolerance=1e-4)
     cold = invert_stack(alike, source=night.source, options=options)
@@ -249,7 +249,7 @@ class TestInputs:
             ([np.ones((5, 6)), np.ones((6, 5))], "expected the same shape for all"),
         ],
     )
-    def test_what_holds_no_shots_is_refused(self, shots, words):
+    def test_input_without_shots_is_refused(self, shots, words):
         with pytest.raises(InputError, match=words):
             invert_stack(shots)
 
@@ -262,7 +262,7 @@ class TestInputs:
         with pytest.raises(FileFormatError, match="none of 1 shots can be read"):
             invert_stack(str(tmp_path / "*.tif"))
 
-    def test_what_does_not_fit_together_is_refused(self, night):
+    def test_lazy_stack_refuses_inputs_that_do_not_match(self, night):
         with pytest.raises(InputError, match=r"source has shape \(5, 6\), shots \(24, 28\)"):
             invert_stack(night.images, source=np.ones((5, 6)))
         with pytest.raises(InputError, match="mask has shape"):
@@ -281,7 +281,7 @@ def test_a_bad_shot_is_named_when_it_is_computed(night):
         stack.potential.compute()
 
 
-def test_only_what_is_asked_for_is_made(night):
+def test_lazy_stack_computes_only_requested_variables(night):
     setup = OpticalSetup(wavelength=5e-7, object_image_distance=0.3, pixel_size=1e-5)
     stack = invert_stack(night.images, setup=setup, variables=["potential_si"], options=OPTIONS)
     quality = {"converged", "flux_residual", "image_residual", "iterations"}

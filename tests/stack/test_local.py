@@ -48,7 +48,7 @@ def test_workers_use_memory_again_that_they_had(monkeypatch):
 
 
 def answers(address: str, **security: object) -> bool:
-    """Tell whether a scheduler or worker goes on talking after hello."""
+    """Return whether a scheduler or worker continues the connection after its greeting."""
 
     async def greet() -> None:
         comm = await connect(address, timeout=2, **security)
@@ -78,7 +78,7 @@ def test_only_who_has_the_key_of_a_run_can_talk_to_it():
             assert friend.submit(sum, (1, 2)).result(timeout=30) == 3
 
 
-def test_no_page_tells_what_is_at_work():
+def test_scheduler_and_workers_serve_no_pages():
     with local_client(1) as client:
         mine = psutil.Process()
         ports = [
@@ -97,7 +97,7 @@ def test_no_page_tells_what_is_at_work():
                 urllib.request.urlopen(page, timeout=5)
 
 
-def test_a_worker_killed_while_it_starts_is_told_in_one_sentence():
+def test_worker_killed_while_it_starts_gives_one_sentence():
     def kill() -> None:
         end = time.monotonic() + 60
         while time.monotonic() < end:

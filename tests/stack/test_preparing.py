@@ -153,7 +153,7 @@ def test_a_store_is_not_continued_with_other_filters_or_guesses(night, out, bare
         ),
     ],
 )
-def test_what_makes_no_sense_is_refused_before_anything_is_made(night, out, arguments, named):
+def test_nonsense_is_refused_before_anything_is_computed(night, out, arguments, named):
     with pytest.raises(InputError, match=named):
         night.run(out, **arguments)
     assert not out.exists()

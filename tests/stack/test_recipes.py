@@ -1,4 +1,4 @@
-"""The recipes for clusters, as the page has them, with what a cluster would do played by a shell.
+"""The recipes for clusters, as the page has them, on a cluster imitated by a shell.
 
 `sbatch` starts the job on this machine and `scancel` ends it; scheduler, workers and the store are
 real. Of Kubernetes nothing is played: only what the recipe asks for is looked at.
@@ -153,7 +153,7 @@ def test_the_recipe_without_dask_jobqueue(project, slurm, tmp_path):
     assert list(read(project / "night.shadowinv.zarr").status) == [DONE] * 6
 
 
-def test_the_recipe_for_kubernetes_asks_for_what_the_page_says():
+def test_kubernetes_recipe_requests_what_the_page_says():
     pytest.importorskip("dask_kubernetes.operator")
     asking = block("KubeCluster").partition("cluster = ")[0]
     names: dict[str, object] = {}
@@ -170,7 +170,7 @@ def test_the_recipe_for_kubernetes_asks_for_what_the_page_says():
         "limits": {"memory": "2Gi"},
     }
     assert {"name": "NUMBA_CACHE_DIR", "value": "/data/.numba"} in container["env"]
-    # What a worker is started with must be what dask's command takes.
+    # The arguments of a worker must be valid for dask's command.
     assert container["args"][:4] == ["dask", "worker", "--nthreads", "1"]
     command = import_module("distributed.cli.dask_worker").main
     taken = command.make_context("dask worker", container["args"][2:]).params

@@ -1,4 +1,4 @@
-"""`run_stack`: what the store holds, going on, refusing what does not belong together."""
+"""`run_stack`: content of the store, resuming, refusing inputs that do not match."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ OPTIONS = InversionOptions(n_sites=100)
 
 
 def stop_after(count: int):
-    """Return a callback and a question that end a run after so many shots."""
+    """Return `on_progress` and `should_stop` that end a run after a number of shots."""
     ended = []
 
     def note(progress):
@@ -42,7 +42,7 @@ def stop_after(count: int):
     return note, lambda: len(ended) >= count
 
 
-def test_the_store_holds_what_the_lazy_stack_computes(night, out, optical_setup):
+def test_store_equals_the_lazy_stack(night, out, optical_setup):
     written = night.run(out, shots=night.images, setup=optical_setup)
     lazy = invert_stack(night.images, source=night.source, options=OPTIONS, setup=optical_setup)
     assert (written.status == DONE).all()
@@ -54,7 +54,7 @@ def test_the_store_holds_what_the_lazy_stack_computes(night, out, optical_setup)
     np.testing.assert_array_equal(written.flux_residual, lazy.flux_residual)
     np.testing.assert_array_equal(written.image_residual, lazy.image_residual)
     assert (written.image_residual > 0).all()
-    # Fields in SI units follow from what is stored, when they are asked for.
+    # Fields in SI units are derived from the stored variables on demand.
     for name in ("deflection_angle", "line_integrated_density"):
         assert written[name].attrs == lazy[name].attrs
         largest = float(abs(lazy[name]).max())
@@ -75,7 +75,7 @@ def test_read_opens_it_and_so_does_plain_xarray(night, out, recwarn):
 
 
 @pytest.mark.parametrize("boundary", ["closed", "free"])
-def test_what_is_stored_can_be_chosen_and_sites_are_stored_once(night, out, boundary):
+def test_stored_variables_can_be_chosen_and_sites_stand_once(night, out, boundary):
     options = OPTIONS.model_copy(update={"boundary": boundary})
     names = ("weights", "sites", "site_flux", "source", "reprojection")
     written = run_stack(
@@ -123,7 +123,7 @@ def test_a_run_goes_on_where_it_stopped(night, out):
     after = night.run(out, **arguments, on_progress=progress.append)
     assert (after.status == DONE).all()
     assert (progress[0].done, progress[0].total) == (len(done), 6)
-    # What was done is neither read nor written again.
+    # Finished shots are neither read nor written again.
     assert not {f"shot_{i}" for i in done} & set(night.reads[reads:])
     assert first.items() <= content(out).items()
     lazy = invert_stack(night.images, source=night.source, options=OPTIONS)
@@ -138,7 +138,7 @@ def test_a_finished_run_has_nothing_to_do(night, out):
 
 
 def spoil(night) -> dict[int, str]:
-    """Spoil some shots; return the words that must tell of each."""
+    """Spoil some shots; return the words of the message about each."""
     night.path(0).write_bytes(b"")
     night.path(1).write_bytes(night.path(1).read_bytes()[:999])
     np.save(night.path(2), 0 * night.images[2])
@@ -147,7 +147,7 @@ def spoil(night) -> dict[int, str]:
     return {0: "is empty", 1: "truncated", 2: "no positive pixel", 3: "(7, 9)", 4: "NaN"}
 
 
-def test_bad_shots_fail_alone_with_their_reason_and_can_be_redone(make_night, out):
+def test_bad_shots_fail_alone_and_can_be_repeated(make_night, out):
     night = make_night(8)
     words = spoil(night)
     arguments = {"source": night.source, "options": OPTIONS}
@@ -330,7 +330,7 @@ def test_store_with_truncated_names_is_refused(night, out):
         read(out)
 
 
-def test_a_reader_is_known_by_where_it_comes_from_and_its_choices():
+def test_reader_text_has_module_and_choices():
     assert reader_text(read_shot) == "napari_shadowinv.read_shot"
     chosen = partial(read_shot, factor=2, channel="red")
     assert reader_text(chosen) == "napari_shadowinv.read_shot(channel='red', factor=2)"

@@ -16,7 +16,7 @@ from napari_shadowinv import (
 OPTIONS = InversionOptions(n_sites=100)
 
 
-def test_they_are_those_of_numpy_and_lazy(night, optical_setup):
+def test_statistics_equal_numpy_and_are_lazy(night, optical_setup):
     stack = invert_stack(night.images, source=night.source, options=OPTIONS, setup=optical_setup)
     statistics = stack_statistics(stack)
     assert all(variable.chunks for variable in statistics.data_vars.values())

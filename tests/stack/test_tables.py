@@ -221,7 +221,7 @@ def test_a_fit_leaves_excluded_images_out(pack: Path) -> None:
     } == {"a": used}
 
 
-def test_columns_that_only_fits_use_are_told(pack: Path, out: Path) -> None:
+def test_columns_for_fits_give_a_warning(pack: Path, out: Path) -> None:
     pack = table("film1.npy,14.7,1,poisson", header="file,energy,psf,noise")
     inverted(pack, out)
     (warning,) = StackStore(out).report(0)["warnings"]
@@ -277,7 +277,7 @@ MISTAKES: dict[str, tuple[str, Sequence[str], tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_is_told_in_a_sentence(name: str, pack: Path) -> None:
+def test_table_mistakes_give_one_sentence(name: str, pack: Path) -> None:
     header, rows, words = MISTAKES[name]
     table(*rows, header=header)
     result = shadowinv("batch", "pack.csv", "--out", "x.shadowinv.zarr")
@@ -361,7 +361,7 @@ def test_rows_may_be_given_in_python(pack: Path, out: Path) -> None:
     assert store["energy"].values.tolist() == [14.7, 30.0]
 
 
-def test_workers_elsewhere_are_told_all_of_a_row(pack: Path, out: Path) -> None:
+def test_worker_processes_receive_all_of_a_row(pack: Path, out: Path) -> None:
     np.save("mask.npy", np.ones(SHAPE))
     pack = table("film0.npy,5,mask.npy", "film2.npy,30,", header="file,energy,mask")
     arguments = {"setup": SETUP, "options": OPTIONS, "source": beam(), "dtype": "float64"}

@@ -1,4 +1,4 @@
-"""A folder that is watched: what arrives is inverted once, completely, and in order."""
+"""A watched folder: files that arrive are inverted once, completely, and in order."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SETTLE = 0.1
 
 
 class Watched:
-    """A folder under watch in a thread, and what was told of it."""
+    """A folder watched in a thread, and its progress."""
 
     def __init__(self, folder: Path, out: Path, **choices: Any) -> None:
         self.folder, self.out = folder, out
@@ -77,7 +77,7 @@ class Watched:
             time.sleep(0.005)
 
     def ended(self, count: int) -> list[WatchProgress]:
-        """Wait until so many shots have ended."""
+        """Wait until a number of shots have ended."""
         self.until(lambda: self.error or len(self.shots) >= count)
         if self.error is not None:
             raise self.error
@@ -116,7 +116,7 @@ def whole(index: int) -> bytes:
 
 
 def watched_once(folder: Path, out: Path, **choices: Any) -> Any:
-    """Invert what is there and return the store."""
+    """Invert the existing files and return the store."""
     with Watched(folder, out, idle=0.2, **choices) as watch:
         watch.until(lambda: not watch._thread.is_alive())
     if watch.error is not None:
@@ -124,7 +124,7 @@ def watched_once(folder: Path, out: Path, **choices: Any) -> Any:
     return watch.result
 
 
-def test_what_is_there_comes_first_and_then_what_arrives_in_its_order(folder, out):
+def test_watch_inverts_existing_files_first_then_arrivals(folder, out):
     put(folder, 2, 1)
     with Watched(folder, out) as watch:
         watch.ended(2)
@@ -146,7 +146,7 @@ def test_what_is_there_comes_first_and_then_what_arrives_in_its_order(folder, ou
     assert watch.result.attrs["warm_start"] == "each shot from an earlier one, as they arrived"
 
 
-def test_fields_are_those_of_a_run_and_of_later_shots_need_fewer_steps(folder, out, tmp_path):
+def test_watch_equals_a_run_and_later_shots_need_fewer_steps(folder, out, tmp_path):
     put(folder, *range(6))
     warm = watched_once(folder, out)
     cold = watched_once(folder, tmp_path / "cold.shadowinv.zarr", warm_start=False)
@@ -163,7 +163,7 @@ def test_fields_are_those_of_a_run_and_of_later_shots_need_fewer_steps(folder, o
         assert (warm[name] > 0).all()
 
 
-def test_each_shot_starts_from_the_last_but_one_however_fast_they_come(folder, out, tmp_path):
+def test_watch_starts_each_shot_from_the_last_but_one(folder, out, tmp_path):
     slow = tmp_path / "slow"
     slow.mkdir()
     with Watched(slow, tmp_path / "slow.shadowinv.zarr", dtype="float64") as watch:
@@ -198,7 +198,7 @@ def test_the_accuracy_decides_once_how_many_sites_all_shots_get(folder, out):
     assert StackStore(run_store).attributes["chosen_sites"] == chosen
 
 
-def test_a_file_that_is_written_slowly_is_inverted_from_its_whole_content(folder, out):
+def test_slowly_written_file_is_inverted_once_complete(folder, out):
     data = whole(0)
     with Watched(folder, out) as watch:
         path = folder / "shot_0.npy"
@@ -222,7 +222,7 @@ def test_a_file_that_is_written_slowly_is_inverted_from_its_whole_content(folder
     )
 
 
-def test_a_shot_that_changes_is_told_of_and_inverted_again(folder, out):
+def test_changed_shot_is_reported_and_inverted_again(folder, out):
     put(folder, 0, 1)
     with Watched(folder, out) as watch:
         watch.ended(2)
@@ -243,7 +243,7 @@ def test_a_shot_that_changes_is_told_of_and_inverted_again(folder, out):
         assert watch.ended(1)[0].again
 
 
-def test_what_is_moved_or_linked_here_counts_and_what_is_not_a_shot_does_not(folder, out, tmp_path):
+def test_moved_and_linked_files_count_and_other_files_do_not(folder, out, tmp_path):
     put(tmp_path, 0, 1, 2)
     with Watched(folder, out, pattern="*") as watch:
         shutil.move(tmp_path / "shot_0.npy", folder)
@@ -270,7 +270,7 @@ def test_a_store_inside_the_folder_does_not_set_it_off(folder):
     assert list(watch.result.status.values) == [DONE, DONE]
 
 
-def test_bad_files_fail_alone_and_the_next_in_their_lane_starts_afresh(folder, out, tmp_path):
+def test_bad_files_fail_alone_and_the_next_starts_from_zero(folder, out, tmp_path):
     (folder / "shot_0.npy").write_bytes(b"")
     np.save(folder / "shot_1.npy", IMAGES[0][:10])
     (folder / "shot_2.npy").write_text("no image")
@@ -408,7 +408,7 @@ def test_without_room_for_another_watch_it_looks_itself(folder, out, monkeypatch
     assert note.startswith("the system cannot watch another folder (No space left on device)")
 
 
-def test_a_folder_that_is_gone_before_it_is_observed_leaves_no_thread(folder):
+def test_folder_removed_before_observation_leaves_no_thread(folder):
     before = set(threading.enumerate())
     arrivals = _folder_events.Arrivals(folder.resolve(), "*")
     shutil.rmtree(folder)
@@ -437,7 +437,7 @@ def test_a_folder_that_disappears_ends_it_with_a_sentence(folder, out, how):
     assert list(read(out).status.values) == [DONE]
 
 
-def test_what_cannot_be_watched_is_refused_at_once(folder, out, tmp_path):
+def test_wrong_folder_or_pattern_is_refused_at_once(folder, out, tmp_path):
     def refused(*more: object, names: str, place: Path = folder) -> None:
         result = shadowinv("watch", place, "--out", out, *more)
         assert result.exit_code == 2, result.output
@@ -455,7 +455,7 @@ def test_what_cannot_be_watched_is_refused_at_once(folder, out, tmp_path):
         watch_stack(folder, out, source=sources)
 
 
-def test_the_command_tells_a_line_for_each_shot(folder, out, tmp_path, monkeypatch):
+def test_watch_command_prints_a_line_for_each_shot(folder, out, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     np.save(tmp_path / "reference.npy", SOURCE)
     put(folder, 0, 1)
@@ -472,7 +472,7 @@ def test_the_command_tells_a_line_for_each_shot(folder, out, tmp_path, monkeypat
     assert all(" peak |d| " in line and " px  residual " in line for line in shot_lines)
     assert all(len(line) <= 100 for line in shot_lines)
     assert "2 waiting" in shot_lines[0]
-    # What casts doubt on a shot is said once, whatever its numbers.
+    # Each kind of doubt about a shot is reported once, whatever its numbers.
     warning, failure = result.stderr.splitlines()
     assert warning.startswith("warning: shot_0.npy: the field reaches the image's edge")
     assert all(line.endswith("doubtful, 1 warning") for line in shot_lines)

@@ -113,7 +113,7 @@ def test_mask_of_a_source_leaves_its_pixels_out(burnt: np.ma.MaskedArray[Any, An
     assert np.array_equal(plan_sites(beam, OPTIONS).mask, ~burnt.mask)
 
 
-def test_given_mask_and_that_of_the_array_both_count(burnt: np.ma.MaskedArray[Any, Any]) -> None:
+def test_mask_argument_and_array_mask_both_count(burnt: np.ma.MaskedArray[Any, Any]) -> None:
     mask = np.ones(SHOT.shape, bool)
     mask[20:24] = False
 

@@ -13,7 +13,7 @@ from napari_shadowinv._system.machine import defer_interrupts
 
 @pytest.fixture(autouse=True)
 def usual_ctrl_c() -> Iterator[None]:
-    """Whatever a package that another test has imported makes of it."""
+    """Restore the usual Ctrl-C, which packages of other tests may have changed."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

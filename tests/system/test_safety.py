@@ -46,7 +46,7 @@ def test_special_files_are_refused_unopened(
     assert not [path for path in opened_paths if path.startswith(str(tmp_path))]
 
 
-def test_whatever_a_reader_raises_is_one_error_with_its_reason(tmp_path: Path) -> None:
+def test_errors_of_readers_become_one_error_with_a_reason(tmp_path: Path) -> None:
     @as_file_errors
     def broken(path: Path, error: BaseException) -> None:
         raise error
@@ -107,7 +107,7 @@ def write_picture(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", LARGE)
-def test_what_unfolds_to_too_much_is_refused_and_told_how_to_allow_it(
+def test_oversized_content_is_refused_with_a_way_to_allow_it(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / name

@@ -110,7 +110,7 @@ def test_blurring_twice_adds_variances():
     )
 
 
-def test_a_wide_blur_is_that_of_narrower_ones_although_it_is_of_means():
+def test_wide_blur_of_means_equals_narrower_blurs():
     image = 0.1 + np.random.default_rng(3).random((210, 331)) ** 8
     image[40:90, 200:260] *= 5
     narrow = blurred(blurred(blurred(image, 24.0), 24.0), 30.0)
@@ -146,7 +146,7 @@ def test_cells_hold_the_same_of_split_pixels(parts):
 
 
 @pytest.mark.parametrize("image", [line(), one_pixel()], ids=["line", "pixel"])
-def test_what_is_thinner_than_a_cell_takes_few_steps(image):
+def test_structure_thinner_than_a_cell_takes_few_steps(image):
     """Each row of cells that passes a pixel's edge took some steps where pixels were not split."""
     plan = planned(UNIFORM, SIDE**2)
     answer = solve(plan.levels, raised(image), InversionOptions())[-1]
@@ -186,7 +186,7 @@ def test_the_report_of_an_unsolved_image_names_the_blur():
     assert re.search(r"not converged.*only the image blurred by \S+ px", report.warnings[0].text)
 
 
-def test_a_solution_short_of_the_tolerance_is_better_than_that_of_a_blurred_image():
+def test_unconverged_solution_beats_a_blurred_one():
     """No solver gets below rounding: the tolerance asked for is out of reach."""
     plan = planned(UNIFORM, 500)
     answer = solve(plan.levels, smooth_image(), InversionOptions(tolerance=1e-16))[-1]
@@ -205,7 +205,7 @@ def test_no_level_takes_more_steps_than_allowed(most):
         assert f"all {most} iterations" in answers[-1].reason
 
 
-def test_steps_on_a_level_that_led_nowhere_are_told():
+def test_steps_on_a_stalled_level_are_reported():
     """The coarser levels' start does not lead to a disc: the finest one is tried twice."""
     plan = planned(UNIFORM)
     answers = solve(plan.levels, raised(DISC), InversionOptions())
@@ -223,7 +223,7 @@ def test_an_island_is_displaced_as_a_whole():
     np.testing.assert_allclose(inversion.displacement[1][inside], 32, atol=0.1)
 
 
-def test_a_square_on_a_disc_keeps_its_symmetry_and_shrinks_evenly():
+def test_square_on_a_disc_stays_symmetric_and_shrinks_evenly():
     inversion = invert(DISC, options=InversionOptions(n_sites=4096))
     inner = slice(2, -2)  # at the edge the potential is extrapolated
     potential = inversion.potential[inner, inner]

@@ -1,4 +1,4 @@
-"""What a solution of Newton's systems must satisfy, for easy and for nasty networks."""
+"""Properties of solutions of Newton's systems, for easy and for difficult networks."""
 
 from __future__ import annotations
 
@@ -245,7 +245,7 @@ def test_infinite_conductances_are_refused() -> None:
         LaplacianSolver(laplacian_of(edges, np.full(len(edges), np.inf), 1600))
 
 
-def test_factorisation_takes_over_where_iterations_do_not_suffice(
+def test_factorisation_replaces_insufficient_iterations(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Lazy(LaplacianSolver):

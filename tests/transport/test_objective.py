@@ -52,7 +52,7 @@ def test_value_is_convex_and_ignores_a_common_weight(problem):
     assert shifted == pytest.approx(ends[0], rel=1e-12)
 
 
-def test_an_empty_cell_is_told_and_the_diagram_stays_usable(problem):
+def test_empty_cell_gives_none_and_keeps_the_diagram_usable(problem):
     objective, weights, _ = problem
     collapsed = weights.copy()
     collapsed[7] -= 1e3

@@ -73,7 +73,7 @@ def test_levels_quarter_and_their_masses_add_up_to_the_source():
         assert (level.mass > 0).all()
 
 
-def test_few_sites_on_a_small_bright_spot_still_hold_the_whole_image():
+def test_few_sites_on_a_bright_spot_hold_the_whole_image():
     source = np.zeros((200, 200))
     source[100:103, 50:53] = 1
     plan = plan_levels(source, 30, lloyd_iterations=2)
