@@ -44,7 +44,7 @@ def unpack_array(
     if dimensions have other names, or pixels are not square.
     """
     if _is_labelled(values):
-        values = _in_order(values, name, dims, unit)
+        values = _order_axes(values, name, dims, unit)
     if isinstance(values, (list, tuple)):
         try:
             return np.asarray(values), None
@@ -165,7 +165,7 @@ def _is_labelled(values: Any) -> bool:
     return all(hasattr(values, name) for name in ("dims", "coords", "transpose", "data"))
 
 
-def _in_order(array: Any, name: str, dims: Sequence[str], unit: str) -> Any:
+def _order_axes(array: Any, name: str, dims: Sequence[str], unit: str) -> Any:
     """Return the values of a labelled array in the order of the dimensions."""
     names = tuple(map(str, array.dims))
     received = str(array.attrs.get("units", unit)).replace(" ", "")

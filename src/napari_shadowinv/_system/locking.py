@@ -30,10 +30,10 @@ def locked(path: Path) -> Iterator[None]:
     # The operating system takes the lock from a process that dies. Where a file system has no
     # locks, or is shared and they do not reach other hosts, signs of life stand in for them: a
     # lock whose file does not change while one watches is stale, whatever the clocks say.
-    lock = path.with_name(f".{_shortened(path.name)}.lock")
-    file, is_new = _opened(path, lock)
+    lock = path.with_name(f".{_shorten_name(path.name)}.lock")
+    file, is_new = _open_lock(path, lock)
     with file:
-        _take(path, lock, file, is_new)
+        _take_lock(path, lock, file, is_new)
         ended = threading.Event()
 
         def beat() -> None:
@@ -46,10 +46,10 @@ def locked(path: Path) -> Iterator[None]:
             yield
         finally:
             ended.set()
-            _give_back(file, lock)
+            _release(file, lock)
 
 
-def _shortened(name: str) -> str:
+def _shorten_name(name: str) -> str:
     """Return a name that leaves room for the ending of its lock."""
     raw = os.fsencode(name)
     if len(raw) <= _MAX_LOCKED_BYTES:
@@ -58,7 +58,7 @@ def _shortened(name: str) -> str:
     return raw[: _MAX_LOCKED_BYTES - len(digest)].decode("utf-8", errors="ignore") + digest
 
 
-def _opened(path: Path, lock: Path) -> tuple[BinaryIO, bool]:
+def _open_lock(path: Path, lock: Path) -> tuple[BinaryIO, bool]:
     """Open the lock file without following links, and return whether it is new."""
     flags = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0)
     try:
@@ -72,45 +72,45 @@ def _opened(path: Path, lock: Path) -> tuple[BinaryIO, bool]:
                 break
     except OSError as error:
         if lock.is_symlink():
-            raise _no_file_of_its_own(path, lock) from None
-        raise _not_writable(path, error) from None
+            raise _not_a_file_error(path, lock) from None
+        raise _not_writable_error(path, error) from None
     file = cast(BinaryIO, os.fdopen(number, "r+b", buffering=0))
     status = os.fstat(number)
     if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
         file.close()
-        raise _no_file_of_its_own(path, lock)
+        raise _not_a_file_error(path, lock)
     return file, is_new
 
 
-def _not_writable(path: Path, error: OSError) -> FileFormatError:
+def _not_writable_error(path: Path, error: OSError) -> FileFormatError:
     return FileFormatError(f"{path} cannot be written ({error.strerror}): choose a writable folder")
 
 
-def _no_file_of_its_own(path: Path, lock: Path) -> FileFormatError:
+def _not_a_file_error(path: Path, lock: Path) -> FileFormatError:
     return FileFormatError(
         f"{path} cannot be written: its lock {lock} is a link or not a file; remove it"
     )
 
 
-def _take(path: Path, lock: Path, file: BinaryIO, is_new: bool) -> None:
+def _take_lock(path: Path, lock: Path, file: BinaryIO, is_new: bool) -> None:
     """Make the lock this process's own."""
-    taken = _taken(file)
-    is_certain = is_new or (taken and _content(file).get("host") in (None, socket.gethostname()))
+    taken = _try_lock(file)
+    is_certain = is_new or (taken and _read_owner(file).get("host") in (None, socket.gethostname()))
     if taken is False or not (is_certain or _is_silent(lock)):
-        raise _held(path, file)
+        raise _lock_error(path, file)
     try:
-        signature = _sign(file)
+        signature = _write_owner(file)
     except OSError as error:
-        _give_back(file, lock)
-        raise _not_writable(path, error) from None
+        _release(file, lock)
+        raise _not_writable_error(path, error) from None
     if not is_certain:
         time.sleep(_SETTLE_S)
-        if _content(file) != signature:
-            raise _held(path, file)
+        if _read_owner(file) != signature:
+            raise _lock_error(path, file)
 
 
-def _held(path: Path, file: BinaryIO) -> FileFormatError:
-    owner = _content(file)
+def _lock_error(path: Path, file: BinaryIO) -> FileFormatError:
+    owner = _read_owner(file)
     holder = f"process {owner.get('pid')} on {owner.get('host')}" if owner else "another process"
     return FileFormatError(
         f"{path} is being written by {holder}: wait for that process, or stop it first"
@@ -119,16 +119,16 @@ def _held(path: Path, file: BinaryIO) -> FileFormatError:
 
 def _is_silent(lock: Path) -> bool:
     """Return whether a lock stays unchanged while it is watched."""
-    before = _look(lock)
+    before = _read_lock(lock)
     end = time.monotonic() + _WATCH_S
     while time.monotonic() < end:
         time.sleep(_BEAT_S / 4)
-        if _look(lock) != before:
+        if _read_lock(lock) != before:
             return False
     return True
 
 
-def _look(lock: Path) -> tuple[int, bytes] | None:
+def _read_lock(lock: Path) -> tuple[int, bytes] | None:
     """Return time stamp and content, opening the file anew to refresh a network file system."""
     try:
         with lock.open("rb") as file:
@@ -137,7 +137,7 @@ def _look(lock: Path) -> tuple[int, bytes] | None:
         return None
 
 
-def _give_back(file: BinaryIO, lock: Path) -> None:
+def _release(file: BinaryIO, lock: Path) -> None:
     with suppress(OSError):
         if os.path.samestat(os.fstat(file.fileno()), os.stat(lock)):
             file.seek(0)
@@ -145,10 +145,10 @@ def _give_back(file: BinaryIO, lock: Path) -> None:
             if os.name != "nt":
                 lock.unlink()
     with suppress(OSError):
-        _free(file)
+        _unlock(file)
 
 
-def _sign(file: BinaryIO) -> dict[str, object]:
+def _write_owner(file: BinaryIO) -> dict[str, object]:
     run = secrets.token_hex(8)
     signature: dict[str, object] = {"host": socket.gethostname(), "pid": os.getpid(), "run": run}
     file.seek(0)
@@ -157,7 +157,7 @@ def _sign(file: BinaryIO) -> dict[str, object]:
     return signature
 
 
-def _content(file: BinaryIO) -> dict[str, object]:
+def _read_owner(file: BinaryIO) -> dict[str, object]:
     file.seek(0)
     try:
         owner = json.loads(file.read() or b"{}")
@@ -166,13 +166,13 @@ def _content(file: BinaryIO) -> dict[str, object]:
     return owner if isinstance(owner, dict) else {}
 
 
-# `_taken` returns whether the operating system gave the lock; None where it has no locks.
+# `_try_lock` returns whether the operating system gave the lock; None where it has no locks.
 if os.name == "nt":  # pragma: no cover - Windows only
     import msvcrt
 
     _BEYOND = 1 << 30  # locks there are mandatory: one on the text would forbid to read it
 
-    def _taken(file: BinaryIO) -> bool | None:
+    def _try_lock(file: BinaryIO) -> bool | None:
         file.seek(_BEYOND)
         try:
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
@@ -180,7 +180,7 @@ if os.name == "nt":  # pragma: no cover - Windows only
             return False
         return True
 
-    def _free(file: BinaryIO) -> None:
+    def _unlock(file: BinaryIO) -> None:
         file.seek(_BEYOND)
         msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)  # type: ignore[attr-defined]
 
@@ -188,7 +188,7 @@ else:
     import errno
     import fcntl
 
-    def _taken(file: BinaryIO) -> bool | None:
+    def _try_lock(file: BinaryIO) -> bool | None:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -197,5 +197,5 @@ else:
         # The previous holder may have removed the file after it was opened here.
         return os.fstat(file.fileno()).st_nlink > 0
 
-    def _free(file: BinaryIO) -> None:
+    def _unlock(file: BinaryIO) -> None:
         fcntl.flock(file, fcntl.LOCK_UN)

@@ -79,7 +79,7 @@ def in_ranges(
     if ranges == 1:
         kernel(0, n, *args)
         return
-    pool = _helpers()
+    pool = _kernel_pool()
     futures = [pool.submit(kernel, bounds[k], bounds[k + 1], *args) for k in range(1, ranges)]
     try:
         kernel(bounds[0], bounds[1], *args)
@@ -90,13 +90,13 @@ def in_ranges(
 
 
 @cache
-def _helpers() -> ThreadPoolExecutor:
+def _kernel_pool() -> ThreadPoolExecutor:
     """Return the pool of kernel threads; starting a thread takes as long as a small kernel."""
     return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="kernels of shadowinv")
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_helpers.cache_clear)  # threads are not copied
+    os.register_at_fork(after_in_child=_kernel_pool.cache_clear)  # threads are not copied
 
 
 # Ctrl-C, and the signals of a job scheduler or a closing terminal.

@@ -49,7 +49,7 @@ def as_file_errors(
         try:
             return read(Path(path), *args, **kwargs)
         except _DamagedContentError as error:
-            raise _damage(path, error.__cause__ or error) from error
+            raise _damage_error(path, error.__cause__ or error) from error
         except (FileFormatError, InputError, InversionCancelled):
             raise
         except (ImportError, NameError):  # a mistake in a program, which no file can cause
@@ -64,19 +64,19 @@ def as_file_errors(
                 raise FileFormatError(
                     f"{path} cannot be read ({error.strerror}): check its permissions and the disk"
                 ) from error
-            raise _damage(path, error) from error
+            raise _damage_error(path, error) from error
 
     return cast("Callable[Concatenate[str | Path, P], Content]", guarded)
 
 
-def _damage(path: str | Path, cause: BaseException) -> FileFormatError:
+def _damage_error(path: str | Path, cause: BaseException) -> FileFormatError:
     return FileFormatError(
-        f"{path} is damaged or truncated ({_reason(cause)}): expected a complete file; copy or "
-        "export it again"
+        f"{path} is damaged or truncated ({_error_reason(cause)}): expected a complete file; copy "
+        "or export it again"
     )
 
 
-def _reason(error: BaseException) -> str:
+def _error_reason(error: BaseException) -> str:
     return " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__
 
 
@@ -89,8 +89,8 @@ def as_input_errors(name: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise _DamagedContentError(
-            f"{name} is damaged or was changed ({_reason(error)}): expected it as this package "
-            "writes it"
+            f"{name} is damaged or was changed ({_error_reason(error)}): expected it as this "
+            "package writes it"
         ) from error
 
 
@@ -104,8 +104,8 @@ def check_regular(path: Path, expected: str) -> None:
         ) from None
     except OSError as error:
         raise FileFormatError(
-            f"{_shown(path)} cannot be opened ({error.strerror}): check its permissions and the "
-            "path"
+            f"{_shorten_path(path)} cannot be opened ({error.strerror}): check its permissions and "
+            "the path"
         ) from None
     except ValueError:
         raise FileFormatError(
@@ -128,7 +128,7 @@ def resolved_path(path: str | Path) -> Path:
         ) from None
 
 
-def _shown(path: Path) -> str:
+def _shorten_path(path: Path) -> str:
     text = str(path)
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
 

@@ -33,7 +33,7 @@ class _CheckedMeta(ModelMetaclass):
             try:
                 return super().__call__(*args, **values)
             except ValidationError as error:
-                raise InputError(f"{self.__name__}: {_sentence(self, error)}") from error
+                raise InputError(f"{self.__name__}: {_error_sentence(self, error)}") from error
 
 
 class CheckedModel(BaseModel, metaclass=_CheckedMeta):
@@ -58,7 +58,7 @@ def as_model(model_class: type[Model], value: Any, name: str) -> Model:
         return value
     if value is None or isinstance(value, Mapping):
         return validated(model_class, value or {}, name)
-    raise InputError(f"{name} is {_shown(value)}, expected {model_class.__name__}")
+    raise InputError(f"{name} is {_shorten(value)}, expected {model_class.__name__}")
 
 
 def check_instance(value: object, expected: type | tuple[type, ...], name: str) -> None:
@@ -67,7 +67,7 @@ def check_instance(value: object, expected: type | tuple[type, ...], name: str) 
         return
     classes = expected if isinstance(expected, tuple) else (expected,)
     titles = " or ".join(expected.__name__ for expected in classes)
-    raise InputError(f"{name} is {_shown(value)}, expected {titles}")
+    raise InputError(f"{name} is {_shorten(value)}, expected {titles}")
 
 
 def validated(
@@ -76,12 +76,12 @@ def validated(
     """Make a model from a mapping, or raise an `InputError` that begins with `where`."""
     if not isinstance(mapping, Mapping):
         raise InputError(
-            f"{where}: received {_shown(mapping)}, expected a table of keys and values"
+            f"{where}: received {_shorten(mapping)}, expected a table of keys and values"
         )
     try:
         return model_class.model_validate(mapping)
     except ValidationError as error:
-        raise InputError(f"{where}: {_sentence(model_class, error)}") from error
+        raise InputError(f"{where}: {_error_sentence(model_class, error)}") from error
 
 
 def nearest(name: str, choices: list[str]) -> str | None:
@@ -90,21 +90,21 @@ def nearest(name: str, choices: list[str]) -> str | None:
     return matches[0] if matches else None
 
 
-def _sentence(model_class: type[BaseModel], error: ValidationError) -> str:
+def _error_sentence(model_class: type[BaseModel], error: ValidationError) -> str:
     details = error.errors(include_url=False)
     intended = {
-        nearest(str(detail["loc"][-1]), list(_place(model_class, detail["loc"])[0].model_fields))
+        nearest(str(detail["loc"][-1]), list(_locate(model_class, detail["loc"])[0].model_fields))
         for detail in details
         if detail["type"] == "extra_forbidden"
     }
     return "; ".join(
-        _clause(model_class, dict(detail))
+        _error_clause(model_class, dict(detail))
         for detail in details
         if not (detail["type"] == "missing" and detail["loc"][-1] in intended)
     )
 
 
-def _place(
+def _locate(
     model_class: type[BaseModel], loc: tuple[int | str, ...]
 ) -> tuple[type[BaseModel], list[str]]:
     """Return the model that contains a value, and the names of the path to it, without unions."""
@@ -134,8 +134,8 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
     return [model for part in get_args(annotation) for model in _models_in(part)]
 
 
-def _clause(model_class: type[BaseModel], detail: dict[str, Any]) -> str:
-    model, names = _place(model_class, detail["loc"])
+def _error_clause(model_class: type[BaseModel], detail: dict[str, Any]) -> str:
+    model, names = _locate(model_class, detail["loc"])
     name = ".".join(names)
     kind, context = detail["type"], detail.get("ctx", {})
     tag_key = context.get("discriminator", "").strip("'")
@@ -157,7 +157,7 @@ def _clause(model_class: type[BaseModel], detail: dict[str, Any]) -> str:
         return f"'{name}' is missing, give the {title}"
     if not name:
         return str(context.get("error", detail["msg"]))
-    received = f"'{name}' is {_shown(detail['input'])}"
+    received = f"'{name}' is {_shorten(detail['input'])}"
     if kind in _BOUNDS:
         key, words = _BOUNDS[kind]
         return f"{received}: {title} must be {words} {context[key]:g}"
@@ -172,6 +172,6 @@ def _lower(text: str) -> str:
     return text if text[1:2].isupper() else text[:1].lower() + text[1:]
 
 
-def _shown(value: object, longest: int = 60) -> str:
+def _shorten(value: object, longest: int = 60) -> str:
     text = " ".join(repr(value).split())
     return text if len(text) <= longest else f"{text[: longest - 1]}…"

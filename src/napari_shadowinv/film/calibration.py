@@ -153,7 +153,7 @@ class Calibration:
             If the file is missing, has no such columns, or a row holds anything but numbers;
             the message names the line.
         """
-        table = _rows(path)
+        table = _read_rows(path)
         strange = ~(np.isfinite(table).all(axis=1) & (table[:, 0] >= 0))
         if strange.any():
             row = ", ".join(f"{value:g}" for value in table[strange][0])
@@ -179,7 +179,7 @@ class Calibration:
         """
         from scipy.optimize import isotonic_regression
 
-        column = _channel(channel)
+        column = _channel_index(channel)
         order = np.argsort(self.doses, kind="stable")
         logarithms = np.log10(self.doses[order])
         density = np.log10(self.background[column] / self.pixels[order, column])
@@ -200,7 +200,7 @@ class Calibration:
 
     def log_error(self, doses: ArrayLike, channel: str = "red") -> FloatArray:
         """Return the standard deviation of the logarithm of a dose measured in one pixel."""
-        column = _channel(channel)
+        column = _channel_index(channel)
         density, table_doses = self.curve(channel)
         order = np.argsort(self.doses, kind="stable")
         spread = (self.spreads[order, column] / self.pixels[order, column]) / np.log(10)
@@ -249,15 +249,15 @@ def net_optical_density(
     >>> net_optical_density([[1000, 100]], 1000.0)
     array([[0., 1.]])
     """
-    plane = _plane(np.asarray(scan), channel, "scan")
-    unexposed = _unexposed(np.asarray(background), channel)
+    plane = _check_plane(np.asarray(scan), channel, "scan")
+    unexposed = _unexposed_level(np.asarray(background), channel)
     with np.errstate(divide="ignore"):
         density: FloatArray = np.log10(unexposed) - np.log10(plane)
     return density
 
 
-def _plane(scan: AnyArray, channel: str, name: str) -> FloatArray:
-    column = _channel(channel)
+def _check_plane(scan: AnyArray, channel: str, name: str) -> FloatArray:
+    column = _channel_index(channel)
     is_colour = scan.ndim == 3 and scan.shape[-1] in (3, 4)
     if scan.size == 0 or not (scan.ndim == 2 or is_colour):
         raise InputError(
@@ -269,13 +269,13 @@ def _plane(scan: AnyArray, channel: str, name: str) -> FloatArray:
     return plane
 
 
-def _unexposed(background: AnyArray, channel: str) -> float:
+def _unexposed_level(background: AnyArray, channel: str) -> float:
     if background.ndim == 0:
         value = float(background)
     elif background.shape == (3,):
-        value = float(background[_channel(channel)])
+        value = float(background[_channel_index(channel)])
     else:
-        value = _median_of_middle(_plane(background, channel, "background"))
+        value = _median_of_middle(_check_plane(background, channel, "background"))
     if not (np.isfinite(value) and value > 0):
         raise InputError(f"the background is {value:g}: expected the pixel of unexposed film, > 0")
     return value
@@ -286,7 +286,7 @@ def unexposed_pixel(scan: ArrayLike) -> FloatArray:
 
     The median of its middle half in height and width, since its rim shows the scanner's bed.
     """
-    planes = (_plane(np.asarray(scan), channel, "scan") for channel in _CHANNELS)
+    planes = (_check_plane(np.asarray(scan), channel, "scan") for channel in _CHANNELS)
     return np.array([_median_of_middle(plane) for plane in planes])
 
 
@@ -295,7 +295,7 @@ def _median_of_middle(plane: FloatArray) -> float:
     return float(np.median(plane[y_top : len(plane) - y_top, x_left : plane.shape[1] - x_left]))
 
 
-def _channel(channel: str) -> int:
+def _channel_index(channel: str) -> int:
     if channel not in _CHANNELS:
         raise InputError(f'channel is {channel!r}: expected "red", "green" or "blue"')
     return _CHANNELS.index(channel)
@@ -415,11 +415,11 @@ def combined_dose(
 
 
 @as_file_errors
-def _rows(path: Path) -> FloatArray:
+def _read_rows(path: Path) -> FloatArray:
     """Read dose and red, green and blue pixel of every film, then spreads if all are present."""
     text = small_text(path, "a calibration table, comma-separated values", "utf-8-sig")
     lines = list(csv.reader(text.splitlines()))
-    columns = _columns(path, [name.strip().lower() for name in lines[0]] if lines else [])
+    columns = _find_columns(path, [name.strip().lower() for name in lines[0]] if lines else [])
     rows: list[list[float]] = []
     for number, cells in enumerate(lines[1:], start=2):
         picked = [cells[column] if column < len(cells) else "" for column in columns]
@@ -435,7 +435,7 @@ def _rows(path: Path) -> FloatArray:
     return np.array(rows, dtype=np.float64).reshape(-1, len(columns))
 
 
-def _columns(path: Path, names: list[str]) -> list[int]:
+def _find_columns(path: Path, names: list[str]) -> list[int]:
     matches = [[at for at, name in enumerate(names) if "dose" in name and "log" not in name]]
     for colour in ("red", "green", "blue"):
         matches.append([at for at, name in enumerate(names) if name.startswith(colour)])

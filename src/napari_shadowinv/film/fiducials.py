@@ -68,13 +68,13 @@ def poses_by_fiducials(
     shifts, turns = np.zeros((count, 2)), np.zeros(count)
     marked = [k for k in range(count) if film_marks[k]]
     for _ in range(_ROUNDS):
-        common = _means(film_marks, shifts, turns)
+        common = _mean_places(film_marks, shifts, turns)
         for k in marked:
-            shifts[k], turns[k] = _rigid(film_marks[k], common)
+            shifts[k], turns[k] = _fit_rigid(film_marks[k], common)
         # The edges of all films determine their common position.
         shifts[marked] -= shifts[marked].mean(axis=0)
         turns[marked] -= turns[marked].mean()
-    common = _means(film_marks, shifts, turns)
+    common = _mean_places(film_marks, shifts, turns)
     misfits = [_misfit(film_marks[k], common, shifts[k], turns[k]) for k in range(count)]
     for name, misfit in zip(names, misfits, strict=True):
         if misfit.size and misfit.max() > _MAX_MISFIT_PX:
@@ -109,7 +109,7 @@ def _rotation(turn: float) -> FloatArray:
     return np.array([[c, s], [-s, c]])
 
 
-def _means(
+def _mean_places(
     film_marks: list[dict[str, FloatArray]], shifts: FloatArray, turns: FloatArray
 ) -> dict[str, FloatArray]:
     """Return the mean place of each mark on aligned films."""
@@ -120,7 +120,9 @@ def _means(
     return {name: np.mean(places, axis=0) for name, places in brought.items()}
 
 
-def _rigid(marks: dict[str, FloatArray], common: dict[str, FloatArray]) -> tuple[FloatArray, float]:
+def _fit_rigid(
+    marks: dict[str, FloatArray], common: dict[str, FloatArray]
+) -> tuple[FloatArray, float]:
     """Fit the shift and turn from the common places to a film's marks, by least squares."""
     on_film = np.array(list(marks.values()))
     expected = np.array([common[name] for name in marks])

@@ -109,12 +109,12 @@ class Slab(CheckedModel):
 _SLAB = re.compile(r"(?P<number>\d+\.?\d*)\s*(?P<unit>um|µm|μm|mm)\s+(?P<material>\S.*)")
 
 
-def _listed(value: Any) -> Any:
+def _split_slabs(value: Any) -> Any:
     """Split a text with slabs separated by semicolons."""
     return [part for part in value.split(";") if part.strip()] if isinstance(value, str) else value
 
 
-Slabs = Annotated[tuple[Slab, ...], BeforeValidator(_listed)]
+Slabs = Annotated[tuple[Slab, ...], BeforeValidator(_split_slabs)]
 
 
 class FilmType(CheckedModel):

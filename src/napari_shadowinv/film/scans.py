@@ -77,7 +77,7 @@ def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[Floa
     for number in film_labels:
         y_top, x_left = (part.start for part in slices[number - 1])
         film = ndimage.binary_fill_holes(labels[slices[number - 1]] == number)
-        corners.append(_sharpened(values, _rectangle(film) + np.array([y_top, x_left])))
+        corners.append(_sharpen_corners(values, _fit_rectangle(film) + np.array([y_top, x_left])))
     return _in_reading_order(corners)
 
 
@@ -164,7 +164,7 @@ def _darker_than_bed(values: AnyArray) -> BoolArray:
     return np.asarray(ndimage.binary_opening(dark, np.ones((3, 3)), iterations=_DUST))
 
 
-def _rectangle(film: BoolArray) -> FloatArray:
+def _fit_rectangle(film: BoolArray) -> FloatArray:
     """Return the corners of lines along the four sides of a region."""
     from scipy.spatial import ConvexHull
 
@@ -178,10 +178,10 @@ def _rectangle(film: BoolArray) -> FloatArray:
         lines = []
         for axis in (0, 1):
             for edge in (low[axis], high[axis]):
-                lines.append(_side(turned, axis, edge, low, high))
+                lines.append(_fit_side(turned, axis, edge, low, high))
         # From the middle of the border's pixels to their outer edge.
         outward = 0.5 * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
-        places = (_meetings(lines) + outward) @ axes
+        places = (_intersections(lines) + outward) @ axes
         (axes, _, _) = upright(places)
     return places
 
@@ -200,16 +200,18 @@ def _axes_of_smallest_box(hull: FloatArray) -> FloatArray:
     return np.stack([down, [-down[1], down[0]]])
 
 
-def _side(turned: FloatArray, axis: int, edge: float, low: FloatArray, high: FloatArray) -> _Line:
+def _fit_side(
+    turned: FloatArray, axis: int, edge: float, low: FloatArray, high: FloatArray
+) -> _Line:
     """Fit offset and slope of the line along most of a side's pixels."""
     size = (high - low)[1 - axis]
     along, across = turned[:, 1 - axis], turned[:, axis]
     inner = np.abs(along - (low + high)[1 - axis] / 2) < (0.5 - _ENDS) * size
     near = np.abs(across - edge) < _MAX_OFFSET * max(high - low)
-    return _line(along[inner & near], across[inner & near], 0.5)
+    return _fit_line(along[inner & near], across[inner & near], 0.5)
 
 
-def _line(along: FloatArray, across: FloatArray, usual: float) -> _Line:
+def _fit_line(along: FloatArray, across: FloatArray, usual: float) -> _Line:
     """Fit a line to most points; points closer than `usual` are no outliers."""
     used = np.ones(along.size, bool)
     slope = offset = 0.0
@@ -220,7 +222,7 @@ def _line(along: FloatArray, across: FloatArray, usual: float) -> _Line:
     return float(offset), float(slope)
 
 
-def _meetings(lines: Sequence[_Line]) -> FloatArray:
+def _intersections(lines: Sequence[_Line]) -> FloatArray:
     """Return the corners of a film, from its upper, lower, left and right side."""
     upper, lower, x_low, x_high = lines
     corners = []
@@ -230,7 +232,7 @@ def _meetings(lines: Sequence[_Line]) -> FloatArray:
     return np.array(corners)
 
 
-def _sharpened(scan: AnyArray, corners: FloatArray) -> FloatArray:
+def _sharpen_corners(scan: AnyArray, corners: FloatArray) -> FloatArray:
     """Refine corners to a part of a pixel, by the share of film in each pixel at the sides.
 
     The border of a mask has steps of a pixel, which average out only along a tilted side.
@@ -252,15 +254,17 @@ def _sharpened(scan: AnyArray, corners: FloatArray) -> FloatArray:
                 at = np.moveaxis(places @ axes + middle, -1, 0)
                 return np.asarray(ndimage.map_coordinates(darkest, at, order=1, mode="nearest"))
 
-            edge, clear = _edge(sample, count)
+            edge, clear = _find_edge(sample, count)
             if clear.mean() < 0.5:
                 return corners
-            offset, slope = _line(along[clear], edge[clear], _MIN_OUTLIER_PX)
+            offset, slope = _fit_line(along[clear], edge[clear], _MIN_OUTLIER_PX)
             lines.append((sign * (half + offset), sign * slope))
-    return np.asarray(middle + _meetings(lines) @ axes)
+    return np.asarray(middle + _intersections(lines) @ axes)
 
 
-def _edge(sample: Callable[[FloatArray], FloatArray], count: int) -> tuple[FloatArray, BoolArray]:
+def _find_edge(
+    sample: Callable[[FloatArray], FloatArray], count: int
+) -> tuple[FloatArray, BoolArray]:
     """Return where lines cross the edge from film to bed, and which of them do so clearly."""
     across = np.tile(np.arange(-_REACH_PX, _REACH_PX + _STEP_PX, _STEP_PX), (count, 1))
     values = sample(across)
@@ -305,7 +309,7 @@ def _in_reading_order(films: Sequence[FloatArray]) -> list[FloatArray]:
 
 
 @as_file_errors
-def _corners_in(path: Path) -> dict[str, FloatArray]:
+def _read_corner_table(path: Path) -> dict[str, FloatArray]:
     text = small_text(path, "a table of corners, comma-separated values", "utf-8-sig")
     lines = [line for line in csv.reader(text.splitlines()) if any(map(str.strip, line))]
     names = [name.strip().lower() for name in lines[0]] if lines else []
@@ -336,7 +340,7 @@ def read_corners(path: str | Path) -> dict[str, FloatArray]:
     InputError
         If corners do not go around a film.
     """
-    return _corners_in(path)
+    return _read_corner_table(path)
 
 
 def write_corners(path: str | Path, films: dict[str, FloatArray]) -> None:

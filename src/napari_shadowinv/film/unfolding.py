@@ -155,7 +155,7 @@ def unfold(
     for first in range(0, len(flat), _PART):
         report("unfold", first, len(flat))
         part = slice(first, first + _PART)
-        spectra = _unfolded(flat[part], per_error[part], basis.matrix, bends)
+        spectra = _unfold_pixels(flat[part], per_error[part], basis.matrix, bends)
         fluence[part], variance[part] = spectra
     planes = (count, *film_doses.shape[1:])
     scaled = [(values * basis.usual).T.reshape(planes) for values in (fluence, np.sqrt(variance))]
@@ -170,7 +170,7 @@ def _usual_basis(mean: FloatArray, response: Response) -> _Basis:
     slope = _FIRST_SLOPE * peaks[-1]
     basis = _Basis.of(response, np.exp(-peaks / slope), slope)
     for _ in range(_ROUNDS):
-        usual = _one_by_one(mean, basis.matrix / basis.usual)
+        usual = _peel_spectrum(mean, basis.matrix / basis.usual)
         if len(usual) > 1:
             falls = max(np.log(usual[-2] / usual[-1]), 1e-9)
             shortest, longest = _FASTEST * peaks[-1], _SLOWEST * peaks[-1]
@@ -183,7 +183,7 @@ def _usual_basis(mean: FloatArray, response: Response) -> _Basis:
     return basis
 
 
-def _one_by_one(mean: FloatArray, matrix: FloatArray) -> FloatArray:
+def _peel_spectrum(mean: FloatArray, matrix: FloatArray) -> FloatArray:
     """Unfold the spectrum from the last film to the first; it is positive."""
     spectrum = np.zeros(len(mean))
     dosed = np.flatnonzero(mean > 0)
@@ -197,7 +197,7 @@ def _one_by_one(mean: FloatArray, matrix: FloatArray) -> FloatArray:
     return np.exp(np.interp(np.arange(len(mean)), dosed, np.log(spectrum[dosed])))
 
 
-def _unfolded(
+def _unfold_pixels(
     doses: FloatArray, per_error: FloatArray, matrix: FloatArray, bends: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return spectra in units of the usual one, and their variances."""

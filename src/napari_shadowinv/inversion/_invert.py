@@ -80,14 +80,14 @@ def plan_sites(
     """
     options = as_model(InversionOptions, options, "options")
     source, _, mask = unpack_shot(source, None, mask)
-    plan = _planned(source, options, mask, measured)
+    plan = _plan(source, options, mask, measured)
     if options.is_adaptive:
         return plan
     levels = plan.levels.with_reporter(Reporter(on_progress, should_stop))
     return replace(plan, levels=levels.made(options.threads))
 
 
-def _planned(
+def _plan(
     source: ArrayLike, options: InversionOptions, mask: ArrayLike | None, measured: bool
 ) -> SitePlan:
     """Plan sites without computing any level."""
@@ -149,7 +149,7 @@ def _site_domain(
 
 
 @contextmanager
-def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
+def _measure_time(stage: str, seconds: dict[str, float]) -> Iterator[None]:
     start = time.perf_counter()
     yield
     seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
@@ -225,7 +225,7 @@ def invert(
     check_instance(start, Inversion, "start")
     report = Reporter(on_progress, should_stop)
     seconds: dict[str, float] = {}
-    with _timed("prepare", seconds):
+    with _measure_time("prepare", seconds):
         report("prepare", 0, 1)
         if plan is not None:
             if source is not None or mask is not None:
@@ -234,17 +234,17 @@ def invert(
                     "contains its own source and mask"
                 )
             _check_boundary(plan, options)
-            image = _unmasked(image, plan.mask)
+            image = _unmasked_values(image, plan.mask)
             source, mask = plan.source, plan.mask
         else:
             image, source, mask = unpack_shot(image, source, mask)
         prepared = prepare(image, source, options, mask)
         report("prepare", 1, 1)
-    with _timed("sites", seconds):
+    with _measure_time("sites", seconds):
         if plan is None:
-            plan = _planned(prepared.source, options, mask, source is not None)
+            plan = _plan(prepared.source, options, mask, source is not None)
         levels = plan.levels.with_reporter(report)
-    with _timed("transport", seconds):
+    with _measure_time("transport", seconds):
         if plan.margin is not None and options.flux == "fit":
             image_flux = fitted_flux(levels, prepared.floored_image, plan.margin, options, report)
             scale = prepared.flux_scale / image_flux
@@ -255,12 +255,12 @@ def invert(
             levels = levels.up_to(_site_domain(plan.source, options, plan.mask).n_sites)
         if start is not None:
             may_differ = options.is_adaptive and not levels.is_complete
-            levels = _up_to(start, levels, plan.margin_width, may_differ=may_differ)
+            levels = _levels_from_start(start, levels, plan.margin_width, may_differ=may_differ)
     adaptive = options.is_adaptive and not levels.is_complete and start is None
     solutions: list[LevelSolution] = []
     coarse = 0
     while True:
-        with _timed("transport", seconds):
+        with _measure_time("transport", seconds):
             solutions = solve(
                 levels,
                 prepared.floored_image,
@@ -272,15 +272,15 @@ def invert(
                 solved=solutions,
             )
         answer = solutions[-1]
-        with _timed("read-out", seconds):
+        with _measure_time("read-out", seconds):
             fields = _read_fields(plan, prepared, answer, options, report)
         more = adaptive and answer.converged and len(answer.weights) < levels.counts[-1]
         if not more or not is_coarse(prepared.in_units(), fields.reprojection, noise):
             break
         coarse = len(answer.weights)
-    with _timed("errors", seconds):
+    with _measure_time("errors", seconds):
         errors = budget.errors(solutions, fields.displacement) if answer.converged else None
-    quality = _report(prepared.in_units(), noise, solutions, fields, seconds, budget)
+    quality = _make_report(prepared.in_units(), noise, solutions, fields, seconds, budget)
     finest = adaptive and len(answer.weights) == levels.counts[-1]
     if finest and errors is not None and quality.warnings == prepared.warnings:
         missed = errors.accuracy_caution(
@@ -290,7 +290,7 @@ def invert(
     if errors is not None:
         of_beam = filter(None, [errors.beam_caution()])
         quality = replace(quality, warnings=(*of_beam, *quality.warnings))
-    with _timed("prepare", seconds):
+    with _measure_time("prepare", seconds):
         beam = prepared.source if plan.measured else None
         signs = image_warnings(prepared.image * prepared.flux_scale, beam, prepared.mask)
         quality = replace(quality, warnings=(*quality.warnings, *signs))
@@ -313,14 +313,14 @@ def invert(
         mask=prepared.mask,
         report=replace(
             quality,
-            sites_reason=_reason(levels, budget, adaptive, start, coarse),
+            sites_reason=_sites_reason(levels, budget, adaptive, start, coarse),
             errors=errors,
         ),
         options=options,
     )
 
 
-def _reason(
+def _sites_reason(
     levels: Levels, budget: Budget, adaptive: bool, start: Inversion | None, coarse: int
 ) -> str:
     """Return the reason for the number of sites."""
@@ -337,7 +337,7 @@ def _reason(
     return "the most that are placed unless more are asked for"
 
 
-def _unmasked(image: ArrayLike, usable: BoolArray | None) -> ArrayLike:
+def _unmasked_values(image: ArrayLike, usable: BoolArray | None) -> ArrayLike:
     """Return the values of an image, refusing masked pixels that a plan uses."""
     values: ArrayLike
     values, unmasked = unpack_array(image, "image")
@@ -430,7 +430,9 @@ def _read_fields(
     )
 
 
-def _up_to(start: Inversion, levels: Levels, margin_width: int, *, may_differ: bool) -> Levels:
+def _levels_from_start(
+    start: Inversion, levels: Levels, margin_width: int, *, may_differ: bool
+) -> Levels:
     """Return the levels up to the one of an inversion to start from, if its sites are the same.
 
     With `may_differ`, the inversion may have a level between those of the plan.
@@ -447,7 +449,7 @@ def _up_to(start: Inversion, levels: Levels, margin_width: int, *, may_differ: b
     )
 
 
-def _report(
+def _make_report(
     prepared: Prepared,
     noise: ImageNoise,
     solutions: list[LevelSolution],

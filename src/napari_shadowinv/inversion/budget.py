@@ -153,7 +153,7 @@ class Errors:
     def scaled(self, factor: float) -> Errors:
         """Return the budget in another unit; 1 px of displacement is `factor` of it."""
         lengths = {
-            field.name: _times(getattr(self, field.name), factor)
+            field.name: _scale_error(getattr(self, field.name), factor)
             for field in dataclasses.fields(self)
             if field.name in ("peak", "rms") or isinstance(getattr(self, field.name), ErrorEstimate)
         }
@@ -241,7 +241,7 @@ class Budget:
 
         Their error must be within the accuracy, or small against the error by noise.
         """
-        solved = _solved(solutions)
+        solved = _usable_levels(solutions)
         if len(solved) < 2:
             return math.inf
         rms = float(np.sqrt(np.mean(np.sum(self._move(solved[-1]) ** 2, axis=0))))
@@ -268,7 +268,7 @@ class Budget:
 
     def errors(self, solutions: Sequence[LevelSolution], displacement: FloatArray) -> Errors:
         """Return the errors of the last solution with its displacement, (2, H, W)."""
-        solved = _solved(solutions)
+        solved = _usable_levels(solutions)
         mask = self._prepared.mask
         variation, basis = self._beam_variation
         length = np.where(mask, np.hypot(*displacement), 0.0)
@@ -300,7 +300,7 @@ class Budget:
             discretisation=discretisation,
             noise=estimate(*self._noisy_moves(response, solved[-1].level.spacing)),
             solver=estimate(response.to(self._solver_gap(response, solved[-1]))),
-            beam=_times(by_percent, times) if variation else None,
+            beam=_scale_error(by_percent, times) if variation else None,
             beam_sensitivity=by_percent,
             beam_variation=variation,
             beam_basis=basis,
@@ -408,7 +408,7 @@ class Budget:
         return np.bincount(group, gap, len(response.flux)).astype(np.float64)[None]
 
 
-def _times(value: float | ErrorEstimate, factor: float) -> Any:
+def _scale_error(value: float | ErrorEstimate, factor: float) -> Any:
     if isinstance(value, ErrorEstimate):
         return ErrorEstimate(factor * value.rms, factor * value.at_peak)
     return factor * value
@@ -424,7 +424,7 @@ def _with_finer(squares: FloatArray, finer: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(squares + finer, _LEAST_NOISE * squares))
 
 
-def _solved(solutions: Sequence[LevelSolution]) -> list[LevelSolution]:
+def _usable_levels(solutions: Sequence[LevelSolution]) -> list[LevelSolution]:
     """Return the last solution, after the coarser ones that lead to it."""
     coarser = [solution for solution in solutions[:-1] if solution.residual < _MAX_RESIDUAL]
     last = solutions[-1]

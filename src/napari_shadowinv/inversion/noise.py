@@ -84,7 +84,7 @@ class ImageNoise:
         inflation, self.clumping = _correlation(excess, mask)
         self.is_correlated_far = self.clumping == 1 and _is_correlated_far(excess, mask)
         self.largest = _rms(differences) * math.sqrt(inflation)
-        self.typical = _clipped(differences) * math.sqrt(inflation)
+        self.typical = _clipped_rms(differences) * math.sqrt(inflation)
         # The source's mean, in units of the recorded image.
         quantum = prepared.flux_scale * prepared.unit * mean
         # Terms of the variance: constant, in proportion to the brightness, and to its square.
@@ -100,7 +100,7 @@ class ImageNoise:
             bright = image[1:, 1:] + image[1:, :-1] + image[:-1, 1:] + image[:-1, :-1]
             self._terms = inflation * _terms(bright[used] / (4 * mean), differences)
         if (level, counts) != (None, None):  # stated for the image, not for its source
-            self._terms[0] += _clipped(_finest(prepared.source / mean, used)) ** 2
+            self._terms[0] += _clipped_rms(_finest(prepared.source / mean, used)) ** 2
         self.correlation_length = 0.0
         if self.clumping > 1:
             self.correlation_length = math.sqrt(self.clumping / (4 * math.pi))
@@ -134,7 +134,7 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _clipped(differences: FloatArray) -> float:
+def _clipped_rms(differences: FloatArray) -> float:
     """Return the standard deviation, with differences clipped that noise does not explain."""
     limit = _CLIPPED_AT * _NORMAL_MAD * float(np.median(differences))
     return _rms(np.minimum(differences, limit)) if limit > 0 else _rms(differences)
@@ -200,7 +200,7 @@ def _quiet_tiles(tiles: FloatArray, used: BoolArray, side: int, lag: int) -> Flo
     finest = _difference_variance(tiles, side, 1)
     used = used & (finest > 0)
     rise = np.where(used, _difference_variance(tiles, side, lag) / np.where(used, finest, 1.0), 1.0)
-    around = _around(rise)
+    around = _average_neighbours(rise)
     return tiles[used & (around <= np.quantile(around, _QUIET_SHARE))]
 
 
@@ -231,7 +231,7 @@ def _difference_variance(tiles: FloatArray, side: int, lag: int) -> FloatArray:
     return np.asarray(((down[..., near] - down[..., far]) ** 2).mean(axis=(-2, -1)) / 4)
 
 
-def _around(values: FloatArray) -> FloatArray:
+def _average_neighbours(values: FloatArray) -> FloatArray:
     """Average tiles with their neighbours, so that noise hardly affects the choice of tiles."""
     cross = ndimage.generate_binary_structure(2, 1).astype(np.float64)
     sums, counts = (ndimage.convolve(v, cross, mode="constant") for v in (values, values**0))
@@ -244,7 +244,7 @@ def _terms(bright: FloatArray, differences: FloatArray) -> FloatArray:
     bright, differences = bright[::step], differences[::step]
     order = order_by_value(bright)
     parts = np.array_split(order, min(_BINS, max(1, len(order) // 20)))
-    bins = [(float(bright[part].mean()), _clipped(differences[part]) ** 2) for part in parts]
+    bins = [(float(bright[part].mean()), _clipped_rms(differences[part]) ** 2) for part in parts]
     places, variances = np.array(bins).T
     if not variances.any():
         return np.zeros(3)

@@ -72,7 +72,7 @@ def prepare(
             "if they result from background subtraction, clip them (negative='clip', or "
             "--clip-negative on the command line)"
         )
-    values = _positive(values)
+    values = _clip_negative(values)
     _check_range(values, "image")
     if source is None:
         beam = np.where(usable, values.sum() / usable.sum(), 0.0)
@@ -98,7 +98,7 @@ def prepare(
     values = values / flux_scale
     least = options.floor * values.sum() / usable.sum()
     floored_flux = masked_source(beam, usable, options).sum() if conserved else None
-    floored = _raised(values, least, floored_flux)
+    floored = _raise_to_floor(values, least, floored_flux)
     below = int((values[usable] < least).sum())
     unit = power_of_two(beam)
     return Prepared(
@@ -128,15 +128,15 @@ def floored_by(
     floored_flux = masked_source(beam, usable, options).sum() if conserved else None
 
     def floored(image: FloatArray) -> FloatArray:
-        values = _positive(np.where(usable, image, 0.0))
+        values = _clip_negative(np.where(usable, image, 0.0))
         if conserved:
             values /= values.sum() / flux
-        return _raised(values, options.floor * values.sum() / count, floored_flux) / unit
+        return _raise_to_floor(values, options.floor * values.sum() / count, floored_flux) / unit
 
     return floored
 
 
-def _positive(values: FloatArray) -> FloatArray:
+def _clip_negative(values: FloatArray) -> FloatArray:
     """Clip an image, refusing one without positive pixels."""
     values = np.maximum(values, 0)
     if not values.any():
@@ -146,7 +146,7 @@ def _positive(values: FloatArray) -> FloatArray:
     return values
 
 
-def _raised(values: FloatArray, least: float, flux: float | None) -> FloatArray:
+def _raise_to_floor(values: FloatArray, least: float, flux: float | None) -> FloatArray:
     """Raise dark pixels to the floor, and then all to a flux."""
     floored = np.maximum(values, least)
     if flux is not None:

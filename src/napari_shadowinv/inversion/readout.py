@@ -89,11 +89,11 @@ def read_centroids(
     triangulation = RegularTriangulation(sites)
     displacement = natural_neighbor(triangulation, site_displacement, pixels, threads=threads)
     displacement = np.ascontiguousarray(displacement.T).reshape(2, *shape)
-    potential = _integrated(displacement, integration)
+    potential = _integrate(displacement, integration)
     return potential - border_mean(potential), displacement
 
 
-def _integrated(displacement: FloatArray, first: Literal["mean", "y", "x"]) -> FloatArray:
+def _integrate(displacement: FloatArray, first: Literal["mean", "y", "x"]) -> FloatArray:
     """Integrate minus the displacement along one axis and then the other."""
     along_y = cumulative_trapezoid(displacement[0], axis=0, initial=0)
     along_x = cumulative_trapezoid(displacement[1], axis=1, initial=0)

@@ -143,12 +143,12 @@ def is_coarse(prepared: Prepared, reprojection: FloatArray, noise: ImageNoise) -
 
     That is the case if the residual exceeds the noise in some squares away from bright lines.
     """
-    residual, counted = _apart_from_lines(prepared, reprojection)
+    residual, counted = _residual_off_lines(prepared, reprojection)
     mean = prepared.source[prepared.mask].mean()
     brightness = np.maximum(prepared.image, reprojection) / mean
     hidden = noise.variance(brightness) + (_INVISIBLE * brightness) ** 2 + _LEAST_VARIANCE
-    excess = _in_squares(np.where(counted, (residual / mean) ** 2 / hidden, 0.0))
-    share = _in_squares(counted.astype(float))
+    excess = _square_means(np.where(counted, (residual / mean) ** 2 / hidden, 0.0))
+    share = _square_means(counted.astype(float))
     is_measured = share > _MIN_SHARE_OF_SQUARE
     if not is_measured.any():
         return False
@@ -156,7 +156,7 @@ def is_coarse(prepared: Prepared, reprojection: FloatArray, noise: ImageNoise) -
     return bool(ratio > _ABOVE_NOISE)
 
 
-def _in_squares(values: FloatArray) -> FloatArray:
+def _square_means(values: FloatArray) -> FloatArray:
     """Return means over squares of pixels; incomplete squares are left out."""
     side = min(_SQUARE_PX, *values.shape)
     rows, columns = (length // side for length in values.shape)
@@ -164,7 +164,9 @@ def _in_squares(values: FloatArray) -> FloatArray:
     return np.asarray(cropped.reshape(rows, side, columns, side).mean(axis=(1, 3)))
 
 
-def _apart_from_lines(prepared: Prepared, reprojection: FloatArray) -> tuple[FloatArray, BoolArray]:
+def _residual_off_lines(
+    prepared: Prepared, reprojection: FloatArray
+) -> tuple[FloatArray, BoolArray]:
     """Return image minus re-projection, 0 at bright lines, and the mask of the other pixels."""
     mean = prepared.source[prepared.mask].mean()
     bright = ndimage.uniform_filter(prepared.image, 3) > _BRIGHT * np.maximum(prepared.source, mean)
@@ -175,7 +177,7 @@ def _apart_from_lines(prepared: Prepared, reprojection: FloatArray) -> tuple[Flo
 def _misfit(prepared: Prepared, reprojection: FloatArray, n_sites: int) -> str:
     """Describe a pattern in the image that the re-projection misses."""
     mask, mean = prepared.mask, prepared.source[prepared.mask].mean()
-    residual, counted = _apart_from_lines(prepared, reprojection)
+    residual, counted = _residual_off_lines(prepared, reprojection)
     share = float(np.sqrt((residual**2).sum() / max(counted.sum(), 1)) / mean)
     if share < _NOTABLE_RESIDUAL:
         return ""

@@ -45,7 +45,7 @@ def read_b16(path: Path) -> tuple[AnyArray, dict[str, Any]]:
             f"{path} comes from a colour camera, whose pixels have different colour filters: "
             "expected a monochrome frame; convert it to a greyscale TIFF"
         )
-    return _frame(path, "PCO", start, (height, width), np.dtype("<u2")), {"bits": 16}
+    return _read_frame(path, "PCO", start, (height, width), np.dtype("<u2")), {"bits": 16}
 
 
 def read_spe(path: Path) -> tuple[AnyArray, dict[str, Any]]:
@@ -53,14 +53,14 @@ def read_spe(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     with path.open("rb") as file:
         header = file.read(_SPE_HEADER)
     check_promise(path, "SPE", _SPE_HEADER, len(header))
-    shape = (_number(header, "H", 656), _number(header, "H", 42))
-    frames, version = _number(header, "i", 1446), _number(header, "f", 1992)
-    dtype = _SPE_TYPES.get(_number(header, "h", 108))
+    shape = (_unpack_number(header, "H", 656), _unpack_number(header, "H", 42))
+    frames, version = _unpack_number(header, "i", 1446), _unpack_number(header, "f", 1992)
+    dtype = _SPE_TYPES.get(_unpack_number(header, "h", 108))
     if dtype is None:
         raise FileFormatError(
             f"{path} is not an SPE file or is damaged: its data type is "
-            f"{_number(header, 'h', 108)}, expected one of {', '.join(map(str, _SPE_TYPES))}; "
-            "export it as TIFF"
+            f"{_unpack_number(header, 'h', 108)}, expected one of "
+            f"{', '.join(map(str, _SPE_TYPES))}; export it as TIFF"
         )
     if frames != 1:
         raise FileFormatError(
@@ -68,12 +68,12 @@ def read_spe(path: Path) -> tuple[AnyArray, dict[str, Any]]:
             "need separately"
         )
     if version >= 3:
-        _check_footer(path, _number(header, "Q", 678))
-    array = _frame(path, "SPE", _SPE_HEADER, shape, np.dtype(dtype))
+        _check_footer(path, _unpack_number(header, "Q", 678))
+    array = _read_frame(path, "SPE", _SPE_HEADER, shape, np.dtype(dtype))
     return array, {"bits": 8 * array.dtype.itemsize, "version": round(version, 2)}
 
 
-def _number(header: bytes, code: str, offset: int) -> Any:
+def _unpack_number(header: bytes, code: str, offset: int) -> Any:
     return struct.unpack_from(f"<{code}", header, offset)[0]
 
 
@@ -90,7 +90,7 @@ def _check_footer(path: Path, start: int) -> None:
         )
 
 
-def _frame(
+def _read_frame(
     path: Path, header: str, start: int, shape: tuple[int, int], dtype: np.dtype[Any]
 ) -> AnyArray:
     height, width = shape

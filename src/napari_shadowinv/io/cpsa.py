@@ -71,7 +71,7 @@ def read_tracks(path: Path) -> Tracks:
     FileFormatError
         If the file is missing, truncated, or has numbers that no scan has.
     """
-    return _read(path)[0]
+    return _read_scan(path)[0]
 
 
 def read_image(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[str, Any]]:
@@ -80,7 +80,7 @@ def read_image(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[
     `variable` is the ranges and the bin as `as_text` writes them: ``"diameter=4:12 bin=300"``.
     """
     chosen = {} if variable is None else _parse_ranges(variable)
-    tracks, warnings = _read(path)
+    tracks, warnings = _read_scan(path)
     bin_ = chosen.pop("bin", None)
     counts, _, bin_ = tracks.selected(**chosen).image(bin_)
     if not chosen:
@@ -117,7 +117,7 @@ def as_text(
     for name, ends in zip(_RANGES, (diameter, contrast, eccentricity), strict=True):
         if ends is not None:
             try:
-                low, high = ("" if end is None else _number(end) for end in ends)
+                low, high = ("" if end is None else _format_number(end) for end in ends)
             except (TypeError, ValueError):
                 raise InputError(
                     f"{name} is {ends!r}: expected its smallest and its largest value, such as "
@@ -125,11 +125,11 @@ def as_text(
                 ) from None
             words.append(f"{name}={low}:{high}")
     if bin is not None:
-        words.append(f"bin={_number(bin)}")
+        words.append(f"bin={_format_number(bin)}")
     return " ".join(words) or None
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     return repr(float(value)).removesuffix(".0")
 
 
@@ -155,13 +155,13 @@ def _parse_ranges(text: str) -> dict[str, Any]:
     return chosen
 
 
-def _read(path: Path) -> tuple[Tracks, tuple[Caution, ...]]:
+def _read_scan(path: Path) -> tuple[Tracks, tuple[Caution, ...]]:
     """Read the tracks of a scan and the warnings about them."""
     check_regular(path, "a CR-39 scan, .cpsa")
     check_size(path, _IN_MEMORY * path.stat().st_size)
     data = path.read_bytes()
-    shape, pixel, frame_size = _header(path, data)
-    frames = _frames(path, data, shape)
+    shape, pixel, frame_size = _read_header(path, data)
+    frames = _read_frames(path, data, shape)
     hits = frames[:, 3]
     ends = np.concatenate([[0], np.cumsum(hits)])
     columns = {"d": "<i2", "e": "u1", "c": "u1", "mean": "u1", "x": "<i2", "y": "<i2"}
@@ -181,7 +181,7 @@ def _read(path: Path) -> tuple[Tracks, tuple[Caution, ...]]:
     return tracks, _pitch_warnings(shape, np.array([width, height]), frame_size)
 
 
-def _header(path: Path, data: bytes) -> tuple[tuple[int, int], float, FloatArray]:
+def _read_header(path: Path, data: bytes) -> tuple[tuple[int, int], float, FloatArray]:
     """Return the frames along x and y, a pixel's width (µm), and a frame's size in x, y (m)."""
     check_promise(path, "CPSA", _HEADER.size, len(data))
     version, columns, rows, _, pixel, _, _, _, _, _, width, height = _HEADER.unpack_from(data)
@@ -204,7 +204,7 @@ def _header(path: Path, data: bytes) -> tuple[tuple[int, int], float, FloatArray
     return (columns, rows), pixel, np.array([width, height]) * (pixel * 1e-6)
 
 
-def _frames(path: Path, data: bytes, shape: tuple[int, int]) -> AnyArray:
+def _read_frames(path: Path, data: bytes, shape: tuple[int, int]) -> AnyArray:
     """Return a row for each frame: offset of its tracks, x and y of its middle, track count."""
     columns, rows = shape
     frames = np.empty((columns * rows, 4), np.int64)

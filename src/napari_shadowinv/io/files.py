@@ -57,10 +57,10 @@ def in_counting_order(paths: Iterable[Path]) -> list[Path]:
     >>> [path.name for path in in_counting_order(map(Path, ["b2", "a10", "a9", "A1"]))]
     ['A1', 'a9', 'a10', 'b2']
     """
-    return sorted(paths, key=lambda path: ([_counting(part) for part in path.parts], path))
+    return sorted(paths, key=lambda path: ([_counting_key(part) for part in path.parts], path))
 
 
-def _counting(name: str) -> list[tuple[int, int, str]]:
+def _counting_key(name: str) -> list[tuple[int, int, str]]:
     parts = re.split(r"(\d+)", name.lower())
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts if part]
 
@@ -147,10 +147,10 @@ def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
     sweep(path.parent)
     temporary = hidden_name(path, path.suffix)
     with clear_up_when_terminated():
-        yield from _written(path, temporary, overwrite)
+        yield from _write_then_replace(path, temporary, overwrite)
 
 
-def _written(path: Path, temporary: Path, overwrite: bool) -> Iterator[Path]:
+def _write_then_replace(path: Path, temporary: Path, overwrite: bool) -> Iterator[Path]:
     try:
         yield temporary
         # Someone else may have written the file during the work.

@@ -147,11 +147,11 @@ def _join_titles(titles: Iterable[str]) -> str:
     return f"{', '.join(most)}, or {last}"
 
 
-def _suffixes(formats: Iterable[Format]) -> frozenset[str]:
+def _collect_suffixes(formats: Iterable[Format]) -> frozenset[str]:
     return frozenset(suffix for each in formats for suffix in each.suffixes)
 
 
-def _writers(
+def _collect_writers(
     kind: Literal["image_writer", "result_writer", "fit_writer", "pack_writer"],
 ) -> dict[str, str]:
     writers = {suffix: getattr(each, kind) for each in FORMATS for suffix in each.suffixes}
@@ -160,14 +160,14 @@ def _writers(
 
 READABLE = _join_titles(each.title for each in FORMATS)
 IMAGE_TITLES = _join_titles(each.title for each in FORMATS if "image" in each.holds)
-RADIOGRAPH_SUFFIXES = _suffixes(each for each in FORMATS if "image" in each.holds)
-SCAN_SUFFIXES = _suffixes(each for each in FORMATS if each.is_scan)
+RADIOGRAPH_SUFFIXES = _collect_suffixes(each for each in FORMATS if "image" in each.holds)
+SCAN_SUFFIXES = _collect_suffixes(each for each in FORMATS if each.is_scan)
 # Endings that napari opens itself: the manifest leaves them out, so that nobody has to choose.
 OPENED_BY_NAPARI = SCAN_SUFFIXES | {".npy", SITES.suffix}
-IMAGE_WRITERS = _writers("image_writer")  # by the ending
-RESULT_WRITERS = _writers("result_writer")
-FIT_WRITERS = _writers("fit_writer")
-PACK_WRITERS = _writers("pack_writer")
+IMAGE_WRITERS = _collect_writers("image_writer")  # by the ending
+RESULT_WRITERS = _collect_writers("result_writer")
+FIT_WRITERS = _collect_writers("fit_writer")
+PACK_WRITERS = _collect_writers("pack_writer")
 FIGURE_SUFFIXES = (PNG.suffix, ".pdf", ".svg")
 NEW_SHOTS = f"*{TIFF.suffix}"  # names in a folder that is watched
 

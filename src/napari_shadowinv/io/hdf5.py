@@ -43,7 +43,7 @@ def member(path: Path, group: Any, name: str, depth: int = 0) -> Any | None:
             return None
         kind = item.id.links.get_info(key).type
         if kind == h5py.h5l.TYPE_EXTERNAL:
-            _refuse(path, name, f"links to {item.id.links.get_val(key)[0].decode()!r}")
+            _refuse_other_file(path, name, f"links to {item.id.links.get_val(key)[0].decode()!r}")
         if kind == h5py.h5l.TYPE_SOFT:
             if depth > _MAX_LINKS:
                 raise ValueError(f"the links of {name!r} form a loop")
@@ -53,7 +53,7 @@ def member(path: Path, group: Any, name: str, depth: int = 0) -> Any | None:
     return item
 
 
-def _refuse(path: Path, name: str, origin: str) -> None:
+def _refuse_other_file(path: Path, name: str, origin: str) -> None:
     raise FileFormatError(
         f"{path} does not hold {name!r} itself but {origin}: expected all data in one file; save "
         "the data as an array in this file"
@@ -71,7 +71,7 @@ def members(path: Path, group: Any) -> Iterator[tuple[str, Any]]:
 
 def load_dataset(path: Path, dataset: Any) -> AnyArray:
     """Return the values of an array, refusing missing ones, which HDF5 would replace by zeros."""
-    check_size(path, _unfolded(path, dataset))
+    check_size(path, _memory_bytes(path, dataset))
     _check_promise(path, dataset)
     return np.asarray(dataset[()])
 
@@ -82,16 +82,16 @@ def _check_promise(path: Path, dataset: Any) -> None:
     check_promise(path, "HDF5", dataset.nbytes, DEFLATE_RATIO * stored if is_packed else stored)
 
 
-def _unfolded(path: Path, dataset: Any) -> int:
+def _memory_bytes(path: Path, dataset: Any) -> int:
     """Return the bytes in memory of an array, which must be in the file itself."""
     layout = dataset.id.get_create_plist()
     if layout.get_external_count():
         external_file = layout.get_external(0)[0].decode(errors="replace")
-        _refuse(path, dataset.name, f"in the raw file {external_file!r}")
+        _refuse_other_file(path, dataset.name, f"in the raw file {external_file!r}")
     if dataset.is_virtual:
         source_files = sorted({source.file_name for source in dataset.virtual_sources()})
         names = ", ".join(map(repr, source_files))
-        _refuse(path, dataset.name, f"as a virtual array from {names}")
+        _refuse_other_file(path, dataset.name, f"as a virtual array from {names}")
     # One chunk may be far larger than what is used of it.
     chunk = int(np.prod(dataset.chunks or (0,), dtype=float)) * dataset.dtype.itemsize
     return int(max(chunk, dataset.size * max(8, dataset.dtype.itemsize)))
@@ -103,15 +103,15 @@ def check_arrays(path: Path) -> None:
 
     total = 0
     with h5py.File(path, "r") as file:
-        for dataset in _all_datasets(path, file):
-            total += _unfolded(path, dataset)
+        for dataset in _iterate_datasets(path, file):
+            total += _memory_bytes(path, dataset)
             check_size(path, total)
             # The length of a dimension without coordinates is an array without values.
             if dataset.id.get_storage_size() or "CLASS" not in dataset.attrs:
                 _check_promise(path, dataset)
 
 
-def _all_datasets(path: Path, group: Any) -> Iterator[Any]:
+def _iterate_datasets(path: Path, group: Any) -> Iterator[Any]:
     import h5py
 
     for name in group:
@@ -119,7 +119,7 @@ def _all_datasets(path: Path, group: Any) -> Iterator[Any]:
         if isinstance(item, h5py.Dataset):
             yield item
         elif isinstance(item, h5py.Group):
-            yield from _all_datasets(path, item)
+            yield from _iterate_datasets(path, item)
 
 
 @contextmanager
@@ -191,13 +191,13 @@ def held_arrays(path: Path, file: Any) -> list[str]:
     """List the first images of an open file and its groups, with shape and type."""
     images = [
         f"{name!r} ({'×'.join(map(str, item.shape))} {item.dtype})"
-        for name, item in itertools.islice(_items(path, file), 10 * _MAX_LISTED)
+        for name, item in itertools.islice(_iterate_shallow_datasets(path, file), 10 * _MAX_LISTED)
         if _is_numeric(item) and item.ndim in (2, 3)
     ]
     return images if len(images) <= _MAX_LISTED else [*images[:_MAX_LISTED], "…"]
 
 
-def _items(path: Path, file: Any) -> Iterator[tuple[str, Any]]:
+def _iterate_shallow_datasets(path: Path, file: Any) -> Iterator[tuple[str, Any]]:
     """Yield the datasets of the file and of its groups."""
     import h5py
 

@@ -33,7 +33,7 @@ _UNPACKERS: dict[str, Callable[[bytes, int], bytes]] = {
 _UNPACKERS["LZMA"] = lambda packed, most: lzma.LZMADecompressor().decompress(packed, most)
 
 
-def _check(path: Path, name: str, array: AnyArray) -> None:
+def _check_picture(path: Path, name: str, array: AnyArray) -> None:
     is_picture = array.ndim == 2 or (array.ndim == 3 and array.shape[-1] in (2, 3, 4))
     if not is_picture or array.size == 0:
         raise FileFormatError(
@@ -47,7 +47,7 @@ def _check(path: Path, name: str, array: AnyArray) -> None:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open_tiff(path: Path) -> Iterator[Any]:
     """Open a TIFF with the decoder's log silenced, because the error says it once."""
     import tifffile
 
@@ -63,7 +63,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 def read_tiff(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     """Read a TIFF with one page."""
-    with _opened(path) as tiff:
+    with _open_tiff(path) as tiff:
         if len(tiff.pages) != 1:
             raise FileFormatError(
                 f"{path} has {len(tiff.pages)} pages: expected one radiograph per file; save the "
@@ -82,7 +82,7 @@ def _read_page(path: Path, page: Any) -> tuple[AnyArray, dict[str, Any]]:
         array = (2**page.bitspersample - 1 - array).astype(array.dtype)
     if array.ndim == 3 and page.axes in ("SYX", "CYX"):
         array = np.moveaxis(array, 0, -1)
-    _check(path, "TIFF", array)
+    _check_picture(path, "TIFF", array)
     return array, {"bits": int(page.bitspersample)}
 
 
@@ -90,7 +90,7 @@ def _read_page(path: Path, page: Any) -> tuple[AnyArray, dict[str, Any]]:
 def tiff_pages(path: Path) -> int:
     """Return how many pages a TIFF has."""
     check_regular(path, "a TIFF")
-    with _opened(path) as tiff:
+    with _open_tiff(path) as tiff:
         return len(tiff.pages)
 
 
@@ -100,7 +100,7 @@ def read_tiff_page(
 ) -> tuple[FloatArray, tuple[Caution, ...]]:
     """Read page `number`, from 0, of a TIFF that holds many, with warnings as of a `Radiograph`."""
     check_regular(path, "a TIFF")
-    with _opened(path) as tiff:
+    with _open_tiff(path) as tiff:
         array, _ = _read_page(path, tiff.pages[number].aspage())
     where = f"page {number} of {path}"
     return to_grey(array, channel, where), film_warnings(array, channel)
@@ -168,21 +168,21 @@ def read_png(path: Path) -> tuple[AnyArray, dict[str, Any]]:
             f"{path} is a colour PNG with 16 bits per channel, which would be reduced to 8 bits: "
             "expected a greyscale PNG or a TIFF; save it as TIFF"
         )
-    _check(path, "PNG", array)
+    _check_picture(path, "PNG", array)
     return array, {"bits": bits}
 
 
 def read_eight_bits(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     """Read a picture whose format has 8 bits per sample."""
     array = _read_with_pillow(path)
-    _check(path, "picture's", array)
+    _check_picture(path, "picture's", array)
     return array, {"bits": 8}
 
 
 _PILLOW_LIMIT = threading.Lock()
 
 
-def _opened_picture(file: BinaryIO) -> Any:
+def _open_picture(file: BinaryIO) -> Any:
     """Open a picture without pillow's limit of pixels; ours on memory follows."""
     import imageio.v3 as iio
     from PIL import Image
@@ -197,7 +197,7 @@ def _opened_picture(file: BinaryIO) -> Any:
 
 def _read_with_pillow(path: Path, index: int = 0) -> AnyArray:
     # A file object, because imageio would believe the name.
-    with path.open("rb") as file, _opened_picture(file) as picture:
+    with path.open("rb") as file, _open_picture(file) as picture:
         shape = picture.properties(index=index).shape
         # A pixel has one bit at least.
         check_promise(path, "picture", math.prod(shape) // 8, DEFLATE_RATIO * path.stat().st_size)

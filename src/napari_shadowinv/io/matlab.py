@@ -86,7 +86,7 @@ def is_matlab(path: Path) -> bool:
 
 def read_mat(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[str, Any]]:
     """Read the only image of a MAT-file, or the named one, rows first as MATLAB shows it."""
-    chosen = _choose(path, mat_variables(path), variable)
+    chosen = _choose_image(path, mat_variables(path), variable)
     array = chosen.load()
     if array.dtype.kind not in "buif" or array.shape != chosen.shape:
         raise FileFormatError(
@@ -107,7 +107,7 @@ def mat_variables(path: Path) -> list[Variable]:
     return _variables_73(path)
 
 
-def _choose(path: Path, variables: list[Variable], name: str | None) -> Variable:
+def _choose_image(path: Path, variables: list[Variable], name: str | None) -> Variable:
     content = ", ".join(map(str, variables)) or "nothing"
     images = [item for item in variables if item.is_image]
     if name is not None:
@@ -134,10 +134,10 @@ def _variables_73(path: Path) -> list[Variable]:
     with h5py.File(path, "r") as file:
         # Names that begin with # are MATLAB's own.
         names = [name for name in file if not name.startswith("#")]
-        return [_described(path, name, member(path, file, name)) for name in names]
+        return [_describe_variable(path, name, member(path, file, name)) for name in names]
 
 
-def _described(path: Path, name: str, item: Any) -> Variable:
+def _describe_variable(path: Path, name: str, item: Any) -> Variable:
     import h5py
 
     mark = item.attrs.get("MATLAB_class", b"")
@@ -163,7 +163,7 @@ def _load_73(path: Path, name: str) -> AnyArray:
 def _variables_5(path: Path, file: BinaryIO) -> Iterator[Variable]:
     """Variables of MATLAB's own layout: their headers are read, not yet their values."""
     size = path.stat().st_size
-    order = _order(file)
+    order = _byte_order(file)
     start = _HEADER
     while start < size:
         file.seek(start)
@@ -176,21 +176,21 @@ def _variables_5(path: Path, file: BinaryIO) -> Iterator[Variable]:
             check_promise(path, "MATLAB", inner, DEFLATE_RATIO * count)
             body = body[8:]
         if kind == _MATRIX:
-            name, shape, type_name, _ = _preamble(body, order)
+            name, shape, type_name, _ = _read_preamble(body, order)
             check_promise(path, "MATLAB", math.prod(shape), DEFLATE_RATIO * count)
             if name:
                 yield Variable(name, shape, type_name, partial(_load_5, path, start, count, shape))
         start += 8 + count
 
 
-def _order(file: BinaryIO) -> str:
+def _byte_order(file: BinaryIO) -> str:
     order = {b"IM": "<", b"MI": ">"}.get(file.read(_HEADER)[126:])
     if order is None:
         raise ValueError("no byte order in its header")
     return order
 
 
-def _preamble(body: _Bytes, order: str) -> tuple[str, tuple[int, ...], str, int]:
+def _read_preamble(body: _Bytes, order: str) -> tuple[str, tuple[int, ...], str, int]:
     """Name, shape and class of a variable, and where its values begin."""
     flags = struct.unpack_from(f"{order}I", body, 8)[0]
     type_name = "logical" if flags & _LOGICAL else _CLASSES.get(flags & 0xFF, "object")
@@ -199,15 +199,15 @@ def _preamble(body: _Bytes, order: str) -> tuple[str, tuple[int, ...], str, int]
         return "an object", (), type_name, 0
     if flags & _COMPLEX:
         type_name = f"complex {type_name}"
-    _, dims, after = _field(body, 16, order)
+    _, dims, after = _read_field(body, 16, order)
     shape = struct.unpack(f"{order}{len(dims) // 4}i", dims)
     if len(shape) < 2 or min(shape) < 0:
         raise ValueError("shape")
-    _, name, after = _field(body, after, order)
+    _, name, after = _read_field(body, after, order)
     return bytes(name).decode("latin-1"), shape, type_name, after
 
 
-def _field(body: _Bytes, start: int, order: str) -> tuple[int, _Bytes, int]:
+def _read_field(body: _Bytes, start: int, order: str) -> tuple[int, _Bytes, int]:
     """Type and content of a data element, and where the next begins."""
     (kind,) = struct.unpack_from(f"{order}I", body, start)
     # Short elements share their tag.
@@ -222,7 +222,7 @@ def _field(body: _Bytes, start: int, order: str) -> tuple[int, _Bytes, int]:
 def _load_5(path: Path, start: int, count: int, shape: tuple[int, ...]) -> AnyArray:
     check_size(path, 8 * math.prod(shape))
     with path.open("rb") as file:
-        order = _order(file)
+        order = _byte_order(file)
         file.seek(start)
         (kind,) = struct.unpack(f"{order}I4x", file.read(8))
         body = file.read(count)
@@ -232,14 +232,14 @@ def _load_5(path: Path, start: int, count: int, shape: tuple[int, ...]) -> AnyAr
         check_size(path, count)
         body = unpacker.decompress(unpacker.unconsumed_tail, max(count, 1))
         check_promise(path, "MATLAB", count, len(body))
-    return _values(body, order)
+    return _read_values(body, order)
 
 
-def _values(body: bytes, order: str) -> AnyArray:
+def _read_values(body: bytes, order: str) -> AnyArray:
     """Read a plane of numbers, which MATLAB keeps column after column."""
     view = memoryview(body)
-    _, shape, type_name, start = _preamble(view, order)
-    kind, content, _ = _field(view, start, order)
+    _, shape, type_name, start = _read_preamble(view, order)
+    kind, content, _ = _read_field(view, start, order)
     stored = np.frombuffer(content, dtype=np.dtype(f"{order}{_STORED[kind]}"))
     # Whole numbers are kept in as few bytes as they need.
     return stored.reshape(shape, order="F").astype(_DTYPES.get(type_name, type_name), copy=False)

@@ -83,10 +83,10 @@ def _root_attributes(path: Path) -> dict[str, Any]:
 
     with h5py.File(path, "r") as file:
         names = [name for name in _ATTRIBUTES.split() if name in file.attrs]
-        return {name: _plain(file.attrs[name]) for name in names}
+        return {name: _as_python_value(file.attrs[name]) for name in names}
 
 
-def _plain(value: Any) -> Any:
+def _as_python_value(value: Any) -> Any:
     """Turn an HDF5 attribute into a Python value; MATLAB writes bytes and arrays of one."""
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
@@ -109,7 +109,7 @@ def read_pradformat(path: Path) -> tuple[AnyArray, dict[str, Any]] | xarray.Data
                 f"{path} is a pradformat radiograph with {content}: expected a dataset 'image' of "
                 "shape (height, width); export it again"
             )
-        geometry = _geometry(path, attributes, "pixel_width")
+        geometry = _read_geometry(path, attributes, "pixel_width")
         return image, {**attributes, "kind": "pradformat", "geometry": geometry}
     if kind == "inversion":
         return _read_inversion(path, attributes)
@@ -131,10 +131,10 @@ def _read_datasets(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray]:
         return {name: load_dataset(path, item) for name, item in items.items() if item is not None}
 
 
-def _geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[str, Any]:
+def _read_geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[str, Any]:
     """Return the fields of a particle setup that the attributes contain."""
     geometry: dict[str, Any] = {"kind": "proton"}
-    source, image = _distances(attributes)
+    source, image = _read_distances(attributes)
     species = {symbol: name for name, symbol in _SYMBOLS.items()}.get(
         attributes.get("spec_name", _SYMBOLS["proton"])
     )
@@ -158,7 +158,7 @@ def _geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[str, A
     return geometry
 
 
-def _distances(attributes: dict[str, Any]) -> tuple[float | None, float | None]:
+def _read_distances(attributes: dict[str, Any]) -> tuple[float | None, float | None]:
     """Return source to object and object to image, from any version of the format."""
     if "object_image_dist" in attributes or "source_object_dist" in attributes:
         return attributes.get("source_object_dist"), attributes.get("object_image_dist")
@@ -172,7 +172,7 @@ def _distances(attributes: dict[str, Any]) -> tuple[float | None, float | None]:
 def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
     from napari_shadowinv.physics.setup import displacement_from_potential, setup_from_dict
 
-    setup = setup_from_dict(_geometry(path, attributes, "dr"), str(path))
+    setup = setup_from_dict(_read_geometry(path, attributes, "dr"), str(path))
     arrays = _read_datasets(path, ("phi", "defl_ax1", "defl_ax2"))
     if "phi" not in arrays and not {"defl_ax1", "defl_ax2"} <= arrays.keys():
         raise FileFormatError(
@@ -216,7 +216,7 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
         attributes["provenance"] = provenance.model_dump_json(exclude_none=True)
         if provenance.image.file:
             attributes["radiograph_filename"] = provenance.image.file
-    _write(path, datasets, attributes)
+    _write_object(path, datasets, attributes)
 
 
 def write_radiograph(path: Path, image: AnyArray, setup: Setup, description: str) -> None:
@@ -228,7 +228,7 @@ def write_radiograph(path: Path, image: AnyArray, setup: Setup, description: str
         **_beam_attributes(proton_setup),
         "description": description,
     }
-    _write(path, {"image": image}, attributes)
+    _write_object(path, {"image": image}, attributes)
 
 
 def _beam_attributes(setup: Any) -> dict[str, Any]:
@@ -245,7 +245,7 @@ def _beam_attributes(setup: Any) -> dict[str, Any]:
     }
 
 
-def _write(path: Path, datasets: dict[str, AnyArray], attributes: dict[str, Any]) -> None:
+def _write_object(path: Path, datasets: dict[str, AnyArray], attributes: dict[str, Any]) -> None:
     import h5py
 
     with hdf5_in_memory(path) as content, h5py.File(content, "w") as file:

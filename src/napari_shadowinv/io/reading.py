@@ -84,10 +84,10 @@ def read(
     if not isinstance(content, tuple):
         return content
     array, metadata = content
-    return _radiograph(path, file_format, array, metadata, channel)
+    return _make_radiograph(path, file_format, array, metadata, channel)
 
 
-def _radiograph(
+def _make_radiograph(
     path: Path,
     file_format: Format,
     array: AnyArray,

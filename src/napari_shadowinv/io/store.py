@@ -111,7 +111,7 @@ def check_store_path(path: str | Path) -> Path:
 
 def is_stack(path: str | Path) -> bool:
     """Return whether a folder is a store of many shots."""
-    return _attributes(Path(path)).get("format") == FORMAT
+    return _read_attributes(Path(path)).get("format") == FORMAT
 
 
 def fitted_field(attributes: Mapping[Any, Any]) -> str | None:
@@ -137,7 +137,7 @@ def number_of(report: Mapping[str, Any], name: str, kind: type) -> Any:
     return report.get("residual" if name == "flux_residual" else name, nothing_yet(kind))
 
 
-def _document(path: Path) -> dict[str, Any]:
+def _read_document(path: Path) -> dict[str, Any]:
     """Return the description of a store, empty for a folder of another kind."""
     try:
         document = dict(json.loads(small_text(path / "zarr.json", "metadata of a store")))
@@ -147,8 +147,8 @@ def _document(path: Path) -> dict[str, Any]:
         return {}
 
 
-def _attributes(path: Path) -> dict[str, Any]:
-    return dict(_document(path).get("attributes", {}))
+def _read_attributes(path: Path) -> dict[str, Any]:
+    return dict(_read_document(path).get("attributes", {}))
 
 
 def store_error(path: Path, error: OSError) -> StoreError:
@@ -183,7 +183,7 @@ class ShotWriter:
     def _commit(
         self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any], status: int
     ) -> None:
-        attributes = _attributes(self.path)
+        attributes = _read_attributes(self.path)
         if attributes.get("store_id") != self.store_id:
             raise StoreError(
                 f"{self.path} is missing or is not the store the run started with: all workers "
@@ -220,7 +220,7 @@ class ShotWriter:
         return labels[index] if labels else {}
 
     def arrays(self) -> dict[str, Any]:
-        return _opened(self.path, self.store_id, self.shots)
+        return _open_arrays(self.path, self.store_id, self.shots)
 
 
 def fields_of(arrays: Mapping[str, Any]) -> tuple[str, ...]:
@@ -253,11 +253,11 @@ def open_to_write(path: Path) -> dict[str, Any]:
 def _labels_of_all(
     path: Path, store_id: str, shots: int, numbers: tuple[str, ...]
 ) -> list[dict[str, Any]]:
-    return read_labels(_opened(path, store_id, shots), numbers, slice(shots))
+    return read_labels(_open_arrays(path, store_id, shots), numbers, slice(shots))
 
 
 @lru_cache(maxsize=4)
-def _opened(path: Path, store_id: str, shots: int) -> dict[str, Any]:
+def _open_arrays(path: Path, store_id: str, shots: int) -> dict[str, Any]:
     arrays = open_to_write(path)
     shot_count = arrays["status"].shape[0]
     if shot_count != shots:
@@ -294,7 +294,7 @@ class StackStore:
                 f"{path} does not exist: expected a stack of shots, name{STORE_SUFFIX}; check the "
                 "path"
             )
-        document = _document(path)
+        document = _read_document(path)
         check_seal(path / "zarr.json", document)
         self.attributes = document.get("attributes", {})
         if self.attributes.get("format") != FORMAT:
@@ -302,7 +302,7 @@ class StackStore:
         self.field = fitted_field(self.attributes)
         self.own_setups = OWN_SETUPS in self.attributes
         self._layout = Layout.of(path, document)
-        self._arrays = _readable(path)
+        self._arrays = _open_readable(path)
         self.names = tuple(map(str, self._values("name").tolist()))
         if self._layout is None:
             self.statuses()
@@ -325,13 +325,13 @@ class StackStore:
         """Return a shot's report; ``reason`` says why it failed, or how it is damaged."""
         if index in self.damage.shots:
             return {"reason": self.damage.shots[index]}
-        return _parsed(self.path, [str(self._values("report", index))])[0]
+        return _parse_reports(self.path, [str(self._values("report", index))])[0]
 
     def reports(self) -> Sequence[dict[str, Any]]:
         """Return the report of each shot, as `report` does."""
         if self.damage.shots:
             return [self.report(index) for index in range(len(self.names))]
-        return _parsed(self.path, self._values("report").tolist())
+        return _parse_reports(self.path, self._values("report").tolist())
 
     @cached_property
     def damage(self) -> Damage:
@@ -356,7 +356,7 @@ class StackStore:
                 index = self._first_ended(first, first + length, damage)
                 if index is None or any(f"{name}/c/{first // length} " in f for f in damage.files):
                     continue
-                report = _parsed(self.path, [str(self._values("report", index))])[0]
+                report = _parse_reports(self.path, [str(self._values("report", index))])[0]
                 value = self._values(name, index).item()
                 expected: list[Any] = [report.get(LABELS, {}).get(name, value)]
                 if name in numbers:
@@ -402,7 +402,7 @@ def check_files(store: StackStore) -> None:
 
 
 @as_file_errors
-def _readable(path: Path) -> dict[str, Any]:
+def _open_readable(path: Path) -> dict[str, Any]:
     import zarr
 
     from napari_shadowinv.io.store_files import CheckedStore
@@ -426,7 +426,7 @@ def _values(path: Path, array: Any, which: Any) -> AnyArray:
 
 
 @as_file_errors
-def _parsed(path: Path, texts: Sequence[str]) -> list[dict[str, Any]]:
+def _parse_reports(path: Path, texts: Sequence[str]) -> list[dict[str, Any]]:
     return [dict(json.loads(text)) if text else {} for text in texts]
 
 

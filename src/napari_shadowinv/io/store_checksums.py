@@ -193,7 +193,7 @@ def stored_checksum(file: Path) -> str | None:
         return None
 
 
-def _content(file: Path) -> bytes | None:
+def _read_chunk(file: Path) -> bytes | None:
     """Return the bytes of a chunk without their checksum, None where there is no chunk."""
     if stored_checksum(file) is None:
         return None
@@ -210,14 +210,14 @@ def _is_intact(raw: bytes) -> bool:
     return struct.pack("<I", google_crc32c.value(content)) == checksum
 
 
-def _status(root: Path, index: int) -> int:
-    content = _content(root / "status" / "c" / str(index))
+def _read_status(root: Path, index: int) -> int:
+    content = _read_chunk(root / "status" / "c" / str(index))
     return content[0] if content else 0
 
 
-def _report(root: Path, index: int) -> dict[str, Any]:
+def _read_report(root: Path, index: int) -> dict[str, Any]:
     """Return the report of a shot, empty where there is none."""
-    content = _content(root / "report" / "c" / str(index)) or bytes(8)
+    content = _read_chunk(root / "report" / "c" / str(index)) or bytes(8)
     count, length = struct.unpack("<II", content[:8])
     if count > 1 or length > len(content) - 8:
         raise FileFormatError(f"its header implies {max(count, length)} bytes or texts")
@@ -243,7 +243,7 @@ def check_chunk(layout: Layout, key: str, name: str, index: int) -> None:
     """
     problem = ""
     if name in layout.of_each_shot:
-        problem = _settled(partial(_shot_problem, layout, index, (name,)))
+        problem = _check_again(partial(_shot_problem, layout, index, (name,)))
     elif name not in _RECORD:
         problem = _chunk_problem(layout, key, every_byte=False)
     if problem:
@@ -279,12 +279,12 @@ def _damage_error(layout: Layout, name: str, index: int, problem: str) -> FileFo
 
 def _label(layout: Layout, index: int) -> str:
     try:
-        return f"shot {index} ({_report(layout.root, index)[LABELS]['name']})"
+        return f"shot {index} ({_read_report(layout.root, index)[LABELS]['name']})"
     except (OSError, ValueError, KeyError, TypeError):
         return f"shot {index}"
 
 
-def _settled(look: Callable[[], str]) -> str:
+def _check_again(look: Callable[[], str]) -> str:
     """Repeat a check that fails, because the shot may be being written at this moment."""
     problem = look()
     for _ in range(_READS - 1):
@@ -298,12 +298,12 @@ def _shot_problem(
 ) -> str:
     """Describe the damage to a shot that has ended; empty if there is none."""
     try:
-        report = _report(layout.root, index)
+        report = _read_report(layout.root, index)
     except (OSError, ValueError, TypeError, struct.error) as error:
         return f"its report is damaged ({error})"
     if CHUNKS not in report:
         try:
-            status = _status(layout.root, index)
+            status = _read_status(layout.root, index)
         except OSError as error:
             return f"its status is damaged ({error})"
         lacks = status == Status.DONE or (status == Status.FAILED and "reason" not in report)
@@ -319,7 +319,7 @@ def _shot_problem(
                     else (f"its {name} is not the one that was written")
                 )
             if every_byte:
-                _content(file)
+                _read_chunk(file)
         except OSError as error:
             return f"its {name} is damaged ({error})"
     return ""
@@ -335,7 +335,7 @@ def _chunk_problem(layout: Layout, key: str, every_byte: bool) -> str:
         if checksum != layout.fixed.get(key, checksum):
             return f"{key} is not the file that was written"
         if every_byte:
-            _content(file)
+            _read_chunk(file)
     except OSError as error:
         return f"{key} is damaged ({error})"
     return ""
@@ -373,7 +373,7 @@ def find_damage(layout: Layout, *, every_byte: bool = False) -> Damage:
     names = layout.of_each_shot
     shots: dict[int, str] = {}
     for index in range(layout.shots):
-        problem = _settled(partial(_record_problem, layout, index, names, every_byte))
+        problem = _check_again(partial(_record_problem, layout, index, names, every_byte))
         if problem:
             shots[index] = problem
     keys = [*layout.keys_of_many(), *layout.fixed]
@@ -391,13 +391,13 @@ def _description_problem(layout: Layout, name: str) -> str:
         metadata = json.loads(small_text(file, "metadata of an array"))
         # A process that was killed while the store grew may have changed the length.
         metadata["shape"] = [*expected["shape"][:1], *metadata["shape"][1:]]
-        is_intact = _comparable(metadata) == _comparable(expected)
+        is_intact = _as_comparable_text(metadata) == _as_comparable_text(expected)
         return "" if is_intact else f"{name}/zarr.json is damaged"
     except (OSError, ValueError, KeyError, TypeError):
         return f"{name}/zarr.json is damaged or missing"
 
 
-def _comparable(description: Mapping[str, Any]) -> str:
+def _as_comparable_text(description: Mapping[str, Any]) -> str:
     """Return a description as text, without empty entries, which are optional."""
     filled = {key: value for key, value in description.items() if value not in (None, {}, [])}
     return json.dumps(filled, sort_keys=True)
@@ -405,7 +405,7 @@ def _comparable(description: Mapping[str, Any]) -> str:
 
 def _record_problem(layout: Layout, index: int, names: tuple[str, ...], every_byte: bool) -> str:
     try:
-        if _status(layout.root, index) not in (Status.DONE, Status.FAILED):
+        if _read_status(layout.root, index) not in (Status.DONE, Status.FAILED):
             return ""
     except OSError as error:
         return f"its status is damaged ({error})"

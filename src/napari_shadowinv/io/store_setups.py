@@ -55,10 +55,10 @@ def of_each_setup(dataset: xarray.Dataset, measure: Callable[[Any], float]) -> A
     """Return a number of each shot's setup, NaN until it is done; None if all share one setup."""
     if "setup" not in dataset:
         return None
-    return dataset["setup"].data.map_blocks(_measured, measure, dtype=np.float64)
+    return dataset["setup"].data.map_blocks(_measure_setups, measure, dtype=np.float64)
 
 
-def _measured(texts: AnyArray, measure: Callable[[Any], float]) -> FloatArray:
+def _measure_setups(texts: AnyArray, measure: Callable[[Any], float]) -> FloatArray:
     from napari_shadowinv.physics.setup import setup_from_dict
 
     measures = (measure(setup_from_dict(json.loads(text))) if text else np.nan for text in texts)

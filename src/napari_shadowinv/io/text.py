@@ -71,16 +71,16 @@ def read_text(path: Path) -> tuple[FloatArray, dict[str, Any]]:
     geometry: dict[str, float] = {}
     blocks: dict[str, tuple[int, int]] = {}
     selected: dict[str, tuple[float, float]] = {}
-    for number, line in _lines(path):
+    for number, line in _read_lines(path):
         if line[0] in "#%":
-            geometry |= _geometry_of(path, number, line)
+            geometry |= _parse_geometry(path, number, line)
             if block := _BLOCK.match(line):
                 first_shape = next(iter(blocks.values()), (0, 0))
                 blocks[block[1]] = (int(block[2]), int(block[3])) if block[2] else first_shape
             if part := _SELECTED.match(line):
                 selected[part[1]] = float(part[2]), float(part[3])
         else:
-            width = _row(path, number, line, width).size
+            width = _parse_row(path, number, line, width).size
             height += 1
             if not height % 1000:
                 check_size(path, 8 * height * width)
@@ -91,11 +91,11 @@ def read_text(path: Path) -> tuple[FloatArray, dict[str, Any]]:
             blocks["mask"] = blocks["flux2D"]
         _check_blocks(path, blocks, (height, width))
     check_size(path, 8 * height * width)
-    image = _filled(path, height, width)
-    metadata: dict[str, Any] = {"bits": 64, "geometry": _complete(geometry)}
+    image = _read_rows(path, height, width)
+    metadata: dict[str, Any] = {"bits": 64, "geometry": _complete_distances(geometry)}
     if "flux2D" not in blocks:
         return image, metadata
-    image, parts = _split(path, image, blocks, selected)
+    image, parts = _split_blocks(path, image, blocks, selected)
     return image, {**metadata, **parts}
 
 
@@ -110,7 +110,7 @@ def _check_blocks(path: Path, blocks: dict[str, tuple[int, int]], shape: tuple[i
         )
 
 
-def _split(
+def _split_blocks(
     path: Path,
     stacked: FloatArray,
     blocks: dict[str, tuple[int, int]],
@@ -138,7 +138,7 @@ def _split(
     return image, parts
 
 
-def _filled(path: Path, height: int, width: int) -> FloatArray:
+def _read_rows(path: Path, height: int, width: int) -> FloatArray:
     if not height:
         raise FileFormatError(
             f"{path} holds no numbers: expected one row of pixels per line; export the image again"
@@ -149,13 +149,13 @@ def _filled(path: Path, height: int, width: int) -> FloatArray:
             "rows and two columns; export the image again"
         )
     image = np.empty((height, width))
-    rows = ((number, line) for number, line in _lines(path) if line[0] not in "#%")
+    rows = ((number, line) for number, line in _read_lines(path) if line[0] not in "#%")
     for row, (number, line) in zip(image, rows, strict=True):
-        row[:] = _row(path, number, line, width)
+        row[:] = _parse_row(path, number, line, width)
     return image
 
 
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
+def _read_lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield the lines that are not blank, with their numbers from 1."""
     with path.open("rb") as file:
         for number in itertools.count(1):
@@ -177,7 +177,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
                 yield number, text
 
 
-def _row(path: Path, number: int, line: str, width: int | None) -> FloatArray:
+def _parse_row(path: Path, number: int, line: str, width: int | None) -> FloatArray:
     words = line.rstrip(",").split("," if "," in line else None)
     if width is not None and len(words) != width:
         raise FileFormatError(
@@ -203,7 +203,7 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _geometry_of(path: Path, number: int, line: str) -> dict[str, float]:
+def _parse_geometry(path: Path, number: int, line: str) -> dict[str, float]:
     """Return the geometry that a comment states, in m and MeV: one entry or none."""
     entry = _ENTRY.match(line) if len(line) <= _LONGEST_ENTRY else None
     if entry is None:
@@ -228,7 +228,7 @@ def _geometry_of(path: Path, number: int, line: str) -> dict[str, float]:
     )
 
 
-def _complete(geometry: dict[str, float]) -> dict[str, float]:
+def _complete_distances(geometry: dict[str, float]) -> dict[str, float]:
     total = geometry.pop("source_image_distance", None)
     near, far = geometry.get("source_object_distance"), geometry.get("object_image_distance")
     if total is not None and near is not None and far is None:

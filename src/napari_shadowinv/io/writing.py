@@ -77,7 +77,7 @@ def write(
         with replacing(path, overwrite) as temporary:
             _write_image(temporary, result, setup)
         return Path(path)
-    dataset = _dataset(result, setup)
+    dataset = _as_dataset(result, setup)
     writers = _writers_of(dataset)
     check_output(path, overwrite, suffixes=writers)
     with replacing(path, overwrite) as temporary:
@@ -91,7 +91,7 @@ def _writers_of(dataset: xarray.Dataset) -> dict[str, str]:
     return FIT_WRITERS if is_fit(dataset.attrs) else RESULT_WRITERS
 
 
-def _dataset(
+def _as_dataset(
     result: Inversion | Uncertainty | Fit | xarray.Dataset, setup: Setup | None
 ) -> xarray.Dataset:
     from napari_shadowinv.fitting import Fit

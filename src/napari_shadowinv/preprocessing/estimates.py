@@ -198,10 +198,10 @@ def low_pass_source(
     values, usable = pixels.beam_pixels(image, mask)
     width = pixels.checked_number("width", width, above=0, unit="px")
     report = Reporter(None, should_stop)
-    beam, support = _masked_blur(values, usable, width, report)
+    beam, support = _blur_masked(values, usable, width, report)
     while not support.all():
         width *= 2
-        wider, reached = _masked_blur(values, usable, width, report)
+        wider, reached = _blur_masked(values, usable, width, report)
         beam, support = np.where(support, beam, wider), support | reached
     return pixels.with_flux_of(beam, values, usable)
 
@@ -221,18 +221,18 @@ class LowPassEstimate(Estimate):
     )
 
 
-def _masked_blur(
+def _blur_masked(
     values: FloatArray, usable: BoolArray, width: float, report: Reporter
 ) -> tuple[FloatArray, BoolArray]:
     """Blur the usable pixels; return also where enough of them are within reach."""
     report("source", 0, 2)
-    support = _blurred(usable.astype(np.float64), width)
+    support = _blur(usable.astype(np.float64), width)
     report("source", 1, 2)
-    blurred = _blurred(np.where(usable, values, 0.0), width)
+    blurred = _blur(np.where(usable, values, 0.0), width)
     return blurred / np.maximum(support, _LEAST_SUPPORT), support >= _LEAST_SUPPORT
 
 
-def _blurred(values: FloatArray, width: float) -> FloatArray:
+def _blur(values: FloatArray, width: float) -> FloatArray:
     """Blur by a Gaussian with a mirrored border."""
     if width < _NARROWEST_WAVES:
         return np.asarray(scipy.ndimage.gaussian_filter(values, width, mode="reflect"))

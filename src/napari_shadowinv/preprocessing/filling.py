@@ -135,10 +135,10 @@ def _coarse_spline(
         pixels.block_means(weighted, 2), pixels.block_means(share, 2), width / 2, power, report
     )
     height, length = weighted.shape
-    return _doubled(_doubled(coarse, height).T, length).T
+    return _double_rows(_double_rows(coarse, height).T, length).T
 
 
-def _doubled(coarse: FloatArray, side: int) -> FloatArray:
+def _double_rows(coarse: FloatArray, side: int) -> FloatArray:
     """Interpolate to twice as many rows, cut to `side`, linearly between the coarse ones."""
     padded = np.pad(coarse, [(1, 1), (0, 0)], mode="edge")
     near, before, after = padded[1:-1], padded[:-2], padded[2:]

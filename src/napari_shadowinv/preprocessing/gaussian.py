@@ -73,9 +73,9 @@ def gaussian_source(
     """
     values, usable = pixels.beam_pixels(image, mask)
     side, mean = max(values.shape), values[usable].mean()
-    y, x, sample = _samples(values / mean, usable)
+    y, x, sample = _block_samples(values / mean, usable)
     report = Reporter(None, should_stop)
-    parameters = _fitted_gaussian(y / side, x / side, sample, report)
+    parameters = _fit_gaussian(y / side, x / side, sample, report)
     rows, columns = (np.arange(n) / side for n in values.shape)
     beam = _gaussian(parameters, rows[:, None], columns)
     rise = float(beam.max() / sample.max())
@@ -96,7 +96,9 @@ def gaussian_source(
     return pixels.with_flux_of(mean * beam, values, usable)
 
 
-def _samples(values: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _block_samples(
+    values: FloatArray, usable: BoolArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return positions y, x and means of blocks of usable pixels, few enough for a fit."""
     block = int(np.ceil(np.sqrt(values.size / _MOST_FITTED_PIXELS)))
     share = pixels.block_means(usable.astype(np.float64), block)
@@ -109,9 +111,7 @@ def _samples(values: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatAr
     return rows, columns, np.asarray(means[y, x] / share[y, x])
 
 
-def _fitted_gaussian(
-    y: FloatArray, x: FloatArray, sample: FloatArray, report: Reporter
-) -> FloatArray:
+def _fit_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray, report: Reporter) -> FloatArray:
     """Fit the parameters of `_gaussian` to samples, by repeated robust least squares."""
     bounds = _bounds(y, x)
 
@@ -127,7 +127,7 @@ def _fitted_gaussian(
         return np.asarray(fit.x)
 
     # A plain fit first: the robust loss, from far away, would call the whole beam an outlier.
-    parameters = fitted(np.clip(_first_gaussian(y, x, sample), *bounds), "linear", 1.0)
+    parameters = fitted(np.clip(_guess_gaussian(y, x, sample), *bounds), "linear", 1.0)
     scale = 0.0
     for _ in range(_MOST_FITS):
         residual = _gaussian(parameters, y, x) - sample
@@ -151,7 +151,7 @@ def _bounds(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     return least, most
 
 
-def _first_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatArray:
+def _guess_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatArray:
     """Return parameters of `_gaussian` by the moments of the image above its dark corners."""
     constant, peak = (float(level) for level in np.percentile(sample, [2, 98]))
     weights = np.maximum(sample - constant, 0) + 1e-9

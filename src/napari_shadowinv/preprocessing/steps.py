@@ -208,7 +208,7 @@ class Dark(Step):
         return replace(shot, image=image, source=source).noted(f"dark {name} subtracted")
 
 
-def _turned(array: AnyArray, turns: int) -> Any:
+def _turn(array: AnyArray, turns: int) -> Any:
     return np.ascontiguousarray(np.rot90(array, turns))
 
 
@@ -246,7 +246,7 @@ class Rotate(Step):
         if turns is None:
             rotated = self._interpolated(shot)
         else:
-            rotated = shot.mapped(partial(_turned, turns=turns), partial(_turned, turns=turns))
+            rotated = shot.mapped(partial(_turn, turns=turns), partial(_turn, turns=turns))
         return rotated.noted(f"rotated by {self.angle:g}°")
 
     def _interpolated(self, shot: Radiograph) -> Radiograph:
