@@ -12,7 +12,7 @@ from napari_shadowinv.geometry.interpolation import CloughTocher
 from napari_shadowinv.geometry.linear_surface import WIDTH, with_gradients
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.inversion import _sampling
-from napari_shadowinv.inversion._drawing import noise_of
+from napari_shadowinv.inversion._noise_samples import noise_of
 from napari_shadowinv.inversion._sampling import FullResampling, LinearResampling, Scatter
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.readout import read_dual

@@ -38,8 +38,8 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry.linear_surface import WIDTH
-from napari_shadowinv.inversion._drawing import noise_of
 from napari_shadowinv.inversion._invert import invert, plan_sites
+from napari_shadowinv.inversion._noise_samples import noise_of
 from napari_shadowinv.inversion._sampling import FullResampling, LinearResampling, Scatter, Seed
 from napari_shadowinv.inversion.labels import dataset_from_field, label
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, prepare
