@@ -21,6 +21,7 @@ from napari_shadowinv.film.calibration import (
     unexposed_pixel,
 )
 from napari_shadowinv.film.fiducials import poses_by_fiducials
+from napari_shadowinv.film.film_response import Band, Response
 from napari_shadowinv.film.image_plates import (
     Luminescence,
     fading,
@@ -30,7 +31,6 @@ from napari_shadowinv.film.image_plates import (
 from napari_shadowinv.film.marks import burnt_edges, usable_pixels
 from napari_shadowinv.film.pack import FilmType, Material, Pack, PackLayer, Slab
 from napari_shadowinv.film.registration import Poses, check_orientation, moved_corners, register
-from napari_shadowinv.film.response import Band, Response
 from napari_shadowinv.film.scans import find_films, read_corners, straightened, write_corners
 from napari_shadowinv.film.stopping import Stopping
 from napari_shadowinv.film.tracks import TrackImage, Tracks

@@ -15,7 +15,7 @@ from scipy.optimize import nnls
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.film.response import Response, check_increasing
+from napari_shadowinv.film.film_response import Response, check_increasing
 
 __all__ = ["Spectra", "unfold"]
 

@@ -29,8 +29,8 @@ from napari_shadowinv.film import (
     unfold,
     usable_pixels,
 )
+from napari_shadowinv.film.film_response import relative_strengths
 from napari_shadowinv.film.registration import EDGES
-from napari_shadowinv.film.response import relative_strengths
 from napari_shadowinv.film.scans import common_shape, upright
 from napari_shadowinv.fitting.measurements import estimated_noise
 from napari_shadowinv.inversion.labels import PACK_FORMAT, PIXEL, place_coordinates

@@ -12,7 +12,7 @@ from srim import TABLES
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film import Material, Pack, PackLayer, Response, Slab
-from napari_shadowinv.film.response import check_increasing, relative_strengths
+from napari_shadowinv.film.film_response import check_increasing, relative_strengths
 from napari_shadowinv.physics.setup import ProtonSetup
 
 
