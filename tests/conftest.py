@@ -17,7 +17,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.fitting import Basin, Fit, FitOptions, FitReport, FittedField, Verdict
 from napari_shadowinv.inversion import Inversion, Report
 from napari_shadowinv.inversion.budget import ErrorEstimate, Errors
-from napari_shadowinv.inversion.trust import image_residual
+from napari_shadowinv.inversion.solution_checks import image_residual
 from napari_shadowinv.io.public_images import BURNER_FILES, fetch_burner
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image

@@ -26,7 +26,12 @@ from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared, margin_around, prepare
 from napari_shadowinv.inversion.readout import read_out
 from napari_shadowinv.inversion.result import Inversion, Report
-from napari_shadowinv.inversion.trust import find_cautions, image_residual, is_coarse, mark_caustics
+from napari_shadowinv.inversion.solution_checks import (
+    find_cautions,
+    image_residual,
+    is_coarse,
+    mark_caustics,
+)
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean

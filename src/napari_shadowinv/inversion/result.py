@@ -24,7 +24,7 @@ from napari_shadowinv.inversion.labels import (
     label,
     numbers_of,
 )
-from napari_shadowinv.inversion.trust import image_residual
+from napari_shadowinv.inversion.solution_checks import image_residual
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.units import peak_facts, shown_fields
 from napari_shadowinv.preprocessing import Provenance

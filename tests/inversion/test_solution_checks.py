@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from napari_shadowinv.inversion import Inversion, Report, invert
 from napari_shadowinv.inversion.edges import inner_sides, turned_back
-from napari_shadowinv.inversion.trust import image_residual, mark_caustics
+from napari_shadowinv.inversion.solution_checks import image_residual, mark_caustics
 from napari_shadowinv.io import read
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics import phantoms
