@@ -29,8 +29,8 @@ from napari_shadowinv.cli._flags import recipe_of
 from napari_shadowinv.cli._inputs import setup_for
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, invert, machine_code
-from napari_shadowinv.inversion.labels import PACK_FORMAT, setup_from_dataset
 from napari_shadowinv.inversion.machine_code import code_folder
+from napari_shadowinv.inversion.variables import PACK_FORMAT, setup_from_dataset
 from napari_shadowinv.io import read, write
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.options import InversionOptions

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from napari_shadowinv import read
 from napari_shadowinv.cli import app
-from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.variables import setup_from_dataset
 
 ROOT = Path(__file__).parents[1]
 # Those for napari are tested with it.

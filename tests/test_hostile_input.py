@@ -43,7 +43,7 @@ from napari_shadowinv._system.safety import LIMIT_VARIABLE, check_regular, resol
 from napari_shadowinv.cli._export import _escape_cell
 from napari_shadowinv.film import Calibration, Pack, usable_pixels
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read_toml
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.options import FitChoices

@@ -66,7 +66,7 @@ def test_the_proton_radiograph_has_the_numbers_of_its_page(tmp_path, monkeypatch
     assert float(measured.attrs["image_residual"]) == pytest.approx(0.0825, abs=5e-4)
     assert "**Caustics** 0.00 % of the pixels" in page
     assert not measured.caustic.any()
-    from napari_shadowinv.inversion.labels import setup_from_dataset
+    from napari_shadowinv.inversion.variables import setup_from_dataset
 
     setup = setup_from_dataset(measured)
 

@@ -10,7 +10,7 @@ import xarray as xr
 
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read, write
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image

@@ -12,7 +12,7 @@ import xarray as xr
 
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.fitting import Fit, Verdict
-from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read, write
 from napari_shadowinv.io.formats import kind_of
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup

@@ -8,7 +8,7 @@ import xarray as xr
 
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read, read_radiograph, write
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.preprocessing import Origin, Provenance, Recipe

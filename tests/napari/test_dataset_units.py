@@ -13,7 +13,7 @@ from napari.components import ViewerModel
 from napari import __version__ as napari_version
 from napari_shadowinv import invert_stack, read, write
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.inversion.labels import update_labels
+from napari_shadowinv.inversion.variables import update_labels
 from napari_shadowinv.physics.setup import OpticalSetup
 
 PIXEL_M = 2e-6

@@ -17,7 +17,7 @@ from pydantic import TypeAdapter
 import napari_shadowinv
 from napari_shadowinv.cli._summary import setup_text
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.labels import dataset_from_field
+from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.physics.phantoms import paper_setup
 from napari_shadowinv.physics.projection import transferred_displacement

@@ -22,7 +22,7 @@ from napari_shadowinv import (
     run_stack,
 )
 from napari_shadowinv.inversion import compilation
-from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import read_shot

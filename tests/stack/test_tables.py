@@ -26,7 +26,7 @@ from napari_shadowinv import (
     synthetic_image,
     write,
 )
-from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
 from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.physics.setup import BeamSetup, OpticalSetup, ProtonSetup

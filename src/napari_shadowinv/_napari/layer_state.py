@@ -25,7 +25,7 @@ from napari_shadowinv._napari.layers import FullLayerData, result_layers
 from napari_shadowinv._napari.packs import pack_frame, pack_layers, pack_result, warnings_of_pack
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.labels import is_fit, is_pack, setup_from_dataset
+from napari_shadowinv.inversion.variables import is_fit, is_pack, setup_from_dataset
 
 if TYPE_CHECKING:
     import xarray

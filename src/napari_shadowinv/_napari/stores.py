@@ -20,7 +20,7 @@ from napari_shadowinv._napari.layers import (
 )
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.formats import RESULT
 from napari_shadowinv.io.store_setups import with_own_setups
 

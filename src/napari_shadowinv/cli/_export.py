@@ -15,7 +15,7 @@ import numpy as np
 from napari_shadowinv.cli._outputs import make_folder, protect_store
 from napari_shadowinv.cli._terminal import escape_invisible
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion.labels import display_unit, setup_from_dataset
+from napari_shadowinv.inversion.variables import display_unit, setup_from_dataset
 from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
 from napari_shadowinv.io.pradformat import check_pradformat_setup

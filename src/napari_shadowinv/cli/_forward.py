@@ -28,7 +28,7 @@ class Field:
 
 def field_from(path: Path, variable: str | None = None) -> Field:
     """Read a displacement from a result, or from an array in px or px²."""
-    from napari_shadowinv.inversion.labels import is_fit, is_pack, setup_from_dataset
+    from napari_shadowinv.inversion.variables import is_fit, is_pack, setup_from_dataset
     from napari_shadowinv.io import read_dataset, read_radiograph
     from napari_shadowinv.io.dataset import require
     from napari_shadowinv.io.formats import kind_of

@@ -135,7 +135,7 @@ def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
     from napari_shadowinv.cli._film_command import pack_rows
     from napari_shadowinv.cli._fit_result import fit_file_rows
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.inversion.labels import is_fit, is_pack, setup_from_dataset
+    from napari_shadowinv.inversion.variables import is_fit, is_pack, setup_from_dataset
     from napari_shadowinv.physics.units import peak_facts
 
     if is_fit(dataset.attrs):

@@ -166,7 +166,7 @@ def rerun(
     from napari_shadowinv.cli._rerun import FileLocator, rerun_inversion
     from napari_shadowinv.cli._rerun_fit import refit_table, rerun_fit
     from napari_shadowinv.cli._summary import rerun_table, two_columns
-    from napari_shadowinv.inversion.labels import is_fit, is_pack
+    from napari_shadowinv.inversion.variables import is_fit, is_pack
     from napari_shadowinv.io import read_dataset
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, FIT_WRITERS, RESULT_WRITERS
 

@@ -17,7 +17,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level, caution_facts, error_fact, time_fact
 from napari_shadowinv.fitting.beam_error import BeamError
 from napari_shadowinv.fitting.verdict import Verdict
-from napari_shadowinv.inversion.labels import (
+from napari_shadowinv.inversion.variables import (
     BEAM_UNCERTAINTY,
     FIT_FORMAT,
     FLUX_DENSITY,

@@ -10,7 +10,7 @@ import numpy as np
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.result import Fit
-from napari_shadowinv.inversion.labels import (
+from napari_shadowinv.inversion.variables import (
     PIXEL,
     UNCERTAINTY,
     belongs,

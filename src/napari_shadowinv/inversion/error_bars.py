@@ -41,9 +41,9 @@ from napari_shadowinv.geometry.linear_surface import WIDTH
 from napari_shadowinv.inversion._invert import invert, plan_sites
 from napari_shadowinv.inversion._noise_samples import noise_of
 from napari_shadowinv.inversion._sampling import FullResampling, LinearResampling, Scatter, Seed
-from napari_shadowinv.inversion.labels import dataset_from_field, label
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, prepare
 from napari_shadowinv.inversion.result import Inversion
+from napari_shadowinv.inversion.variables import dataset_from_field, label
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.transport.sites import SitePlan
 

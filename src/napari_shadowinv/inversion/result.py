@@ -17,14 +17,14 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Headline, Level, caution_facts, error_fact, time_fact
 from napari_shadowinv.inversion.budget import Errors
-from napari_shadowinv.inversion.labels import (
+from napari_shadowinv.inversion.solution_checks import image_residual
+from napari_shadowinv.inversion.variables import (
     FORMAT,
     VARIABLES,
     dataset_from_field,
     label,
     numbers_of,
 )
-from napari_shadowinv.inversion.solution_checks import image_residual
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.units import peak_facts, shown_fields
 from napari_shadowinv.preprocessing import Provenance

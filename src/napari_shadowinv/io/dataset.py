@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.labels import FORMAT, is_fit, is_pack, update_labels
+from napari_shadowinv.inversion.variables import FORMAT, is_fit, is_pack, update_labels
 from napari_shadowinv.io.hdf5 import check_arrays, check_hdf5_seal, hdf5_in_memory
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ import numpy as np
 from napari_shadowinv._system.safety import as_file_errors, check_regular
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion.labels import (
+from napari_shadowinv.inversion.variables import (
     FORMAT,
     dataset_from_field,
     is_fit,

@@ -17,7 +17,7 @@ import numpy as np
 from napari_shadowinv._system.safety import as_file_errors, small_text
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion.labels import is_pack
+from napari_shadowinv.inversion.variables import is_pack
 from napari_shadowinv.io.colours import film_warnings, to_grey
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.formats import CPSA, Format, format_of

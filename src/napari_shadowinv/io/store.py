@@ -22,7 +22,7 @@ import numpy as np
 from napari_shadowinv._system.safety import as_file_errors, small_text
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.inversion.labels import (
+from napari_shadowinv.inversion.variables import (
     PIXEL,
     fit_labels,
     setup_from_dataset,

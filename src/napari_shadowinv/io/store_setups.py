@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._typing import AnyArray, FloatArray
-from napari_shadowinv.inversion.labels import SETUPS_LABEL, place_label
+from napari_shadowinv.inversion.variables import SETUPS_LABEL, place_label
 
 if TYPE_CHECKING:
     import xarray

@@ -9,7 +9,7 @@ import numpy as np
 
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.labels import is_fit, is_pack
+from napari_shadowinv.inversion.variables import is_fit, is_pack
 from napari_shadowinv.io.files import check_output, replacing
 from napari_shadowinv.io.formats import (
     FIT_WRITERS,

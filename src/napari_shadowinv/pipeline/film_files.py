@@ -17,7 +17,7 @@ import numpy as np
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.film import Pack, PackLayer
-from napari_shadowinv.inversion.labels import is_pack
+from napari_shadowinv.inversion.variables import is_pack
 from napari_shadowinv.io import read_toml, replacing, write
 from napari_shadowinv.io.formats import PRADFORMAT, SITES, TIFF
 from napari_shadowinv.io.pradformat import write_radiograph

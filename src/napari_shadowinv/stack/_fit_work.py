@@ -13,7 +13,7 @@ from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit
-from napari_shadowinv.inversion.labels import dataset_from_field
+from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import FitShot, run_fit

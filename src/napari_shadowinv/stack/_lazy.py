@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._system.validation import check_instance
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.labels import SETUPS_LABEL, variable_labels
+from napari_shadowinv.inversion.variables import SETUPS_LABEL, variable_labels
 from napari_shadowinv.io.store import SUMMARY
 from napari_shadowinv.io.store_setups import with_places
 from napari_shadowinv.options import InversionOptions

@@ -22,8 +22,8 @@ from napari_shadowinv._system.arrays import (
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, checked_mask, checked_source
+from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.options import FitChoices, InversionOptions

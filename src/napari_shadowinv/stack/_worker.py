@@ -26,7 +26,7 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion, plan_sites
-from napari_shadowinv.inversion.labels import dataset_from_field, variable_labels
+from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.store import DONE, FAILED, ShotWriter
 from napari_shadowinv.io.store_growing import GrowingStore
 from napari_shadowinv.options import InversionOptions

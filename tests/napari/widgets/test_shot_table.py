@@ -12,7 +12,7 @@ from qtpy.QtCore import Qt
 
 from napari_shadowinv._napari.layer_metadata import role_of
 from napari_shadowinv._napari.widgets import _shot_table
-from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
 from napari_shadowinv.physics.forward import synthetic_image

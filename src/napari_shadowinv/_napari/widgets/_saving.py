@@ -18,7 +18,7 @@ from napari_shadowinv._napari.widgets._qt import notify_errors
 from napari_shadowinv._napari.widgets._results import ResultLayers
 from napari_shadowinv._napari.writer import dataset_to_save
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.labels import setup_from_dataset
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import write
 from napari_shadowinv.io.formats import NPY, PNG, PRADFORMAT, RESULT, SITES, TIFF, Format
 
