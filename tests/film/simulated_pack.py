@@ -10,8 +10,8 @@ a proton leaves in each film is used (`Response`). Straight rays cross the pack:
 along the axis, and protons neither scatter nor straggle. Counting noise is that of each film alone,
 although the same protons cross several.
 
-Arrays are [y, x]. Pixels of the object are those of the first film over its magnification. Unless
-told otherwise, lengths are in m and energies in MeV.
+Arrays are [y, x]. Pixels of the object are those of the first film over its magnification. Lengths
+are in m and energies in MeV, unless stated otherwise.
 """
 
 from __future__ import annotations

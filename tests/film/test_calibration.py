@@ -205,7 +205,7 @@ def test_all_channels_together_give_back_the_dose(table: Path) -> None:
     assert not combined.outside.any()
 
 
-def test_errors_of_noisy_films_are_as_told(table: Path) -> None:
+def test_errors_of_noisy_films_match_their_scatter(table: Path) -> None:
     """In the spread of the table; of three channels they are smaller than of the best."""
     np.testing.assert_array_equal(Calibration.from_csv(table).spreads[0], [700, 700, 500])
     doses = np.geomspace(1, 2000, 25)

@@ -52,7 +52,7 @@ def test_shifts_and_turns_are_those_of_the_marks() -> None:
             np.testing.assert_allclose((place - middle) @ axes.T, THROUGH[name], atol=3e-3)
 
 
-def test_one_mark_tells_a_shift_and_none_leaves_the_edges() -> None:
+def test_one_mark_gives_a_shift_and_none_leaves_the_edges() -> None:
     (first, corners), (second, _), _ = (scanned(layer) for layer in range(3))
     points = [first, {"a": second["a"]}, {"x": second["b"]}]
     poses = poses_by_fiducials(points, [corners] * 3, [1.0] * 3, NAMES)

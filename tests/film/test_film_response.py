@@ -103,7 +103,7 @@ def test_a_pack_that_stops_all_is_refused() -> None:
         ({"film": "EBT3", "filters": [{"material": "Al", "thickness": 25}]}, "less than or equal"),
     ],
 )
-def test_what_is_unknown_is_refused(layer: dict, message: str) -> None:
+def test_unknown_films_and_materials_are_refused(layer: dict, message: str) -> None:
     with pytest.raises(ValidationError) as refused:
         Pack.model_validate({"layers": [layer]})
     assert message in str(refused.value)

@@ -184,7 +184,7 @@ def test_noise_is_that_of_whole_protons_and_of_grain() -> None:
     assert counts.var() == pytest.approx(expected, rel=0.02)
 
 
-def test_scans_are_pictures_of_16_bits_with_marks_where_told(truth: Truth) -> None:
+def test_scans_have_16_bits_and_marks_only_if_requested(truth: Truth) -> None:
     for k, file in enumerate(truth.files):
         with tifffile.TiffFile(file) as tiff:
             tags = tiff.pages[0].tags

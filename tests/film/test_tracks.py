@@ -29,7 +29,7 @@ def test_tracks_on_the_edges_count_and_an_empty_bin_has_the_error_of_one_track()
     np.testing.assert_array_equal(error, 1.0)
 
 
-def test_what_is_left_at_the_edge_is_cut_off() -> None:
+def test_incomplete_bins_at_the_edge_are_cut_off() -> None:
     y, x = np.full(2, 0.1e-3), np.array([0.1e-3, 0.95e-3])
     counts, _, _ = tracks_at(y, x).image(300.0)
     assert (counts.shape, counts.sum()) == ((3, 3), 1)

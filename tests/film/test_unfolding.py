@@ -42,7 +42,7 @@ def test_a_falling_spectrum_comes_back(
     np.testing.assert_allclose(spectra.fluence, spectra.fluence[:, :1, :1] * np.ones(SHAPE))
 
 
-def test_each_layer_shows_protons_of_the_energy_that_is_told(response: Response) -> None:
+def test_each_layer_shows_protons_of_its_reported_energy(response: Response) -> None:
     spectrum = falling(response, 10.0)
     # What a magnetic and an electric field add in a pixel, to the first order.
     for power in (0.5, 1.0):
@@ -80,7 +80,7 @@ def test_nothing_is_negative(response: Response) -> None:
     assert (spectra.error > 0).all()
 
 
-def test_a_film_that_tells_nothing_is_bridged(response: Response) -> None:
+def test_an_unknown_dose_is_bridged(response: Response) -> None:
     doses = doses_of(response, falling(response, 15.0))
     errors = np.full(doses.shape, 0.01)
     errors[3, 2, 2] = np.inf

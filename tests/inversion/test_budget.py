@@ -127,7 +127,7 @@ def test_given_noise_is_used_and_scales(image):
     assert noise_errors["counts"] == pytest.approx(noise_errors["weak"] * 0.2646 / 0.07, rel=0.25)
 
 
-def test_discretisation_is_what_many_more_sites_change(every_image):
+def test_discretisation_is_the_change_by_many_more_sites(every_image):
     size = every_image.size
     many, *coarse = (
         invert(every_image, options=InversionOptions(n_sites=count))
@@ -138,7 +138,7 @@ def test_discretisation_is_what_many_more_sites_change(every_image):
         assert true / 2 < few.errors.discretisation.rms < 2 * true
 
 
-def test_the_solvers_part_is_what_a_better_solution_changes(image):
+def test_the_solvers_part_is_the_change_by_a_better_solution(image):
     loose, exact = (
         invert(image, options=InversionOptions(n_sites=2000, tolerance=tolerance))
         for tolerance in (0.02, 1e-9)
@@ -148,7 +148,7 @@ def test_the_solvers_part_is_what_a_better_solution_changes(image):
     assert exact.errors.solver.rms < 1e-3 * true
 
 
-def test_an_unmeasured_beam_is_told_by_what_other_beams_do(image):
+def test_the_error_by_an_unmeasured_beam_is_that_by_other_beams(image):
     """Beams that are drawn here, in another way, with the same spectrum."""
     options = InversionOptions(n_sites=900, beam_variation=0.02, beam_scale=0.2)
     unchanged = invert(image, options=options)
@@ -333,7 +333,7 @@ def test_a_pattern_that_few_sites_miss_gets_more():
     assert patterned.warnings == ()
 
 
-def test_what_is_given_is_used_and_the_paper_has_a_site_a_pixel(image):
+def test_given_sites_are_used_and_the_paper_has_one_a_pixel(image):
     report = invert(image, options=InversionOptions(n_sites=300, accuracy=1e-6)).report
     assert (report.n_sites, report.sites_reason) == (300, "as requested")
     small = image[:20, :24]
@@ -356,14 +356,14 @@ def test_the_number_of_a_plan_is_used_and_else_that_of_the_options(image):
         invert(image, plan=numbered_plan, start=coarse)
 
 
-def test_an_accuracy_out_of_reach_is_told():
+def test_an_accuracy_out_of_reach_is_reported():
     image = synthetic_image(pair().displacement)
     report = invert(image, options=InversionOptions(accuracy=1e-6)).report
     assert report.n_sites == image.size
     assert "the accuracy of 0.0001 % is not reached" in str(report.warnings)
 
 
-def test_nothing_is_told_of_an_answer_that_is_none(image):
+def test_an_unconverged_solution_has_no_errors(image):
     report = invert(image, options=InversionOptions(n_sites=900, max_iterations=1)).report
     assert not report.converged
     assert report.errors is None

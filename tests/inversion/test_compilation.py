@@ -29,7 +29,7 @@ def test_an_empty_cache_means_to_compile(tmp_path):
     assert printed.stdout.strip() == "False"
 
 
-def test_it_is_told_and_can_be_cancelled_and_is_done_once(monkeypatch):
+def test_compilation_is_reported_cancellable_and_done_once(monkeypatch):
     progress = []
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
     ensure_compiled(progress.append)

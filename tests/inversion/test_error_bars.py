@@ -187,7 +187,7 @@ def test_the_linear_response_to_little_noise_is_that_of_solving_again(clean, pla
         assert np.linalg.norm(linear_bars - solved_bars) < 0.05 * np.linalg.norm(solved_bars)
 
 
-def test_noise_too_strong_for_a_linear_response_is_told(clean, plan):
+def test_noise_too_strong_for_a_linear_response_is_reported(clean, plan):
     result = uncertainty(clean, 5, plan=plan, noise=1.5, options=OPTIONS)
     assert result.nonlinearity > 0.3
     assert "method='resolve'" in result.warnings[0].text
@@ -199,7 +199,7 @@ def test_each_sample_is_zero_in_the_mean_over_the_border(counts, plan):
     )
 
 
-def test_what_masked_pixels_hold_does_not_matter(counts):
+def test_values_of_masked_pixels_do_not_matter(counts):
     mask = np.ones(SHAPE, bool)
     mask[:8, :9] = False
     first, second = (
@@ -297,18 +297,18 @@ def test_an_image_that_is_not_counts_needs_a_gain(clean):
 
 
 @pytest.fixture(scope="module")
-def found(counts, plan):
+def result(counts, plan):
     return uncertainty(counts, 3, plan=plan)
 
 
 def test_dataset_has_a_deviation_beside_each_field(
-    found, proton_setup: ProtonSetup, optical_setup: OpticalSetup
+    result, proton_setup: ProtonSetup, optical_setup: OpticalSetup
 ):
     for setup in (None, proton_setup, optical_setup):
-        dataset = found.to_dataset(setup)
-        fields = set(found.inversion.to_dataset(setup).data_vars)
-        np.testing.assert_array_equal(dataset["potential_std"], found.potential_std)
-        np.testing.assert_array_equal(dataset["displacement_mean"], found.displacement_mean)
+        dataset = result.to_dataset(setup)
+        fields = set(result.inversion.to_dataset(setup).data_vars)
+        np.testing.assert_array_equal(dataset["potential_std"], result.potential_std)
+        np.testing.assert_array_equal(dataset["displacement_mean"], result.displacement_mean)
         deviations = {str(name) for name in dataset.data_vars if str(name).endswith("_std")}
         assert {name.removesuffix("_std") for name in deviations} < fields
         for name in deviations:
@@ -321,21 +321,21 @@ def test_dataset_has_a_deviation_beside_each_field(
     assert json.loads(dataset.attrs["uncertainty"])["n"] == 3
 
 
-def test_deviations_of_si_fields_belong_to_their_components(found, proton_setup: ProtonSetup):
+def test_deviations_of_si_fields_belong_to_their_components(result, proton_setup: ProtonSetup):
     """Protons deflected along y have met a field along x."""
-    dataset = found.to_dataset(proton_setup)
+    dataset = result.to_dataset(proton_setup)
     of_one_pixel = np.abs(proton_setup.path_integrated_b(np.array([1.0, 0.0])[:, None, None]))
     along_x = float(of_one_pixel[1, 0, 0])
     np.testing.assert_allclose(
-        dataset["path_integrated_b_std"], along_x * found.displacement_std[::-1], rtol=1e-12
+        dataset["path_integrated_b_std"], along_x * result.displacement_std[::-1], rtol=1e-12
     )
 
 
-def test_a_file_keeps_the_error_bars(tmp_path: Path, found, optical_setup: OpticalSetup):
-    write(tmp_path / "shot.shadowinv", found, setup=optical_setup)
+def test_a_file_keeps_the_error_bars(tmp_path: Path, result, optical_setup: OpticalSetup):
+    write(tmp_path / "shot.shadowinv", result, setup=optical_setup)
     dataset = read(tmp_path / "shot.shadowinv")
-    np.testing.assert_array_equal(dataset["displacement_std"], found.displacement_std)
-    np.testing.assert_array_equal(dataset["potential"], found.inversion.potential)
+    np.testing.assert_array_equal(dataset["displacement_std"], result.displacement_std)
+    np.testing.assert_array_equal(dataset["potential"], result.inversion.potential)
     assert json.loads(dataset.attrs["uncertainty"])["noise"] == "Poisson, gain 1"
 
 
@@ -347,7 +347,7 @@ def test_the_page_about_error_bars_works_as_it_stands_there(tmp_path: Path, monk
     for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(compile(block, page.name, "exec"), names)
     assert (tmp_path / "shot.shadowinv").exists()
-    middle = names["found"].potential_std[24:40, 24:40]  # type: ignore[attr-defined]
+    middle = names["result"].potential_std[24:40, 24:40]  # type: ignore[attr-defined]
     assert 0.3 * middle.mean() < names["error_bar"] < 1.5 * middle.mean()  # type: ignore[operator]
     for target in re.findall(r"\]\(([^)#]+)\)", text):
         assert (page.parent / target).exists(), target

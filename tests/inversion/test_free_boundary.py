@@ -33,8 +33,8 @@ def shot(blobs, peak=3.0):
     return synthetic_image(field, np.ones(shape)), field
 
 
-def l2(found, true):
-    return float(np.linalg.norm(found - true) / np.linalg.norm(true))
+def l2(field, true):
+    return float(np.linalg.norm(field - true) / np.linalg.norm(true))
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +144,7 @@ def test_error_bars_know_the_boundary(across, plan):
     assert np.abs(deviation).max() < 6 * bars.potential_std.max()
 
 
-def test_the_source_goes_on_beyond_the_edge_past_what_cannot_be_used():
+def test_the_source_continues_beyond_masked_pixels_at_the_edge():
     source = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
     mask = np.array([[True, True, True], [False, True, True]])
     margin = Margin.around(source, 2, mask)

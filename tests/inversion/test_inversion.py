@@ -37,8 +37,8 @@ def image(phantom):
     return synthetic_image(phantom.displacement)
 
 
-def relative_error(found, true):
-    return np.linalg.norm(found - true) / np.linalg.norm(true)
+def relative_error(field, true):
+    return np.linalg.norm(field - true) / np.linalg.norm(true)
 
 
 def peak(displacement):
@@ -217,7 +217,7 @@ def test_masked_handwriting_does_not_poison_the_field(phantom, image):
     np.testing.assert_array_equal(masked.mask, ~ink)
 
 
-def test_what_masked_pixels_hold_does_not_matter(image):
+def test_values_of_masked_pixels_do_not_matter(image):
     ink = handwriting(SHAPE)
     inversions = [
         invert(np.where(ink, value, image), source=np.where(ink, source_value, 1.0), mask=~ink)
@@ -335,7 +335,7 @@ def test_one_thread_leaves_all_other_threads_at_rest(image):
     assert ticks[str(threading.get_native_id())] > 5
 
 
-def test_the_report_tells_how_it_went(image):
+def test_the_report_describes_the_run(image):
     noisy = image - 0.3 * (np.random.default_rng(2).random(SHAPE) < 0.01)
     noisy[5, 5:12] = -1.0  # 0.15 % of the pixels
     inversion = invert(noisy, options=InversionOptions(negative="clip"))
@@ -372,13 +372,13 @@ def test_progress_covers_all_stages_and_cancelling_ends_each(image):
         with pytest.raises(InversionCancelled):
             invert(
                 image,
-                on_progress=lambda progress, seen=steps: seen.append(progress.stage),
-                should_stop=lambda stage=stage, seen=steps: stage in seen,
+                on_progress=lambda progress, steps=steps: steps.append(progress.stage),
+                should_stop=lambda stage=stage, steps=steps: stage in steps,
             )
 
 
 @pytest.mark.parametrize("boundary", ["closed", "free"])
-def test_the_read_out_tells_its_share_and_can_be_stopped_within(image, boundary):
+def test_the_read_out_reports_its_share_and_can_be_stopped(image, boundary):
     options, steps = InversionOptions(n_sites=500, boundary=boundary), []
 
     def listen(news):

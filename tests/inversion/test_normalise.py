@@ -68,7 +68,7 @@ def test_sites_default_to_the_pixels_up_to_a_limit():
 
 
 @pytest.mark.parametrize(("rows", "said"), [(3, False), (5, True)])
-def test_a_mask_over_much_of_the_image_is_told(rows, said):
+def test_a_mask_over_much_of_the_image_is_reported(rows, said):
     mask = np.ones((20, 30), bool)
     mask[:rows] = False
     warnings = prepare(np.ones((20, 30)), None, InversionOptions(), mask).warnings

@@ -114,7 +114,7 @@ def test_the_residual_is_the_rms_over_the_used_pixels_relative_to_their_mean():
     assert image_residual(image, image - off, mask) == pytest.approx(expected)
 
 
-def test_the_report_tells_the_residual_of_the_pixels_that_were_used():
+def test_the_report_has_the_residual_of_the_used_pixels():
     image = noisy(traced(gaussian(0.3)), 0.05)
     mask = np.ones(image.shape, dtype=bool)
     mask[:30] = False

@@ -13,7 +13,9 @@ FOOTER = b'<SpeFormat version="3.0"><DataFormat><DataBlock type="Frame" count="1
 REGION = b'<DataBlock type="Region" count="1" width="9" height="6" size="108" />'
 
 
-def save_b16(path: Path, pixels: np.ndarray[Any, Any], comment: bytes = b"", **told: int) -> Path:
+def save_b16(
+    path: Path, pixels: np.ndarray[Any, Any], comment: bytes = b"", **entries: int
+) -> Path:
     start = 128 + len(comment)
     height, width = pixels.shape
     fields = {
@@ -23,7 +25,7 @@ def save_b16(path: Path, pixels: np.ndarray[Any, Any], comment: bytes = b"", **t
         "height": height,
         "extended": -1,
         "colour": 0,
-        **told,
+        **entries,
     }
     header = b"PCO-" + struct.pack("<6i", *fields.values())
     path.write_bytes(header.ljust(128, b"\0") + comment + pixels.astype("<u2").tobytes())
@@ -36,10 +38,10 @@ def save_spe(
     code: int,
     footer: bytes = b"",
     marked: bool = True,
-    **told: int,
+    **entries: int,
 ) -> Path:
     header = bytearray(4100)
-    fields = {"width": pixels.shape[-1], "height": pixels.shape[-2], "frames": 1, **told}
+    fields = {"width": pixels.shape[-1], "height": pixels.shape[-2], "frames": 1, **entries}
     struct.pack_into("<H", header, 42, fields["width"])
     struct.pack_into("<H", header, 656, fields["height"])
     struct.pack_into("<i", header, 1446, fields["frames"])

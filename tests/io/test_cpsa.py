@@ -37,7 +37,7 @@ def frame_bytes(number: int, frame: Frame, pitch: float = 1.0) -> bytes:
 
 
 def save(
-    path: Path, shape: tuple[int, int], frames: Iterable[Frame], pitch: float = 1.0, **told: Any
+    path: Path, shape: tuple[int, int], frames: Iterable[Frame], pitch: float = 1.0, **header: Any
 ) -> Path:
     fields = {
         "version": -104,
@@ -52,7 +52,7 @@ def save(
         "moments": 2,
         "width": WIDTH,
         "height": HEIGHT,
-        **told,
+        **header,
     }
     content = b"".join(frame_bytes(n, frame, pitch) for n, frame in enumerate(frames, 1))
     trailer = struct.pack("<i", -1) + b"Scan of shot 17\n\xb5m"
@@ -154,7 +154,7 @@ def test_ranges_are_written_as_one_types_them(text: str, ranges: dict[str, Any])
         *("bin=nan", "bin=1e9", "bin=1e-4", "contrast=nan:", "diameter=1e5:"),
     ],
 )
-def test_impossible_ranges_are_told(scan: Path, text: str) -> None:
+def test_impossible_ranges_are_refused(scan: Path, text: str) -> None:
     with pytest.raises(InputError, match="expected") as error:
         read(scan, variable=text)
     assert "\n" not in str(error.value)
@@ -166,14 +166,14 @@ def test_a_range_of_two_numbers_is_wanted(scan: Path, ends: Any) -> None:
         read_cpsa(scan, diameter=ends)
 
 
-def test_gaps_between_frames_are_told(tmp_path: Path) -> None:
+def test_gaps_between_frames_are_reported(tmp_path: Path) -> None:
     frames = snake(4, 4, lambda c, r: [ROUND])
     path = save(tmp_path / "a.cpsa", (4, 4), frames, pitch=1.2)
     assert "overlap or leave gaps" in str(read_radiograph(path).warnings)
 
 
 @pytest.mark.parametrize(
-    ("told", "words"),
+    ("header", "words"),
     [
         ({"version": 104}, "its version is 104, expected a negative number"),
         ({"columns": 0}, "gives 0 × 6 frames"),
@@ -187,8 +187,8 @@ def test_gaps_between_frames_are_told(tmp_path: Path) -> None:
         ({"columns": 9, "rows": 4}, "expected each place of 9 × 4 once"),
     ],
 )
-def test_headers_that_cannot_be_are_refused(tmp_path: Path, told: Any, words: str) -> None:
-    path = save(tmp_path / "a.cpsa", (6, 6), snake(6, 6, lambda c, r: [ROUND]), **told)
+def test_headers_that_cannot_be_are_refused(tmp_path: Path, header: Any, words: str) -> None:
+    path = save(tmp_path / "a.cpsa", (6, 6), snake(6, 6, lambda c, r: [ROUND]), **header)
     tracemalloc.start()
     with pytest.raises(FileFormatError, match=words):
         read(path)
@@ -196,7 +196,7 @@ def test_headers_that_cannot_be_are_refused(tmp_path: Path, told: Any, words: st
     tracemalloc.stop()
 
 
-def test_wherever_a_file_is_cut_it_is_told(tmp_path: Path, scan: Path) -> None:
+def test_a_file_cut_anywhere_is_refused(tmp_path: Path, scan: Path) -> None:
     content = scan.read_bytes()
     end = len(content) - len(struct.pack("<i", -1) + b"Scan of shot 17\n\xb5m")
     cut = tmp_path / "cut.cpsa"

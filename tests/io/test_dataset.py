@@ -117,7 +117,7 @@ def test_si_values_of_light_follow_from_the_setup(
     assert "path_integrated_b" not in dataset
 
 
-def test_attributes_tell_how_and_from_what(tmp_path: Path, proton_setup: ProtonSetup) -> None:
+def test_attributes_contain_recipe_and_origins(tmp_path: Path, proton_setup: ProtonSetup) -> None:
     image = 100 * synthetic_image(gaussian_blob((24, 32), 6.0, 4.0).displacement)
     np.save(tmp_path / "shot.npy", image)
     np.save(tmp_path / "beam.npy", np.full_like(image, 100))

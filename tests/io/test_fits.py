@@ -71,7 +71,7 @@ def test_file_gives_back_every_bit(
     )
 
 
-def test_what_is_not_known_stays_so(tmp_path: Path, make_fit: MakeFit) -> None:
+def test_unknown_parts_stay_unknown(tmp_path: Path, make_fit: MakeFit) -> None:
     complete_fit = make_fit(strengths=(1.0,), verdict=Verdict.AMBIGUOUS, explanation="cannot tell")
     fields = tuple(dataclasses.replace(field, uncertainty=None) for field in complete_fit.fields)
     report = dataclasses.replace(complete_fit.report, uncertainty=float("nan"))
@@ -126,7 +126,7 @@ def test_the_field_of_a_fit_is_written_as_pradformat_with_its_verdict(
         assert file.attrs["description"].endswith(": one of several")
 
 
-def test_what_pradformat_cannot_hold_of_a_fit_is_refused(tmp_path: Path, make_fit: MakeFit) -> None:
+def test_fits_that_pradformat_cannot_hold_are_refused(tmp_path: Path, make_fit: MakeFit) -> None:
     with pytest.raises(InputError, match=r"holds one field, received B and E: write .shadowinv"):
         write(tmp_path / "fit.h5", make_fit(names=("B", "E"), setups=(protons(3), protons(5))))
     with pytest.raises(InputError, match="needs a setup of kind 'proton'"):

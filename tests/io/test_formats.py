@@ -53,7 +53,7 @@ def test_its_functions_exist(each: Format) -> None:
     assert all(suffix == suffix.lower() and suffix[0] == "." for suffix in each.suffixes)
 
 
-def test_marks_lie_in_what_is_read_of_a_file() -> None:
+def test_marks_are_in_the_head_of_a_file() -> None:
     ends = [at + len(mark) for each in FORMATS for at, mark in each.marks]
     assert max(ends) <= formats._HEAD_BYTES
 

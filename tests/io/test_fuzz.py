@@ -20,7 +20,7 @@ FUZZ = Path(__file__).parents[2] / "benchmarks" / "fuzz.py"
 RESULTS = ("inversion.h5", "result.shadowinv")
 STORE = "run.shadowinv.zarr"
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory is told by Linux")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux reports memory")
 
 
 def load() -> ModuleType:

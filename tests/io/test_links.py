@@ -52,39 +52,39 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("found", ELSEWHERE)
-def test_pradformat_and_any_array_by_name(folder: Path, found: str) -> None:
+@pytest.mark.parametrize("place", ELSEWHERE)
+def test_pradformat_and_any_array_by_name(folder: Path, place: str) -> None:
     path = folder / "shot.h5"
     with h5py.File(path, "w") as file:
         file.attrs["object_type"] = "radiograph"
-        ELSEWHERE[found](file, "image")
+        ELSEWHERE[place](file, "image")
         file["own"] = IMAGE
         file["again"] = h5py.SoftLink("own")
     for variable in (None, "image"):
-        with pytest.raises(FileFormatError, match=found.strip()) as error:
+        with pytest.raises(FileFormatError, match=place.strip()) as error:
             read(path, variable=variable)
         assert "image" in str(error.value)
     for variable in ("own", "again", "/own"):
         np.testing.assert_array_equal(read_radiograph(path, variable=variable).image, IMAGE)
 
 
-@pytest.mark.parametrize("found", ELSEWHERE)
-def test_matlab(folder: Path, found: str) -> None:
+@pytest.mark.parametrize("place", ELSEWHERE)
+def test_matlab(folder: Path, place: str) -> None:
     path = folder / "shot.mat"
     with h5py.File(path, "w") as file:
         file["own"] = IMAGE.T
         file["own"].attrs["MATLAB_class"] = np.bytes_(b"double")
-        ELSEWHERE[found](file, "shot")
+        ELSEWHERE[place](file, "shot")
     with pytest.raises(FileFormatError, match="other"):
         read(path, variable="shot")
 
 
-@pytest.mark.parametrize("found", ELSEWHERE)
-def test_results(folder: Path, found: str, inversion: Inversion) -> None:
+@pytest.mark.parametrize("place", ELSEWHERE)
+def test_results(folder: Path, place: str, inversion: Inversion) -> None:
     path = folder / "shot.shadowinv"
     write(path, inversion)
     with h5py.File(path, "r+") as file:
-        ELSEWHERE[found](file, "more")
+        ELSEWHERE[place](file, "more")
     with pytest.raises(FileFormatError, match="other"):
         read(path)
 

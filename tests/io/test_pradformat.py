@@ -68,7 +68,7 @@ def test_distances_of_version_0_1_are_measured_from_the_image(tmp_path: Path) ->
 @pytest.mark.parametrize(
     "changes", [{"spec_energy": None}, {"spec_name": "Au 79+"}, {"source_object_dist": None}]
 )
-def test_incomplete_radiograph_keeps_what_it_knows(
+def test_an_incomplete_radiograph_keeps_its_geometry(
     tmp_path: Path, changes: dict[str, object]
 ) -> None:
     radiograph = read_radiograph(radiograph_file(tmp_path / "shot.h5", **changes))

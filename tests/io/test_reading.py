@@ -302,7 +302,7 @@ def test_real_film_scan(shared_data: Path) -> None:
     assert "wrong sign unless it is converted to dose first" in red.warnings[0].text
 
 
-def test_every_real_film_is_told_and_no_linear_image(shared_data: Path) -> None:
+def test_only_real_films_get_the_film_warning(shared_data: Path) -> None:
     for path in (shared_data / "rcf").glob("*.tif"):
         scan = tifffile.imread(path)
         for grey in (scan[..., 0], scan[..., 2], (scan[..., 1] // 257).astype(np.uint8)):

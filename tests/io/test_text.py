@@ -135,7 +135,7 @@ def test_pradreader_selects_rows_and_columns_by_their_share(tmp_path: Path) -> N
         (("flux2D (5, 7)", "flux2D_ref (6, 7)"), 2),
     ],
 )
-def test_other_blocks_than_the_header_tells_are_refused(
+def test_blocks_unlike_the_header_are_refused(
     tmp_path: Path, header: tuple[str, ...], blocks: int
 ) -> None:
     with pytest.raises(FileFormatError, match=r"rows of 7 numbers, but its header gives flux2D"):

@@ -84,7 +84,7 @@ def test_error_while_writing_leaves_the_old_result(
 
 
 @pytest.mark.parametrize("name", ["a.shadowinv", "a.h5", "a.csv", "a.tif", "a.npy", "a.png"])
-def test_a_full_disk_is_told_and_keeps_the_old_file(
+def test_a_full_disk_is_reported_and_keeps_the_old_file(
     name: str, small_disk: Disk, inversion: Inversion, proton_setup: ProtonSetup
 ) -> None:
     folder, _ = small_disk

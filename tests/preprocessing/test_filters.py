@@ -153,7 +153,7 @@ def test_subtracting_serves_a_potential_that_changes_sign():
         remove_background(potential + tilt, 1)
 
 
-def test_the_background_is_blind_to_what_the_mask_leaves_out():
+def test_the_background_ignores_masked_pixels():
     image = random_image(6)
     mask = np.ones(SHAPE, dtype=bool)
     mask[5:30, 10:50] = False
@@ -249,7 +249,7 @@ def test_an_image_without_noise_shows_its_hot_pixel():
         (np.ones((5, 5), dtype=complex), "complex128"),
     ],
 )
-def test_what_is_no_image_is_refused(name, image, words):
+def test_arrays_that_are_no_images_are_refused(name, image, words):
     with pytest.raises(InputError, match=words):
         FILTERS[name](image)
 

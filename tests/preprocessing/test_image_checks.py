@@ -88,8 +88,8 @@ def test_dark_level_of_image_and_source_needs_no_deep_shadows():
         rng = np.random.default_rng(seed)
         image, source = (rng.poisson(COUNTS * plane).astype(float) for plane in (clean, beam()))
         offset = 0.2 * image.mean()
-        found = dark_level(image + offset, None, source + offset)
-        assert found == pytest.approx(0.2 / 1.2, rel=0.3)
+        level = dark_level(image + offset, None, source + offset)
+        assert level == pytest.approx(0.2 / 1.2, rel=0.3)
         assert dark_level(image, None, source) == 0
         alone.append(dark_level(image + offset))
     assert np.count_nonzero(alone) < 4
@@ -165,7 +165,7 @@ def test_negative_and_swapped_are_named(shot, faint):
     assert named(shot[1], shot[0])[-1:] == ["swapped"]
 
 
-def test_invert_reports_what_the_checks_see(shot):
+def test_invert_reports_the_cautions_of_the_checks(shot):
     image, source = (plane[30:130, 30:130] for plane in shot)
     dark = 0.5 * image.mean()
     few = InversionOptions(n_sites=300)

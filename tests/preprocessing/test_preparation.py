@@ -1,4 +1,4 @@
-"""What is done before an inversion: masks that make sense together, and what is told."""
+"""Preparation of an inversion: consistent masks and cautions."""
 
 from __future__ import annotations
 
@@ -76,12 +76,12 @@ def test_masks_that_share_dead_pixels_are_fine(
     check(PolynomialEstimate(), mask, source_mask)
 
 
-def test_what_is_filled_in_must_be_inverted() -> None:
+def test_filled_in_pixels_must_be_inverted() -> None:
     with pytest.raises(InputError, match="without a source mask"):
         check(InterpolatedEstimate(), OBJECT, None)
 
 
-def test_a_source_that_is_dark_behind_the_source_mask_is_told_of() -> None:
+def test_a_source_dark_behind_the_source_mask_is_reported() -> None:
     """A straight line that falls from 120 to 21 where it is seen, and below zero where not."""
     x = np.mgrid[: SHAPE[0], : SHAPE[1]][1]
     for image, count in ((np.maximum(120.0 - x, 15), 1), (np.full(SHAPE, 100.0), 0)):

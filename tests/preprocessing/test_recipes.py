@@ -34,7 +34,7 @@ def test_defaults_are_those_of_the_function(recipe: Any, function: Any) -> None:
 @pytest.mark.parametrize(
     "recipe", [*preprocessing.ESTIMATES.values(), *preprocessing.STEPS.values()]
 )
-def test_a_choice_tells_its_values_apart(recipe: Any) -> None:
+def test_a_choice_describes_its_values(recipe: Any) -> None:
     choice = recipe()
     assert pickle.loads(pickle.dumps(choice)) == choice
     assert choice.described.startswith(recipe.title)

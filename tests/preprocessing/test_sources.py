@@ -216,7 +216,7 @@ def test_a_plate_continues_a_slope_exactly():
     np.testing.assert_allclose(filled, ramp, rtol=2e-3)
 
 
-def test_a_membrane_stays_within_what_surrounds_it():
+def test_a_membrane_stays_within_its_surroundings():
     shot = np.random.default_rng(2).uniform(1, 9, SHAPE)
     mask = np.ones(SHAPE, dtype=bool)
     mask[:30, :20] = False
@@ -258,7 +258,7 @@ def test_a_gaussian_source_makes_the_inversion_right_where_a_uniform_one_makes_i
         (np.full((5, 5), -1.0), "flux of -25"),
     ],
 )
-def test_what_is_no_image_of_a_beam_is_refused(estimate, image, words):
+def test_images_without_a_beam_are_refused(estimate, image, words):
     with pytest.raises(InputError, match=words):
         estimate(image)
 
@@ -343,7 +343,7 @@ def test_work_ends_at_the_look_that_asks_to_stop(work, min_looks):
         assert stop.looks == at
 
 
-def test_the_isotropic_source_is_what_rays_in_all_directions_make():
+def test_the_isotropic_source_equals_rays_in_all_directions():
     shape, centre, rays = (60, 90), (35.0, 20.0), 2_000_000
     beam = isotropic_source(np.ones(shape), NEAR, centre_y=centre[0], centre_x=centre[1])
     assert beam.max() > 1.15 * beam.min()
@@ -435,7 +435,7 @@ def test_a_gaussian_that_hides_behind_the_mask_is_not_taken(hidden_middle):
         gaussian_source(shot, mask=mask)
 
 
-def test_a_gaussian_that_rises_behind_the_mask_is_told_of():
+def test_a_gaussian_that_rises_behind_the_mask_is_reported():
     beam = gaussian_beam((60, 80), centre=(0.5, 0.5), widths=(0.2, 0.2))
     y, x = np.mgrid[:60, :80]
     cautions = []

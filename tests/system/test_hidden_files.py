@@ -104,7 +104,7 @@ def test_sweep_keeps_files_of_others(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="starts of processes are told by Linux")
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux reports starts of processes")
 def test_number_of_a_process_may_be_used_again(tmp_path: Path) -> None:
     owner = hidden_files._owner()
     stale = tmp_path / f".a-{owner}-{os.getpid()}-ffff-01234567"

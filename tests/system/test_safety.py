@@ -52,17 +52,17 @@ def test_errors_of_readers_become_one_error_with_a_reason(tmp_path: Path) -> Non
         raise error
 
     for reason in (KeyError("x"), SystemError("odd"), RecursionError("deep"), OSError("h5")):
-        with pytest.raises(FileFormatError, match=r"a\.tif is damaged or truncated") as told:
+        with pytest.raises(FileFormatError, match=r"a\.tif is damaged or truncated") as refused:
             broken(tmp_path / "a.tif", reason)
-        assert told.value.__cause__ is reason
+        assert refused.value.__cause__ is reason
     with pytest.raises(FileFormatError, match="more memory than is available"):
         broken("a.tif", MemoryError())
     with pytest.raises(FileFormatError, match="Permission denied"):
         broken("a.tif", PermissionError(13, "Permission denied"))
     for clear_error in (InputError("mine"), FileFormatError("mine"), InversionCancelled()):
-        with pytest.raises(type(clear_error)) as told:
+        with pytest.raises(type(clear_error)) as refused:
             broken("a.tif", clear_error)
-        assert told.value is clear_error
+        assert refused.value is clear_error
     with pytest.raises(KeyboardInterrupt):
         broken("a.tif", KeyboardInterrupt())
 
