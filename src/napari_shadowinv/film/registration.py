@@ -323,23 +323,25 @@ def _texture(image: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArr
 
 def _compared(first: int, second: int, films: list[_Film]) -> _Pair | None:
     """Pose of the second film against the first, or None if they do not show the same."""
-    one, in_one = films[first].texture, films[first].counts
-    other, in_other = _with_dose_of(films[second], films[first])
-    shift, correlation = _coarse_shift(one, in_one, other, in_other)
+    reference, reference_mask = films[first].texture, films[first].counts
+    texture, mask = _with_dose_of(films[second], films[first])
+    shift, correlation = _coarse_shift(reference, reference_mask, texture, mask)
     if correlation < _ALIKE:
         return None
     pose = np.array([*shift, 0.0])
-    slope_y, slope_x = (np.gradient(other, axis=axis) for axis in (0, 1))
-    y, x = _from_middle(one.shape)
+    slope_y, slope_x = (np.gradient(texture, axis=axis) for axis in (0, 1))
+    y, x = _from_middle(reference.shape)
     for _ in range(_STEPS):
-        moved, both, along_y, along_x = _moved(pose, other, in_one, in_other, slope_y, slope_x)
+        moved, both, along_y, along_x = _moved(
+            pose, texture, reference_mask, mask, slope_y, slope_x
+        )
         c, s = np.cos(pose[2]), np.sin(pose[2])
         turning = along_y * (-s * y - c * x) + along_x * (c * y - s * x)
         slopes = np.stack([along_y[both], along_x[both], turning[both]], axis=1)
         power = moved[both] @ moved[both]
-        if not (power > 0 and (gain := (moved[both] @ one[both]) / power) > 0):
+        if not (power > 0 and (gain := (moved[both] @ reference[both]) / power) > 0):
             return None
-        rest = one[both] - gain * moved[both]
+        rest = reference[both] - gain * moved[both]
         usual = 1.4826 * np.median(np.abs(rest)) + 1e-300
         weight = 1 / (1 + (rest / (2 * usual)) ** 2)
         normal = gain * slopes.T @ (weight[:, None] * slopes)
@@ -349,8 +351,8 @@ def _compared(first: int, second: int, films: list[_Film]) -> _Pair | None:
             return None
         if np.abs(step[:2]).max() < _CLOSE:
             break
-    moved, both, along_y, along_x = _moved(pose, other, in_one, in_other, slope_y, slope_x)
-    error = _disagreement(one, moved, both, along_y, along_x)
+    moved, both, along_y, along_x = _moved(pose, texture, reference_mask, mask, slope_y, slope_x)
+    error = _disagreement(reference, moved, both, along_y, along_x)
     if error is None:
         return None
     shift_error = max(_LEAST_ERROR, error)
@@ -368,52 +370,56 @@ def _from_middle(shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
 def _moved(
     pose: FloatArray,
     image: FloatArray,
-    in_one: BoolArray,
-    in_other: BoolArray,
+    reference_mask: BoolArray,
+    mask: BoolArray,
     *slopes: FloatArray,
 ) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
-    """The other film, where both count, and its slopes, as they lie on the first."""
+    """The second film, where both count, and its slopes, as they lie on the first."""
     y, x = _from_middle(image.shape)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     at = [c * y - s * x - y[0, 0] + pose[0], s * y + c * x - x[0, 0] + pose[1]]
-    planes = (image, in_other.astype(np.float64), *slopes)
+    planes = (image, mask.astype(np.float64), *slopes)
     there = [ndimage.map_coordinates(plane, at, order=1) for plane in planes]
-    return there[0], in_one & (there[1] > 0.99), there[2], there[3]
+    return there[0], reference_mask & (there[1] > 0.99), there[2], there[3]
 
 
 def _coarse_shift(
-    one: FloatArray, in_one: BoolArray, other: FloatArray, in_other: BoolArray
+    reference: FloatArray, reference_mask: BoolArray, texture: FloatArray, mask: BoolArray
 ) -> tuple[FloatArray, float]:
-    """Whole pixels by which the other film correlates best, each counting where it is known."""
-    shape = tuple(fft.next_fast_len(length + _REACH, real=True) for length in one.shape)
+    """Whole pixels by which the second film correlates best, each counting where it is known."""
+    shape = tuple(fft.next_fast_len(length + _REACH, real=True) for length in reference.shape)
 
     def products(left: AnyArray, right: AnyArray) -> FloatArray:
         spectra = [fft.rfft2(plane.astype(np.float64), shape) for plane in (left, right)]
         return np.asarray(fft.irfft2(np.conj(spectra[0]) * spectra[1], shape))
 
-    common = products(one, other)
-    powers = products(one**2, in_other) * products(in_one, other**2)
-    least = 0.05 * float((one**2).sum() * (other**2).sum())
+    common = products(reference, texture)
+    powers = products(reference**2, mask) * products(reference_mask, texture**2)
+    least = 0.05 * float((reference**2).sum() * (texture**2).sum())
     alike = common / np.sqrt(np.maximum(powers, max(least, 1e-300)))
     near = np.arange(-_REACH, _REACH + 1)
     window = alike[np.ix_(near, near)]
-    found = np.unravel_index(int(np.argmax(window)), window.shape)
-    return near[list(found)].astype(np.float64), float(window[found])
+    place = np.unravel_index(int(np.argmax(window)), window.shape)
+    return near[list(place)].astype(np.float64), float(window[place])
 
 
 def _disagreement(
-    one: FloatArray, moved: FloatArray, both: BoolArray, along_y: FloatArray, along_x: FloatArray
+    reference: FloatArray,
+    moved: FloatArray,
+    both: BoolArray,
+    along_y: FloatArray,
+    along_x: FloatArray,
 ) -> float | None:
     """Error of a shift by how far parts of the films are from it, or None if too few agree."""
     parts, away, weights, alike = 0, [], [], 0
-    for rows in np.array_split(np.arange(one.shape[0]), _BLOCKS[0]):
-        for columns in np.array_split(np.arange(one.shape[1]), _BLOCKS[1]):
+    for rows in np.array_split(np.arange(reference.shape[0]), _BLOCKS[0]):
+        for columns in np.array_split(np.arange(reference.shape[1]), _BLOCKS[1]):
             part = np.ix_(rows, columns)
             counts = both[part]
             if counts.mean() < _FILLED:
                 continue
             parts += 1
-            here, there = one[part][counts], moved[part][counts]
+            here, there = reference[part][counts], moved[part][counts]
             size = np.sqrt((here @ here) * (there @ there))
             if size == 0 or here @ there < _ALIKE * size:
                 continue
@@ -470,11 +476,11 @@ def _large(image: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray
 
 
 def _greatest_correlation(
-    one: tuple[FloatArray, FloatArray], other: tuple[FloatArray, FloatArray]
+    first: tuple[FloatArray, FloatArray], second: tuple[FloatArray, FloatArray]
 ) -> float:
     """Of two images, over shifts by the reach."""
     steps = _REACH // _LARGE
-    found = -1.0
+    greatest = -1.0
     for down in range(-steps, steps + 1):
         for right in range(-steps, steps + 1):
             parts = [
@@ -482,7 +488,7 @@ def _greatest_correlation(
                     max(0, sign * down) or None : min(0, sign * down) or None,
                     max(0, sign * right) or None : min(0, sign * right) or None,
                 ]
-                for planes, sign in ((one, 1), (other, -1))
+                for planes, sign in ((first, 1), (second, -1))
                 for plane in planes
             ]
             both = (parts[1] > 0.5) & (parts[3] > 0.5)
@@ -490,5 +496,5 @@ def _greatest_correlation(
                 continue
             here, there = parts[0][both], parts[2][both]
             if np.ptp(here) > 0 and np.ptp(there) > 0:
-                found = max(found, float(np.corrcoef(here, there)[0, 1]))
-    return found
+                greatest = max(greatest, float(np.corrcoef(here, there)[0, 1]))
+    return greatest
