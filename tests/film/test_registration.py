@@ -162,6 +162,17 @@ def test_a_large_move_needs_a_third_film_of_the_same_kind() -> None:
     assert list(alone.by_images) == [True, False, True]
 
 
+def test_films_at_three_places_confirm_each_other() -> None:
+    # 12 px from each other, further than a comparison may move two films by itself.
+    places = [(0.0, 0.0), (12.0, 0.0), (6.0, 10.4)]
+    films = [film(place, noise=k) for k, place in enumerate(places)]
+    for first, second in ((0, 1), (1, 2), (0, 2)):
+        assert not register([films[first], films[second]], [ALL] * 2).by_images.any()
+    poses = register(films, [ALL] * 3)
+    assert poses.by_images.all()
+    np.testing.assert_allclose(poses.shifts - poses.shifts[0], places, atol=0.3)
+
+
 def test_edges_of_a_kind_are_trusted_by_films_of_that_kind() -> None:
     nothing = 0.3 * np.random.default_rng(5).normal(size=(2, *SHAPE))
     torn = [film((7.0, 0), noise=7), film((-7.0, 0), noise=8), film((7.0, 0), noise=9)]

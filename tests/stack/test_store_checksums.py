@@ -168,6 +168,22 @@ def test_done_shot_whose_file_turns_bad_loses_every_field(make_night, out):
     assert shadowinv("status", out, "--verify").exit_code == 0
 
 
+@pytest.mark.parametrize("way", ["reopened", "failed"])
+def test_shot_that_was_done_keeps_no_field(make_night, out, way):
+    names = ("potential", "displacement", "caustic", "weights")
+    make_night(2).run(out, variables=names)
+    writer = StackStore(out).writer
+    if way == "reopened":
+        writer.reopen(1)
+    else:
+        writer.fail(1, {"error": "no image"})
+    arrays = writer.arrays()
+    for name in ("potential", "displacement", "weights"):
+        assert np.isnan(arrays[name][1]).all(), name
+        assert np.isfinite(arrays[name][0]).all(), name
+    assert not arrays["caustic"][1].any()
+
+
 def test_store_of_an_earlier_version_is_read_without_checksums(finished, tmp_path):
     path = tmp_path / "old.shadowinv.zarr"
     shutil.copytree(finished, path)
