@@ -84,9 +84,11 @@ def test_without_distances_the_table_lists_strengths(truth: Truth, here: Path) -
     ended = shadowinv("film", pack, "--layers", "layers", "-q")
     assert ended.exit_code == 0, ended.output
     header, first, second, _ = (here / "layers" / "layers.csv").read_text().splitlines()
-    assert header == "file,mask,strength"
+    assert header == "file,mask,energy,strength"
     assert first.endswith(",1")
     energies = read("no_setup.shadowinv")["energy"].values
+    listed = [float(line.split(",")[2]) for line in (first, second)]
+    np.testing.assert_allclose(listed, energies[:2], rtol=1e-5)
     assert float(second.split(",")[-1]) == pytest.approx(
         (energies[0] / energies[1]) ** 0.5, rel=2e-3
     )

@@ -657,6 +657,18 @@ def test_left_out_images_and_windows_are_written(folder: Path) -> None:
     assert "window 2 images 2, 4, 3, χ²" in description
 
 
+def test_images_left_out_have_energies_without_a_setup(folder: Path) -> None:
+    films()
+    lines = ["file,energy,strength", "a.tif,5,1", "b.tif,7,0.844", "d.tif,10,0.706"]
+    Path("films.csv").write_text("\n".join(lines))
+    quick = ("--spacing", 0.3, "--steps", 3, "--samples", 0)
+    result = shadowinv("fit", "films.csv", "--noise", 20, *quick, "--leave-one-out")
+    assert result.exit_code in (0, 3), result.output
+    for words in ("a 5 MeV", "b 7 MeV", "d 10 MeV"):
+        assert words in flat(result.stdout)
+    assert fit_in("a_fit.shadowinv")[0].setups == ()
+
+
 STATIC_MISTAKES = {
     "fit a.tif b.tif --strengths 1,2 --leave-one-out": ("received 2 images", "needs 3 or more"),
     "fit a.tif b.tif --strengths 1,2 --window 3": ("received 2 images and windows of 3",),

@@ -132,20 +132,21 @@ def fit(
     _outputs.check_setup(result, shots[0].setup, chosen.fit.fields if chosen.fit else None)
     warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)
     names = [str(row.file) for row in rows]
+    short = _static_result.short_names(names)
     if compare:
         result_fit = _fit_result.compare_fields(
             chosen, shots, fiducials, quiet, written=flags.get("fields")
         )
     else:
         result_fit = _fit_result.fit_images(chosen, shots, fiducials, quiet)
-    static = _static_result.run_checks(chosen, shots, result_fit, quiet, **checks)
+    static = _static_result.run_checks(chosen, shots, result_fit, short, quiet, **checks)
     _fit_result.write_fit(result_fit, names, result, figure, overwrite, static)
     if save_recipe is not None:
         setups = {shot.setup for shot in shots}
         (common,) = setups if len(setups) == 1 else (None,)
         write_recipe(save_recipe, chosen.model_copy(update={"setup": common}), overwrite=overwrite)
     if not quiet:
-        for table in static.tables(result_fit, names):
+        for table in static.tables(result_fit, short, [row.energy for row in rows]):
             say(table)
         say(_fit_result.fit_table(result_fit, names, list(outputs)))
     static.exit_unless_static(result)

@@ -57,11 +57,13 @@ class StaticChecks:
             figures[windows] = windows_figure(self.windows, title=title)
         return figures
 
-    def tables(self, fit: Fit, names: Sequence[str]) -> list[Table]:
-        """Return a table for each check."""
+    def tables(
+        self, fit: Fit, names: Sequence[str], energies: Sequence[float | None]
+    ) -> list[Table]:
+        """Return a table for each check; `energies` (MeV) are those of the rows."""
         tables = []
         if self.left_out is not None:
-            tables.append(left_out_table(self.left_out, fit, names))
+            tables.append(left_out_table(self.left_out, fit, names, energies))
         if self.windows is not None:
             tables.append(windows_table(self.windows))
         return tables
@@ -110,6 +112,7 @@ def run_checks(
     recipe: Recipe,
     shots: Sequence[FitShot],
     fit: Fit,
+    names: Sequence[str],
     quiet: bool,
     *,
     left_out: bool,
@@ -126,17 +129,22 @@ def run_checks(
     with nullcontext() if quiet else progress_bars() as show:
         callbacks: dict[str, Any] = {"on_progress": show, "should_stop": is_interrupted}
         return StaticChecks(
-            run_leave_one_out(chosen, shots, **callbacks) if left_out else None,
+            run_leave_one_out(chosen, shots, names=names, **callbacks) if left_out else None,
             None if window is None else run_windows(chosen, shots, window, **callbacks),
         )
 
 
-def left_out_table(left_out: LeaveOneOut, fit: Fit, names: Sequence[str]) -> Table:
-    """Build a table of how well the other images predict each image."""
+def left_out_table(
+    left_out: LeaveOneOut, fit: Fit, names: Sequence[str], energies: Sequence[float | None]
+) -> Table:
+    """Build a table of how well the other images predict each image.
+
+    Without setups, the energies (MeV) are those of the rows.
+    """
     headings = ["image", "energy", "χ² left out", "χ² alone", "up to", "r.m.s.", "verdict"]
     table = _table("Left out", headings, left_out.explanation)
-    energies = [getattr(setup, "energy", None) for setup in fit.setups] or [None] * len(names)
-    for k, (name, energy) in enumerate(zip(short_names(names), energies, strict=True)):
+    energies = [getattr(setup, "energy", None) for setup in fit.setups] or energies
+    for k, (name, energy) in enumerate(zip(names, energies, strict=True)):
         explained = bool(left_out.explained[k])
         table.add_row(
             plain(name),

@@ -53,7 +53,8 @@ def _read(row: ShotRow, recipe: Recipe, channel: str | None, variable: str | Non
 def row_setup(row: ShotRow, shot: Radiograph, recipe: Recipe) -> Setup | None:
     """Return the setup of an image from its row, the recipe, or its file, in this order.
 
-    An `InputError` is raised if the row has an energy and there is no setup to complete it.
+    An `InputError` is raised if the row has an energy, no strength, and there is no setup to
+    complete it. With a strength, an energy without a setup is a name of the image.
     """
     changes = {} if row.energy is None else {"energy": row.energy}
     if row.setup is not None:
@@ -61,7 +62,7 @@ def row_setup(row: ShotRow, shot: Radiograph, recipe: Recipe) -> Setup | None:
     setup = recipe.setup or shot.setup
     if setup is not None:
         return setup_from_dict({**setup.model_dump(), **changes}, str(row.file))
-    if not changes:
+    if not changes or row.strength is not None:
         return None
     raise InputError(
         f"{row.file} has an energy of {row.energy:g} MeV and no setup: give the rest of the "

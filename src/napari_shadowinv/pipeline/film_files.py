@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["LAYERS_TABLE", "read_pack", "write_layers"]
 
 LAYERS_TABLE = f"layers{SITES.suffix}"
-_COLUMNS = ("file", "mask", "setup", "strength", "exclude")
+_COLUMNS = ("file", "mask", "setup", "energy", "strength", "exclude")
 
 
 def read_pack(path: Path) -> Pack:
@@ -69,7 +69,8 @@ def write_layers(
     """Write the fluence of each layer as an image, its mask, its setup, and a table of them.
 
     The table, ``layers.csv``, is for `shadowinv fit` and `shadowinv batch`. Without a setup it
-    contains the displacement of each layer's protons by a magnetic field, relative to the first.
+    contains the energy of each layer and the displacement of its protons by a magnetic field,
+    relative to the first.
 
     Parameters
     ----------
@@ -123,6 +124,7 @@ def write_layers(
             row["setup"] = f"{name}.toml"
             written.append(_write_setup(folder / row["setup"], setups[k].model_dump(), overwrite))
         elif not setups:
+            row["energy"] = f"{dataset['energy'].values[k]:.6g}"
             row["strength"] = f"{dataset['strength'].values[k]:.6g}"
         if not used.any():
             row["exclude"] = "yes"

@@ -72,7 +72,7 @@ class ShotRow(CheckedModel):
         gt=0,
         le=1e5,
         title="Energy",
-        description="Energy in MeV, in place of the setup's.",
+        description="Energy in MeV, in place of the setup's; a label if only strengths are given.",
     )
     strength: Annotated[tuple[float, ...], BeforeValidator(_strength)] | None = Field(
         default=None,
