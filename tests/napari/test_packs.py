@@ -144,6 +144,16 @@ def test_images_for_a_fit_know_setup_energy_and_usable_pixels(pack_dataset: Any)
         np.testing.assert_allclose(layer.scale, 1e6 * setup.object_pixel_size)
 
 
+def test_faint_layers_with_the_dose_of_the_last_film_are_marked(pack_dataset: Any) -> None:
+    flat = pack_dataset.copy(deep=True)
+    usable = flat["usable"].values
+    for scale, is_measured in ((2.5, False), (4.0, True)):
+        # Electrons leave 0.1 Gy in the last film; what protons and they leave before it.
+        for k, dose in enumerate((10.0, 0.1 * scale, 0.1)):
+            flat["dose"].values[k] = np.where(usable[k], dose, np.nan)
+        assert list(packs.spectrum_in(flat).is_measured) == [True, is_measured, False]
+
+
 def test_layers_that_are_no_measurement_are_marked(pack_dataset: Any) -> None:
     assert list(packs.spectrum_in(pack_dataset).is_measured) == [True, True, False]
     faint = pack_dataset.copy(deep=True)

@@ -44,7 +44,8 @@ EXCLUDED, BY_HAND = 1, 2
 """Labels of unusable pixels: excluded by `run_film`, and painted by the user."""
 
 _LABEL_COLOURS = ["transparent", "#5dff5d", "#00c8ff"]
-_MIN_SIGNIFICANCE = 2.0  # fluence over its error
+_MIN_SIGNIFICANCE = 2.0  # fluence over its error, dose over that of a flat background
+_MAX_BACKGROUND_SHARE = 0.05  # of the largest dose; above, the last film sees the beam
 _MIN_TIME_IN_NS = 1e-9  # s; shorter times are in ps
 _LIMITS_PERCENTILES = (0.1, 99.7)
 _MAX_DARK_FRACTION = 0.3  # of the upper limit, for limits that start at zero
@@ -59,7 +60,9 @@ class Spectrum(NamedTuple):
     bands: FloatArray  # shape (n, 2), MeV
     is_measured: BoolArray
     """False for layers without usable pixels or with a fluence below twice its error, and for the
-    last layer, whose fluence depends on the assumed spectrum beyond it."""
+    last layer, whose fluence depends on the assumed spectrum beyond it. Also for a faint layer
+    whose dose exceeds the dose of the last film, which electrons or X-rays may leave in all films,
+    by less than twice that dose."""
 
 
 def pack_layers(
@@ -211,6 +214,10 @@ def spectrum_in(dataset: xarray.Dataset, region: BoolArray | None = None) -> Spe
     error = reduce("fluence_error", np.median)
     is_measured = fluence > _MIN_SIGNIFICANCE * error  # False for NaN
     is_measured[-1] = False
+    dose = reduce("dose", partial(np.mean, dtype=np.float64))
+    background = dose[-1]
+    is_faint = dose < _MAX_BACKGROUND_SHARE * np.nanmax(dose, initial=0.0)
+    is_measured &= ~(is_faint & (dose - background < _MIN_SIGNIFICANCE * background))
     bands = np.stack([dataset["energy_low"].values, dataset["energy_high"].values], axis=1)
     return Spectrum(dataset["energy"].values, fluence, error, bands, is_measured)
 
