@@ -19,7 +19,7 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.fitting._fit import reweighted, starts
 from napari_shadowinv.fitting.agreement import LeaveOneOut, check_count, explanation_of
 from napari_shadowinv.fitting.compilation import ensure_compiled
-from napari_shadowinv.fitting.descent import coarser, finer
+from napari_shadowinv.fitting.descent import coarser, finer, settle
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import Measured, measured
 from napari_shadowinv.fitting.minimise import product
@@ -45,10 +45,13 @@ __all__ = ["leave_one_out"]
 
 _LEAST_AGREEING = 2
 _LAST_GAIN = 0.5
-# A prediction is off by more than the noise: by what the others leave open, which near folds is
-# up to five times what the Gaussian around the best field tells.
-_DRAWN, _OPEN, _SPACING_OF_SAMPLES = 4, 5.0, 1 / 3
-_WORSE = 1.15  # χ² over that of a field of the image's own
+_SAMPLES, _SAMPLE_TOLERANCE = 2, 0.05  # of the Gaussian around the unknowns of a fit
+_MAX_SAMPLED_PIXELS = 2_000_000  # of all images; more are sampled in pixels of two
+# Folds are deeper in the image that is displaced most than in those that predict it.
+_RAY_SPACING_RATIO, _DENSE_STEPS = 0.5, 4
+_RAY_VARIANCE_RATIO = 2.5
+_MAX_FITTED_SHARE = 0.9  # of the noise in an image with few pixels in use
+_MAX_NOISE_RATIO, _MAX_VARIANCE_RATIO = 1.15, 2.0  # of χ², of the variance of a prediction
 _WORSE_IN_MIDDLE = 1.3  # the same in pixels of two, where a misfit counts four times
 _FRAME_STEPS = 4
 
@@ -136,12 +139,30 @@ class _Prediction:
 
 
 @dataclass(frozen=True)
-class _Fitted:
-    """What a fit at full size tells: unknowns of all images, and what it leaves open."""
+class _SampledFit:
+    """Unknowns of all images by a fit at full size of some; random changes that it leaves open."""
 
+    scene: Scene  # of those images
     unknowns: Unknowns
-    spacing: float
-    drawn: list[Unknowns]
+    changes: list[Unknowns]
+
+    def variance_in(self, scene: Scene, unknowns: Unknowns) -> float:
+        """Return the mean square of the changes in one image, in units of its noise."""
+        linear = scene.linear(unknowns, scene.ray_counts(unknowns))
+        kept = unknowns.zeros()
+        residuals = [
+            linear.pushed(kept._replace(potentials=change.potentials, beam=change.beam))
+            for change in self.changes
+        ]
+        return float(np.mean(np.square(residuals)[:, scene.weights > 0]))
+
+
+@dataclass(frozen=True)
+class _OwnFit:
+    """χ² of an image with a field of its own, and of the noise in it."""
+
+    chi2: float
+    noise_chi2: float
 
 
 class _Work:
@@ -212,65 +233,77 @@ class _Work:
 
         Larger pixels may set aside too many: what the others predict comes back to them.
         """
-        alone = [self._alone(scene, k, common) for k in self._all]
-        while True:
-            fitted = self._fitted(scene, common, agreeing)
-            outside = [k for k in self._all if k not in agreeing]
-            found = {k: self._predicted(k, agreeing, scene, fitted, alone[k]) for k in outside}
-            back = [k for k, one in found.items() if one.chi2 <= one.limit]
+        own_fits = [self._own_fit(scene, k, common) for k in self._all]
+        predictions: dict[int, _Prediction] = {}
+        while outside := [k for k in self._all if k not in agreeing]:
+            fit = self._sampled_fit(scene, common, agreeing)
+            for k in outside:
+                predictions[k] = self._predicted(k, agreeing, scene, fit, own_fits[k])
+            back = [k for k in outside if predictions[k].chi2 <= predictions[k].limit]
             if not back:
                 break
             agreeing = sorted([*agreeing, *back])
         for k in agreeing:
             others = [other for other in agreeing if other != k]
-            fitted = self._fitted(scene, common, others)
-            found[k] = self._predicted(k, others, scene, fitted, alone[k])
-        return [found[k] for k in self._all]
+            fit = self._sampled_fit(scene, common, others)
+            predictions[k] = self._predicted(k, others, scene, fit, own_fits[k])
+        return [predictions[k] for k in self._all]
 
-    def _fitted(self, scene: Scene, common: Found, members: list[int]) -> _Fitted:
+    def _sampled_fit(self, scene: Scene, common: Found, members: list[int]) -> _SampledFit:
         name = f"images {', '.join(str(k + 1) for k in members)}"
-        found = self._settled(scene, common, members, name, _LAST_GAIN)
+        coarse = self._settled(scene, common, members, name, _LAST_GAIN)
         part = scene.only(members)
-        first = replace(found, unknowns=found.unknowns.only(members))
+        first = replace(coarse, unknowns=coarse.unknowns.only(members))
         fine, unknowns, *_ = refined(part, first, self._options, self._tell)
-        whole = finer(found.unknowns).with_those(members, unknowns)
-        posterior = Posterior(
-            replace(coarser(part, MIDDLE), spacing=_SPACING_OF_SAMPLES),
-            first.unknowns,
-            np.random.default_rng(self._options.seed),
-            lambda: self._tell(name, found.value),
+        # Folds are deeper in the image that is left out if it is displaced most.
+        fine = replace(fine, spacing=_RAY_SPACING_RATIO * fine.spacing)
+        unknowns, value, *_ = settle(
+            fine,
+            unknowns,
+            steps=_DENSE_STEPS,
+            least_gain=_LAST_GAIN,
+            after_step=lambda now: self._tell(name, now),
         )
-        drawn = [finer(posterior.drawn()) for _ in range(_DRAWN)]
-        return _Fitted(whole, fine.spacing, drawn)
+        rng = np.random.default_rng(self._options.seed)
+        large = fine.images.size > _MAX_SAMPLED_PIXELS
+        posterior = Posterior(
+            replace(coarser(part, MIDDLE), spacing=MIDDLE_SPACING) if large else fine,
+            first.unknowns if large else unknowns,
+            rng,
+            lambda: self._tell(name, value),
+        )
+        changes = [posterior.drawn(_SAMPLE_TOLERANCE) for _ in range(_SAMPLES)]
+        if large:
+            changes = [finer(change) for change in changes]
+        return _SampledFit(fine, finer(coarse.unknowns).with_those(members, unknowns), changes)
 
     def _predicted(
-        self, k: int, others: list[int], scene: Scene, fitted: _Fitted, alone: float
+        self, k: int, others: list[int], scene: Scene, fit: _SampledFit, own_fit: _OwnFit
     ) -> _Prediction:
         """One image, as others predict it."""
-        scene = replace(scene, spacing=fitted.spacing)
-        whole = fitted.unknowns
+        scene = replace(scene, spacing=fit.scene.spacing)
+        unknowns = fit.unknowns
         if scene.free_frames.any():
-            whole = _placed(scene, whole, others[0], k)
-        there = whole.only([k])._replace(gains=np.zeros(1))
-        one = scene.only([k])
-        counts = one.ray_counts(there)
-        (made,) = one.model(there, counts)
-        gain, weights = self._matched(k, made, one)
-        chi2 = _chi2(gain * made, one.images[0], weights)
-        linear, nothing = one.linear(there, counts), there.zeros()
-        changes = [
-            linear.pushed(nothing._replace(potentials=drawn.potentials, beam=drawn.beam))
-            for drawn in fitted.drawn
-        ]
-        left_open = float(np.mean([_chi2(each[0], 0.0, one.weights[0] > 0) for each in changes]))
-        return _Prediction(gain * made, gain, chi2, alone, _WORSE * alone + _OPEN * left_open)
+            unknowns = _placed(scene, unknowns, others[0], k)
+        unknowns = unknowns.only([k])._replace(gains=np.zeros(1))
+        scene = scene.only([k])
+        (rough,) = scene.model(unknowns, scene.ray_counts(unknowns))
+        scene = replace(scene, spacing=_RAY_SPACING_RATIO * scene.spacing)
+        (image,) = scene.model(unknowns, scene.ray_counts(unknowns))
+        gain, weights = self._matched(k, image, scene)
+        chi2 = _chi2(gain * image, scene.images[0], weights)
+        variance = fit.variance_in(scene, unknowns)
+        variance += _RAY_VARIANCE_RATIO * _chi2(gain * image, gain * rough, weights)
+        limit = _MAX_NOISE_RATIO + _MAX_VARIANCE_RATIO * variance
+        return _Prediction(gain * image, gain, chi2, own_fit.chi2, limit * own_fit.noise_chi2)
 
-    def _alone(self, scene: Scene, k: int, common: Found) -> float:
-        """χ² of an image with a field of its own."""
-        one, first = scene.only([k]), replace(common, unknowns=common.unknowns.only([k]))
-        found = settled(one, first, self._tell, f"image {k + 1} alone", _LAST_GAIN)
-        fine, unknowns, *_ = refined(one, found, self._options, self._tell)
-        return float(fine.chi2(unknowns, fine.ray_counts(unknowns))[0])
+    def _own_fit(self, scene: Scene, k: int, common: Found) -> _OwnFit:
+        fit = self._sampled_fit(scene, common, [k])
+        unknowns = fit.unknowns.only([k])
+        chi2 = float(fit.scene.chi2(unknowns, fit.scene.ray_counts(unknowns))[0])
+        # A field of an image's own follows the noise by as much as it is left open.
+        share = min(fit.variance_in(fit.scene, unknowns), _MAX_FITTED_SHARE)
+        return _OwnFit(chi2, chi2 / (1 - share))
 
     def _matched(self, k: int, made: FloatArray, one: Scene) -> tuple[float, FloatArray]:
         """The gain with which a prediction is nearest to an image, and the weights of pixels."""

@@ -86,12 +86,12 @@ class Posterior:
         weights = determined / determined.sum(axis=1, keepdims=True)
         return smoothness * np.exp(change), float((np.abs(change) * weights).sum(axis=1).max())
 
-    def drawn(self) -> Unknowns:
+    def drawn(self, tolerance: float = _CLOSELY) -> Unknowns:
         """Return a random change of the unknowns, as large as the data leave possible."""
         noise = self._rng.normal(size=self._scene.images.shape)
         slope = self._linear.pulled(noise)
         slope = slope.plus(self._scene.prior.drawn(self._unknowns, self._rng))
-        return self._scales.times(self._unknowns.like(self._solved(slope, _CLOSELY)))
+        return self._scales.times(self._unknowns.like(self._solved(slope, tolerance)))
 
     def moved_by_beams(self, variations: FloatArray) -> Unknowns:
         """Return the change of the unknowns if the beams differ from their sources.
