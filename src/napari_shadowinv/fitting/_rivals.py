@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from napari_shadowinv.fitting.descent import coarser
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import strengths_of
-from napari_shadowinv.fitting.search import Found, Tell, settled
+from napari_shadowinv.fitting.search import MIDDLE, MIDDLE_SPACING, Found, Tell, settled
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.physics.setup import Setup
 
@@ -22,6 +23,9 @@ _WIDER_PX, _MUCH_WIDER_PX = (
 # A free beam lowers Σχ² by at most 19 where the beam was right, by 584 and more where it was off.
 _MIN_GAIN = 60.0
 _AS_LIKELY = 0.7  # of the largest gain
+_EXPLAINED = (
+    0.5  # of what Σχ² is above the number of pixels: a cause that explains less is doubtful
+)
 _BEAM_MODES, _FINE_BEAM_MODES = 8, 20
 _BEAM_SPREAD = 0.3
 _SHIFT = np.array([True, False, False] * 2)
@@ -62,6 +66,9 @@ def name_cause(
     tell : callable
         Receives the stage and the objective.
     """
+    pixels = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
+    misfit = pixels.chi2(best.unknowns, pixels.ray_counts(best.unknowns)) - 1
+    excess = float((misfit * (pixels.weights > 0).sum(axis=(1, 2))).sum())
     gains = []
     for rival in _rivals(scene, best, names, setups):
         start = Found(best.start, rival.unknowns, best.value, best.displacement)
@@ -71,9 +78,14 @@ def name_cause(
     if not gains or gains[0][0] < _MIN_GAIN:
         return ""
     largest = gains[0][0]
+    is_doubtful = largest < _EXPLAINED * excess
+    least = _MIN_GAIN if is_doubtful else _AS_LIKELY * largest
     # Two rivals may have the same cause.
-    likely = dict.fromkeys(cause for gain, cause in gains if gain > _AS_LIKELY * largest)
-    return f"{', or '.join(list(likely)[:2])} (Σχ² falls by {largest:.0f})"
+    likely = dict.fromkeys(cause for gain, cause in gains if gain >= least)
+    falls = f"Σχ² falls by {largest:.0f}"
+    if is_doubtful:
+        falls += f" of the {excess:.0f} that it is too large: something else is wrong, too"
+    return f"{', or '.join(list(likely)[:2])} ({falls})"
 
 
 def with_wider_spread(scene: Scene, best: Found, tell: Tell) -> Found:

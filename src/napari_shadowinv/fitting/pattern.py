@@ -15,9 +15,9 @@ __all__ = ["SUSPECT_PATTERN", "Pattern", "find_pattern"]
 
 SUSPECT_PATTERN = 3.5
 """Standard deviations of a smoothed residual beyond which the fit has to find a cause."""
-# Of fits with a right model it is -5 to 2, on small images up to 3; with a beam that is 2 % off 18
-# and more, with absorption of 5 % 5.6 on 64 × 64 px and 15 on 96 × 96.
-_CERTAIN_PATTERN = 8.0  # without a cause
+# Of fits with a right model it is -5 to 2, on small images up to 3; with a beam that is 2 % off 31
+# and more, with absorption of 5 % 5.4 to 12.6.
+_CERTAIN_PATTERN = 5.0  # without a cause
 
 
 @dataclass(frozen=True)
