@@ -73,8 +73,9 @@ def test_images_that_are_explained_better_with_more_blur_do_not_fit() -> None:
     [
         (3.0, "the beam", Verdict.DETERMINED),
         (4.5, "", Verdict.DETERMINED),
-        (4.5, "the beam differs", Verdict.MISFIT),
+        (4.5, "the beam differs", Verdict.DETERMINED),
         (6.6, "", Verdict.MISFIT),
+        (6.6, "the beam differs", Verdict.MISFIT),
         (40.0, "", Verdict.MISFIT),
     ],
 )

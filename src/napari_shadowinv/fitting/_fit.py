@@ -31,7 +31,7 @@ from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import Measured, measured
-from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, find_pattern
+from napari_shadowinv.fitting.pattern import Pattern, find_pattern
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.search import (
@@ -209,7 +209,7 @@ def fit(
             )
         ):
             gain_by_blur = best.value - with_wider_spread(scene, best, tell).value
-        if pattern.largest > SUSPECT_PATTERN and pattern.chi2 < _MAX_RIVAL_CHI2:
+        if pattern.is_certain and pattern.chi2 < _MAX_RIVAL_CHI2:
             cause = name_cause(scene, best, fields, setups, tell)
             pattern = replace(pattern, cause=cause)
     with _timed("samples", seconds):

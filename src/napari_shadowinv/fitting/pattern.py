@@ -13,11 +13,10 @@ from napari_shadowinv.fitting.whiteness import blur_score, correlation_length, p
 
 __all__ = ["SUSPECT_PATTERN", "Pattern", "find_pattern"]
 
-SUSPECT_PATTERN = 3.5
-"""Standard deviations of a smoothed residual beyond which the fit has to find a cause."""
-# Of fits with a right model it is -5 to 2, on small images up to 3; with a beam that is 2 % off 31
-# and more, with absorption of 5 % 5.4 to 12.6.
-_CERTAIN_PATTERN = 5.0  # without a cause
+SUSPECT_PATTERN = 5.0
+"""Standard deviations of a smoothed residual beyond which the model is wrong."""
+# Of fits with a right model it is -5 to 2, once 4.2: a deep fold at 30 counts a pixel. With a beam
+# that is 2 % off it is 31 and more, with absorption of 5 % 5.4 to 12.6.
 
 
 @dataclass(frozen=True)
@@ -51,8 +50,8 @@ class Pattern:
 
     @property
     def is_certain(self) -> bool:
-        """Whether the model is wrong: by the pattern alone, or because a cause explains it."""
-        return self.largest > (SUSPECT_PATTERN if self.cause else _CERTAIN_PATTERN)
+        """Whether the pattern shows that the model is wrong."""
+        return self.largest > SUSPECT_PATTERN
 
 
 def find_pattern(scene: Scene, unknowns: Unknowns, size: tuple[int, int]) -> Pattern:
