@@ -5,11 +5,11 @@
 - how far the image's noise moves its field: `uncertainty`
 - several images of one object, folds, an unknown beam: `fit`, with `FitOptions`; the answer is
   a `Fit` with a verdict
-- what a deflection means in SI units: `ProtonSetup`, `OpticalSetup`
+- deflections in SI units: `ProtonSetup`, `OpticalSetup`
 - many shots, with dask: `invert_stack`, `run_stack`, `stack_statistics`; as they arrive in a
   folder: `watch_stack`
 - everything that is done to a shot, as one model: `Recipe`; apply it: `run`; its parts, and
-  what else cleans images and estimates beams: `napari_shadowinv.preprocessing`
+  further filters of images and estimates of beams: `napari_shadowinv.preprocessing`
 - predict an image, or invert it linearly: `synthetic_image`, `poisson_invert`
 - predict the image of the same object in another experiment: `project`, `project_potential`
 - read and write files: `read`, `write`

@@ -65,7 +65,7 @@ class Caution:
     code : str
         One of `CAUTION_CODES`.
     text : str
-        What was seen, what it does to the result, and what helps, in a sentence.
+        The observation, its effect on the result, and the remedy, in a sentence.
     """
 
     code: str

@@ -1,7 +1,7 @@
 """The errors that a user of the package can meet.
 
-Each message is one sentence (or two) that says what was received, what is
-expected and what to do. Everything the package raises for a user's mistake is an
+Each message is one sentence (or two) that names the received and the expected
+value and the remedy. Everything the package raises for a user's mistake is an
 `InputError` or a `FileFormatError`, so a caller needs to catch no more than
 ``(ValueError, OSError)``.
 """

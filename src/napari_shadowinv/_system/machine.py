@@ -52,7 +52,7 @@ def _group_limits() -> Iterator[int]:
 
 
 def _nested(name: str) -> list[Path]:
-    """Return a group's path below the root, and those of the groups around it."""
+    """Return a group's path below the root, and the paths of the groups around it."""
     path = Path(name.lstrip("/"))
     return [path, *path.parents]
 

@@ -60,7 +60,7 @@ class StaticChecks:
     def tables(
         self, fit: Fit, names: Sequence[str], energies: Sequence[float | None]
     ) -> list[Table]:
-        """Return a table for each check; `energies` (MeV) are those of the rows."""
+        """Return a table for each check; `energies` (MeV) are given in the rows."""
         tables = []
         if self.left_out is not None:
             tables.append(left_out_table(self.left_out, fit, names, energies))
@@ -139,7 +139,7 @@ def left_out_table(
 ) -> Table:
     """Build a table of how well the other images predict each image.
 
-    Without setups, the energies (MeV) are those of the rows.
+    Without setups, the energies (MeV) come from the rows.
     """
     headings = ["image", "energy", "χ² left out", "χ² alone", "up to", "r.m.s.", "verdict"]
     table = _table("Left out", headings, left_out.explanation)

@@ -1,7 +1,7 @@
 """Films of one pack laid on each other: `register`, `moved_corners`, `check_orientation`.
 
-Films are cut and stacked by hand, so their edges tell their places within some pixels only. What
-several films show alike, the fine structure of the beam, tells them within one.
+Films are cut and stacked by hand, so their edges determine their places within some pixels only.
+The fine structure of the beam, which several films share, determines them within one.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ class Poses(NamedTuple):
     Attributes
     ----------
     shifts : ndarray, shape (n, 2)
-        Displacement (y, x) of what they show, in px.
+        Displacement (y, x) of their content, in px.
     turns : ndarray, shape (n,)
         The same as an angle about the middle in rad, from y towards x.
     errors : ndarray, shape (n,)
         Standard deviation of a shift in px, against the film that it is best compared with.
     by_images : ndarray of bool, shape (n,)
-        Whether films beside it show the same; else only its edges tell.
+        Whether neighbouring films share its structure; else only its edges count.
     closure : float
         How far the comparisons of films, or their fiducials, contradict each other: r.m.s. along
         an axis in px, NaN if none can.
@@ -79,7 +79,7 @@ class Poses(NamedTuple):
 
     @classmethod
     def by_edges(cls, count: int) -> Poses:
-        """As the edges of so many films are, which nothing improves."""
+        """Return the poses of films by their edges alone."""
         return cls(
             np.zeros((count, 2)),
             np.zeros(count),
@@ -114,16 +114,16 @@ def register(
     kinds: Sequence[Hashable] | None = None,
     report: Reporter | None = None,
 ) -> Poses:
-    """Find how films lie on each other by what they show.
+    """Align films by the structure that they share.
 
     Each film is compared with the next two: shift and turn by least squares on the fine structure,
-    which must agree all over the film. Before, the dose of one film is mapped to that of the other
-    by a monotone function, so that lines of equal dose, such as kinks of a calibration table, are
-    not structure. A comparison is refused if it turns films more than three times the error of
+    which must agree all over the film. Before, the dose of one film is mapped to the other's
+    dose by a monotone function, so that lines of equal dose, such as kinks of a calibration table,
+    are not structure. A comparison is refused if it turns films more than three times the error of
     their edges, or moves a corner by more than 2.5 times that error; 4 times, if comparisons with a
     third film of the same kind agree. Comparisons and edges together give the poses, each
-    weighted by its error. Where no comparison is further than 1.5 px from what edges tell, edges
-    count alone: fields displace what films show by different amounts, which looks like a shift.
+    weighted by its error. Where no comparison is further than 1.5 px from the edges, edges
+    count alone: fields displace the structure by different amounts, which looks like a shift.
 
     Parameters
     ----------
@@ -132,9 +132,9 @@ def register(
     usable : array_like of bool, shape (n, H, W)
         Where it is known.
     spread : float or array_like, shape (n,), default 3
-        Standard deviation in px of what edges or marks tell of a film's place.
+        Standard deviation in px of a film's place by edges or marks.
     kinds : sequence of hashable, length n, optional
-        Films of one kind were cut alike, so that the edges of one are as far off as those of
+        Films of one kind were cut alike, so that the edges of one are as far off as the edges of
         another. Default: all are.
 
     Raises
@@ -142,16 +142,16 @@ def register(
     InputError
         If shapes do not fit.
     """
-    values, known = np.asarray(images, np.float64), np.asarray(usable, bool)
-    if values.ndim != 3 or known.shape != values.shape:
+    values, is_usable = np.asarray(images, np.float64), np.asarray(usable, bool)
+    if values.ndim != 3 or is_usable.shape != values.shape:
         raise InputError(
-            f"images have shape {values.shape}, masks {known.shape}: expected both as "
+            f"images have shape {values.shape}, masks {is_usable.shape}: expected both as "
             "(films, height, width)"
         )
     report = report or Reporter(None, None)
     edges = np.broadcast_to(np.asarray(spread, np.float64), len(values))
     alike: list[Hashable] = [None] * len(values) if kinds is None else list(kinds)
-    films = [_film(*film) for film in zip(values, known, strict=True)]
+    films = [_film(*film) for film in zip(values, is_usable, strict=True)]
     compared = []
     for first in range(len(films)):
         report("register", first, len(films))
@@ -221,10 +221,10 @@ def check_orientation(images: ArrayLike, usable: ArrayLike, names: Sequence[str]
         for number, flip in enumerate(flips)
         if flip != usual
     }
-    (first, way), *others = ways.items()
+    (first, way), *further = ways.items()
     clue = clues.get(first) or clues[min(clues)]
     neighbour = names[first - 1 if first else first + 1]
-    if not others:
+    if not further:
         subject = "one of them" if len(names) == 2 else "it"
         raise InputError(
             f"{names[first]} does not lie as {neighbour} does ({clue}): {subject} was scanned {way}"
@@ -264,12 +264,12 @@ def _is_confirmed(pair: _Pair, pairs: list[_Pair], kinds: list[Hashable]) -> boo
         by_films[item.first, item.second] = item.shift, item.error
         by_films[item.second, item.first] = -item.shift, item.error
     for third, kind in enumerate(kinds):
-        there, back = by_films.get((pair.first, third)), by_films.get((third, pair.second))
+        onwards, back = by_films.get((pair.first, third)), by_films.get((third, pair.second))
         is_alike = kind == kinds[pair.first] == kinds[pair.second]
-        if not is_alike or there is None or back is None:
+        if not is_alike or onwards is None or back is None:
             continue
-        gap = np.abs(there[0] + back[0] - pair.shift).max()
-        error = np.sqrt(there[1] ** 2 + back[1] ** 2 + pair.error**2)
+        gap = np.abs(onwards[0] + back[0] - pair.shift).max()
+        error = np.sqrt(onwards[1] ** 2 + back[1] ** 2 + pair.error**2)
         if gap < max(_CLOSED_PX, _CLOSING * error):
             return True
     return False
@@ -281,7 +281,7 @@ def _film(image: FloatArray, usable: BoolArray) -> _Film:
 
 
 def _with_dose_of(film: _Film, onto: _Film) -> tuple[FloatArray, BoolArray]:
-    """Texture of a film whose dose is mapped to that of another by a monotone function."""
+    """Texture of a film whose dose is mapped to the dose of another by a monotone function."""
     both = film.counts & onto.counts
     if both.sum() < _DOSE_STEPS**2:
         return film.texture, film.counts
@@ -341,11 +341,11 @@ def _compared(first: int, second: int, films: list[_Film]) -> _Pair | None:
         power = moved[both] @ moved[both]
         if not (power > 0 and (gain := (moved[both] @ reference[both]) / power) > 0):
             return None
-        rest = reference[both] - gain * moved[both]
-        usual = 1.4826 * np.median(np.abs(rest)) + 1e-300
-        weight = 1 / (1 + (rest / (2 * usual)) ** 2)
+        residual = reference[both] - gain * moved[both]
+        usual = 1.4826 * np.median(np.abs(residual)) + 1e-300
+        weight = 1 / (1 + (residual / (2 * usual)) ** 2)
         normal = gain * slopes.T @ (weight[:, None] * slopes)
-        step = np.linalg.lstsq(normal, slopes.T @ (weight * rest), rcond=None)[0]
+        step = np.linalg.lstsq(normal, slopes.T @ (weight * residual), rcond=None)[0]
         pose += step
         if np.abs(pose[:2]).max() > 2 * _REACH or abs(pose[2]) > 10 * _TURN:
             return None
@@ -379,8 +379,8 @@ def _moved(
     c, s = np.cos(pose[2]), np.sin(pose[2])
     at = [c * y - s * x - y[0, 0] + pose[0], s * y + c * x - x[0, 0] + pose[1]]
     planes = (image, mask.astype(np.float64), *slopes)
-    there = [ndimage.map_coordinates(plane, at, order=1) for plane in planes]
-    return there[0], reference_mask & (there[1] > 0.99), there[2], there[3]
+    sampled = [ndimage.map_coordinates(plane, at, order=1) for plane in planes]
+    return sampled[0], reference_mask & (sampled[1] > 0.99), sampled[2], sampled[3]
 
 
 def _coarse_shift(
@@ -419,14 +419,14 @@ def _disagreement(
             if counts.mean() < _FILLED:
                 continue
             parts += 1
-            here, there = reference[part][counts], moved[part][counts]
-            size = np.sqrt((here @ here) * (there @ there))
-            if size == 0 or here @ there < _ALIKE * size:
+            fixed_part, moved_part = reference[part][counts], moved[part][counts]
+            size = np.sqrt((fixed_part @ fixed_part) * (moved_part @ moved_part))
+            if size == 0 or fixed_part @ moved_part < _ALIKE * size:
                 continue
             alike += 1
-            gain = (here @ there) / (there @ there)
+            gain = (fixed_part @ moved_part) / (moved_part @ moved_part)
             slopes = gain * np.stack([along_y[part][counts], along_x[part][counts]], axis=1)
-            step = np.linalg.lstsq(slopes, here - gain * there, rcond=None)[0]
+            step = np.linalg.lstsq(slopes, fixed_part - gain * moved_part, rcond=None)[0]
             away.append((np.clip(_EVERY * step, -_FAR, _FAR) ** 2).mean())
             weights.append((slopes**2).sum())
     if alike < max(2, _AGREEING * parts):
@@ -451,14 +451,16 @@ def _settled(pairs: list[_Pair], edges: FloatArray) -> Poses:
     variance = np.diag(covariance)
     between = variance[:, None] + variance - 2 * covariance + np.diag(np.full(count, np.inf))
     shifts = np.asarray(covariance @ sides)
-    seen = np.isin(np.arange(count), [k for pair in pairs for k in (pair.first, pair.second)])
+    is_compared = np.isin(
+        np.arange(count), [k for pair in pairs for k in (pair.first, pair.second)]
+    )
     apart = [shifts[pair.second] - shifts[pair.first] - pair.shift for pair in pairs]
-    closes = len(pairs) > seen.sum() - 1 if pairs else False
+    closes = len(pairs) > is_compared.sum() - 1 if pairs else False
     return Poses(
         shifts,
         np.asarray(np.linalg.solve(turns, turned)),
         np.sqrt(between.min(axis=1) if count > 1 else variance),
-        seen,
+        is_compared,
         float(np.sqrt(np.mean(np.square(apart)))) if closes else float("nan"),
     )
 
@@ -471,8 +473,8 @@ def _large(image: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray
         part = plane[:height, :width]
         return np.asarray(part.reshape(height // _LARGE, _LARGE, -1, _LARGE).sum(axis=(1, 3)))
 
-    known = summed(usable.astype(np.float64))
-    return summed(np.where(usable, image, 0.0)) / np.maximum(known, 1.0), known / _LARGE**2
+    counts = summed(usable.astype(np.float64))
+    return summed(np.where(usable, image, 0.0)) / np.maximum(counts, 1.0), counts / _LARGE**2
 
 
 def _greatest_correlation(
@@ -494,7 +496,7 @@ def _greatest_correlation(
             both = (parts[1] > 0.5) & (parts[3] > 0.5)
             if both.sum() < both.size / 4:
                 continue
-            here, there = parts[0][both], parts[2][both]
-            if np.ptp(here) > 0 and np.ptp(there) > 0:
-                greatest = max(greatest, float(np.corrcoef(here, there)[0, 1]))
+            fixed_part, moved_part = parts[0][both], parts[2][both]
+            if np.ptp(fixed_part) > 0 and np.ptp(moved_part) > 0:
+                greatest = max(greatest, float(np.corrcoef(fixed_part, moved_part)[0, 1]))
     return greatest

@@ -42,8 +42,8 @@ def errors_by_noise(
 class BeamShifts:
     """Standard deviations of each field's displacement by its beam in px, (M, 2, H, W).
 
-    `by_percent` is for beams that vary by 1 %, `errors` for what the images leave open of beams
-    that vary as far as `variation` says.
+    `by_percent` is for beams that vary by 1 %. `errors` is for beams that vary by `variation`, as
+    far as the images do not exclude them.
     """
 
     variation: float
@@ -54,7 +54,7 @@ class BeamShifts:
 def shifts_by_beam(
     given: Measured, scene: Scene, posterior: Posterior, options: FitOptions
 ) -> BeamShifts | None:
-    """Return what beams that differ from their sources do; None if they are fitted."""
+    """Return the effect of beams that differ from their sources; None if beams are fitted."""
     if options.samples < 2 or scene.beam_modes:
         return None
     variation = options.beam_variation

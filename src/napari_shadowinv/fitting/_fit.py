@@ -94,8 +94,8 @@ def fit(
     """Find the fields, and the beam, that explain one or several images of one object.
 
     Rays may cross, images may be blurred, the beam may be unknown: the forward model is fitted
-    as it is. Several images at different energies tell what one cannot; the verdict of the
-    result says whether they do.
+    as it is. Several images at different energies determine what one leaves open; the verdict
+    says whether they do.
 
     Parameters
     ----------
@@ -106,15 +106,15 @@ def fit(
     setups : sequence of Setup, optional
         The experiment of each image, from which the strengths follow.
     fields : sequence of {"B", "E", "plasma", "phase"}, default ("B",)
-        What deflects. Two fields need images of at least two energies.
+        Cause of the deflection. Two fields need images of at least two energies.
     source : array_like or "unknown", optional
         The undisturbed beam, (H, W) or one for each image, in the units of the images; or
         "unknown": a smooth beam is fitted, the same for all images but for gains. Default:
         uniform, with the mean of each image.
     noise : array_like, "poisson" or "proportional", optional
         Standard deviation of the noise: one number, one an image, or one a pixel. "poisson" if
-        the images are counts; "proportional" if it is a share of each pixel, as that of film, which
-        is estimated. Default: estimated from differences of neighbouring pixels, and the same in
+        the images are counts; "proportional" if it is a share of each pixel, as on film,
+        which is estimated. Default: estimated from differences of neighbouring pixels, the same in
         all of them.
     psf : float or array_like, default 0
         Standard deviation in px of the point spread, or a kernel with odd sides; one, or one for
@@ -122,7 +122,7 @@ def fit(
     mask : array_like of bool, shape (H, W) or (L, H, W), optional
         The pixels to use. Default: all.
     gains : "known", "free" or array_like, default "known"
-        Whether each image is brighter than the source by an unknown factor, or by what.
+        Brightness of each image relative to the source: factors, or "free" to fit them.
     fiducials : array_like, shape (n, 5), optional
         Known displacements in the first image: rows of y, x, dy, dx and their σ, in px.
     options : FitOptions, optional
@@ -130,7 +130,7 @@ def fit(
     start : array_like, shape (H, W), optional
         A potential in px² to start from, too, of the first field in the first image.
     names : sequence of str, optional
-        What messages call the images. Default: their numbers.
+        Names of the images in messages. Default: their numbers.
     on_progress, should_stop : callable, optional
         Receives a `Progress` after each step, with its objective; ends the work
         when it returns true.
@@ -161,7 +161,7 @@ def fit(
     report = Reporter(on_progress, should_stop)
     seconds: dict[str, float] = {}
     rng = np.random.default_rng(options.seed)
-    given = measured(
+    data = measured(
         images,
         strengths=strengths,
         setups=setups,
@@ -176,7 +176,7 @@ def fit(
         names=names,
     )
     ensure_compiled(on_progress, should_stop)
-    scene = given.held(options.smoothness)
+    scene = data.held(options.smoothness)
     steps = 0
 
     def tell(stage: str, objective: float) -> None:
@@ -185,23 +185,23 @@ def fit(
         report("fit", steps, None, stage, objective)
 
     with _timed("starts", seconds):
-        found = search(scene, starts(given, start, tell, should_stop), tell)
+        minima = search(scene, starts(data, start, tell, should_stop), tell)
     with _timed("smoothness", seconds):
-        scene, best = with_likely_smoothness(scene, found[0], rng, tell)
-        if given.counted:
-            scene = reweighted(given, scene, best)
+        scene, best = with_likely_smoothness(scene, minima[0], rng, tell)
+        if data.counted:
+            scene = reweighted(data, scene, best)
             best = settled(scene, best, tell)
-        basins = _basins(scene, best, found[1:], tell)
+        basins = _basins(scene, best, minima[1:], tell)
     with _timed("full size", seconds):
         fine, unknowns, value, taken, ended = refined(scene, best, options, tell)
     with _timed("residual", seconds):
-        pattern = find_pattern(fine, unknowns, given.size)
+        pattern = find_pattern(fine, unknowns, data.size)
         middle = replace(coarser(scene, MIDDLE), spacing=_SPACING_OF_SAMPLES)
         posterior = Posterior(middle, best.unknowns, rng, lambda: tell("samples", value))
         gain_by_blur = 0.0
         # With several images the fit is repeated only if the residual asks for it.
         if (
-            given.single
+            data.single
             or pattern.blur_score > _MIN_BLUR_SCORE
             or (
                 basins[0].chi2 < _MAX_COARSE_CHI2
@@ -213,8 +213,8 @@ def fit(
             cause = name_cause(scene, best, fields, setups, tell)
             pattern = replace(pattern, cause=cause)
     with _timed("samples", seconds):
-        errors = errors_by_noise(scene, posterior, given.size, options.samples)
-        by_beam = shifts_by_beam(given, scene, posterior, options)
+        errors = errors_by_noise(scene, posterior, data.size, options.samples)
+        by_beam = shifts_by_beam(data, scene, posterior, options)
         evidence = float("nan")
         if options.evidence:
             evidence = _log_evidence(scene, best, fields, options, tell)
@@ -231,7 +231,7 @@ def fit(
         noise_correlation=pattern.correlation,
     )
     return _result(
-        given,
+        data,
         fine,
         unknowns,
         fields,
@@ -260,7 +260,7 @@ def compare(
     images, options, **keywords
         As for `fit`, with `setups`.
     choices : sequence of sequence of str, default B alone, E alone, both
-        What may deflect.
+        Possible causes of the deflection.
 
     Returns
     -------
@@ -278,8 +278,8 @@ def compare(
             "comparing fields needs the setup of each image, and neither fields nor strengths: "
             "how much each field displaces follows from the setups"
         )
-    asked = as_model(FitOptions, options, "options").model_copy(update={"evidence": True})
-    fits = [fit(images, fields=choice, options=asked, **keywords) for choice in choices]
+    with_evidence = as_model(FitOptions, options, "options").model_copy(update={"evidence": True})
+    fits = [fit(images, fields=choice, options=with_evidence, **keywords) for choice in choices]
     least = max(each.report.log_evidence for each in fits) - _DECIDES
 
     def rank(one: Fit) -> tuple[float, float]:
@@ -299,9 +299,9 @@ def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
 def starts(
     given: Measured, start: ArrayLike | None, tell: Any, should_stop: ShouldStop | None
 ) -> list[Start]:
-    """What to start from: nothing, a field that was given, what transport makes of an image."""
+    """Return the starting points: no field, the `start` field, and inversions by transport."""
     scene = given.scene
-    found = []
+    candidates = []
     if start is not None:
         potential = as_numbers("start", plain_array(start, "start", unit=SQUARE_PIXELS))
         if potential.shape != given.size or not np.isfinite(potential).all():
@@ -309,24 +309,24 @@ def starts(
                 f"start has shape {potential.shape}: expected a finite potential in px² of the "
                 f"images' shape {given.size}"
             )
-        found.append(Start("given", ((2, 1.0),), potential))
+        candidates.append(Start("given", ((2, 1.0),), potential))
     if not given.single:
-        found.append(Start("from far", _FROM_FAR))
-    found.append(Start("from near", _FROM_NEAR))
+        candidates.append(Start("from far", _FROM_FAR))
+    candidates.append(Start("from near", _FROM_NEAR))
     if scene.beam_modes and not given.single:
-        found.append(Start("from far, beam held", _FROM_FAR, beam_held=True))
+        candidates.append(Start("from far, beam held", _FROM_FAR, beam_held=True))
     if scene.strengths.shape[1] > 1 or scene.beam_modes:
-        return found
+        return candidates
     sizes = np.abs(scene.strengths[:, 0])  # zero where the object does not deflect: a blank shot
     weakest = int(np.argmin(np.where(sizes > 0, sizes, np.inf)))
     tell("transport", float("nan"))
     transported = _transported(given, weakest, should_stop)
     if transported is None:
-        return found
+        return candidates
     potential = gaussian_filter(transported, _ROUNDED) / scene.strengths[weakest, 0]
     if not given.single:
-        return [*found, Start("transport", ((2, 2.0), (2, 1.0)), potential)]
-    return found + [
+        return [*candidates, Start("transport", ((2, 2.0), (2, 1.0)), potential)]
+    return candidates + [
         Start(f"{share:g} × transport", _FROM_FIELD, share * potential)
         for share in _SHARES_OF_TRANSPORT
     ]
@@ -355,7 +355,7 @@ def _transported(given: Measured, number: int, should_stop: ShouldStop | None) -
 
 
 def reweighted(given: Measured, scene: Scene, found: Found) -> Scene:
-    """Weights of counts, by what is expected instead of what was counted."""
+    """Return the weights of counts from the expected instead of the recorded counts."""
     unknowns = finer(found.unknowns)
     expected = scene.model(unknowns, scene.ray_counts(unknowns))
     units = given.units[:, None, None]
@@ -366,12 +366,15 @@ def reweighted(given: Measured, scene: Scene, found: Found) -> Scene:
 def _basins(scene: Scene, best: Found, others: Sequence[Found], tell: Any) -> tuple[Basin, ...]:
     """The best answer and others, with the same λ and without blur.
 
-    Which is best has been told by smoother fields: the λ that is held now favours what follows the
+    Smoother fields have decided which is best: the present λ favours what follows the
     noise.
     """
     middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
-    ends = [best, *(settled(scene, one, tell, "other starts") for one in others[:2])]
-    chi2 = [middle.chi2(one.unknowns, middle.ray_counts(one.unknowns)).mean() for one in ends]
+    ends = [best, *(settled(scene, minimum, tell, "other starts") for minimum in others[:2])]
+    chi2 = [
+        middle.chi2(minimum.unknowns, middle.ray_counts(minimum.unknowns)).mean()
+        for minimum in ends
+    ]
     return tuple(
         Basin(end.start, end.value, float(each), best.distance(end), end.displacement)
         for end, each in zip(ends, chi2, strict=True)
@@ -381,7 +384,7 @@ def _basins(scene: Scene, best: Found, others: Sequence[Found], tell: Any) -> tu
 def _log_evidence(
     scene: Scene, best: Found, names: Sequence[str], options: FitOptions, tell: Any
 ) -> float:
-    """That of the likeliest λ and κ, where it does not depend on how closely they were found."""
+    """Log evidence at the likeliest λ and κ, where it depends least on their accuracy."""
     if options.smoothness is None:
         scene = replace(scene, smoothness=scene.smoothness / HELD)
     ended = settled(scene, best, tell, "evidence", least_gain=0.1)
@@ -410,7 +413,7 @@ def _result(
     units = given.units[:, None, None]
     used = scene.weights[:, :height, :width] > 0
     data = scene.images[:, :height, :width] * units
-    made = scene.model(unknowns, counts)[:, :height, :width] * units
+    model = scene.model(unknowns, counts)[:, :height, :width] * units
     gains = np.exp(unknowns.gains)
     beams = scene.beam(unknowns)[:, :height, :width] * units * gains[:, None, None]
     chi2 = scene.chi2(unknowns, counts)
@@ -426,28 +429,29 @@ def _result(
                 name, potential - border_mean(potential), displacement, error, smooth, beam_error
             )
         )
-    found = np.stack([field.displacement for field in fields])
-    uncertainty = float("nan") if errors is None else largest_share(errors, found)
+    displacements = np.stack([field.displacement for field in fields])
+    uncertainty = float("nan") if errors is None else largest_share(errors, displacements)
     beam = None
     if by_beam is not None:
         beam = BeamError(
-            sensitivity=largest_share(by_beam.by_percent, found),
+            sensitivity=largest_share(by_beam.by_percent, displacements),
             variation=by_beam.variation,
-            share=largest_share(by_beam.errors, found),
+            share=largest_share(by_beam.errors, displacements),
             scale=options.beam_scale,
             assumed=given.assumed,
         )
     report = replace(report, uncertainty=uncertainty, beam=beam)
     jacobians = [
-        jacobian_determinant(moved) for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, found)
+        jacobian_determinant(moved)
+        for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, displacements)
     ]
     jacobian = max(jacobians, key=lambda each: int((each < 0).sum()))
     folded = float((jacobian < 0).mean())
-    others = [(basin.objective / basins[0].objective - 1, basin.distance) for basin in basins[1:]]
+    rivals = [(basin.objective / basins[0].objective - 1, basin.distance) for basin in basins[1:]]
     verdict, explanation = judged(
         chi2=chi2,
         names=_names(setups, len(data)),
-        others=others,
+        others=rivals,
         single=given.single,
         beam_unknown=scene.beam_modes > 0,
         jacobian=jacobian,
@@ -456,9 +460,9 @@ def _result(
         gain_by_blur=gain_by_blur,
         pattern=pattern,
         beam=beam,
-        displacement=found.sum(axis=0),
+        displacement=displacements.sum(axis=0),
         used=np.asarray(used.any(axis=0)),
-        hidden=hidden_contrast(made / np.maximum(beams, _DARKEST * units) - 1, used),
+        hidden=hidden_contrast(model / np.maximum(beams, _DARKEST * units) - 1, used),
         edge_is_free=options.edge == "free",
     )
     return Fit(
@@ -469,8 +473,8 @@ def _result(
         source=beams,
         gains=gains * given.gains,
         frames=unknowns.frames,
-        reprojection=made,
-        residual=np.where(used, data - made, 0.0),
+        reprojection=model,
+        residual=np.where(used, data - model, 0.0),
         chi2=chi2,
         basins=basins,
         folded=folded,

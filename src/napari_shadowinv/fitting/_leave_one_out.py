@@ -100,7 +100,7 @@ def leave_one_out(
         "mask": None,
         "gains": "known",
     }
-    given = measured(
+    data = measured(
         images,
         fields=fields,
         setups=setups,
@@ -109,7 +109,7 @@ def leave_one_out(
         fiducials=None,
         **{**usual, **keywords},
     )
-    check_count(len(given.units))
+    check_count(len(data.units))
     ensure_compiled(on_progress, should_stop)
     report = Reporter(on_progress, should_stop)
     steps = 0
@@ -119,17 +119,17 @@ def leave_one_out(
         steps += 1
         report("leave one out", steps, None, stage, objective)
 
-    work = _Work(given, options, tell)
+    work = _Work(data, options, tell)
     begun = work.begun(should_stop)
     agreeing = work.agreeing(begun)
     scene, common = work.with_likely_smoothness(agreeing, begun)
     predictions = work.predictions(agreeing, scene, common)
-    return _result(given, predictions, setups, names)
+    return _result(data, predictions, setups, names)
 
 
 @dataclass(frozen=True)
 class _Prediction:
-    """An image as others predict it, in units of its beam, and what χ² it may have."""
+    """The prediction of an image by others, in units of its beam, and the limit of its χ²."""
 
     image: FloatArray
     gain: float
@@ -149,9 +149,9 @@ class _SampledFit:
     def variance_in(self, scene: Scene, unknowns: Unknowns) -> float:
         """Return the mean square of the changes in one image, in units of its noise."""
         linear = scene.linear(unknowns, scene.ray_counts(unknowns))
-        kept = unknowns.zeros()
+        no_change = unknowns.zeros()
         residuals = [
-            linear.pushed(kept._replace(potentials=change.potentials, beam=change.beam))
+            linear.pushed(no_change._replace(potentials=change.potentials, beam=change.beam))
             for change in self.changes
         ]
         return float(np.mean(np.square(residuals)[:, scene.weights > 0]))
@@ -166,7 +166,7 @@ class _OwnFit:
 
 
 class _Work:
-    """What all steps need: images, options, whom to tell."""
+    """Context of all steps: images, options, and the callback for progress."""
 
     def __init__(self, given: Measured, options: FitOptions, tell: Any) -> None:
         self._given, self._options, self._tell = given, options, tell
@@ -186,15 +186,15 @@ class _Work:
             scene = replace(scene, smoothness=usual)
         alone = [self._settled(scene, begun, [k], f"image {k + 1} alone") for k in self._all]
         most: list[int] = []
-        left = self._all
-        while len(left) > len(most):
-            group = self._group(scene, begun, left, alone)
+        remaining = self._all
+        while len(remaining) > len(most):
+            group = self._group(scene, begun, remaining, alone)
             most = max(most, group, key=len)
-            left = [k for k in left if k not in group]
+            remaining = [k for k in remaining if k not in group]
         return most
 
     def _group(self, scene: Scene, begun: Found, left: list[int], alone: list[Found]) -> list[int]:
-        """Images that one field explains: what is left without those that spoil a fit most."""
+        """Images that one field explains, after removing the worst one by one."""
         least = np.array([self._chi2_in_middle(scene, alone[k], [k])[0] for k in self._all])
         together = self._settled(scene, begun, left, "all images")
         while len(left) > _LEAST_AGREEING:
@@ -203,9 +203,9 @@ class _Work:
                 break
             tried = {}
             for k in left:
-                others = [other for other in left if other != k]
+                members = [image for image in left if image != k]
                 # Unknowns of all images are kept, so that each can come back.
-                tried[k] = self._settled(scene, together, others, f"without image {k + 1}")
+                tried[k] = self._settled(scene, together, members, f"without image {k + 1}")
             out = min(left, key=lambda k: tried[k].value + alone[k].value)
             left = [k for k in left if k != out]
             together = tried[out]
@@ -231,7 +231,7 @@ class _Work:
     def predictions(self, agreeing: list[int], scene: Scene, common: Found) -> list[_Prediction]:
         """Each image as all others predict it that agree.
 
-        Larger pixels may set aside too many: what the others predict comes back to them.
+        Larger pixels may set aside too many: images that the others predict are added again.
         """
         own_fits = [self._own_fit(scene, k, common) for k in self._all]
         predictions: dict[int, _Prediction] = {}
@@ -244,9 +244,9 @@ class _Work:
                 break
             agreeing = sorted([*agreeing, *back])
         for k in agreeing:
-            others = [other for other in agreeing if other != k]
-            fit = self._sampled_fit(scene, common, others)
-            predictions[k] = self._predicted(k, others, scene, fit, own_fits[k])
+            members = [image for image in agreeing if image != k]
+            fit = self._sampled_fit(scene, common, members)
+            predictions[k] = self._predicted(k, members, scene, fit, own_fits[k])
         return [predictions[k] for k in self._all]
 
     def _sampled_fit(self, scene: Scene, common: Found, members: list[int]) -> _SampledFit:
@@ -324,7 +324,7 @@ class _Work:
         name: str,
         least_gain: float = COARSE_GAIN,
     ) -> Found:
-        """What some of the images tell; gains and frames of the others stay."""
+        """Fit some of the images; gains and frames of the others stay."""
         first = replace(found, unknowns=found.unknowns.only(members))
         end = settled(scene.only(members), first, self._tell, name, least_gain)
         return replace(end, unknowns=found.unknowns.with_those(members, end.unknowns))
@@ -339,7 +339,7 @@ class _Work:
 def _placed(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknowns:
     """Find where an image lies, and its gain, beside one whose place is known."""
     pair = scene.only([first, k])
-    held = np.append(np.where(scene.free_frames, scene.prior.frame_weights, 0.0), 1.0)
+    weights = np.append(np.where(scene.free_frames, scene.prior.frame_weights, 0.0), 1.0)
     now = unknowns.only([first, k])
     for _ in range(_FRAME_STEPS):
         counts = pair.ray_counts(now)
@@ -347,10 +347,12 @@ def _placed(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknowns:
         columns = [linear.pushed(change)[1].ravel() for change in _moves(now, scene.free_frames)]
         misfit = (pair.model(now, counts) - pair.images)[1] * np.sqrt(pair.weights[1])
         matrix = np.array([[product(a, b) for b in columns] for a in columns])
-        slope = np.array([product(one, misfit.ravel()) for one in columns])
+        slope = np.array([product(column, misfit.ravel()) for column in columns])
         about_rest = np.append(now.frames[1] - at_rest(), now.gains[1])
         free = np.append(scene.free_frames, True)
-        step = np.linalg.solve(matrix + np.diag(held[free]), -slope - held[free] * about_rest[free])
+        step = np.linalg.solve(
+            matrix + np.diag(weights[free]), -slope - weights[free] * about_rest[free]
+        )
         for place, change in zip(np.flatnonzero(free), step, strict=True):
             if place < len(scene.free_frames):
                 now.frames[1, place] += change
@@ -389,19 +391,20 @@ def _result(
     units = given.units[:, None, None]
     used = given.scene.weights[:, :height, :width] > 0
     data = given.scene.images[:, :height, :width] * units
-    made = np.stack([one.image for one in predictions])[:, :height, :width] * units
-    residual = np.where(used, data - made, 0.0)
+    models = np.stack([each.image for each in predictions])[:, :height, :width] * units
+    residual = np.where(used, data - models, 0.0)
     level = np.where(used, data, 0.0).sum(axis=(1, 2)) / used.sum(axis=(1, 2))
     squares = (residual**2).sum(axis=(1, 2)) / used.sum(axis=(1, 2))
     chi2, alone, limit = (
-        np.array([getattr(one, name) for one in predictions]) for name in ("chi2", "alone", "limit")
+        np.array([getattr(each, name) for each in predictions])
+        for name in ("chi2", "alone", "limit")
     )
     return LeaveOneOut(
         images=data,
         mask=used,
-        predicted=made,
+        predicted=models,
         residual=residual,
-        gains=np.array([one.gain for one in predictions]) * given.gains,
+        gains=np.array([each.gain for each in predictions]) * given.gains,
         chi2=chi2,
         alone=alone,
         limit=limit,

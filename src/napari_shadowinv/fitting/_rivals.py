@@ -1,4 +1,4 @@
-"""Fits with one more unknown, to name what a fit that leaves a pattern has wrong: `name_cause`."""
+"""Fits with one more unknown, to name the cause of a pattern in the residuals: `name_cause`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _PEDESTALS = 0.09, 0.17  # of each image's mean: dark levels of 10 and 20 % of t
 
 @dataclass(frozen=True)
 class _Rival:
-    """A scene with one more unknown, where its search starts, and what a better fit means."""
+    """A scene with one more unknown, the start of its search, and the cause that it stands for."""
 
     scene: Scene
     unknowns: Unknowns
@@ -126,7 +126,7 @@ def _rivals(
 
 
 def _with_free_beam(scene: Scene, best: Found) -> Iterator[_Rival]:
-    """Beams that differ from the assumed one on long waves, or also on those of the object."""
+    """Beams that differ from the assumed one on long waves, or also on the object's scale."""
     advice = "give a reference of this shot, or fit the beam (source='unknown', --source unknown)"
     causes = {
         _BEAM_MODES: f"the beam differs from its source, smoothly over the image; {advice}",

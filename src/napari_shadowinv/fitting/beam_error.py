@@ -48,7 +48,7 @@ class BeamError:
     @property
     def text(self) -> str:
         """The response in a sentence."""
-        beam = "the beam was assumed to be as given or uniform: " if self.assumed else ""
+        beam = "the beam was assumed to be the source or uniform: " if self.assumed else ""
         sentence = (
             f"{beam}a beam that differs by 1 % (r.m.s.) over {self.scale:.2g} of the image's "
             f"shorter side would move the displacement by {self.sensitivity:.1%} (r.m.s.)"

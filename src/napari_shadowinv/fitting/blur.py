@@ -59,19 +59,19 @@ def checked_point_spread(psf: Any, count: int, size: tuple[int, int]) -> list[fl
     each = [psf] * count if alone else list(psf)
     if len(each) != count:
         raise InputError(f"psf has {len(each)} entries: expected one, or one for each of {count}")
-    found: list[float | FloatArray] = []
-    for one in each:
-        values = as_numbers("psf", one)
+    kernels: list[float | FloatArray] = []
+    for blur in each:
+        values = as_numbers("psf", blur)
         if not values.size or not np.isfinite(values).all() or values.min() < 0:
-            raise InputError(f"psf is {one}: expected a standard deviation in px or a kernel")
+            raise InputError(f"psf is {blur}: expected a standard deviation in px or a kernel")
         if values.ndim == 0:
             if float(values) > min(size) / 8:
                 raise InputError(
                     f"psf is {float(values):g} px: expected less than an eighth of a side"
                 )
-            found.append(float(values))
+            kernels.append(float(values))
             continue
         if values.ndim != 2 or not all(side % 2 for side in values.shape) or not values.sum() > 0:
             raise InputError(f"psf has shape {values.shape}: expected a kernel with odd sides")
-        found.append(values / values.sum())
-    return found
+        kernels.append(values / values.sum())
+    return kernels

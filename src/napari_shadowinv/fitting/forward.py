@@ -338,12 +338,12 @@ class Linear:
             pull = self._roots[k] * residuals[k]
             slope.gains[k] = np.einsum("yx,yx", pull, self.bare[k])
             columns = transposed @ scene._spread_back(k, pull).ravel()
-            of_potential, others = np.split(columns, [math.prod(scene.rays.shape)])
+            of_potential, of_instrument = np.split(columns, [math.prod(scene.rays.shape)])
             psi = of_potential.reshape(scene.rays.shape)
             slope.potentials[:] += scene.strengths[k][:, None, None] * psi
             if self._has_others:
-                of_shape += others[:-6].reshape(of_shape.shape) * scene.beams[k]
-                slope.frames[k] = others[-6:]
+                of_shape += of_instrument[:-6].reshape(of_shape.shape) * scene.beams[k]
+                slope.frames[k] = of_instrument[-6:]
         if self._has_others:
             slope.beam[:] = scene._of_modes(of_shape * self._beam_shape)
         return scene._only_free(slope)

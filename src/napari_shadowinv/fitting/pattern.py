@@ -59,8 +59,8 @@ def find_pattern(scene: Scene, unknowns: Unknowns, size: tuple[int, int]) -> Pat
     height, width = size
     counts = scene.ray_counts(unknowns)
     roots = np.sqrt(scene.weights[:, :height, :width])
-    made = scene.model(unknowns, counts)[:, :height, :width]
-    residuals = roots * (scene.images[:, :height, :width] - made)
+    models = scene.model(unknowns, counts)[:, :height, :width]
+    residuals = roots * (scene.images[:, :height, :width] - models)
     used = roots > 0
     correlation = max(map(correlation_length, residuals, used))
     strengths = [
@@ -71,5 +71,5 @@ def find_pattern(scene: Scene, unknowns: Unknowns, size: tuple[int, int]) -> Pat
         strengths=np.array(strengths),
         correlation=correlation,
         chi2=float(scene.chi2(unknowns, counts).max()),
-        blur_score=blur_score(residuals, roots, made),
+        blur_score=blur_score(residuals, roots, models),
     )

@@ -1,4 +1,4 @@
-"""What the data leave open around the best unknowns, by the Gauss-Newton Hessian: `Posterior`.
+"""Uncertainty of the best unknowns by the Gauss-Newton Hessian: `Posterior`.
 
 References
 ----------
@@ -41,11 +41,11 @@ class Posterior:
     Parameters
     ----------
     scene, unknowns
-        What is explained, and how.
+        The scene and its best unknowns.
     rng : numpy.random.Generator
         For all random choices.
     after_step : callable, optional
-        Called often, to tell of progress and to be stopped.
+        Called after each step, to report progress and to stop.
     """
 
     def __init__(
@@ -75,14 +75,16 @@ class Posterior:
         prior, smoothness = self._scene.prior, self._scene.smoothness
         determined, energy = np.empty(smoothness.shape), np.empty(smoothness.shape)
         for m in range(len(smoothness)):
-            each, whole = prior.of_rough[m], prior.of_rough[m].sum(axis=0)
-            signs = self._rng.choice([-1.0, 1.0], whole.shape)
+            each, roughness = prior.of_rough[m], prior.of_rough[m].sum(axis=0)
+            signs = self._rng.choice([-1.0, 1.0], roughness.shape)
             slope = self._unknowns.zeros()
             slope.potentials[m] = prior.root_of_smoothness(m, signs)
             solved = self._scales.times(self._unknowns.like(self._solved(slope, _ROUGHLY)))
-            left = np.sqrt(whole) * signs * dctn(solved.potentials[m], norm="ortho")
-            shares = np.divide(each, whole, out=np.zeros_like(each), where=whole > 0)
-            determined[m] = np.maximum((shares * (1 - left)).sum(axis=(1, 2)), _LEAST_DETERMINED)
+            open_part = np.sqrt(roughness) * signs * dctn(solved.potentials[m], norm="ortho")
+            shares = np.divide(each, roughness, out=np.zeros_like(each), where=roughness > 0)
+            determined[m] = np.maximum(
+                (shares * (1 - open_part)).sum(axis=(1, 2)), _LEAST_DETERMINED
+            )
             waves = dctn(self._unknowns.potentials[m], norm="ortho")
             energy[m] = (each * waves**2).sum(axis=(1, 2))
         ratio = np.clip(determined / np.maximum(energy, 1e-300), 1 / _MOST_CHANGE, _MOST_CHANGE)
@@ -147,11 +149,11 @@ class Posterior:
         freed = self._scene.with_free_beam(_BEAM_MODES, variation)
         beam = np.zeros((_BEAM_MODES, _BEAM_MODES))
         posterior = Posterior(freed, self._unknowns._replace(beam=beam), rng, self._after_step)
-        drawn = (posterior.drawn(_OPEN_BEAMS) for _ in range(count))
-        return [freed.beam_changes(each) for each in drawn]
+        changes = (posterior.drawn(_OPEN_BEAMS) for _ in range(count))
+        return [freed.beam_changes(each) for each in changes]
 
     def log_volume(self, chances: Sequence[np.random.Generator]) -> float:
-        """Return half the log of the Hessian's determinant over that of the prior of potentials.
+        """Return half the log-determinant of the Hessian relative to the prior of potentials.
 
         By stochastic Lanczos quadrature, with the same probes for both, and for each field those
         of its own generator: a field that the data do not show adds nothing to others.
@@ -162,13 +164,13 @@ class Posterior:
         if np.isinf(self._scene.decay):
             moved.potentials[:, 0, 0] = 0
         free = moved.flat() != 0
-        held = np.arange(free.size) < ones.potentials.size
+        is_potential = np.arange(free.size) < ones.potentials.size
         total = 0.0
         for _ in range(_PROBES):
             of_fields = [chance.choice([-1.0, 1.0], free.size) for chance in chances]
             signs = free * self._signs(of_fields)
             total += self._log_determinant(self._times, signs)
-            total -= self._log_determinant(self._prior_times, held * signs)
+            total -= self._log_determinant(self._prior_times, is_potential * signs)
         return total / _PROBES / 2 - self._scales.log_size()
 
     def _signs(self, of_fields: Sequence[FloatArray]) -> FloatArray:
@@ -181,7 +183,7 @@ class Posterior:
     def log_evidence(self, chances: Sequence[np.random.Generator]) -> float:
         """Return the logarithm of how likely the model makes the data, but for a constant.
 
-        `chances` are the sources of what is random about each field.
+        `chances` are the random generators of the fields.
         """
         value, _ = self._scene.value_and_gradient(self._unknowns, self._counts)
         return -value - self.log_volume(chances)
@@ -209,7 +211,7 @@ class Posterior:
     def _log_determinant(
         self, times: Callable[[FloatArray], FloatArray], signs: FloatArray
     ) -> float:
-        """What a probe tells of the trace of a matrix's logarithm."""
+        """Estimate the trace of a matrix's logarithm from a probe."""
         size = float(np.abs(signs).sum())
         diagonal, beside = self._lanczos(times, signs / np.sqrt(size))
         values, vectors = eigh_tridiagonal(diagonal, beside)

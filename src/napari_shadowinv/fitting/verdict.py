@@ -1,7 +1,8 @@
 """Whether a fit's field may be believed: `Verdict`, `judged`.
 
-χ² alone does not tell: one image, or several that the object displaces alike, can be explained
-perfectly by a wrong field. What tells is whether other fields explain them as well.
+χ² alone does not show whether a field is right: one image, or several that the object displaces
+alike, can be explained perfectly by a wrong field. The test is whether other fields explain them
+as well.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ _SMOOTHED, _FROM_EDGE = 2.0, 2  # px
 
 
 class Verdict(StrEnum):
-    """What a fit's field is worth."""
+    """How far the field of a fit can be trusted."""
 
     DETERMINED = "determined"
     SEVERAL = "one of several"
@@ -82,7 +83,7 @@ def judged(
     chi2 : ndarray, shape (L,)
         Of each image.
     names : sequence of str
-        What to call the images.
+        Names of the images.
     others : sequence of (float, float)
         Other answers: how much worse their objective is, as a share, and how far away they are.
     single : bool
@@ -102,7 +103,7 @@ def judged(
     beam : BeamError or None
         Response of the displacement to a beam that differs from its source, if known.
     displacement : ndarray, shape (2, H, W)
-        That of all fields in the first image, px.
+        Sum over all fields in the first image, px.
     used : ndarray of bool, shape (H, W)
         The pixels that were fitted in any image.
     hidden : float
@@ -111,7 +112,7 @@ def judged(
         Whether the field was let go on beyond the edge.
     """
     if worst := _those(names, chi2, chi2 > _MISFIT):
-        causes = "noise, source (uniform, measured or unknown) or point spread may not be as given"
+        causes = "noise, source (uniform, measured or unknown) or point spread may be wrong"
         if len(chi2) > 1:
             causes = f"the object may have changed between images, or energies, {causes}"
         if pattern.cause:
@@ -210,7 +211,7 @@ def _pattern_text(pattern: Pattern, names: Sequence[str]) -> str:
     ]
     cause = pattern.cause and f"likely {pattern.cause}"
     cause = cause or (
-        "source, gains, point spread, dark level or registration may not be as given, or the "
+        "source, gains, point spread, dark level or registration may be wrong, or the "
         "object absorbs"
     )
     return (
@@ -261,7 +262,7 @@ def _share_lost(displacement: FloatArray) -> float:
 
 
 def _share_at_edge(values: FloatArray, inwards: int = 0) -> float:
-    """Largest value at an image's edge, or so many pixels inwards, as a share of that anywhere."""
+    """Largest value at, or `depth` pixels inside, an image's edge over the largest anywhere."""
     first, last = inwards, -1 - inwards
     sides = values[first], values[last], values[:, first], values[:, last]
     return float(max(side.max() for side in sides) / max(values.max(), 1e-12))
@@ -280,5 +281,5 @@ def _share_bent_at_edge(displacement: FloatArray) -> float:
 
 
 def _those(names: Sequence[str], chi2: FloatArray, which: BoolArray) -> str:
-    told = zip(names, chi2, which, strict=True)
-    return "; ".join(f"{name}: χ² {value:.2g}" for name, value, meant in told if meant)
+    rows = zip(names, chi2, which, strict=True)
+    return "; ".join(f"{name}: χ² {value:.2g}" for name, value, is_listed in rows if is_listed)

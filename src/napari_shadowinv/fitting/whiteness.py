@@ -63,7 +63,7 @@ def pattern_strength(residual: FloatArray, used: BoolArray, correlation: float =
 def correlation_length(residual: FloatArray, used: BoolArray) -> float:
     """Return the standard deviation in px of the Gaussian that has blurred white noise.
 
-    Differences of neighbouring pixels are compared with those of pixels four apart. Their medians
+    Differences of neighbouring pixels are compared with differences of pixels four apart. Medians
     are taken, so that bright lines that the model misses do not count. 0 if the noise is white.
 
     Parameters
@@ -100,8 +100,8 @@ def noise_amplification(correlation: float) -> float:
 def blur_score(residuals: FloatArray, roots: FloatArray, made: FloatArray) -> float:
     """Return how much the residuals look like missing blur, in standard deviations of noise.
 
-    Blur adds the Laplacian of an image to it. The fit has removed from the residual what fields
-    can imitate, so noise gives less than 1.
+    Blur adds the Laplacian of an image to it. The fit has removed the part that fields can imitate
+    from the residual, so noise gives less than 1.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def blur_score(residuals: FloatArray, roots: FloatArray, made: FloatArray) -> fl
 
 
 def _amplification_after(width: float, correlation: float) -> float:
-    """Power of correlated noise after a Gaussian over that of white noise."""
+    """Power of correlated noise after a Gaussian over the power of white noise."""
     if correlation <= 0:
         return 1.0
     squares = width**2 / (width**2 + correlation**2)

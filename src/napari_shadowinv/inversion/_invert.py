@@ -440,7 +440,7 @@ def _levels_from_start(
 ) -> Levels:
     """Return the levels up to the one of an inversion to start from, if its sites are the same.
 
-    With `may_differ`, the inversion may have a level between those of the plan.
+    With `may_differ`, the inversion may have a level between two of the plan.
     """
     start_sites = start.sites + margin_width
     if len(start_sites) in levels.counts or (may_differ and len(start_sites) <= levels.counts[-1]):

@@ -75,7 +75,7 @@ class Filter(Step):
         return self.function(image, **self.values())
 
     def note(self, before: FloatArray, after: FloatArray, mask: BoolArray | None) -> str:
-        """Return a note on what the filter changed."""
+        """Return a note on the changes by the filter."""
         return self.described
 
     def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:

@@ -30,7 +30,7 @@ class FitOrigin(CheckedModel):
     setup : Setup or None
         The experiment, with the pixels as recorded.
     strength, gain, psf, noise
-        As given for this image; None where the recipe counts.
+        Values of this image; None where the recipe counts.
     notes : tuple of str
         Notes of the steps.
     warnings : tuple of Caution

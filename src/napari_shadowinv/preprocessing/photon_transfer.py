@@ -2,8 +2,8 @@
 
 The variance of counts is proportional to the signal, so it vanishes where the signal does (photon
 transfer). Noise of reading moves that point below the offset, never above. Noise in proportion to
-the signal, such as that of uneven pixels, moves it above; only deep shadows tell that from an
-offset. A recorded source has the same uneven pixels as the image, so what the two have in common
+the signal, such as by uneven pixels, moves it above; only deep shadows distinguish that from an
+offset. A recorded source has the same uneven pixels as the image, so their common part
 is a limit for such noise, and shadows need not be deep.
 """
 
@@ -65,11 +65,11 @@ def dark_level(
     mean = float(planes[0].brightness.mean())
     if not mean > 0:
         return 0.0
-    found = [_offset(plane.bins / mean, math.inf, _MIN_GAIN) for plane in planes]
+    offsets = [_offset(plane.bins / mean, math.inf, _MIN_GAIN) for plane in planes]
     if len(planes) > 1:
         both = np.concatenate([plane.bins for plane in planes], axis=1) / mean
-        found.append(_offset(both, _common_pattern(*planes), _MIN_SHARED_GAIN))
-    return max(found)
+        offsets.append(_offset(both, _common_pattern(*planes), _MIN_SHARED_GAIN))
+    return max(offsets)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +85,8 @@ class _NoisyPlane:
         image, mask = self.image, self.mask
         rows = max(1, image.size // _SAMPLES)  # of long images, lines far apart
         starts = np.arange(0, image.shape[0] - 2, rows)
-        above, here, below = (image[starts + shift] for shift in range(3))
-        column_sums, bends = above + here + below, above - 2 * here + below
+        above, middle, below = (image[starts + shift] for shift in range(3))
+        column_sums, bends = above + middle + below, above - 2 * middle + below
         means = (column_sums[:, 2:] + column_sums[:, 1:-1] + column_sums[:, :-2]) / 9
         differences = (bends[:, 2:] - 2 * bends[:, 1:-1] + bends[:, :-2]) / 6
         if mask is None or mask.all():
@@ -103,7 +103,7 @@ class _NoisyPlane:
     def bins(self) -> FloatArray:
         """Brightness, noise and its uncertainty by brightness, shape (3, bins).
 
-        The noise is a standard deviation, the uncertainty that of the variance over the noise.
+        The noise is a standard deviation, the uncertainty is of the variance over the noise.
         """
         brightness, differences = self._local
         order = order_by_value(brightness)
@@ -147,17 +147,17 @@ def _offset(bins: FloatArray, max_pattern: float, min_gain: float) -> float:
         return 0.0
     variances, weights = noise**2, 1 / (noise * uncertainty)
     powers = np.stack([np.ones_like(levels), levels, levels**2], axis=1) * weights[:, None]
-    wanted = variances * weights
-    terms, freely = nnls(powers, wanted)
+    goal = variances * weights
+    terms, freely = nnls(powers, goal)
     distance = freely
     if terms[2] > max_pattern:
-        distance = nnls(powers[:, :2], wanted - max_pattern * powers[:, 2])[1]
+        distance = nnls(powers[:, :2], goal - max_pattern * powers[:, 2])[1]
     # Weighted least squares of v = g (m - D).
     line = powers[:, [1, 0]] * [1.0, -1.0]
-    (gain, offset), *_ = np.linalg.lstsq(line, wanted, rcond=None)
+    (gain, offset), *_ = np.linalg.lstsq(line, goal, rcond=None)
     if not gain > 0:
         return 0.0
-    with_offset = float(((gain * line[:, 0] + offset * line[:, 1] - wanted) ** 2).sum())
+    with_offset = float(((gain * line[:, 0] + offset * line[:, 1] - goal) ** 2).sum())
     dark = float(offset / gain)
     chi2 = max(1.0, with_offset / (len(levels) - 2))
     least = (min_gain if highest > _WIDE_RANGE * lowest else _MIN_GAIN_NARROW) * chi2

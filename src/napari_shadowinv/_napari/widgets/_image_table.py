@@ -71,7 +71,7 @@ class ImageRow:
         return about.setup_of(self.layer)
 
     def entries(self) -> dict[str, Any]:
-        """Return what the user entered in this row."""
+        """Return the entries of the user in this row."""
         rows = about.metadata_of(self.layer).get(_METADATA_KEY, {})
         return dict(rows.get(self.plane or 0, {}))
 

@@ -125,7 +125,7 @@ class SetupPicker(QWidget):
         self.changed.emit()
 
     def _show(self, kind: str, entry: _Entry | None = None) -> None:
-        """Show a setup or none; the forms of other kinds show what the user entered last."""
+        """Show a setup or none; the forms of other kinds keep the last entries."""
         self._shown = {**self._entered} | ({} if entry is None else {kind: entry})
         blank: dict[str, Any] = {name: {} for name in self.picker.state()["values"]}
         values = blank | {name: state.values for name, state in self._shown.items()}

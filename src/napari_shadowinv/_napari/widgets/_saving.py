@@ -97,7 +97,7 @@ def _has_particles(setup: Setup | None) -> bool:
 
 
 class SaveButton(QPushButton):
-    """Asks for a file, saves what `savable` returns, and reports the path."""
+    """Asks for a file, saves the result of `savable`, and reports the path."""
 
     def __init__(self, tool: ToolPanel, savable: Callable[[], Savable], tip: str) -> None:
         super().__init__("Save result…")
