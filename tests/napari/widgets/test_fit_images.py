@@ -319,7 +319,7 @@ def test_a_stack_has_a_row_for_each_plane(window: Any, open_widget: Any) -> None
     tool.images.stacks.layer = layer
     assert texts(tool, 0) == ["run 0", "run 1", "run 2"]
     assert texts(tool, BEAM) == ["14.7", "", ""]
-    with pytest.raises(InputError, match="'run 1' has no energy: type it"):
+    with pytest.raises(InputError, match="'run 1' has no energy: enter it"):
         tool.request()
     type_in(tool, 1, BEAM, "6")
     tool.images.table.item(2, 0).setCheckState(Qt.CheckState.Unchecked)
