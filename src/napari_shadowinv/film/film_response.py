@@ -17,8 +17,10 @@ from napari_shadowinv.film.stopping import PROTON_MASS, Stopping
 __all__ = ["Band", "Response", "relative_strengths"]
 
 _MEV = 1.602176634e-13  # J
-_FIRST, _LAST, _STEPS = 0.5, 200.0, 6000  # MeV
-_BAND = 0.5  # of the peak
+_MIN_ENERGY_MEV = 0.5
+_MAX_ENERGY_MEV = 200.0
+_ENERGIES = 6000
+_BAND_SHARE = 0.5  # of the peak
 
 
 @dataclass(frozen=True)
@@ -72,8 +74,12 @@ class Response:
             If an energy is above the range of a stopping table.
         """
         stoppings = pack.stoppings()
-        last = min(_LAST, *(stopping.energies[-1] for stopping in stoppings.values()))
-        inside = np.geomspace(_FIRST, last, _STEPS) if energies is None else np.asarray(energies)
+        last = min(_MAX_ENERGY_MEV, *(stopping.energies[-1] for stopping in stoppings.values()))
+        inside = (
+            np.geomspace(_MIN_ENERGY_MEV, last, _ENERGIES)
+            if energies is None
+            else np.asarray(energies)
+        )
         first = np.array(inside, dtype=np.float64)
         deposits, doses = [], []
         now = first
@@ -104,7 +110,7 @@ class Response:
                     f"no proton of up to {self.energies[-1]:.4g} MeV reaches film {number}: check "
                     "the thicknesses of the pack, which are in m"
                 )
-            above = np.flatnonzero(deposit >= _BAND * deposit[top])
+            above = np.flatnonzero(deposit >= _BAND_SHARE * deposit[top])
             first = above[0]
             # The first gap ends it; protons that are much faster cross all films.
             gaps = np.flatnonzero(np.diff(above[above >= top]) > 1)

@@ -354,8 +354,8 @@ class Pack(CheckedModel):
         return {name: self._all_materials[name].stopping() for name in sorted(names)}
 
 
-def _check_known(name: str, known: Mapping[str, Any], who: str, table: str) -> None:
-    if name not in known:
-        match = nearest(name, list(known))
-        hint = f"did you mean '{match}'?" if match else f"known are {', '.join(known)}"
+def _check_known(name: str, choices: Mapping[str, Any], who: str, table: str) -> None:
+    if name not in choices:
+        match = nearest(name, list(choices))
+        hint = f"did you mean '{match}'?" if match else f"known are {', '.join(choices)}"
         raise ValueError(f"{who} '{name}': {hint} Others are described under [{table}]")

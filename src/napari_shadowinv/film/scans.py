@@ -30,7 +30,8 @@ _SMALLEST = 0.02  # of the scan's area, or `least_side` squared
 _DUST = 2  # px
 _ENDS = 0.08  # of a side, at its ends, do not count for its place: corners are cut and bent
 _MAX_OFFSET = 0.04  # of the film's size, from a side to its border
-_ROUNDS, _OUTLIERS = 8, 2.5
+_ROUNDS = 8
+_MAX_DEVIATIONS = 2.5  # of a point that is no outlier
 _REACH_PX = 6.0  # of the search from a side
 _BLUR_PX = 2.0  # of a side
 _STEP_PX = 0.5
@@ -218,7 +219,7 @@ def _fit_line(along: FloatArray, across: FloatArray, usual: float) -> _Line:
     for _ in range(_ROUNDS):
         slope, offset = np.polyfit(along[used], across[used], 1)
         away = np.abs(across - offset - slope * along)
-        used = away <= max(_OUTLIERS * 1.5 * np.median(away), usual)
+        used = away <= max(_MAX_DEVIATIONS * 1.5 * np.median(away), usual)
     return float(offset), float(slope)
 
 

@@ -29,11 +29,15 @@ from napari_shadowinv.errors import FileFormatError, InputError
 
 __all__ = ["PROTON_MASS", "Stopping"]
 
-PROTON_MASS, _ELECTRON = 938.27209, 0.51099895  # MeV
+PROTON_MASS = 938.27209  # MeV
+_ELECTRON_MASS = 0.51099895  # MeV
 _BETHE = 0.307075  # MeV cm²/mol
-_FIRST, _LAST, _STEPS = 0.01, 300.0, 4000  # MeV
+_MIN_ENERGY_MEV = 0.01
+_MAX_ENERGY_MEV = 300.0
+_ENERGIES = 4000
 # Below, Bethe's formula is wrong: it goes on with its slope, then in proportion to the velocity.
-_BETHE_FROM, _SLOW = 0.5, 0.1  # MeV
+_MIN_BETHE_MEV = 0.5
+_MIN_SLOPE_MEV = 0.1
 _PER_M = 100.0  # from 1/cm
 
 _UNITS = {"eV": 1e-6, "keV": 1e-3, "MeV": 1.0, "GeV": 1e3}
@@ -91,19 +95,19 @@ class Stopping:
         >>> float(aluminium.loss(10.0) / 2699 * 10)  # 33.8 MeV cm²/g by ICRU 49
         34.2...
         """
-        energies = np.geomspace(_FIRST, _LAST, _STEPS)
-        fast = _mass_loss(np.maximum(energies, _BETHE_FROM), charge_per_mass, excitation)
-        near = _mass_loss(_BETHE_FROM * np.array([1.0, 1.01]), charge_per_mass, excitation)
+        energies = np.geomspace(_MIN_ENERGY_MEV, _MAX_ENERGY_MEV, _ENERGIES)
+        fast = _mass_loss(np.maximum(energies, _MIN_BETHE_MEV), charge_per_mass, excitation)
+        near = _mass_loss(_MIN_BETHE_MEV * np.array([1.0, 1.01]), charge_per_mass, excitation)
         slope = np.log(near[1] / near[0]) / np.log(1.01)
-        going_on = np.minimum(np.maximum(energies, _SLOW) / _BETHE_FROM, 1.0) ** slope
-        slow = np.sqrt(np.minimum(energies / _SLOW, 1.0))
+        going_on = np.minimum(np.maximum(energies, _MIN_SLOPE_MEV) / _MIN_BETHE_MEV, 1.0) ** slope
+        slow = np.sqrt(np.minimum(energies / _MIN_SLOPE_MEV, 1.0))
         losses = fast * going_on * slow * (density / 1000) * _PER_M
         return cls(energies, losses, density)
 
     @cached_property
     def _depths(self) -> tuple[FloatArray, FloatArray]:
         """Closely spaced energies, and the range of protons at each."""
-        energies = np.geomspace(self.energies[0], self.energies[-1], _STEPS)
+        energies = np.geomspace(self.energies[0], self.energies[-1], _ENERGIES)
         per_loss = 1 / self.loss(energies)
         steps = 0.5 * (per_loss[1:] + per_loss[:-1]) * np.diff(energies)
         # Below the first energy the loss goes as the velocity.
@@ -145,9 +149,9 @@ def _mass_loss(energies: FloatArray, charge_per_mass: float, excitation: float) 
     """Return the loss by Bethe's formula without shell and density corrections, in MeV cm²/g."""
     gamma = 1 + energies / PROTON_MASS
     squared = 1 - 1 / gamma**2
-    ratio = _ELECTRON / PROTON_MASS
-    most = 2 * _ELECTRON * squared * gamma**2 / (1 + 2 * gamma * ratio + ratio**2)
-    inside = 2 * _ELECTRON * squared * gamma**2 * most / (1e-6 * excitation) ** 2
+    ratio = _ELECTRON_MASS / PROTON_MASS
+    most = 2 * _ELECTRON_MASS * squared * gamma**2 / (1 + 2 * gamma * ratio + ratio**2)
+    inside = 2 * _ELECTRON_MASS * squared * gamma**2 * most / (1e-6 * excitation) ** 2
     return np.asarray(_BETHE * charge_per_mass / squared * (0.5 * np.log(inside) - squared))
 
 

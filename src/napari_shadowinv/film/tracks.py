@@ -27,7 +27,8 @@ from napari_shadowinv.errors import InputError
 
 __all__ = ["TrackImage", "Tracks"]
 
-_TRACKS_PER_BIN, _BINS_PER_SIDE = 50, 300
+_TRACKS_PER_BIN = 50
+_BINS_PER_SIDE = 300
 _MOST_BINS = 100_000_000
 _ON_THE_EDGE = 1e-9  # of a bin: rounding does not push a track out of the image
 _MICRONS = 1e6  # in a metre

@@ -19,11 +19,13 @@ from napari_shadowinv.film.film_response import Response, check_increasing
 
 __all__ = ["Spectra", "unfold"]
 
-_PART = 4096  # pixels
-# Of the last energy: in how many MeV the spectrum falls to 1/e beyond it.
-_FIRST_SLOPE, _FASTEST, _SLOWEST = 0.15, 0.02, 2.0
+_BLOCK_PX = 4096
+# Shares of the last energy within which the spectrum falls to 1/e beyond it.
+_START_SLOPE = 0.15
+_MIN_SLOPE = 0.02
+_MAX_SLOPE = 2.0
 _ROUNDS = 100
-_DISPLACED = 0.75  # displacement falls with this power of the energy: 0.5 by B, 1 by E
+_DISPLACEMENT_POWER = 0.75  # displacement falls with this power of the energy: 0.5 by B, 1 by E
 
 
 class Spectra(NamedTuple):
@@ -88,12 +90,12 @@ class _Basis(NamedTuple):
         normal = weighed.T @ weighed + self.bends.T @ self.bends / curvature**2
         unfolded = np.linalg.solve(normal, weighed.T * per_error) @ self.kernel
         displaced = unfolded @ _displacement(self.energies) / unfolded.sum(axis=1)
-        return np.asarray(displaced ** (-1 / _DISPLACED))
+        return np.asarray(displaced ** (-1 / _DISPLACEMENT_POWER))
 
 
 def _displacement(energies: FloatArray) -> FloatArray:
     """Return the displacement of protons by fields, up to a factor."""
-    return np.asarray(energies**-_DISPLACED)
+    return np.asarray(energies**-_DISPLACEMENT_POWER)
 
 
 def unfold(
@@ -152,9 +154,9 @@ def unfold(
     basis = _usual_basis(mean, response)
     bends = basis.bends / curvature
     fluence, variance = np.zeros_like(flat), np.zeros_like(flat)
-    for first in range(0, len(flat), _PART):
+    for first in range(0, len(flat), _BLOCK_PX):
         report("unfold", first, len(flat))
-        part = slice(first, first + _PART)
+        part = slice(first, first + _BLOCK_PX)
         spectra = _unfold_pixels(flat[part], per_error[part], basis.matrix, bends)
         fluence[part], variance[part] = spectra
     planes = (count, *film_doses.shape[1:])
@@ -167,13 +169,13 @@ def _usual_basis(mean: FloatArray, response: Response) -> _Basis:
     """Return the basis of the spectrum of the mean doses, extrapolated by its fall at the end."""
     check_increasing(response.bands)
     peaks = np.array([band.peak for band in response.bands])
-    slope = _FIRST_SLOPE * peaks[-1]
+    slope = _START_SLOPE * peaks[-1]
     basis = _Basis.of(response, np.exp(-peaks / slope), slope)
     for _ in range(_ROUNDS):
         usual = _peel_spectrum(mean, basis.matrix / basis.usual)
         if len(usual) > 1:
             falls = max(np.log(usual[-2] / usual[-1]), 1e-9)
-            shortest, longest = _FASTEST * peaks[-1], _SLOWEST * peaks[-1]
+            shortest, longest = _MIN_SLOPE * peaks[-1], _MAX_SLOPE * peaks[-1]
             measured_slope = np.clip((peaks[-1] - peaks[-2]) / falls, shortest, longest)
             # Half way, because a slower fall beyond the last film makes the next one faster.
             slope = float(np.sqrt(slope * measured_slope))

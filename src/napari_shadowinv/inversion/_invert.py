@@ -43,7 +43,8 @@ from napari_shadowinv.transport.solvers import LevelSolution, fitted_flux, solve
 __all__ = ["count_sites", "invert", "plan_sites"]
 
 # Steps of the read-out: up to the first number the potential, then the re-projection.
-_READ, _STEPS = 30, 100
+_READ_STEPS = 30
+_STEPS = 100
 
 
 def plan_sites(
@@ -409,19 +410,19 @@ def _read_fields(
             on_progress=lambda news: report_share(news.step / (news.total or 1), first, last),
         )
 
-    report_share(0, 0, _READ)
+    report_share(0, 0, _READ_STEPS)
     potential, displacement = read_out(
-        solution, options, lambda share: report_share(share, 0, _READ)
+        solution, options, lambda share: report_share(share, 0, _READ_STEPS)
     )
     source = prepared.source / prepared.unit
     flux_left: dict[str, float] = {}
     flux_entered: dict[str, float] = {}
     if plan.margin is None:
-        reprojection = reprojected(source, _READ, _STEPS)
+        reprojection = reprojected(source, _READ_STEPS, _STEPS)
     else:
-        halfway = (_READ + _STEPS) // 2
+        halfway = (_READ_STEPS + _STEPS) // 2
         of_image, of_margin = plan.margin.parts(source)
-        from_image = reprojected(of_image, _READ, halfway)
+        from_image = reprojected(of_image, _READ_STEPS, halfway)
         from_margin = reprojected(of_margin, halfway, _STEPS)
         reprojection = plan.within(from_image + from_margin)
         flux_left, flux_entered = edge_flux(from_image, from_margin, plan.margin)

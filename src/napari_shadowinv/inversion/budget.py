@@ -41,8 +41,10 @@ _USUAL_RATE, _RATES = 0.35, (0.25, 0.7)  # of the change between levels to the o
 _MIN_STEP = 3.0  # times the sites of the level before, for a full step
 _SAFETY = 1.3
 _MAX_RESIDUAL = 0.1  # of a level, for its error to be estimated
-_SHARE_OF_NOISE, _MUCH_NOISE = 0.2, 0.8
-_MAX_BEAM_AT_PEAK, _MAX_BEAM_RMS = 0.1, 0.25  # without a warning, of the displacement
+_SHARE_OF_NOISE = 0.2
+_MAX_SHARE_OF_NOISE = 0.8  # above it, an estimate of the noise suffices
+_MAX_BEAM_AT_PEAK = 0.1  # of the displacement, without a warning
+_MAX_BEAM_RMS = 0.25  # of the displacement, without a warning
 
 _MAX_RESPONSE_SITES = 4500  # of a level whose linear response is computed
 _NOISE_SAMPLES, _BEAM_SAMPLES, _WAVES = 16, 8, 16
@@ -255,7 +257,7 @@ class Budget:
             return 0.0
         # An estimate for a uniform beam; the exact value is needed only where this is large.
         noise, _ = self._noise.displacements(self._noise.typical)
-        if error < _MUCH_NOISE * noise:
+        if error < _MAX_SHARE_OF_NOISE * noise:
             response = self._response(solved)
             moves, finer = self._noisy_moves(response, solved[-1].level.spacing)
             by_noise = _with_finer(_mean_square(moves), finer)
@@ -456,8 +458,8 @@ def _roots(square: float, square_at_peak: float) -> ErrorEstimate:
     return ErrorEstimate(math.sqrt(square), math.sqrt(square_at_peak))
 
 
-def _percent(error: float, whole: float) -> str:
-    if not whole > 0:
+def _percent(error: float, total: float) -> str:
+    if not total > 0:
         return "0 %"
-    percent = 100 * error / whole
+    percent = 100 * error / total
     return f"{percent:.0f} %" if percent >= 100 else f"{percent:.2g} %"

@@ -280,7 +280,7 @@ def uncertainty(
         clean = prepare(image, plan.source, clipping, plan.mask).floored_image
         response = _in_thread(lambda: LinearResampling(resampling, clean, options.threads), quietly)
         linear = _in_thread(lambda: response.changes(seeds[:_CHECKED]), quietly)
-        off = _share(linear[:, 1:] - checked[:, 1:], checked[:, 1:])
+        off = _relative_length(linear[:, 1:] - checked[:, 1:], checked[:, 1:])
         del checked, linear
         blocks = [seeds[start : start + WIDTH] for start in range(0, len(seeds), WIDTH)]
         scatter = reduce(add, _in_order(response.scatter, blocks, workers, report))
@@ -317,9 +317,9 @@ def uncertainty(
     )
 
 
-def _share(part: FloatArray, whole: FloatArray) -> float:
+def _relative_length(part: FloatArray, reference: FloatArray) -> float:
     """Return the length of one vector relative to another."""
-    length = float(np.linalg.norm(whole))
+    length = float(np.linalg.norm(reference))
     return float(np.linalg.norm(part)) / length if length > 0 else 0.0
 
 

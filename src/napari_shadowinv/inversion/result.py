@@ -178,7 +178,7 @@ class Inversion:
         if smoothing and not is_stated and not self.errors.noise_correlation:
             caveat = (
                 f"measured after {', '.join(smoothing)}, where most of it cannot be seen: its "
-                "error is larger than told; give the noise_level or quantum of the recorded image"
+                "error is larger than stated; give the noise_level or quantum of the recorded image"
             )
             rows.append(("noise", caveat))
         return rows

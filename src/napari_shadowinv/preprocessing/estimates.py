@@ -40,7 +40,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import OnCaution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import pixels
-from napari_shadowinv.preprocessing.filling import FILL_WIDTH, filled, interpolated_source
+from napari_shadowinv.preprocessing.filling import FILL_WIDTH, fill_masked, interpolated_source
 from napari_shadowinv.preprocessing.filters import low_pass
 from napari_shadowinv.preprocessing.steps import Choice, degree_field, width_field
 
@@ -273,7 +273,7 @@ def total_variation_source(
     weight = pixels.checked_number("weight", weight, above=0, unit="px")
     iterations = pixels.checked_integer("iterations", iterations, least=1)
     report = Reporter(None, should_stop)
-    complete = values if usable.all() else filled(values, usable, FILL_WIDTH, 2, report)
+    complete = values if usable.all() else fill_masked(values, usable, FILL_WIDTH, 2, report)
     mean = values[usable].mean()
     beam = mean * least_variation(complete / mean, weight, iterations, report)
     return pixels.with_flux_of(beam, values, usable)

@@ -78,11 +78,11 @@ def interpolated_source(
     width = pixels.checked_number("width", width, above=0, unit="px")
     power = 2 if kind == "biharmonic" else 1
     report = Reporter(None, should_stop)
-    beam = np.where(usable, values, filled(values, usable, width, power, report))
+    beam = np.where(usable, values, fill_masked(values, usable, width, power, report))
     return pixels.with_flux_of(beam, values, usable)
 
 
-def filled(
+def fill_masked(
     values: FloatArray, usable: BoolArray, width: float, power: int, report: Reporter
 ) -> FloatArray:
     """Fit a smoothing spline to the usable pixels and continue it over the others."""

@@ -19,7 +19,8 @@ _MOST_FITTED_PIXELS = 2**16
 _MOST_FITS = 10
 _NOTABLE_EXTRAPOLATION = 1.5  # times the brightest pixel seen
 # Of a fitted Gaussian: height over the image's mean, and sides from the image's middle.
-_HIGHEST, _FARTHEST = 1e3, 3.0
+_MAX_HEIGHT = 1e3
+_MAX_DISTANCE = 3.0
 
 
 class GaussianEstimate(Estimate):
@@ -142,9 +143,9 @@ def _bounds(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return bounds of the parameters of `_gaussian`, without which it may hide behind a mask."""
     steepest = math.sqrt(_MOST_FITTED_PIXELS)  # one over the width of a block of pixels
     ranges = [
-        (0, _HIGHEST),
-        (0, _HIGHEST),
-        *((axis.mean() - _FARTHEST, axis.mean() + _FARTHEST) for axis in (y, x)),
+        (0, _MAX_HEIGHT),
+        (0, _MAX_HEIGHT),
+        *((axis.mean() - _MAX_DISTANCE, axis.mean() + _MAX_DISTANCE) for axis in (y, x)),
         *[(-steepest, steepest)] * 3,
     ]
     least, most = np.transpose(ranges)
