@@ -110,12 +110,12 @@ def test_fluence_of_a_pixel_grows_with_its_dose_where_a_film_is_bridged(response
     bent = falling(response, 8.0) * (1 + 0.3 * (response.energies / 3) ** -0.75)
     # Three pixels of the same spectrum, among 97 plain ones that set the usual one.
     spectra = [*(factor * bent for factor in factors), *[falling(response, 8.0)] * 97]
-    doses = np.stack([doses_of(response, one)[:, 0, 0] for one in spectra], axis=1)
+    doses = np.stack([doses_of(response, spectrum)[:, 0, 0] for spectrum in spectra], axis=1)
     doses = doses.reshape(len(doses), 10, 10)
     errors = np.full(doses.shape, 0.1)
     errors[3, 0, :3] = np.inf
-    found = unfold(doses, errors, response).fluence[:, 0, :3]
-    np.testing.assert_allclose(found / factors, found[:, :1] * np.ones(3), rtol=1e-6)
+    fluence = unfold(doses, errors, response).fluence[:, 0, :3]
+    np.testing.assert_allclose(fluence / factors, fluence[:, :1] * np.ones(3), rtol=1e-6)
 
 
 def test_twice_the_dose_is_twice_the_fluence(response: Response) -> None:

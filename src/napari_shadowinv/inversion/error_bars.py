@@ -185,7 +185,7 @@ def uncertainty(
     noise : "poisson" or float or array_like of shape (H, W)
         ``"poisson"``: each pixel counts quanta (photons, protons), whose number scatters by
         its square root. Else the standard deviation of Gaussian noise, in the image's units.
-        Gaussian noise is as correlated between pixels as the image's noise is measured to be.
+        Gaussian noise is correlated between pixels as measured in the image.
         Samples that it drives below zero are clipped there, whatever `options.negative` says of
         the image.
     gain : float, optional

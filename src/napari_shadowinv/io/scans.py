@@ -43,7 +43,7 @@ def read_scan(path: Path) -> Scan:
 
 
 def _pixel_size(path: Path) -> float | None:
-    """Return the pixel size by a TIFF's resolution; scanners do not set it in other formats."""
+    """Return the pixel size by a TIFF's resolution; scanners set none in other formats."""
     import tifffile
 
     try:

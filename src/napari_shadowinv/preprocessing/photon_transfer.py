@@ -2,9 +2,9 @@
 
 The variance of counts is proportional to the signal, so it vanishes where the signal does (photon
 transfer). Noise of reading moves that point below the offset, never above. Noise in proportion to
-the signal, such as by uneven pixels, moves it above; only deep shadows distinguish that from an
-offset. A recorded source has the same uneven pixels as the image, so their common part
-is a limit for such noise, and shadows need not be deep.
+the signal, as from uneven pixels, moves it above; only deep shadows distinguish it from an offset.
+A recorded source has the same uneven pixels as the image, so their common pattern limits such
+noise, and shadows need not be deep.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class _NoisyPlane:
 
     @cached_property
     def _local(self) -> tuple[FloatArray, FloatArray]:
-        """Mean of 3 × 3 pixels, and a difference in which all but noise cancels, where usable."""
+        """Means of 3 × 3 usable pixels, and differences in which all but noise cancels."""
         image, mask = self.image, self.mask
         rows = max(1, image.size // _SAMPLES)  # of long images, lines far apart
         starts = np.arange(0, image.shape[0] - 2, rows)
@@ -103,7 +103,7 @@ class _NoisyPlane:
     def bins(self) -> FloatArray:
         """Brightness, noise and its uncertainty by brightness, shape (3, bins).
 
-        The noise is a standard deviation, the uncertainty is of the variance over the noise.
+        The noise is a standard deviation; its uncertainty is the variance's, divided by the noise.
         """
         brightness, differences = self._local
         order = order_by_value(brightness)
@@ -147,17 +147,17 @@ def _offset(bins: FloatArray, max_pattern: float, min_gain: float) -> float:
         return 0.0
     variances, weights = noise**2, 1 / (noise * uncertainty)
     powers = np.stack([np.ones_like(levels), levels, levels**2], axis=1) * weights[:, None]
-    goal = variances * weights
-    terms, freely = nnls(powers, goal)
+    weighted = variances * weights
+    terms, freely = nnls(powers, weighted)
     distance = freely
     if terms[2] > max_pattern:
-        distance = nnls(powers[:, :2], goal - max_pattern * powers[:, 2])[1]
+        distance = nnls(powers[:, :2], weighted - max_pattern * powers[:, 2])[1]
     # Weighted least squares of v = g (m - D).
     line = powers[:, [1, 0]] * [1.0, -1.0]
-    (gain, offset), *_ = np.linalg.lstsq(line, goal, rcond=None)
+    (gain, offset), *_ = np.linalg.lstsq(line, weighted, rcond=None)
     if not gain > 0:
         return 0.0
-    with_offset = float(((gain * line[:, 0] + offset * line[:, 1] - goal) ** 2).sum())
+    with_offset = float(((gain * line[:, 0] + offset * line[:, 1] - weighted) ** 2).sum())
     dark = float(offset / gain)
     chi2 = max(1.0, with_offset / (len(levels) - 2))
     least = (min_gain if highest > _WIDE_RANGE * lowest else _MIN_GAIN_NARROW) * chi2
