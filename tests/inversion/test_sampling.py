@@ -42,7 +42,8 @@ def case(request, image):
     options = InversionOptions(n_sites=1000, negative="clip", **KINDS[request.param])
     plan = plan_sites(np.ones(SHAPE), options, mask=mask)
     draw, _ = noise_of(image, NOISE, None, mask)
-    samples = FullResampling(plan, invert(image, plan=plan, options=options).weights, draw, options)
+    weights = invert(image, plan=plan, options=options).weights
+    samples = FullResampling(plan, weights, lambda rng: draw(rng, 0.0), options)
     clean = prepare(image, plan.source, options, mask).floored_image
     return samples, clean
 
