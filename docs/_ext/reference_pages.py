@@ -28,7 +28,14 @@ FOLDER = Path(__file__).parents[1] / "reference"
 _SHAPES: dict[Any, str] = {Path: "PATH", int: "INTEGER", float: "NUMBER", str: "TEXT"}
 
 TASKS: dict[str, tuple[str, ...]] = {
-    "Invert one image": ("invert", "InversionOptions", "Inversion", "Report", "plan_sites"),
+    "Invert one image": (
+        "invert",
+        "InversionOptions",
+        "Inversion",
+        "Report",
+        "Caution",
+        "plan_sites",
+    ),
     "Apply a recipe to a file": ("read", "Radiograph", "Recipe", "run", "write"),
     "Describe the experiment, for SI units": ("ProtonSetup", "OpticalSetup"),
     "Estimate the error of a field": ("uncertainty", "Uncertainty"),

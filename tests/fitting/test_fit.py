@@ -164,7 +164,7 @@ def test_energies_that_hardly_differ_tell_no_more_than_one_image() -> None:
     result = fit(noisy(images, 0.1), strengths=[1, 0.97], noise=0.1, options=PLAIN)
     assert result.folded > 0.15
     assert result.verdict is Verdict.AMBIGUOUS
-    assert "one image does not tell" in result.explanation
+    assert "one image does not show" in result.explanation
 
 
 def test_a_start_at_the_truth_is_taken() -> None:

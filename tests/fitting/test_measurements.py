@@ -79,7 +79,7 @@ def nearly_all_masked() -> FloatArray:
         ({"strengths": [1, 0.6, 0.3]}, r"strengths have shape \(3, 1\).* each of 2 images"),
         ({"strengths": [1, np.nan]}, "strengths have shape.*: expected a finite number"),
         ({"strengths": [0, 1]}, r"strengths of the first image are \[0.0\]: all fields must act"),
-        ({"strengths": [[1, 1], [0.5, 0.5]]}, "2 fields cannot be told apart by images"),
+        ({"strengths": [[1, 1], [0.5, 0.5]]}, "2 fields cannot be distinguished by images"),
         ({"strengths": None}, "2 images and neither strengths nor setups: give"),
         ({"setups": [protons(3), protons(15)]}, "both strengths and setups, expected one of them"),
         (

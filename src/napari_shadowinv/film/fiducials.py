@@ -79,8 +79,8 @@ def poses_by_fiducials(
     for name, misfit in zip(names, misfits, strict=True):
         if misfit.size and misfit.max() > _MAX_MISFIT_PX:
             raise InputError(
-                f"fiducials: a mark on {name} is {misfit.max():.0f} px from where the marks of all "
-                "films tell: correct its name or its place"
+                f"fiducials: a mark on {name} is {misfit.max():.0f} px from its place by the marks "
+                "of all films: correct its name or its place"
             )
     # Degrees of freedom left by the marks' common places and each film's pose.
     poses = [len(marks) and min(3, 1 + len(marks)) for marks in film_marks]

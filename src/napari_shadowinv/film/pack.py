@@ -173,7 +173,7 @@ class PackLayer(CheckedModel):
         description="Image of the upright film's shape, 0 at unusable pixels.",
     )
     exclude: bool = Field(
-        default=False, title="Exclude", description="Whether its scan tells nothing."
+        default=False, title="Exclude", description="Whether its scan is useless."
     )
 
 
@@ -197,7 +197,7 @@ class Pack(CheckedModel):
     setup: Mapping[str, Any] | None = Field(
         default=None,
         title="Setup",
-        description="Distances, object_image_distance to the first film. The scans tell the size "
+        description="Distances, object_image_distance to the first film. The scans give the size "
         "of pixels, the pack the energies.",
     )
     scan: Path | None = Field(
@@ -245,7 +245,7 @@ class Pack(CheckedModel):
     align: Literal["images", "edges"] = Field(
         default="images",
         title="Align",
-        description="By what films show alike, or by their edges alone; not where fiducials tell.",
+        description="By shared structure, or by edges alone; not used where there are fiducials.",
     )
 
     @model_validator(mode="before")
@@ -273,7 +273,7 @@ class Pack(CheckedModel):
         if self.setup is not None:
             self.setups(np.ones(len(self.layers)), 1e-4)
         elif self.axis is not None:
-            raise ValueError("axis is given and no setup: without it nothing tells magnifications")
+            raise ValueError("axis is given and no setup: without it magnifications are not known")
         return self
 
     @property

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 from zlib import crc32
 
@@ -179,25 +180,25 @@ def fit(
     scene = data.held(options.smoothness)
     steps = 0
 
-    def tell(stage: str, objective: float) -> None:
+    def on_step(stage: str, objective: float) -> None:
         nonlocal steps
         steps += 1
         report("fit", steps, None, stage, objective)
 
     with _timed("starts", seconds):
-        minima = search(scene, starts(data, start, tell, should_stop), tell)
+        minima = search(scene, starts(data, start, on_step, should_stop), on_step)
     with _timed("smoothness", seconds):
-        scene, best = with_likely_smoothness(scene, minima[0], rng, tell)
+        scene, best = with_likely_smoothness(scene, minima[0], rng, on_step)
         if data.counted:
             scene = reweighted(data, scene, best)
-            best = settled(scene, best, tell)
-        basins = _basins(scene, best, minima[1:], tell)
+            best = settled(scene, best, on_step)
+        basins = _basins(scene, best, minima[1:], on_step)
     with _timed("full size", seconds):
-        fine, unknowns, value, taken, ended = refined(scene, best, options, tell)
+        fine, unknowns, value, taken, ended = refined(scene, best, options, on_step)
     with _timed("residual", seconds):
         pattern = find_pattern(fine, unknowns, data.size)
         middle = replace(coarser(scene, MIDDLE), spacing=_SPACING_OF_SAMPLES)
-        posterior = Posterior(middle, best.unknowns, rng, lambda: tell("samples", value))
+        posterior = Posterior(middle, best.unknowns, rng, lambda: on_step("samples", value))
         gain_by_blur = 0.0
         # With several images the fit is repeated only if the residual asks for it.
         if (
@@ -208,16 +209,16 @@ def fit(
                 and posterior.blur_score() > _MIN_COARSE_BLUR_SCORE
             )
         ):
-            gain_by_blur = best.value - with_wider_spread(scene, best, tell).value
+            gain_by_blur = best.value - with_wider_spread(scene, best, on_step).value
         if pattern.is_certain and pattern.chi2 < _MAX_RIVAL_CHI2:
-            cause = name_cause(scene, best, fields, setups, tell)
+            cause = name_cause(scene, best, fields, setups, on_step)
             pattern = replace(pattern, cause=cause)
     with _timed("samples", seconds):
         errors = errors_by_noise(scene, posterior, data.size, options.samples)
         by_beam = shifts_by_beam(data, scene, posterior, options)
         evidence = float("nan")
         if options.evidence:
-            evidence = _log_evidence(scene, best, fields, options, tell)
+            evidence = _log_evidence(scene, best, fields, options, on_step)
         if errors is not None:
             errors *= noise_amplification(pattern.correlation)
     found_by = FitReport(
@@ -297,7 +298,7 @@ def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
 
 
 def starts(
-    given: Measured, start: ArrayLike | None, tell: Any, should_stop: ShouldStop | None
+    given: Measured, start: ArrayLike | None, on_step: Any, should_stop: ShouldStop | None
 ) -> list[Start]:
     """Return the starting points: no field, the `start` field, and inversions by transport."""
     scene = given.scene
@@ -319,7 +320,7 @@ def starts(
         return candidates
     sizes = np.abs(scene.strengths[:, 0])  # zero where the object does not deflect: a blank shot
     weakest = int(np.argmin(np.where(sizes > 0, sizes, np.inf)))
-    tell("transport", float("nan"))
+    on_step("transport", float("nan"))
     transported = _transported(given, weakest, should_stop)
     if transported is None:
         return candidates
@@ -363,14 +364,14 @@ def reweighted(given: Measured, scene: Scene, found: Found) -> Scene:
     return replace(scene, weights=np.where(scene.weights > 0, weights, 0.0))
 
 
-def _basins(scene: Scene, best: Found, others: Sequence[Found], tell: Any) -> tuple[Basin, ...]:
+def _basins(scene: Scene, best: Found, others: Sequence[Found], on_step: Any) -> tuple[Basin, ...]:
     """The best answer and others, with the same λ and without blur.
 
     Smoother fields have decided which is best: the present λ favours what follows the
     noise.
     """
     middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
-    ends = [best, *(settled(scene, minimum, tell, "other starts") for minimum in others[:2])]
+    ends = [best, *(settled(scene, minimum, on_step, "other starts") for minimum in others[:2])]
     chi2 = [
         middle.chi2(minimum.unknowns, middle.ray_counts(minimum.unknowns)).mean()
         for minimum in ends
@@ -382,15 +383,16 @@ def _basins(scene: Scene, best: Found, others: Sequence[Found], tell: Any) -> tu
 
 
 def _log_evidence(
-    scene: Scene, best: Found, names: Sequence[str], options: FitOptions, tell: Any
+    scene: Scene, best: Found, names: Sequence[str], options: FitOptions, on_step: Any
 ) -> float:
     """Log evidence at the likeliest λ and κ, where it depends least on their accuracy."""
     if options.smoothness is None:
         scene = replace(scene, smoothness=scene.smoothness / HELD)
-    ended = settled(scene, best, tell, "evidence", least_gain=0.1)
+    ended = settled(scene, best, on_step, "evidence", least_gain=0.1)
     middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
     chances = [np.random.default_rng([options.seed, crc32(name.encode())]) for name in names]
-    posterior = Posterior(middle, ended.unknowns, chances[0], lambda: tell("evidence", ended.value))
+    report = partial(on_step, "evidence", ended.value)
+    posterior = Posterior(middle, ended.unknowns, chances[0], report)
     return posterior.log_evidence(chances)
 
 

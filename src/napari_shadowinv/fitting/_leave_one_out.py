@@ -114,12 +114,12 @@ def leave_one_out(
     report = Reporter(on_progress, should_stop)
     steps = 0
 
-    def tell(stage: str, objective: float) -> None:
+    def on_step(stage: str, objective: float) -> None:
         nonlocal steps
         steps += 1
         report("leave one out", steps, None, stage, objective)
 
-    work = _Work(data, options, tell)
+    work = _Work(data, options, on_step)
     begun = work.begun(should_stop)
     agreeing = work.agreeing(begun)
     scene, common = work.with_likely_smoothness(agreeing, begun)
@@ -168,15 +168,15 @@ class _OwnFit:
 class _Work:
     """Context of all steps: images, options, and the callback for progress."""
 
-    def __init__(self, given: Measured, options: FitOptions, tell: Any) -> None:
-        self._given, self._options, self._tell = given, options, tell
+    def __init__(self, given: Measured, options: FitOptions, on_step: Any) -> None:
+        self._given, self._options, self._on_step = given, options, on_step
         self._count = len(given.units)
 
     def begun(self, should_stop: ShouldStop | None) -> Found:
         """Where a search in all images ends, in pixels of two."""
         scene = self._given.held(self._options.smoothness)
-        begun = starts(self._given, None, self._tell, should_stop)
-        return search(scene, begun, self._tell)[0]
+        begun = starts(self._given, None, self._on_step, should_stop)
+        return search(scene, begun, self._on_step)[0]
 
     def agreeing(self, begun: Found) -> list[int]:
         """The most images that one field explains, found in pixels of two."""
@@ -220,7 +220,7 @@ class _Work:
         scene = self._given.held(self._options.smoothness)
         rng = np.random.default_rng(self._options.seed)
         first = replace(begun, unknowns=begun.unknowns.only(members))
-        part, best = with_likely_smoothness(scene.only(members), first, rng, self._tell)
+        part, best = with_likely_smoothness(scene.only(members), first, rng, self._on_step)
         scene = replace(scene, smoothness=part.smoothness)
         common = replace(best, unknowns=begun.unknowns.with_those(members, best.unknowns))
         if self._given.counted:
@@ -254,7 +254,7 @@ class _Work:
         coarse = self._settled(scene, common, members, name, _LAST_GAIN)
         part = scene.only(members)
         first = replace(coarse, unknowns=coarse.unknowns.only(members))
-        fine, unknowns, *_ = refined(part, first, self._options, self._tell)
+        fine, unknowns, *_ = refined(part, first, self._options, self._on_step)
         # Folds are deeper in the image that is left out if it is displaced most.
         fine = replace(fine, spacing=_RAY_SPACING_RATIO * fine.spacing)
         unknowns, value, *_ = settle(
@@ -262,7 +262,7 @@ class _Work:
             unknowns,
             steps=_DENSE_STEPS,
             least_gain=_LAST_GAIN,
-            after_step=lambda now: self._tell(name, now),
+            after_step=lambda now: self._on_step(name, now),
         )
         rng = np.random.default_rng(self._options.seed)
         large = fine.images.size > _MAX_SAMPLED_PIXELS
@@ -270,7 +270,7 @@ class _Work:
             replace(coarser(part, MIDDLE), spacing=MIDDLE_SPACING) if large else fine,
             first.unknowns if large else unknowns,
             rng,
-            lambda: self._tell(name, value),
+            lambda: self._on_step(name, value),
         )
         changes = [posterior.drawn(_SAMPLE_TOLERANCE) for _ in range(_SAMPLES)]
         if large:
@@ -326,7 +326,7 @@ class _Work:
     ) -> Found:
         """Fit some of the images; gains and frames of the others stay."""
         first = replace(found, unknowns=found.unknowns.only(members))
-        end = settled(scene.only(members), first, self._tell, name, least_gain)
+        end = settled(scene.only(members), first, self._on_step, name, least_gain)
         return replace(end, unknowns=found.unknowns.with_those(members, end.unknowns))
 
     @staticmethod

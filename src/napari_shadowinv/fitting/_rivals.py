@@ -10,7 +10,7 @@ import numpy as np
 from napari_shadowinv.fitting.descent import coarser
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import strengths_of
-from napari_shadowinv.fitting.search import MIDDLE, MIDDLE_SPACING, Found, Tell, settled
+from napari_shadowinv.fitting.search import MIDDLE, MIDDLE_SPACING, Found, OnStep, settled
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.physics.setup import Setup
 
@@ -48,7 +48,7 @@ def name_cause(
     best: Found,
     names: Sequence[str],
     setups: Sequence[Setup] | None,
-    tell: Tell,
+    on_step: OnStep,
 ) -> str:
     """Return the likeliest reason why a fit leaves a pattern, as a clause; "" if none is likely.
 
@@ -63,7 +63,7 @@ def name_cause(
         The fields.
     setups : sequence of Setup, optional
         The experiment of each image.
-    tell : callable
+    on_step : callable
         Receives the stage and the objective.
     """
     pixels = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
@@ -72,7 +72,7 @@ def name_cause(
     gains = []
     for rival in _rivals(scene, best, names, setups):
         start = Found(best.start, rival.unknowns, best.value, best.displacement)
-        end = settled(rival.scene, start, tell, "rivals", steps=_STEPS)
+        end = settled(rival.scene, start, on_step, "rivals", steps=_STEPS)
         gains.append((2 * (best.value - end.value) - rival.free_numbers, rival.cause))
     gains.sort(reverse=True)
     if not gains or gains[0][0] < _MIN_GAIN:
@@ -88,9 +88,9 @@ def name_cause(
     return f"{', or '.join(list(likely)[:2])} ({falls})"
 
 
-def with_wider_spread(scene: Scene, best: Found, tell: Tell) -> Found:
+def with_wider_spread(scene: Scene, best: Found, on_step: OnStep) -> Found:
     """Return the fit of images that are blurred by more than was given; kernels stay."""
-    return settled(_wider(scene, _WIDER_PX), best, tell, "point spread")
+    return settled(_wider(scene, _WIDER_PX), best, on_step, "point spread")
 
 
 def _rivals(

@@ -164,7 +164,7 @@ def measured(
     )
 
 
-_SAME_STRENGTH = 1.08  # images that differ by less tell no more than one
+_SAME_STRENGTH = 1.08  # images that differ by less add no information
 
 
 def strengths_of(
@@ -306,8 +306,8 @@ def _checked_strengths(strengths: ArrayLike, count: int) -> FloatArray:
         )
     if matrix.shape[1] > 1 and np.linalg.matrix_rank(matrix, tol=0.02) < matrix.shape[1]:
         raise InputError(
-            f"{matrix.shape[1]} fields cannot be told apart by images of these energies: expected "
-            "strengths that differ between the fields; give more energies or one field"
+            f"{matrix.shape[1]} fields cannot be distinguished by images of these energies: "
+            "expected strengths that differ between the fields; give more energies or one field"
         )
     # All in units of the first image's.
     with np.errstate(over="ignore"):

@@ -31,7 +31,7 @@ __all__ = [
     "with_likely_smoothness",
 ]
 
-Tell = Callable[[str, float], None]
+OnStep = Callable[[str, float], None]
 
 MIDDLE = 2  # pixels in which starts are compared and λ is found
 FIRST_SMOOTHNESS = np.array([50.0, 2000.0])  # λ and κ
@@ -90,7 +90,7 @@ def _splines_of(scene: Scene, potential: FloatArray) -> FloatArray:
     return np.asarray(values) / scene.bin**2
 
 
-def search(scene: Scene, starts: Sequence[Start], tell: Tell) -> list[Found]:
+def search(scene: Scene, starts: Sequence[Start], on_step: OnStep) -> list[Found]:
     """Descend from each start to pixels of two; return the distinct minima, best first.
 
     Of the starts that have come to the same stage before the last, those go on that are best.
@@ -107,14 +107,14 @@ def search(scene: Scene, starts: Sequence[Start], tell: Tell) -> list[Found]:
         end = _begun(coarser(rough, start.stages[0][0]), start)
         first = replace(rough, beam_spread=_HELD_BEAM) if start.beam_held else rough
         for stage in before:
-            end = _descended(first, end, stage, tell)
+            end = _descended(first, end, stage, on_step)
         if before:
             halfway.setdefault(before[-1], []).append(end)
         else:
-            ends.append(_descended(rough, end, last, tell))
+            ends.append(_descended(rough, end, last, on_step))
     for rivals in halfway.values():
         for end in _different(rivals)[:_CONTINUED]:
-            ends.append(_descended(rough, end, starts[0].stages[-1], tell))
+            ends.append(_descended(rough, end, starts[0].stages[-1], on_step))
     return _different(ends)
 
 
@@ -134,7 +134,7 @@ def _begun(scene: Scene, start: Start) -> Found:
     return Found(start.name, unknowns, np.inf, _displacement(scene, unknowns), scene.bin)
 
 
-def _descended(scene: Scene, found: Found, stage: tuple[int, float], tell: Tell) -> Found:
+def _descended(scene: Scene, found: Found, stage: tuple[int, float], on_step: OnStep) -> Found:
     factor, blur = stage
     now = replace(coarser(scene, factor), blur=blur)
     unknowns = found.unknowns
@@ -145,7 +145,7 @@ def _descended(scene: Scene, found: Found, stage: tuple[int, float], tell: Tell)
         unknowns,
         iterations=_COARSE_STEPS,
         least_gain=COARSE_GAIN,
-        after_step=lambda now: tell(found.start, now),
+        after_step=lambda now: on_step(found.start, now),
     )
     return Found(found.start, unknowns, value, _displacement(now, unknowns), factor)
 
@@ -156,32 +156,32 @@ def _displacement(scene: Scene, unknowns: Unknowns) -> FloatArray:
 
 
 def with_likely_smoothness(
-    scene: Scene, end: Found, rng: np.random.Generator, tell: Tell
+    scene: Scene, end: Found, rng: np.random.Generator, on_step: OnStep
 ) -> tuple[Scene, Found]:
     """Find λ and κ, unless they are given, and the unknowns that belong to them."""
     is_fixed = bool(scene.smoothness.any())
     if not is_fixed:
         scene = replace(scene, smoothness=np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1)))
-    end = settled(scene, end, tell)
+    end = settled(scene, end, on_step)
     if is_fixed:
         return scene, end
     for _ in range(_ROUNDS):
         middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
         value = end.value
-        posterior = Posterior(middle, end.unknowns, rng, lambda: tell("smoothness", value))  # noqa: B023
+        posterior = Posterior(middle, end.unknowns, rng, lambda: on_step("smoothness", value))  # noqa: B023
         likely, change = posterior.likely_smoothness()
         if change < _SETTLED:
             break
         scene = replace(scene, smoothness=likely / smoothness_in_pixels(MIDDLE))
-        end = settled(scene, end, tell)
+        end = settled(scene, end, on_step)
     scene = replace(scene, smoothness=HELD * likely / smoothness_in_pixels(MIDDLE))
-    return scene, settled(scene, end, tell, least_gain=_LAST_GAIN)
+    return scene, settled(scene, end, on_step, least_gain=_LAST_GAIN)
 
 
 def settled(
     scene: Scene,
     found: Found,
-    tell: Tell,
+    on_step: OnStep,
     name: str = "smoothness",
     least_gain: float = COARSE_GAIN,
     steps: int = _ROUND_STEPS,
@@ -193,13 +193,13 @@ def settled(
         found.unknowns,
         steps=steps,
         least_gain=least_gain,
-        after_step=lambda now: tell(name, now),
+        after_step=lambda now: on_step(name, now),
     )
     return Found(found.start, unknowns, value, _displacement(middle, unknowns))
 
 
 def refined(
-    scene: Scene, found: Found, options: FitOptions, tell: Tell
+    scene: Scene, found: Found, options: FitOptions, on_step: OnStep
 ) -> tuple[Scene, Unknowns, float, int, bool]:
     """Descend with the pixels as recorded, with rays as dense as the data need.
 
@@ -215,7 +215,7 @@ def refined(
             unknowns,
             steps=min(most, options.steps - steps),
             least_gain=_FINE_GAIN,
-            after_step=lambda now: tell("full size", now),
+            after_step=lambda now: on_step("full size", now),
         )
         steps += taken
         chi2 = scene.chi2(unknowns, scene.ray_counts(unknowns))

@@ -138,12 +138,12 @@ def judged(
         )
     if single and (lost := _share_lost(displacement)) > _LOST:
         return Verdict.AMBIGUOUS, (
-            f"the object sends {lost:.0%} of the rays past the image, and one image does not tell "
+            f"the object sends {lost:.0%} of the rays past the image, and one image does not show "
             "which; record a larger field of view, or take another energy"
         )
     if single and (meeting := _share_meeting(jacobian, displacement)) > _FEW:
         return Verdict.AMBIGUOUS, (
-            f"rays meet or cross over {meeting:.0%} of the object, and one image does not tell "
+            f"rays meet or cross over {meeting:.0%} of the object, and one image does not show "
             "which came from where: the same bright lines come from fields with other folds; take "
             "another energy"
         )

@@ -1,0 +1,123 @@
+"""The language of the code: names are nouns of the field, sentences those of an experimenter.
+
+Read from the source with `ast`, so that comments and code of other people do not count.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SOURCES = sorted((ROOT / "src").rglob("*.py"))
+FILES = [*SOURCES, *sorted((ROOT / "tests").rglob("*.py"))]
+TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+
+VAGUE_WORDS = """
+one own other others found known told given kept made left whole rest asked held seen here there
+these those such same planned named shown placed drawn wanted meant
+"""
+VAGUE_NAMES = frozenset(VAGUE_WORDS.split())
+MAX_VAGUE_SHARE = 0.005
+# Idioms that no experimenter writes, and what to write instead.
+IDIOMS = {
+    r"(?<!cannot )\b(?:tells?|told|telling)\b": "report, show, say, depend on, contain",
+    r"\bso many\b": "the number",
+    r"\bas given\b": "by name what was entered",
+    r"\bE beside B\b": "E and B together",
+}
+
+
+def assigned_names(node: ast.AST) -> Iterator[str]:
+    """The variables that a statement or comprehension assigns."""
+    targets: list[ast.expr] = []
+    if isinstance(node, ast.Assign):
+        targets = node.targets
+    elif isinstance(node, ast.For | ast.comprehension | ast.AnnAssign | ast.NamedExpr):
+        targets = [node.target]
+    while targets:
+        target = targets.pop()
+        if isinstance(target, ast.Name):
+            yield target.id
+        elif isinstance(target, ast.Tuple | ast.List):
+            targets += target.elts
+        elif isinstance(target, ast.Starred):
+            targets.append(target.value)
+
+
+def docstrings(paths: list[Path]) -> Iterator[tuple[str, str]]:
+    """Each docstring with the place of its function, class or module."""
+    documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+    for path in paths:
+        for node in ast.walk(TREES[path]):
+            if isinstance(node, documented) and (text := ast.get_docstring(node)):
+                line = getattr(node, "lineno", 1)
+                yield f"{path.relative_to(ROOT)}:{line}", text
+
+
+def messages(path: Path) -> Iterator[tuple[int, str]]:
+    """The texts of a module that people read: sentences, not docstrings, keys or patterns."""
+    tree = TREES[path]
+    skipped = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        and node.body
+        and isinstance(node.body[0], ast.Expr)
+    }
+    for node in ast.walk(tree):
+        is_text = isinstance(node, ast.Constant) and isinstance(node.value, str)
+        if is_text and id(node) not in skipped and " " in node.value:
+            yield node.lineno, node.value
+
+
+def test_variables_are_named_by_what_they_hold():
+    names = Counter[str]()
+    vague = Counter[str]()
+    for path, tree in TREES.items():
+        for node in ast.walk(tree):
+            for name in assigned_names(node):
+                names[name] += 1
+                if name.strip("_") in VAGUE_NAMES:
+                    vague[str(path.relative_to(ROOT))] += 1
+    share = vague.total() / names.total()
+    assert share < MAX_VAGUE_SHARE, f"{share:.2%}, most in {vague.most_common(8)}"
+
+
+def test_docstrings_begin_with_a_verb_or_a_noun():
+    wrong = [place for place, text in docstrings(SOURCES) if re.match(r"(?:What|Tell)\b", text)]
+    assert not wrong
+
+
+@pytest.mark.parametrize("idiom", IDIOMS)
+def test_docstrings_use_no_idiom(idiom):
+    wrong = [place for place, text in docstrings(SOURCES) if re.search(idiom, text)]
+    assert not wrong, f"write {IDIOMS[idiom]}"
+
+
+@pytest.mark.parametrize("idiom", IDIOMS)
+def test_messages_help_and_windows_use_no_idiom(idiom):
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line}"
+        for path in SOURCES
+        for line, text in messages(path)
+        if re.search(idiom, text)
+    ]
+    assert not wrong, f"write {IDIOMS[idiom]}"
+
+
+@pytest.mark.parametrize("idiom", IDIOMS)
+def test_pages_use_no_idiom(idiom):
+    wrong = [
+        f"{path.relative_to(ROOT)}:{number}"
+        for path in PAGES
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if re.search(idiom, line)
+    ]
+    assert not wrong, f"write {IDIOMS[idiom]}"
