@@ -129,6 +129,38 @@ def test_an_image_that_lies_elsewhere_on_its_detector_is_found_there() -> None:
     np.testing.assert_allclose(aligned.chi2, levels(3), atol=0.06)
 
 
+def test_deep_folds_of_a_static_object_are_no_change() -> None:
+    strengths, blob = [1.0, 0.85, 0.7, 0.55], bump(2.6, 5, (23, 27))
+    images = [
+        counted(lambda y, x, s=strength: s * blob(y, x), (48, 56), rays=28)
+        for strength in strengths
+    ]
+    left_out = leave_one_out(noisy(images, 0.03), strengths=strengths, noise=0.03)
+    assert left_out.explained.all()
+
+
+def test_the_limit_allows_twice_the_variance_of_the_prediction() -> None:
+    strengths, blob, sigma = [1.0, 0.8, 0.65], bump(1.6, 5, (21, 25)), 0.05
+    clean = np.stack(
+        [
+            counted(lambda y, x, s=strength: s * blob(y, x), (44, 48), rays=28, margin=8)
+            for strength in strengths
+        ]
+    )
+    images = noisy(clean, sigma)
+    beam, options = np.ones((44, 48)), FitOptions(spacing=0.2)
+    known = {"strengths": strengths, "source": beam, "noise": sigma, "options": options}
+    left_out = leave_one_out(images, **known)
+    noise, variance = (
+        (((planes - clean) / sigma) ** 2).mean(axis=(1, 2))
+        for planes in (images, left_out.predicted)
+    )
+    # Of the image displaced most, which the others leave open by a tenth of the noise.
+    assert 0.08 < variance[0] < 0.2
+    assert 1.4 < (left_out.limit[0] - 1.15 * noise[0]) / variance[0] < 2.6
+    assert left_out.explained.all()
+
+
 def test_two_images_are_too_few() -> None:
     with pytest.raises(InputError, match="received 2 images: leaving one out needs 3 or more"):
         checked(np.ones((2, *SHAPE)), setups=SETUPS[:2])
