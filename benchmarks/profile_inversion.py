@@ -18,10 +18,10 @@ from unittest.mock import patch
 import numpy as np
 
 from napari_shadowinv import Inversion, InversionOptions, invert
-from napari_shadowinv.geometry import _flips
-from napari_shadowinv.geometry._mesh import FLIPS
+from napari_shadowinv.geometry import flips
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangle_mesh import FLIPS
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.transport.objective import TransportObjective
 from reference import toroid_case
@@ -67,7 +67,7 @@ def shares(profile: cProfile.Profile) -> dict[str, float]:
 def counted(image: np.ndarray, options: InversionOptions) -> tuple[Inversion, SimpleNamespace]:
     """Invert once more and count trial steps and flips."""
     count = SimpleNamespace(trials=0, rejected=0, flips=0)
-    repair = _flips.repair
+    repair = flips.repair
     try_weights = TransportObjective.diagram_if_full
 
     def counting_repair(mesh, *arguments):
@@ -83,7 +83,7 @@ def counted(image: np.ndarray, options: InversionOptions) -> tuple[Inversion, Si
         return diagram
 
     with (
-        patch.object(_flips, "repair", counting_repair),
+        patch.object(flips, "repair", counting_repair),
         patch.object(TransportObjective, "diagram_if_full", counting_trial),
     ):
         inversion = invert(image, source=np.ones(image.shape), options=options)

@@ -52,10 +52,10 @@ def opened_paths() -> Iterator[list[str]]:
 @pytest.fixture(scope="session", autouse=True)
 def dots_per_inch() -> int:
     """Write figures with few pixels, which take half as long; return the usual resolution."""
-    from napari_shadowinv.plotting import _figures
+    from napari_shadowinv.plotting import figures
 
-    usual = _figures.DOTS_PER_INCH
-    _figures.DOTS_PER_INCH = 40
+    usual = figures.DOTS_PER_INCH
+    figures.DOTS_PER_INCH = 40
     return usual
 
 

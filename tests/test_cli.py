@@ -1193,7 +1193,7 @@ def test_a_bug_keeps_its_traceback(shot: Path, monkeypatch: pytest.MonkeyPatch) 
     def broken(*arguments: object, **options: object) -> None:
         raise ValueError("shapes do not broadcast")
 
-    monkeypatch.setattr("napari_shadowinv.pipeline._run.invert", broken)
+    monkeypatch.setattr("napari_shadowinv.pipeline.inversion_run.invert", broken)
     result = shadowinv("invert", shot)
     assert isinstance(result.exception, ValueError)
 

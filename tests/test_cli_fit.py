@@ -70,7 +70,7 @@ def fit_arguments(
         strengths = (1.0, 1.7, 2.0, 3.0)[: len(arguments["images"])]
         return make_fit(strengths=strengths)
 
-    monkeypatch.setattr("napari_shadowinv.pipeline._fit.fit", fit)
+    monkeypatch.setattr("napari_shadowinv.pipeline.fit_run.fit", fit)
     return recorded
 
 
@@ -728,7 +728,7 @@ def test_setup_warnings_come_before_the_fit(monkeypatch: pytest.MonkeyPatch) -> 
     def fit(**_: Any) -> Fit:
         raise InputError("the work began")
 
-    monkeypatch.setattr("napari_shadowinv.pipeline._fit.fit", fit)
+    monkeypatch.setattr("napari_shadowinv.pipeline.fit_run.fit", fit)
     text = Path("setup.toml").read_text()
     near = text.replace("object_image_distance = 0.3", "object_image_distance = 1e-4")
     Path("setup.toml").write_text(near)

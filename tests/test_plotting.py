@@ -173,7 +173,7 @@ def test_comparison_has_one_scale(inversion: Inversion, proton_setup: ProtonSetu
 def test_saved_figure_has_page_size_and_replaces_on_request(
     tmp_path: Path, inversion: Inversion, dots_per_inch: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("napari_shadowinv.plotting._figures.DOTS_PER_INCH", dots_per_inch)
+    monkeypatch.setattr("napari_shadowinv.plotting.figures.DOTS_PER_INCH", dots_per_inch)
     figure = report_figure(inversion)
     path = save_figure(tmp_path / "report.png", figure)
     width, height = figure.get_size_inches() * 160

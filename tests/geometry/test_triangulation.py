@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.geometry import triangulation as module
-from napari_shadowinv.geometry._mesh import LIMIT
+from napari_shadowinv.geometry.triangle_mesh import LIMIT
 from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
 
 Array = NDArray[np.float64]

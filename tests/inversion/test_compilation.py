@@ -123,7 +123,7 @@ print([name for name, _ in signatures() - compiled])
 ONE_KERNEL = """
 import numpy as np
 from napari_shadowinv.preprocessing._total_variation import _smooth_row as kernel
-from napari_shadowinv.geometry._kernel import is_code_cached
+from napari_shadowinv.geometry.compiler import is_code_cached
 
 image = np.ones((3, 4))
 smooth = np.empty(4)

@@ -16,7 +16,7 @@ from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import FitShot, read_recipe, run_fit, write_recipe
-from napari_shadowinv.pipeline._fit import collect_fit_inputs
+from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.preprocessing import (
     Bin,
     Crop,

@@ -30,7 +30,7 @@ from napari_shadowinv._system.arrays import coordinate_spacing, order_by_value
 from napari_shadowinv.fitting.measurements import measured
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import FitShot
-from napari_shadowinv.pipeline._fit import collect_fit_inputs
+from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.preprocessing.estimates import uniform_source
 
 OPTIONS = InversionOptions(n_sites=300)

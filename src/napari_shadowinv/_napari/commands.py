@@ -163,7 +163,7 @@ def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> lis
 
 
 def _invert(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
-    from napari_shadowinv.pipeline._run import run
+    from napari_shadowinv.pipeline.inversion_run import run
     from napari_shadowinv.preprocessing import Recipe, UniformEstimate
 
     recipe = Recipe(source=UniformEstimate(), setup=selection.setup)

@@ -22,7 +22,7 @@ from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline import FitShot, run_fit, run_refinement
-from napari_shadowinv.pipeline._refine import refinement_choices
+from napari_shadowinv.pipeline.refinement import refinement_choices
 from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 if TYPE_CHECKING:

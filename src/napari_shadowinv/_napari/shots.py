@@ -131,7 +131,7 @@ def source_of_shot(
 
 def load_radiograph(shot: io.Radiograph, name: str) -> io.Radiograph:
     """Return the radiograph with its image in memory, and the checksum of its file."""
-    from napari_shadowinv.pipeline._run import plane_of
+    from napari_shadowinv.pipeline.inversion_run import plane_of
 
     metadata = dict(shot.metadata)
     if shot.path is not None and "sha256" not in metadata and shot.path.is_file():

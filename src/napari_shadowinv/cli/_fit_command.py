@@ -107,7 +107,7 @@ def fit(
     from napari_shadowinv.cli import _fit_result, _static_result
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, FIT_WRITERS
     from napari_shadowinv.pipeline import write_recipe
-    from napari_shadowinv.pipeline._fit_shots import read_rows
+    from napari_shadowinv.pipeline.fit_shots import read_rows
     from napari_shadowinv.pipeline.shot_table import shot_rows
 
     lists = {"energy": energies, "strength": strengths}

@@ -75,7 +75,7 @@ def compare_fields(
 ) -> Fit:
     """Fit several choices of fields and print how likely each is; return the one to write."""
     from napari_shadowinv.pipeline import run_comparison
-    from napari_shadowinv.pipeline._fit import COMPARED
+    from napari_shadowinv.pipeline.fit_run import COMPARED
 
     names = set(recipe.fit.fields or ()) if recipe.fit else set()
     if written is not None and names not in map(set, COMPARED):

@@ -111,7 +111,7 @@ def write_with_figures(
 ) -> None:
     """Write a result and its figures, all or none."""
     from napari_shadowinv.io import replacing, write
-    from napari_shadowinv.plotting._figures import DOTS_PER_INCH
+    from napari_shadowinv.plotting.figures import DOTS_PER_INCH
 
     with ExitStack() as stack:
         for path, figure in figures.items():

@@ -25,7 +25,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.pipeline import FitShot
-from napari_shadowinv.pipeline._run import picture_mask
+from napari_shadowinv.pipeline.inversion_run import picture_mask
 
 if TYPE_CHECKING:
     import xarray

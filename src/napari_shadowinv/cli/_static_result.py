@@ -79,7 +79,7 @@ def check_requests(
     count: int, *, left_out: bool, window: int | None, fiducials: Path | None, result: Path
 ) -> None:
     """Refuse, before any work, checks that the images or the result file do not allow."""
-    from napari_shadowinv.pipeline._static import check_count, check_window
+    from napari_shadowinv.pipeline.static_checks import check_count, check_window
 
     if left_out:
         check_count(count)

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
-from napari_shadowinv.geometry._kernel import njit
+from napari_shadowinv.geometry.compiler import njit
 
 __all__ = ["KNOT", "MOST_RAYS", "boxes", "collect", "deposit", "gather", "spline_tables"]
 

@@ -16,7 +16,7 @@ import numpy as np
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.fitting import _ray_kernels
 from napari_shadowinv.fitting.rays import RayModel
-from napari_shadowinv.geometry._kernel import is_code_cached
+from napari_shadowinv.geometry.compiler import is_code_cached
 from napari_shadowinv.inversion import compilation as of_transport
 from napari_shadowinv.inversion.machine_code import how_often
 

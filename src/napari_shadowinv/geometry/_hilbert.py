@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv._typing import FloatArray, IntArray
-from napari_shadowinv.geometry._kernel import kernel, kernel_that_allocates
-from napari_shadowinv.geometry._mesh import Indices
+from napari_shadowinv.geometry.compiler import kernel, kernel_that_allocates
+from napari_shadowinv.geometry.triangle_mesh import Indices
 
 BITS = 16
 

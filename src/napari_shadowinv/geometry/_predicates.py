@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.geometry._kernel import kernel
+from napari_shadowinv.geometry.compiler import kernel
 
 Twofold = tuple[float, float]
 

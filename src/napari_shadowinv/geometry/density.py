@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.geometry._kernel import njit
+from napari_shadowinv.geometry.compiler import njit
 
 __all__ = ["Density", "split_pixels", "walk_edge"]
 

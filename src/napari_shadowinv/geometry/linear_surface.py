@@ -13,8 +13,7 @@ import numpy as np
 
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.geometry._kernel import njit
-from napari_shadowinv.geometry._mesh import Indices
+from napari_shadowinv.geometry.compiler import njit
 from napari_shadowinv.geometry.interpolation import (
     BLOCK,
     PATCH,
@@ -24,6 +23,7 @@ from napari_shadowinv.geometry.interpolation import (
     nearest_corner,
     value_on_patch,
 )
+from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 __all__ = ["WIDTH", "corner_weights", "with_gradients"]

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.geometry._kernel import njit
-from napari_shadowinv.geometry._mesh import Indices
+from napari_shadowinv.geometry.compiler import njit
 from napari_shadowinv.geometry.interpolation import BLOCK, locate, mesh_arrays
+from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 __all__ = ["natural_neighbor"]

@@ -11,10 +11,10 @@ from scipy.sparse import csr_array
 
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.geometry._kernel import njit
-from napari_shadowinv.geometry._mesh import Indices
+from napari_shadowinv.geometry.compiler import njit
 from napari_shadowinv.geometry.density import walk_edge
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangle_mesh import Indices
 
 __all__ = ["pixel_shares"]
 

@@ -30,9 +30,9 @@ from numpy.typing import ArrayLike, NDArray
 from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.geometry import _flips
+from napari_shadowinv.geometry import flips
 from napari_shadowinv.geometry._hilbert import hilbert_permutation, insertion_order
-from napari_shadowinv.geometry._mesh import LIMIT, N_COUNTERS, SIZE, Indices, Mesh
+from napari_shadowinv.geometry.triangle_mesh import LIMIT, N_COUNTERS, SIZE, Indices, Mesh
 
 __all__ = ["RegularTriangulation", "hilbert_order"]
 
@@ -202,11 +202,11 @@ class RegularTriangulation:
         self._set_weights(_checked_weights(weights, self._mesh.hidden.size))
         self.forget()
         suspects = np.empty(self._mesh.counters[SIZE], np.bool_)
-        in_ranges(_flips.look_for_irregular, suspects.size, threads, self._mesh, suspects)
-        policy = _flips.STOP if stop_when_hidden else _flips.REMOVE
-        status = _flips.repair(self._mesh, policy, suspects)
-        if status != _flips.EXHAUSTED:
-            return bool(status == _flips.DONE)
+        in_ranges(flips.look_for_irregular, suspects.size, threads, self._mesh, suspects)
+        policy = flips.STOP if stop_when_hidden else flips.REMOVE
+        status = flips.repair(self._mesh, policy, suspects)
+        if status != flips.EXHAUSTED:
+            return bool(status == flips.DONE)
         fresh = self.copy()
         fresh._build()
         if stop_when_hidden and np.any(fresh._mesh.hidden & ~self._mesh.hidden):
@@ -231,7 +231,7 @@ class RegularTriangulation:
         self.forget()
         if same_ghosts:
             self._mesh = self._mesh._replace(points=self._mesh.points.copy())
-            if _flips.relocate(self._mesh, targets) == _flips.DONE:
+            if flips.relocate(self._mesh, targets) == flips.DONE:
                 return
         self._mesh = self._mesh._replace(points=points)
         self._weigh_ghosts()
@@ -251,7 +251,7 @@ class RegularTriangulation:
         ghosts = np.inf
         while self._mesh.hidden.any() and ghosts != self._mesh.weights[-1]:
             ghosts = self._mesh.weights[-1]
-            if _flips.raise_hidden(self._mesh) == _flips.EXHAUSTED:
+            if flips.raise_hidden(self._mesh) == flips.EXHAUSTED:
                 raise RuntimeError(self._exhausted())
             self.forget()
             # The ghosts follow if the lightest sites were raised; then a site may hide again.
@@ -304,7 +304,7 @@ class RegularTriangulation:
             counters=counters,
             scratch=np.empty(16),
         )
-        if _flips.add(twin._mesh, n + insertion_order(count)) == _flips.EXHAUSTED:
+        if flips.add(twin._mesh, n + insertion_order(count)) == flips.EXHAUSTED:
             raise RuntimeError(twin._exhausted())
         return twin
 
@@ -314,7 +314,7 @@ class RegularTriangulation:
             if alive is not None:
                 alive()
             last = min(first + _SITES_PER_PART, order.size)
-            if _flips.build(self._mesh, order, first, last) == _flips.EXHAUSTED:
+            if flips.build(self._mesh, order, first, last) == flips.EXHAUSTED:
                 raise RuntimeError(self._exhausted())
 
     def _exhausted(self) -> str:

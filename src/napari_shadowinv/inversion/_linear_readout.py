@@ -9,9 +9,9 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.geometry._kernel import njit
-from napari_shadowinv.geometry._mesh import Indices
+from napari_shadowinv.geometry.compiler import njit
 from napari_shadowinv.geometry.linear_surface import WIDTH, corner_weights, with_gradients
+from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.transport.sites import Level, SitePlan
 
 __all__ = ["LinearReadout"]

@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.geometry._mesh import Indices
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.transport.factorised import FactorisedLaplacian
 from napari_shadowinv.transport.sites import SitePlan

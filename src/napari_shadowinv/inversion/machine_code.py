@@ -53,7 +53,7 @@ def compiling_together() -> Iterator[None]:
 
 def how_often() -> str:
     """Return how often compilation delays a run, in words."""
-    from napari_shadowinv.geometry._kernel import is_code_cached
+    from napari_shadowinv.geometry.compiler import is_code_cached
 
     if is_code_cached():
         return "once, for a minute or so"
@@ -62,7 +62,7 @@ def how_often() -> str:
 
 def is_compiled() -> bool:
     """Return whether the machine code is loaded, or cached by an earlier process."""
-    from napari_shadowinv.geometry._flips import build
+    from napari_shadowinv.geometry.flips import build
 
     if build.signatures:  # type: ignore[attr-defined]
         return True
@@ -72,8 +72,8 @@ def is_compiled() -> bool:
 
 def code_folder() -> Path | None:
     """Return the folder of the triangulation's machine code; None where nothing can be cached."""
-    from napari_shadowinv.geometry._flips import build
-    from napari_shadowinv.geometry._kernel import is_code_cached
+    from napari_shadowinv.geometry.compiler import is_code_cached
+    from napari_shadowinv.geometry.flips import build
 
     if not is_code_cached():
         return None

@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from napari_shadowinv._typing import FloatArray, IntArray
-from napari_shadowinv.geometry._kernel import njit
+from napari_shadowinv.geometry.compiler import njit
 
 __all__ = ["deposit_band"]
 

@@ -1,11 +1,11 @@
 from ._film import run_film
-from ._fit import FitShot, run_comparison, run_fit
-from ._refine import run_refinement
-from ._run import Inputs, collect_inputs, run, run_prepared
-from ._static import run_leave_one_out, run_windows
 from .cache import Cache
 from .files import read_recipe, write_recipe
 from .film_files import read_pack, write_layers
+from .fit_run import FitShot, run_comparison, run_fit
+from .inversion_run import Inputs, collect_inputs, run, run_prepared
+from .refinement import run_refinement
+from .static_checks import run_leave_one_out, run_windows
 
 __all__ = [
     "Cache",

@@ -4,11 +4,11 @@ The figures use matplotlib's objects and no pyplot, so they neither need a windo
 disturb the figures of a notebook.
 """
 
-from napari_shadowinv.plotting._figures import comparison_figure, report_figure, save_figure
 from napari_shadowinv.plotting._film_figure import pack_figure
 from napari_shadowinv.plotting._fit_figure import fit_figure
 from napari_shadowinv.plotting._movie import in_few_colours, stack_frames, write_film
 from napari_shadowinv.plotting._static_figure import left_out_figure, windows_figure
+from napari_shadowinv.plotting.figures import comparison_figure, report_figure, save_figure
 
 __all__ = [
     "comparison_figure",

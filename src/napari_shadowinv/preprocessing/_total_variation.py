@@ -8,7 +8,7 @@ import numpy as np
 
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.geometry._kernel import njit
+from napari_shadowinv.geometry.compiler import njit
 
 __all__ = ["least_variation"]
 

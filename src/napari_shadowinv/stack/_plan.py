@@ -28,7 +28,7 @@ from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.pipeline import Inputs, collect_inputs
-from napari_shadowinv.pipeline._fit import check_fit
+from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.pipeline.shot_table import ShotRow, is_table
 from napari_shadowinv.preprocessing import (
     Estimate,

@@ -13,7 +13,7 @@ from napari_shadowinv.inversion.variables import fit_labels, variable_labels
 from napari_shadowinv.io.store_setups import OWN_SETUPS
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline import Inputs
-from napari_shadowinv.pipeline._fit import usual_fields
+from napari_shadowinv.pipeline.fit_run import usual_fields
 from napari_shadowinv.preprocessing import Estimate, Radiograph, Recipe
 from napari_shadowinv.stack._discovery import Shots
 from napari_shadowinv.stack._fit_work import FitWork

@@ -23,8 +23,8 @@ from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.formats import PRADFORMAT, TEXT, kind_of
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
 from napari_shadowinv.pipeline import FitShot, Inputs, collect_inputs
-from napari_shadowinv.pipeline._fit_shots import read_rows, row_setup
 from napari_shadowinv.pipeline.files import read_part
+from napari_shadowinv.pipeline.fit_shots import read_rows, row_setup
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, rows_to_invert
 from napari_shadowinv.preprocessing import Estimate, Radiograph, Recipe
 from napari_shadowinv.stack._discovery import names_of

@@ -23,8 +23,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
-from napari_shadowinv.geometry._kernel import njit
-from napari_shadowinv.geometry._mesh import Indices
+from napari_shadowinv.geometry.compiler import njit
+from napari_shadowinv.geometry.triangle_mesh import Indices
 
 _MAX_COARSEST_NODES = 60
 _MIN_TIE = 0.2

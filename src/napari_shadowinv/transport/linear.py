@@ -24,8 +24,8 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.geometry._kernel import njit
-from napari_shadowinv.geometry._mesh import Indices
+from napari_shadowinv.geometry.compiler import njit
+from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.transport._coarsening import (
     Hierarchy,
     Network,

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.geometry._kernel import njit
-from napari_shadowinv.geometry._mesh import Indices
+from napari_shadowinv.geometry.compiler import njit
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import with_mirror_images
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
 from napari_shadowinv.transport.margin import Margin
 

@@ -41,7 +41,7 @@ from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.projection import project, transferred_displacement
 from napari_shadowinv.physics.setup import OpticalSetup
 from napari_shadowinv.pipeline import FitShot, read_recipe
-from napari_shadowinv.pipeline._fit import FitInputs, collect_fit_inputs
+from napari_shadowinv.pipeline.fit_run import FitInputs, collect_fit_inputs
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 120_000  # ms

@@ -26,7 +26,7 @@ from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import SETUPS, Setup, geometry_text, setup_warnings
-from napari_shadowinv.pipeline._run import PREVIEW_SITES
+from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
 
 _NONE = "none"
 _CHANGED = ", changed by hand"

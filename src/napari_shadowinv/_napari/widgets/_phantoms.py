@@ -15,7 +15,7 @@ from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.pipeline._run import plane_of
+from napari_shadowinv.pipeline.inversion_run import plane_of
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.phantoms import Phantom

@@ -22,9 +22,9 @@ from napari_shadowinv.io import check_output, write
 from napari_shadowinv.io.formats import NPY, PNG
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline import read_recipe, write_recipe
-from napari_shadowinv.pipeline._fit import check_fit
-from napari_shadowinv.pipeline._run import picture_mask, plane_of
 from napari_shadowinv.pipeline.files import read_part
+from napari_shadowinv.pipeline.fit_run import check_fit
+from napari_shadowinv.pipeline.inversion_run import picture_mask, plane_of
 from napari_shadowinv.preprocessing import (
     Crop,
     MeasuredSource,

@@ -15,7 +15,7 @@ from napari_shadowinv._napari.widgets._panels import LivePanel, RunPanel
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.pipeline import Cache
-from napari_shadowinv.pipeline._run import PREVIEW_PIXELS
+from napari_shadowinv.pipeline.inversion_run import PREVIEW_PIXELS
 from napari_shadowinv.preprocessing import ESTIMATES, Estimate, Radiograph, estimated_source
 
 if TYPE_CHECKING:

@@ -53,7 +53,7 @@ from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.pipeline import Cache
-from napari_shadowinv.pipeline._run import PREVIEW_SITES, run
+from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES, run
 from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 if TYPE_CHECKING:

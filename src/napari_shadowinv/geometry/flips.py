@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
-from napari_shadowinv.geometry import _mesh
+from napari_shadowinv.geometry import triangle_mesh
 from napari_shadowinv.geometry._hilbert import insertion_order
-from napari_shadowinv.geometry._kernel import kernel, kernel_that_allocates
-from napari_shadowinv.geometry._mesh import Mesh, after, around, before, push
 from napari_shadowinv.geometry._predicates import (
     FLIP,
     LEGAL,
@@ -19,6 +17,8 @@ from napari_shadowinv.geometry._predicates import (
     precise_excess,
     turn,
 )
+from napari_shadowinv.geometry.compiler import kernel, kernel_that_allocates
+from napari_shadowinv.geometry.triangle_mesh import Mesh, after, around, before, push
 
 # What to do with a vertex that is proven hidden.
 REMOVE, STOP, RAISE, KEEP = 0, 1, 2, 3
@@ -58,8 +58,11 @@ def _raise_vertex(mesh: Mesh, h: int, a: int, b: int, c: int) -> None:
     weight = mesh.weights[v]
     # Close sites that are coplanar but for rounding would chase each other up by single roundings.
     # A wider step now and then (1, 8, 1, 64, 1, 8, 1, 512 ... roundings) ends that soon.
-    mesh.counters[_mesh.RAISES] += 1
-    step = min((mesh.counters[_mesh.RAISES] & -mesh.counters[_mesh.RAISES]) ** 3, LONGEST_STEP)
+    mesh.counters[triangle_mesh.RAISES] += 1
+    step = min(
+        (mesh.counters[triangle_mesh.RAISES] & -mesh.counters[triangle_mesh.RAISES]) ** 3,
+        LONGEST_STEP,
+    )
     rounding = np.nextafter(abs(weight), np.inf) - abs(weight)
     height = precise_excess(mesh.points, mesh.weights, a, b, c, v)
     mesh.weights[v] = weight + max(height, 0.0) + step * rounding
@@ -76,8 +79,8 @@ def _raise_vertex(mesh: Mesh, h: int, a: int, b: int, c: int) -> None:
 def _remove_or_raise(mesh: Mesh, h: int, g: int, reflex_a: bool) -> None:
     """Remove or raise the hidden end of the edge h, whose twin is g."""
     v = after(h) if reflex_a else before(h)
-    if mesh.counters[_mesh.POLICY] == REMOVE:
-        _mesh.remove(mesh, v)
+    if mesh.counters[triangle_mesh.POLICY] == REMOVE:
+        triangle_mesh.remove(mesh, v)
         return
     p, q = mesh.corners[h], mesh.corners[g]
     corner = mesh.corners[before(h) if reflex_a else after(h)]
@@ -92,9 +95,9 @@ def restore(mesh: Mesh) -> int:
     # After an insertion into a regular triangulation only edges opposite to the new vertex can
     # be irregular; with EVERYWHERE all four edges around a flip are looked at.
     counters, twins, corners = mesh.counters, mesh.twins, mesh.corners
-    while counters[_mesh.TOP] > 0:
-        counters[_mesh.TOP] -= 1
-        h = mesh.stack[counters[_mesh.TOP]]
+    while counters[triangle_mesh.TOP] > 0:
+        counters[triangle_mesh.TOP] -= 1
+        h = mesh.stack[counters[triangle_mesh.TOP]]
         if corners[h - h % 3] < 0:
             continue
         g = twins[h]
@@ -103,23 +106,26 @@ def restore(mesh: Mesh) -> int:
         state = _symmetric_edge_state(mesh, h, g)
         if state == LEGAL:
             continue
-        if counters[_mesh.FLIPS] + counters[_mesh.RAISES] >= counters[_mesh.LIMIT]:
-            counters[_mesh.TOP] = 0
+        if (
+            counters[triangle_mesh.FLIPS] + counters[triangle_mesh.RAISES]
+            >= counters[triangle_mesh.LIMIT]
+        ):
+            counters[triangle_mesh.TOP] = 0
             return EXHAUSTED
         if state == FLIP:
-            _mesh.flip(mesh, h, g)
-            if counters[_mesh.EVERYWHERE] == 1:
+            triangle_mesh.flip(mesh, h, g)
+            if counters[triangle_mesh.EVERYWHERE] == 1:
                 push(mesh, before(h))
                 push(mesh, g)
             push(mesh, h)
             push(mesh, before(g))
             continue
-        if counters[_mesh.POLICY] == KEEP:
+        if counters[triangle_mesh.POLICY] == KEEP:
             continue
-        if counters[_mesh.POLICY] == STOP:
-            counters[_mesh.TOP] = 0
+        if counters[triangle_mesh.POLICY] == STOP:
+            counters[triangle_mesh.TOP] = 0
             return HIDDEN
-        counters[_mesh.EVERYWHERE] = 1
+        counters[triangle_mesh.EVERYWHERE] = 1
         _remove_or_raise(mesh, h, g, state == REFLEX_A)
     return DONE
 
@@ -196,20 +202,20 @@ def _sweep(mesh: Mesh, suspects: BoolArray) -> int:
     # their edges looked at anyway.
     counters = mesh.counters
     n_screened = suspects.size
-    counters[_mesh.OVERFLOW] = 1
-    while counters[_mesh.OVERFLOW] == 1:
-        counters[_mesh.OVERFLOW] = 0
+    counters[triangle_mesh.OVERFLOW] = 1
+    while counters[triangle_mesh.OVERFLOW] == 1:
+        counters[triangle_mesh.OVERFLOW] = 0
         t = 0
-        while t < counters[_mesh.SIZE]:
+        while t < counters[triangle_mesh.SIZE]:
             if mesh.corners[3 * t] < 0 or (t < n_screened and not suspects[t]):
                 marked = False
-            elif counters[_mesh.POLICY] == RAISE:
-                _mesh.push_triangle(mesh, t)
+            elif counters[triangle_mesh.POLICY] == RAISE:
+                triangle_mesh.push_triangle(mesh, t)
                 marked = True
             else:
                 marked = _mark_irregular(mesh, t)
             if marked:
-                counters[_mesh.EVERYWHERE] = 1
+                counters[triangle_mesh.EVERYWHERE] = 1
                 status = restore(mesh)
                 if status != DONE:
                     return status
@@ -222,13 +228,13 @@ def _sweep(mesh: Mesh, suspects: BoolArray) -> int:
 def _locate(mesh: Mesh, v: int) -> tuple[int, int]:
     """Walk to site v; return where it is, and that triangle's corner, edge or first corner."""
     corners, twins, points = mesh.corners, mesh.twins, mesh.points
-    h = 3 * mesh.counters[_mesh.LAST]
+    h = 3 * mesh.counters[triangle_mesh.LAST]
     side = turn(points, mesh.scratch, corners[h + 1], corners[h + 2], v)
     if side < 0:
         h, side = twins[h], 1
     noise = v + 1  # visiting the other two edges in random order, it cannot go in circles
     steps = 0
-    while steps < 4 * mesh.counters[_mesh.SIZE] + 1000:
+    while steps < 4 * mesh.counters[triangle_mesh.SIZE] + 1000:
         steps += 1
         noise = (noise * 1103515245 + 12345) & 0x7FFFFFFF
         swap = (noise >> 16) & 1
@@ -265,12 +271,12 @@ def insert(mesh: Mesh, v: int, certainty: float) -> int:
     where, h = _locate(mesh, v)
     if where == NOWHERE:
         return EXHAUSTED
-    mesh.counters[_mesh.LAST] = h // 3
+    mesh.counters[triangle_mesh.LAST] = h // 3
     if where == ON_CORNER:
         u, weights = mesh.corners[h], mesh.weights
         if weights[u] > weights[v] or (weights[u] == weights[v] and u < v):
             return DONE
-        _mesh.replace(mesh, h, v)
+        triangle_mesh.replace(mesh, h, v)
     else:
         a, b, c = mesh.corners[h], mesh.corners[after(h)], mesh.corners[before(h)]
         height, bound = excess(mesh.points, mesh.weights, a, b, c, v)
@@ -278,10 +284,10 @@ def insert(mesh: Mesh, v: int, certainty: float) -> int:
             return DONE
         mesh.hidden[v] = False
         if where == INSIDE:
-            _mesh.split_triangle(mesh, h // 3, v)
+            triangle_mesh.split_triangle(mesh, h // 3, v)
         else:
-            _mesh.split_edge(mesh, h, v)
-    mesh.counters[_mesh.EVERYWHERE] = 0
+            triangle_mesh.split_edge(mesh, h, v)
+    mesh.counters[triangle_mesh.EVERYWHERE] = 0
     return restore(mesh)
 
 
@@ -299,9 +305,9 @@ def _return_hidden(mesh: Mesh) -> int:
 
 @kernel
 def _reset_counters(mesh: Mesh, policy: int) -> None:
-    for counter in (_mesh.TOP, _mesh.FLIPS, _mesh.RAISES):
+    for counter in (triangle_mesh.TOP, triangle_mesh.FLIPS, triangle_mesh.RAISES):
         mesh.counters[counter] = 0
-    mesh.counters[_mesh.POLICY] = policy
+    mesh.counters[triangle_mesh.POLICY] = policy
 
 
 @kernel_that_allocates
@@ -311,9 +317,9 @@ def repair(mesh: Mesh, policy: int, suspects: BoolArray) -> int:
     status = _sweep(mesh, suspects)
     if status == DONE:
         status = _return_hidden(mesh)
-    if status == DONE and mesh.counters[_mesh.OVERFLOW] == 1:
+    if status == DONE and mesh.counters[triangle_mesh.OVERFLOW] == 1:
         status = _sweep(mesh, suspects[:0])
-    _mesh.compact(mesh)
+    triangle_mesh.compact(mesh)
     return status
 
 
@@ -323,7 +329,7 @@ def _insert_on_hull(mesh: Mesh, v: int) -> int:
     where, h = _locate(mesh, v)
     if where == NOWHERE:
         return EXHAUSTED
-    mesh.counters[_mesh.LAST] = h // 3
+    mesh.counters[triangle_mesh.LAST] = h // 3
     a, b, c = mesh.corners[h], mesh.corners[after(h)], mesh.corners[before(h)]
     if where == ON_CORNER:
         mesh.weights[v] = max(mesh.weights[v], mesh.weights[a])
@@ -344,11 +350,11 @@ def raise_hidden(mesh: Mesh) -> int:
         if mesh.hidden[v] and _insert_on_hull(mesh, v) == EXHAUSTED:
             return EXHAUSTED
     on_hull = mesh.weights.copy()
-    mesh.counters[_mesh.POLICY] = RAISE
+    mesh.counters[triangle_mesh.POLICY] = RAISE
     if _sweep(mesh, np.empty(0, np.bool_)) == EXHAUSTED:
         for v in range(on_hull.size):
             mesh.weights[v] = on_hull[v]
-    _mesh.compact(mesh)
+    triangle_mesh.compact(mesh)
     return DONE
 
 
@@ -357,8 +363,8 @@ def _start_with_ghosts(mesh: Mesh) -> None:
     """Make two triangles of ghosts, with no site."""
     n = mesh.hidden.size
     mesh.counters[:] = 0
-    mesh.counters[_mesh.SIZE], mesh.counters[_mesh.FREE] = 2, -1
-    mesh.counters[_mesh.POLICY], mesh.counters[_mesh.LIMIT] = REMOVE, 100 * n + 1000
+    mesh.counters[triangle_mesh.SIZE], mesh.counters[triangle_mesh.FREE] = 2, -1
+    mesh.counters[triangle_mesh.POLICY], mesh.counters[triangle_mesh.LIMIT] = REMOVE, 100 * n + 1000
     mesh.hidden[:] = True
     for h, corner in enumerate((n, n + 1, n + 2, n + 2, n + 3, n)):
         mesh.corners[h] = corner
@@ -369,7 +375,7 @@ def _start_with_ghosts(mesh: Mesh) -> None:
 @kernel_that_allocates
 def _sort_triangles(mesh: Mesh) -> None:
     """Store the triangles in the order of their smallest corner: neighbours close in memory."""
-    m, n = mesh.counters[_mesh.SIZE], mesh.hidden.size
+    m, n = mesh.counters[triangle_mesh.SIZE], mesh.hidden.size
     starts = np.zeros(n + 5, dtype=np.int32)
     smallest = np.empty(m, dtype=np.int32)
     for t in range(m):
@@ -390,7 +396,7 @@ def _sort_triangles(mesh: Mesh) -> None:
             g = twins[3 * t + k]
             mesh.corners[3 * s + k] = corners[3 * t + k]
             mesh.twins[3 * s + k] = 3 * places[g // 3] + g % 3 if g >= 0 else -1
-    mesh.counters[_mesh.LAST] = places[mesh.counters[_mesh.LAST]]
+    mesh.counters[triangle_mesh.LAST] = places[mesh.counters[triangle_mesh.LAST]]
 
 
 @kernel_that_allocates
@@ -405,9 +411,9 @@ def build(mesh: Mesh, order: IntArray, first: int, last: int) -> int:
             break
     if status == DONE and last < order.size:
         return DONE
-    if status == DONE and mesh.counters[_mesh.OVERFLOW] == 1:
+    if status == DONE and mesh.counters[triangle_mesh.OVERFLOW] == 1:
         status = _sweep(mesh, np.empty(0, np.bool_))
-    _mesh.compact(mesh)
+    triangle_mesh.compact(mesh)
     _sort_triangles(mesh)
     return status
 
@@ -421,9 +427,9 @@ def add(mesh: Mesh, order: IntArray) -> int:
         status = insert(mesh, v, 1.0)
         if status != DONE:
             break
-    if status == DONE and mesh.counters[_mesh.OVERFLOW] == 1:
+    if status == DONE and mesh.counters[triangle_mesh.OVERFLOW] == 1:
         status = _sweep(mesh, np.empty(0, np.bool_))
-    _mesh.compact(mesh)
+    triangle_mesh.compact(mesh)
     return status
 
 
@@ -431,7 +437,7 @@ def add(mesh: Mesh, order: IntArray) -> int:
 def _return_overturned(mesh: Mesh, origins: FloatArray, strays: BoolArray) -> bool:
     """Return corners of overturned triangles to their origins, and whether there were any."""
     overturned = False
-    for t in range(mesh.counters[_mesh.SIZE]):
+    for t in range(mesh.counters[triangle_mesh.SIZE]):
         i, j, k = mesh.corners[3 * t], mesh.corners[3 * t + 1], mesh.corners[3 * t + 2]
         if turn(mesh.points, mesh.scratch, i, j, k) <= 0:
             overturned = True
@@ -448,12 +454,12 @@ def _remove_strays(mesh: Mesh, strays: BoolArray) -> int:
     removed = True
     while removed:  # flips may move a stray to a triangle that the pass has left behind
         removed = False
-        for h in range(3 * mesh.counters[_mesh.SIZE]):
+        for h in range(3 * mesh.counters[triangle_mesh.SIZE]):
             v = mesh.corners[h]
             if mesh.corners[h - h % 3] >= 0 and v < strays.size and strays[v]:
                 removed = True
-                _mesh.remove(mesh, h)
-                mesh.counters[_mesh.EVERYWHERE] = 1
+                triangle_mesh.remove(mesh, h)
+                mesh.counters[triangle_mesh.EVERYWHERE] = 1
                 if restore(mesh) != DONE:
                     return EXHAUSTED
     return DONE
@@ -481,5 +487,5 @@ def relocate(mesh: Mesh, targets: FloatArray) -> int:
     for v in range(n):
         if mesh.hidden[v] and status == DONE:
             status = insert(mesh, v, 1.0 if strays[v] else -1.0)
-    _mesh.compact(mesh)
+    triangle_mesh.compact(mesh)
     return status

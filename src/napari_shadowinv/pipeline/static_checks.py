@@ -16,8 +16,8 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import FitWindows, LeaveOneOut, fit, leave_one_out
 from napari_shadowinv.fitting.agreement import check_count
 from napari_shadowinv.fitting.measurements import strengths_of
-from napari_shadowinv.pipeline._fit import FitInputs, FitShot, collect_fit_inputs
-from napari_shadowinv.pipeline._run import Shot
+from napari_shadowinv.pipeline.fit_run import FitInputs, FitShot, collect_fit_inputs
+from napari_shadowinv.pipeline.inversion_run import Shot
 from napari_shadowinv.preprocessing import Recipe
 
 __all__ = ["check_count", "check_window", "run_leave_one_out", "run_windows"]

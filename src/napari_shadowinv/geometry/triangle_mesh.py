@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
-from napari_shadowinv.geometry._kernel import kernel
 from napari_shadowinv.geometry._predicates import turn
+from napari_shadowinv.geometry.compiler import kernel
 
 Indices = NDArray[np.int32]
 
@@ -90,6 +90,7 @@ def _set_triangle(mesh: Mesh, t: int, a: int, b: int, c: int) -> None:
 
 @kernel
 def push_triangle(mesh: Mesh, t: int) -> None:
+    """Put the edges of a triangle on the stack of edges to check."""
     for h in range(3 * t, 3 * t + 3):
         push(mesh, h)
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
-from napari_shadowinv.pipeline._fit import FitShot
 from napari_shadowinv.pipeline.files import read_part, setup_from
+from napari_shadowinv.pipeline.fit_run import FitShot
 from napari_shadowinv.pipeline.shot_table import ShotRow
 from napari_shadowinv.preprocessing import Radiograph, Recipe
 

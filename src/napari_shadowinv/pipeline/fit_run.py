@@ -26,7 +26,7 @@ from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.options import FIELDS, FitChoices, FitOptions, KindOfNoise
 from napari_shadowinv.physics.projection import default_deflector
 from napari_shadowinv.physics.setup import Setup, setup_warnings
-from napari_shadowinv.pipeline._run import Inputs, Shot, collect_inputs, radiograph_of
+from napari_shadowinv.pipeline.inversion_run import Inputs, Shot, collect_inputs, radiograph_of
 from napari_shadowinv.pipeline.shot_table import fiducials_from
 from napari_shadowinv.preprocessing import (
     FIT_STEPS,
