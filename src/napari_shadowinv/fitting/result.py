@@ -289,10 +289,11 @@ class Fit:
         names : sequence of str, optional
             Names of the images. Default: their numbers.
         """
-        level = Level.SOUND if self.verdict is Verdict.DETERMINED else Level.DOUBTFUL
+        is_determined = self.verdict is Verdict.DETERMINED
+        level = Level.SOUND if is_determined else Level.DOUBTFUL
         return (
             Fact("verdict", "Verdict", str(self.verdict), level),
-            Fact("verdict", "Reason", self.explanation, level),
+            Fact("verdict", "Reason" if is_determined else "Warning", self.explanation, level),
             *caution_facts(self.warnings),
             *self._image_facts(names),
             *(self._field_fact(field) for field in self.fields),
