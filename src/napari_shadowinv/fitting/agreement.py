@@ -56,7 +56,7 @@ class LeaveOneOut:
         The same if the image is fitted alone: due to noise, source, point spread.
     limit : ndarray, shape (L,)
         The largest χ² that one static field would give: 1.15 times the χ² of the noise, which
-        follows from `alone`, plus twice the variance of the prediction.
+        follows from `alone`, plus five times the variance of the prediction.
     rms : ndarray, shape (L,)
         R.m.s. residual, relative to the image's mean.
     explanation : str
