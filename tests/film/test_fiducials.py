@@ -81,5 +81,5 @@ def test_marks_that_tell_nothing_or_another_thing_are_refused() -> None:
     with pytest.raises(InputError, match="no mark is on two films or more"):
         poses_by_fiducials([first, {}, {"x": second["b"]}], [corners] * 3, [1.0] * 3, NAMES)
     swapped = {**second, "a": second["b"], "b": second["a"]}
-    with pytest.raises(InputError, match=r"mark on film . is .* px from where the marks"):
+    with pytest.raises(InputError, match=r"mark on film . is .* px from its place by the marks"):
         poses_by_fiducials([first, swapped, first], [corners] * 3, [1.0] * 3, NAMES)

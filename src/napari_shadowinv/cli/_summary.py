@@ -91,7 +91,7 @@ def provenance_rows(provenance: Provenance | None) -> Rows:
 
 def fact_rows(facts: Iterable[Fact]) -> Rows:
     """Return facts as rows of a table."""
-    return [(fact.title.lower(), fact.text) for fact in facts]
+    return [(fact.title[:1].lower() + fact.title[1:], fact.text) for fact in facts]
 
 
 def written_rows(paths: Iterable[Path]) -> Rows:

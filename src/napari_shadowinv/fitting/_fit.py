@@ -65,10 +65,6 @@ _ROUNDED = 8.0  # px
 _TRANSPORT_SITES = 10_000
 _DECIDES = 10.0  # in log evidence
 _MIN_BLUR_SCORE = 4.0  # standard deviations, for which images are fitted with more blur
-# The coarse residual's score is 13 at most where the point spread is right, and blur does not lower
-# the objective there; with blur of 1.5 px it is 25. Where pixels of two are too coarse for the
-# image (χ² 1.2 and more with folds) it means nothing.
-_MIN_COARSE_BLUR_SCORE, _MAX_COARSE_CHI2 = 5.0, 1.15
 _DARKEST = 1e-3  # of a beam's mean
 _MAX_RIVAL_CHI2 = 3.0  # a fit that ended further away is no start for a rival
 _SPACING_OF_SAMPLES = 1 / 3  # px
@@ -201,14 +197,7 @@ def fit(
         posterior = Posterior(middle, best.unknowns, rng, lambda: on_step("samples", value))
         gain_by_blur = 0.0
         # With several images the fit is repeated only if the residual asks for it.
-        if (
-            data.single
-            or pattern.blur_score > _MIN_BLUR_SCORE
-            or (
-                basins[0].chi2 < _MAX_COARSE_CHI2
-                and posterior.blur_score() > _MIN_COARSE_BLUR_SCORE
-            )
-        ):
+        if data.single or pattern.blur_score > _MIN_BLUR_SCORE:
             gain_by_blur = best.value - with_wider_spread(scene, best, on_step).value
         if pattern.is_certain and pattern.chi2 < _MAX_RIVAL_CHI2:
             cause = name_cause(scene, best, fields, setups, on_step)

@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.fft import dctn, idctn
 from scipy.linalg import eigh_tridiagonal
-from scipy.ndimage import laplace
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.descent import Preconditioner
@@ -98,22 +97,6 @@ class Posterior:
         slope = self._linear.pulled(noise)
         slope = slope.plus(self._scene.prior.drawn(self._unknowns, self._rng))
         return self._scales.times(self._unknowns.like(self._solved(slope, tolerance)))
-
-    def blur_score(self) -> float:
-        """Return how much the residuals look like missing blur, in standard deviations.
-
-        Of the Laplacian that blur adds to an image only the part counts that no change of the
-        unknowns imitates.
-        """
-        model = self._scene.model(self._unknowns, self._counts)
-        roots = np.sqrt(self._scene.weights)
-        change = roots * np.stack([laplace(image, mode="nearest") for image in model])
-        solved = self._solved(self._linear.pulled(change), _MOVED_BY_BEAMS)
-        imitated = self._linear.pushed(self._scales.times(self._unknowns.like(solved)))
-        residual = roots * (self._scene.images - model)
-        size = float(((change - imitated) * change).sum())
-        score = float(((change - imitated) * residual).sum())
-        return score / np.sqrt(size) if size > 0 else 0.0
 
     def moved_by_beams(self, variations: FloatArray) -> Unknowns:
         """Return the change of the unknowns if the beams differ from their sources.

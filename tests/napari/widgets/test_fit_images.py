@@ -602,7 +602,7 @@ def test_other_answers_are_shown_beside_the_best(
     assert len(messages) == 1
     answers = tool.view.solutions
     assert answers.isVisible()
-    assert answers.itemText(0).endswith("the best")
+    assert answers.itemText(0).endswith(": best")
     assert answers.itemText(1) == "from near: +2.0 %, differs by 50%"
     count = len(window.layers)
     answers.setCurrentIndex(1)
@@ -1047,7 +1047,7 @@ def test_a_recipe_tells_noise_and_point_spread(
     [
         ('[source]\nmethod = "polynomial"\n', "estimates the source"),
         ('[[steps]]\nstep = "high-pass"\nwidth = 9\n', "changes what the forward model is fitted"),
-        ('[fit]\nfields = ["plasma"]\n', "asks for the fields plasma: with this setup expected"),
+        ('[fit]\nfields = ["plasma"]\n', "fits the fields plasma: with this setup expected"),
         ('[fit]\nbeam = "dark"\n', "beam"),
     ],
 )
