@@ -115,6 +115,7 @@ CODES = {
     "dark level 10 %": "dark-level",
     "dark level 20 %": "dark-level",
     "dark level 200 counts": "dark-level",
+    "hot pixels": "hot-pixels",
     "reference shifted by 5 px": "register",
     "reference shifted by 25 px": "register",
 }

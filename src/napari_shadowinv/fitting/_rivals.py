@@ -23,9 +23,8 @@ _WIDER_PX, _MUCH_WIDER_PX = (
 # A free beam lowers Σχ² by at most 19 where the beam was right, by 584 and more where it was off.
 _MIN_GAIN = 60.0
 _AS_LIKELY = 0.7  # of the largest gain
-_EXPLAINED = (
-    0.5  # of what Σχ² is above the number of pixels: a cause that explains less is doubtful
-)
+# Of the excess of Σχ² over the number of pixels; a cause that explains less is doubtful.
+_MIN_EXPLAINED_SHARE = 0.5
 _BEAM_MODES, _FINE_BEAM_MODES = 8, 20
 _BEAM_SPREAD = 0.3
 _SHIFT = np.array([True, False, False] * 2)
@@ -78,13 +77,13 @@ def name_cause(
     if not gains or gains[0][0] < _MIN_GAIN:
         return ""
     largest = gains[0][0]
-    is_doubtful = largest < _EXPLAINED * excess
+    is_doubtful = largest < _MIN_EXPLAINED_SHARE * excess
     least = _MIN_GAIN if is_doubtful else _AS_LIKELY * largest
     # Two rivals may have the same cause.
     likely = dict.fromkeys(cause for gain, cause in gains if gain >= least)
     falls = f"Σχ² falls by {largest:.0f}"
     if is_doubtful:
-        falls += f" of the {excess:.0f} that it is too large: something else is wrong, too"
+        falls += f", of an excess of {excess:.0f}: something else is wrong, too"
     return f"{', or '.join(list(likely)[:2])} ({falls})"
 
 

@@ -133,8 +133,9 @@ def judged(
         )
     if gain_by_blur > _BLURRED:
         return Verdict.MISFIT, (
-            "a wider point spread explains the image better: it is blurred more than was said, by "
-            "source or detector; give the point spread (psf, or source size and resolution)"
+            "a wider point spread explains the image better: it is blurred by more than the "
+            "given one, by source or detector; give the point spread (psf, or source size and "
+            "resolution)"
         )
     if single and (lost := _share_lost(displacement)) > _LOST:
         return Verdict.AMBIGUOUS, (
