@@ -184,7 +184,7 @@ def fitted(
         for plane, mask, setup in zip(images.planes, images.masks, images.setups, strict=True)
     ]
     options = FitOptions(align=align, align_spread=spread / binned)
-    choices = FitChoices(fields=("B", "E"), gains="free", options=options)
+    choices = FitChoices(fields=("B", "E"), brightness="free", options=options)
     recipe = Recipe(steps=(Bin(factor=binned),), fit=choices)
     begun = time.perf_counter()
     fit = run_fit(recipe, shots)

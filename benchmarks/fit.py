@@ -180,13 +180,13 @@ class Case:
 
 def cases() -> Iterator[Case]:
     three, two = (14.7, 30.0, 60.0), (14.7, 20.0)
-    free: dict[str, Any] = {"gains": "free"}
+    free: dict[str, Any] = {"brightness": "free"}
     unknown: dict[str, Any] = {"source": "unknown"}
     for peak, goal, must in ((290, 1.0, 1.5), (340, 2.0, 3.0)):
         yield Case(f"toroid {peak}", [toroid(peak)], three[:1], goals=(goal,), musts=(must,))
     yield Case("folded ellipses", [folded_ellipses()], three[:1], goals=(2.5,), musts=(4.0,))
     for peak in (340, 500, 700):
-        name = f"toroid {peak}, three energies, gains free"
+        name = f"toroid {peak}, three energies, brightness free"
         yield Case(name, [toroid(peak)], three, goals=(0.5,), musts=(1.0,), keywords=free)
     five = (10.0, 12.0, 14.7, 17.0, 20.0)
     yield Case("toroid 500, five energies", [toroid(500)], five, goals=(0.8,), musts=(1.5,))

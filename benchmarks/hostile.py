@@ -92,10 +92,10 @@ def _with_text(name: str, text: str, *arguments: object) -> Case:
 
 def tables() -> Iterator[Case]:
     """Tables of shots, fiducials and calibrations with hostile cells."""
-    columns = {"file": "shot.npy", "energy": "14.7", "strength": "1", "gain": "1", "psf": "0"}
+    columns = {"file": "shot.npy", "energy": "14.7", "strength": "1", "brightness": "1", "psf": "0"}
     columns |= {"mask": "", "source": "", "noise": "poisson", "setup": "", "exclude": ""}
     commands = (
-        ["fit", "t.csv", "--samples", 0, "--steps", 1],
+        ["fit", "t.csv", "--samples", 0, "--max-iterations", 1],
         ["batch", "t.csv", "--out", "o.zarr"],
     )
     for name, cell, command in itertools.product(columns, CELLS, commands):

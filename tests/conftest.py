@@ -147,7 +147,7 @@ def fit_exactly(
             for name in names
         ),
         "source": np.full(images.shape, 3.0),
-        "gains": np.linspace(1, 1.1, count),
+        "brightness": np.linspace(1, 1.1, count),
         "frames": rng.normal(0, 0.1, (count, 6)),
         "reprojection": images,
         "residual": residual,

@@ -391,7 +391,7 @@ def test_outputs_without_a_folder_are_refused(
     folder: Path, shot: Path, refused: Callable[..., None]
 ) -> None:
     refused("invert", shot, "--out", "nowhere/a.shadowinv", names="folder nowhere does not exist")
-    refused("invert", shot, "--report", "nowhere/a.png", names="folder nowhere does not exist")
+    refused("invert", shot, "--figure", "nowhere/a.png", names="folder nowhere does not exist")
     refused("invert", shot, "--out", "a.xlsx", names=".xlsx")
     refused("invert", shot, "--out", folder, names="its ending is none")
     refused("forward", shot, "--out", shot, "--overwrite", names="both read and written")
@@ -1048,7 +1048,7 @@ def test_a_film_pack_is_described_but_has_no_field(
 
 
 def test_info_reports_the_installation() -> None:
-    text = shadowinv("info", "--report").stdout
+    text = shadowinv("info", "--system").stdout
     entries = dict(re.split(r"\s{2,}", line, maxsplit=1) for line in text.splitlines())
     assert entries["napari-shadowinv"] == __version__
     assert entries["python"].startswith(platform.python_version())
@@ -1070,7 +1070,7 @@ def test_report_lists_missing_packages(monkeypatch: pytest.MonkeyPatch) -> None:
         return metadata.version(name)
 
     monkeypatch.setattr(_info, "version", without_windows)
-    entries = [line.split(maxsplit=1) for line in shadowinv("info", "--report").stdout.splitlines()]
+    entries = [line.split(maxsplit=1) for line in shadowinv("info", "--system").stdout.splitlines()]
     for name in ("napari", "npe2", "qtpy", "Qt"):
         assert [name, "not installed"] in entries
     only = {"PySide6_Essentials": "6.11.0"}
@@ -1081,7 +1081,7 @@ def test_report_lists_missing_packages(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_report_hides_the_home_folder(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     monkeypatch.setattr(Path, "home", lambda: folder)
     monkeypatch.setattr(machine_code, "code_folder", lambda: folder / "kept")
-    text = shadowinv("info", "--report").stdout
+    text = shadowinv("info", "--system").stdout
     assert str(Path("~") / "kept") in text
     assert str(folder) not in text
 
@@ -1091,7 +1091,7 @@ def test_the_report_survives_a_compiler_that_fails(monkeypatch: pytest.MonkeyPat
         raise ImportError("llvmlite does not\nload")
 
     monkeypatch.setattr(machine_code, "code_folder", broken)
-    last = shadowinv("info", "--report").stdout.splitlines()[-1]
+    last = shadowinv("info", "--system").stdout.splitlines()[-1]
     assert last.endswith("unknown: ImportError: llvmlite does not load")
 
 
@@ -1101,7 +1101,7 @@ import sys
 from typer.testing import CliRunner
 from napari_shadowinv.cli import app
 
-assert CliRunner().invoke(app, ["info", "--report"]).exit_code == 0
+assert CliRunner().invoke(app, ["info", "--system"]).exit_code == 0
 print(sorted({"napari", "qtpy", "PyQt6", "PySide6"} & set(sys.modules)))
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
@@ -1109,9 +1109,9 @@ print(sorted({"napari", "qtpy", "PyQt6", "PySide6"} & set(sys.modules)))
 
 
 def test_info_needs_a_file_or_report(refused: Callable[..., None]) -> None:
-    refused("info", names="--report")
-    refused("info", "shot.npy", "--report", names="no file")
-    refused("info", "--variable", "beam", "--report", names="no file")
+    refused("info", names="--system")
+    refused("info", "shot.npy", "--system", names="no file")
+    refused("info", "--variable", "beam", "--system", names="no file")
 
 
 def test_info_of_a_result_shows_options_and_peak(folder: Path, shot: Path) -> None:
@@ -1270,7 +1270,7 @@ def test_neither_result_nor_figure_is_left_on_a_full_disk(
     assert resize("64k")
     for out, figure in (("shot.shadowinv", disk / "a.png"), (disk / "a.shadowinv", "a.png")):
         (disk / "other").write_bytes(bytes(60_000))
-        result = shadowinv("invert", shot, "--n-sites", 300, "--out", out, "--report", figure)
+        result = shadowinv("invert", shot, "--n-sites", 300, "--out", out, "--figure", figure)
         assert result.exit_code == 2
         (line,) = result.stderr.splitlines()
         assert f"{disk}/a." in line

@@ -132,7 +132,7 @@ def test_the_field_of_two_energies_is_found_and_written(folder: Path) -> None:
 
 
 def test_an_ambiguous_field_is_written_with_exit_code_3() -> None:
-    arguments = ("fit", "a.tif", "--source", "unknown", "--samples", 0, "--steps", 2)
+    arguments = ("fit", "a.tif", "--source", "unknown", "--samples", 0, "--max-iterations", 2)
     result = shadowinv(*arguments, "--ambiguous", "--beam-modes", 3, "--quiet")
     assert result.exit_code == 3
     (line,) = result.stderr.splitlines()
@@ -172,7 +172,7 @@ def test_ctrl_c_leaves_nothing(folder: Path) -> None:
 
 def test_images_setups_and_choices_reach_the_fit(fit_arguments: dict[str, Any]) -> None:
     result = shadowinv(
-        *PAIR, "--fields", "B, E", "--noise", "poisson", "--psf", 1.5, "--gains", "free",
+        *PAIR, "--fields", "B, E", "--noise", "poisson", "--psf", 1.5, "--brightness", "free",
         "--align", "shift", "--seed", 3,
     )  # fmt: skip
     assert result.exit_code == 0, result.output
@@ -180,7 +180,7 @@ def test_images_setups_and_choices_reach_the_fit(fit_arguments: dict[str, Any]) 
     assert fit_arguments["setups"] == (FIRST, SECOND)
     assert "strengths" not in fit_arguments
     assert fit_arguments["fields"] == ("B", "E")
-    assert (fit_arguments["noise"], fit_arguments["psf"], fit_arguments["gains"]) == (
+    assert (fit_arguments["noise"], fit_arguments["psf"], fit_arguments["brightness"]) == (
         "poisson",
         [1.5, 1.5],
         "free",
@@ -200,7 +200,7 @@ def test_a_table_describes_each_image(folder: Path, fit_arguments: dict[str, Any
     tifffile.imwrite(night / "mask.tif", mask)
     (night / "shots.csv").write_text(
         "# the second shot of the night\n"
-        "file, energy, setup, source, gain, psf, mask, noise\n"
+        "file, energy, setup, source, brightness, psf, mask, noise\n"
         "a.tif, 14.7, setup.toml, beam.tif, 1,, mask.tif, 20\n"
         "\n"
         "b.tif, 5, setup.toml, beam.tif, 1.2, 0.5,,\n"
@@ -211,7 +211,7 @@ def test_a_table_describes_each_image(folder: Path, fit_arguments: dict[str, Any
     # Flags hold where a cell is empty.
     assert fit_arguments["psf"] == [2.0, 0.5]
     assert fit_arguments["noise"] == (20.0, 30.0)
-    assert fit_arguments["gains"] == (1.0, 1.2)
+    assert fit_arguments["brightness"] == (1.0, 1.2)
     np.testing.assert_array_equal(fit_arguments["source"], np.full((2, *SHAPE), 900))
     np.testing.assert_array_equal(fit_arguments["mask"], [mask > 0, np.ones(SHAPE, bool)])
     provenance = provenance_in("a_fit.shadowinv")
@@ -222,7 +222,7 @@ def test_a_table_describes_each_image(folder: Path, fit_arguments: dict[str, Any
     assert (origin.file, origin.sha256) == ("mask.tif", sha256(night / "mask.tif"))
     np.testing.assert_array_equal(origin.mask(), mask > 0)
     assert [image.psf for image in provenance.images] == [None, 0.5]
-    assert [image.gain for image in provenance.images] == [1.0, 1.2]
+    assert [image.brightness for image in provenance.images] == [1.0, 1.2]
     assert [image.setup for image in provenance.images] == [FIRST, SECOND]
 
 
@@ -282,9 +282,9 @@ def test_light_is_deflected_by_a_refractive_index_by_default(
 
 
 def test_options_come_from_a_file_and_flags_override_it(fit_arguments: dict[str, Any]) -> None:
-    Path("options.toml").write_text('edge = "free"\nsamples = 4\n')
+    Path("options.toml").write_text('boundary = "free"\nsamples = 4\n')
     assert shadowinv("fit", "a.tif", "--options", "options.toml", "--samples", 0).exit_code == 0
-    assert fit_arguments["options"] == FitOptions(edge="free", samples=0)
+    assert fit_arguments["options"] == FitOptions(boundary="free", samples=0)
 
 
 def test_every_option_of_a_fit_has_a_flag() -> None:
@@ -340,11 +340,11 @@ MISTAKES = {
     "fit a.tif b.tif --energies 3,5 --setup setup.toml --fields B,E --out fit.h5": (
         "holds one field, received B and E",
     ),
-    "fit a.tif --out setup.shadowinv --report setup.toml": (".toml", "expected one of"),
-    "fit a.tif --edge soft": ("'edge' is 'soft'", "'fading' or 'free'"),
+    "fit a.tif --out setup.shadowinv --figure setup.toml": (".toml", "expected one of"),
+    "fit a.tif --boundary soft": ("'boundary' is 'soft'", "'fading' or 'free'"),
     "fit shots.csv --energies 3": ("column 'energy'",),
     "fit a.tif --options setup.toml": ("setup.toml: unknown key 'kind'",),
-    "fit a.tif b.tif --gains 1,0 --strengths 1,2": ("b.tif: 'gain' is '0'",),
+    "fit a.tif b.tif --brightness 1,0 --strengths 1,2": ("b.tif: 'brightness' is '0'",),
 }
 
 
@@ -361,7 +361,7 @@ def test_an_input_is_never_overwritten(refused: Callable[..., None]) -> None:
     np.save("beam.npy", np.ones(SHAPE))
     Path("beam.npy").rename("beam.png")  # the content counts
     for option in ("--source", "--mask"):
-        arguments = (option, "beam.png", "--report", "beam.png", "--overwrite")
+        arguments = (option, "beam.png", "--figure", "beam.png", "--overwrite")
         refused("fit", "a.tif", *arguments, names=("beam.png is both read and written",))
 
 
@@ -411,7 +411,7 @@ def test_info_shows_a_doubtful_verdict(make_fit: Callable[..., Fit]) -> None:
     assert "verdict one of several" in output
     assert "warning 2 different fields explain the data" in output
     assert "alternative from near: objective +20.00%, displacement 30.00% away" in output
-    assert "gain 1.1, shifted by y" in output
+    assert "brightness 1.1, shifted by y" in output
 
 
 # Rerun
@@ -426,8 +426,8 @@ def test_rerun_of_a_fit_is_identical_bit_for_bit(
     tifffile.imwrite("beam.tif", np.full(SHAPE, 1000, np.float32))
     steps = ("--crop-y", "2:46", "--crop-x", "0:54", "--hot-pixels", 8)
     inputs = ("--mask", "mask.tif", "--source", "beam.tif", "--psf", 0.3, "--noise", 20)
-    quick = ("--samples", 2, "--steps", 5, "--spacing", 0.25)
-    result = shadowinv(*PAIR, *steps, *inputs, *quick, "--gains", "1,1.01")
+    quick = ("--samples", 2, "--max-iterations", 5, "--spacing", 0.25)
+    result = shadowinv(*PAIR, *steps, *inputs, *quick, "--brightness", "1,1.01")
     assert result.exit_code in (0, 3), result.output
     # A mask whose pixels are kept need not be there any more.
     Path("mask.tif").unlink()
@@ -462,7 +462,7 @@ def test_rerun_of_a_fit_is_identical_bit_for_bit(
 
 
 def test_rerun_reports_an_older_version(empty_figure: None) -> None:
-    quick = ("--samples", 0, "--steps", 1, "--spacing", 0.5, "--smoothness", 10)
+    quick = ("--samples", 0, "--max-iterations", 1, "--spacing", 0.5, "--smoothness", 10)
     assert shadowinv("fit", "a.tif", "--bin", 1, *quick).exit_code in (0, 3)
     fit, _ = fit_in("a_fit.shadowinv")
     assert fit.provenance is not None
@@ -482,7 +482,7 @@ def test_rerun_uses_the_fiducials_and_masks(empty_figure: None) -> None:
     Path("shots.csv").write_text("\n".join(lines))
     rows = ["y,x,dy,dx,sigma", *(f"{k % 30}.25,{k % 40}.5,0,0,10" for k in range(1000))]
     Path("mesh.csv").write_text("\n".join(rows))
-    quick = ("--samples", 0, "--steps", 1, "--spacing", 0.5, "--smoothness", 10)
+    quick = ("--samples", 0, "--max-iterations", 1, "--spacing", 0.5, "--smoothness", 10)
     part = ("--crop-y", "9:49", "--crop-x", "8:56")
     result = shadowinv("fit", "shots.csv", "--fiducials", "mesh.csv", *part, *quick)
     assert result.exit_code in (0, 3), result.output
@@ -530,13 +530,24 @@ def test_a_saved_recipe_gives_the_same_fit(fit_arguments: dict[str, Any]) -> Non
         np.testing.assert_equal(fit_arguments[name], before[name], err_msg=name)
 
     # Flags override the recipe.
-    overrides = ("--psf", 0.5, "--samples", 3, "--source", "a.tif", "--gains", "free", "--bin", 4)
+    overrides = (
+        "--psf",
+        0.5,
+        "--samples",
+        3,
+        "--source",
+        "a.tif",
+        "--brightness",
+        "free",
+        "--bin",
+        4,
+    )
     changed = shadowinv(*PAIR, "--recipe", "r.toml", *overrides, "--overwrite")
     assert changed.exit_code == 0, changed.output
     assert fit_arguments["psf"] == [0.5, 0.5]
     assert fit_arguments["options"] == FitOptions(samples=3)
     assert fit_arguments["source"].shape == (2, SHAPE[0] // 4, SHAPE[1] // 4)
-    assert (fit_arguments["gains"], fit_arguments["fields"]) == ("free", ("B", "E"))
+    assert (fit_arguments["brightness"], fit_arguments["fields"]) == ("free", ("B", "E"))
 
 
 def test_the_setup_of_one_image_is_in_its_recipe(fit_arguments: dict[str, Any]) -> None:
@@ -579,7 +590,7 @@ def test_the_recipe_on_the_page_works(fit_arguments: dict[str, Any]) -> None:
     Path("page.toml").write_text(text, encoding="utf-8")
     result = shadowinv(*PAIR, "--recipe", "page.toml")
     assert result.exit_code == 0, result.output
-    assert (fit_arguments["noise"], fit_arguments["gains"]) == ("poisson", "free")
+    assert (fit_arguments["noise"], fit_arguments["brightness"]) == ("poisson", "free")
     assert fit_arguments["options"] == FitOptions(samples=10)
     assert fit_arguments["images"].shape == (2, 24, 28)
     assert fit_arguments["psf"][0] > 0
@@ -591,7 +602,18 @@ def test_the_recipe_on_the_page_works(fit_arguments: dict[str, Any]) -> None:
 
 
 def test_fields_are_compared_and_the_likeliest_is_written(empty_figure: None) -> None:
-    quick = ("--noise", 20, "--samples", 0, "--steps", 5, "--spacing", 0.25, "--smoothness", 10)
+    quick = (
+        "--noise",
+        20,
+        "--samples",
+        0,
+        "--max-iterations",
+        5,
+        "--spacing",
+        0.25,
+        "--smoothness",
+        10,
+    )
     result = shadowinv(*PAIR, "--compare", *quick)
     assert result.exit_code in (0, 3), result.output
     output = flat(result.stdout)
@@ -637,7 +659,7 @@ FILMS = ("fit", "films.csv", "--setup", "setup.toml", "--noise", 20, "--samples"
 def test_left_out_images_and_windows_are_written(folder: Path) -> None:
     films()
     before = set(content(folder))
-    result = shadowinv(*FILMS, "--spacing", 0.2, "--leave-one-out", "--window", 3)
+    result = shadowinv(*FILMS, "--spacing", 0.2, "--leave-one-out", "--energy-window", 3)
     assert result.exit_code == 3, result.output
     output = flat(result.stdout)
     for words in ("Left out", "c 14.7", "not explained", "Windows", "1, 2, 4", "2, 4, 3"):
@@ -661,7 +683,7 @@ def test_images_left_out_have_energies_without_a_setup(folder: Path) -> None:
     films()
     lines = ["file,energy,strength", "a.tif,5,1", "b.tif,7,0.844", "d.tif,10,0.706"]
     Path("films.csv").write_text("\n".join(lines))
-    quick = ("--spacing", 0.3, "--steps", 3, "--samples", 0)
+    quick = ("--spacing", 0.3, "--max-iterations", 3, "--samples", 0)
     result = shadowinv("fit", "films.csv", "--noise", 20, *quick, "--leave-one-out")
     assert result.exit_code in (0, 3), result.output
     for words in ("a 5 MeV", "b 7 MeV", "d 10 MeV"):
@@ -671,10 +693,16 @@ def test_images_left_out_have_energies_without_a_setup(folder: Path) -> None:
 
 STATIC_MISTAKES = {
     "fit a.tif b.tif --strengths 1,2 --leave-one-out": ("received 2 images", "needs 3 or more"),
-    "fit a.tif b.tif --strengths 1,2 --window 3": ("received 2 images and windows of 3",),
-    "fit a.tif b.tif --window 2": ("neither strengths nor setups",),
-    "fit a.tif b.tif --strengths 1,2 --window 2 --out fit.h5": ("fit.h5", "a format without it"),
-    "fit a.tif b.tif --strengths 1,2 --window 2 --fiducials mesh.csv": ("--fiducials", "first"),
+    "fit a.tif b.tif --strengths 1,2 --energy-window 3": ("received 2 images and windows of 3",),
+    "fit a.tif b.tif --energy-window 2": ("neither strengths nor setups",),
+    "fit a.tif b.tif --strengths 1,2 --energy-window 2 --out fit.h5": (
+        "fit.h5",
+        "a format without it",
+    ),
+    "fit a.tif b.tif --strengths 1,2 --energy-window 2 --fiducials mesh.csv": (
+        "--fiducials",
+        "first",
+    ),
 }
 
 

@@ -311,7 +311,7 @@ def left_out_of(fit: Fit, limit: float) -> LeaveOneOut:
         mask=fit.mask,
         predicted=fit.reprojection,
         residual=fit.residual,
-        gains=fit.gains,
+        brightness=fit.brightness,
         chi2=fit.chi2,
         alone=fit.chi2,
         limit=np.append(np.full(count - 1, 2.0), limit),

@@ -260,5 +260,5 @@ def test_the_issue_templates_have_what_their_form_needs() -> None:
 def test_a_bug_report_asks_for_the_report() -> None:
     form = loaded(ROOT / ".github" / "ISSUE_TEMPLATE" / "bug_report.yml")
     (field,) = [field for field in form["body"] if field["id"] == "report"]
-    assert "`shadowinv info --report`" in field["attributes"]["description"]
+    assert "`shadowinv info --system`" in field["attributes"]["description"]
     assert field["validations"]["required"] is True

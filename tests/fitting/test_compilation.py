@@ -31,7 +31,7 @@ def test_a_fit_tells_that_it_compiles_and_can_be_cancelled(monkeypatch: pytest.M
     keywords: dict[str, Any] = {
         "strengths": [1, 0.5],
         "noise": 0.1,
-        "options": FitOptions(samples=0, steps=1),
+        "options": FitOptions(samples=0, max_iterations=1),
     }
     ensure_compiled()  # else transport tells that it compiles, too
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
@@ -92,7 +92,7 @@ kernels = {
 compiled = {kernel: len(kernel.signatures) for kernel in kernels}
 y, x = np.indices((36, 48)) / 10
 image = 1 + 0.1 * np.sin(y) * np.cos(x)
-keywords = {"noise": 0.02, "options": FitOptions(samples=2, steps=2, align="affine")}
+keywords = {"noise": 0.02, "options": FitOptions(samples=2, max_iterations=2, align="affine")}
 fit([image, 1 + 0.5 * (image - 1)], strengths=[1, 0.5], **keywords)
 print([kernel.py_func.__name__ for kernel in kernels if len(kernel.signatures) > compiled[kernel]])
 """

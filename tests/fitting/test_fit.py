@@ -18,8 +18,8 @@ from napari_shadowinv.physics.setup import ProtonSetup
 SIZE = (48, 56)
 STRENGTHS = [1, 0.6]
 NOISE = 0.03
-PLAIN = FitOptions(samples=0, steps=30, spacing=0.25, threads=1)
-HASTY = FitOptions(samples=0, steps=5, spacing=0.25, threads=1)
+PLAIN = FitOptions(samples=0, max_iterations=30, spacing=0.25, threads=1)
+HASTY = FitOptions(samples=0, max_iterations=5, spacing=0.25, threads=1)
 RING_AND_SPOT = together(bump(3.2, 4.5, (20, 32)), bump(-1.6, 5, (30, 19)))
 """Rays cross around a ring, and behind a spot."""
 WEAK = bump(0.4, 8, (22, 29))
@@ -194,12 +194,12 @@ def test_a_shot_without_the_object_is_one_more_image() -> None:
     assert result.verdict is Verdict.DETERMINED
 
 
-@pytest.mark.parametrize("edge", ["fading", "free"])
-def test_an_object_that_the_edge_cuts_is_told(edge: Any) -> None:
+@pytest.mark.parametrize("boundary", ["fading", "free"])
+def test_an_object_that_the_edge_cuts_is_told(boundary: Any) -> None:
     """A converged answer that explains both images, and is off by a quarter and more."""
     cut = bump(0.7, 8, (0, 30))
     images = [counted(lambda y, x: s * cut(y, x), SIZE) for s in (1, 0.7)]  # noqa: B023
-    options = FitOptions(samples=0, edge=edge)
+    options = FitOptions(samples=0, boundary=boundary)
     result = fit(noisy(images, 0.02), strengths=[1, 0.7], noise=0.02, options=options)
     assert result.chi2.max() < 1.3
     assert result.verdict is Verdict.EDGE

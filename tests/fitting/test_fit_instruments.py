@@ -1,4 +1,4 @@
-"""Fits of images with blur, dead pixels, shifts, unknown gains and counts; and of any shape."""
+"""Fits of images with blur, dead pixels, shifts, unknown brightness and counts, any shape."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def shots() -> list[FloatArray]:
 
 
 def fitted(images: Any, align: Any = "none", threads: int = 1, **keywords: Any) -> Fit:
-    options = FitOptions(samples=0, steps=30, spacing=0.25, threads=threads, align=align)
+    options = FitOptions(samples=0, max_iterations=30, spacing=0.25, threads=threads, align=align)
     keywords = {"strengths": STRENGTHS, "noise": NOISE} | keywords
     return fit(images, options=options, **keywords)
 
@@ -106,7 +106,9 @@ def test_a_shifted_image_is_brought_back(
 
 def test_an_image_is_shifted_no_further_than_it_may_be(shots: list[FloatArray]) -> None:
     images = noisy([shots[0], shot(1, frame=(1.2, 1, 0, -2.0, 0, 1))], NOISE)
-    options = FitOptions(samples=0, steps=30, spacing=0.25, align="shift", align_spread=1e-3)
+    options = FitOptions(
+        samples=0, max_iterations=30, spacing=0.25, align="shift", align_spread=1e-3
+    )
     result = fit(images, strengths=STRENGTHS, noise=NOISE, options=options)
     assert np.abs(result.frames[1][[0, 3]]).max() < 0.5
     assert result.verdict == Verdict.MISFIT
@@ -131,11 +133,11 @@ def test_a_turned_and_magnified_image_is_brought_back() -> None:
 def test_unknown_gains_are_found(shots: list[FloatArray]) -> None:
     images = noisy([shots[0], 1.2 * shots[1]], NOISE)
     source = np.ones(SIZE)
-    result = fitted(images, gains="free", source=source)
-    assert result.gains[1] / result.gains[0] == pytest.approx(1.2, rel=0.005)
+    result = fitted(images, brightness="free", source=source)
+    assert result.brightness[1] / result.brightness[0] == pytest.approx(1.2, rel=0.005)
     assert error(result) < 0.04
-    np.testing.assert_allclose(result.source, result.gains[:, None, None] * np.ones(SIZE))
-    aware = fitted(images, gains=[1, 1.2], source=source)
+    np.testing.assert_allclose(result.source, result.brightness[:, None, None] * np.ones(SIZE))
+    aware = fitted(images, brightness=[1, 1.2], source=source)
     assert error(aware) < 0.04
 
 
@@ -154,7 +156,7 @@ def test_answers_to_few_counts_are_compared_by_what_is_expected() -> None:
     size = (64, 64)
     strong = bump(6.0, 6, (31, 31))
     counts = np.random.default_rng(5).poisson(30 * counted(strong, size))
-    options = FitOptions(samples=0, steps=20, spacing=0.25, smoothness=200, ambiguous=True)
+    options = FitOptions(samples=0, max_iterations=20, spacing=0.25, smoothness=200, ambiguous=True)
     source = np.full(size, 30)
     result = fit(counts, source=source, noise="poisson", options=options)
     noise = np.sqrt(np.maximum(result.reprojection[0], 1))
@@ -172,7 +174,7 @@ def test_sides_may_be_odd_and_unlike() -> None:
 def test_units_of_the_images_do_not_matter(shots: list[FloatArray]) -> None:
     """Not even by rounding, if one is a power of two of the other."""
     images = noisy(shots, NOISE)
-    options = FitOptions(samples=0, steps=5, spacing=0.25, threads=1)
+    options = FitOptions(samples=0, max_iterations=5, spacing=0.25, threads=1)
     first, second = (
         fit(unit * images, strengths=STRENGTHS, noise=unit * NOISE, options=options)
         for unit in (1, 1024)
@@ -212,7 +214,7 @@ def test_neither_threads_nor_a_second_time_change_a_bit(shots: list[FloatArray])
     images = noisy(shots, NOISE)
     runs = []
     for threads in (1, 3):
-        options = FitOptions(samples=2, steps=5, spacing=0.25, threads=threads, seed=3)
+        options = FitOptions(samples=2, max_iterations=5, spacing=0.25, threads=threads, seed=3)
         runs.append(fit(images, strengths=STRENGTHS, noise=NOISE, options=options))
     first, second = runs
     np.testing.assert_array_equal(first.fields[0].displacement, second.fields[0].displacement)
@@ -239,7 +241,7 @@ def test_a_fit_ends_at_once_when_asked(shots: list[FloatArray], after: int) -> N
 def test_each_step_is_told_with_its_stage_and_objective() -> None:
     reports: list[Progress] = []
     image = noisy([counted(bump(0.4, 7, (23, 29)), SIZE)], NOISE)
-    options = FitOptions(samples=2, steps=10, spacing=0.25, threads=1)
+    options = FitOptions(samples=2, max_iterations=10, spacing=0.25, threads=1)
     fit(image, noise=NOISE, options=options, on_progress=reports.append)
     for stage in ("from near", "transport", "smoothness", "full size", "samples"):
         objectives = [news.objective for news in reports if news.message == stage]

@@ -40,7 +40,7 @@ def scene() -> Scene:
         decay=20.0,
         pad=PAD,
         beam_modes=4,
-        free_gains=True,
+        free_brightness=True,
         free_frames=np.ones(6, bool),
         fiducials=Fiducials(
             np.array([[9.3, 11.2], [20.0, 30.5]]),
@@ -54,14 +54,14 @@ def scene() -> Scene:
 
 
 def some(scene: Scene) -> Unknowns:
-    """An object, a beam, gains and frames."""
+    """An object, a beam, brightness and frames."""
     unknowns = scene.nothing()
     y, x = (KNOT * (np.arange(n) - 1.0) - PAD for n in scene.rays.shape)
     bump = np.exp(-((y[:, None] - 14) ** 2 + (x - 22) ** 2) / 2 / 5**2)
     unknowns.potentials[0] = -18 * bump
     unknowns.potentials[1] = 9 * bump * np.cos(x / 3)
     unknowns.beam[0, 1], unknowns.beam[2, 1] = 0.1, -0.05
-    unknowns.gains[:] = 0.1, -0.2
+    unknowns.brightness[:] = 0.1, -0.2
     unknowns.frames[1] = [0.4, 1.01, -0.01, -0.3, 0.02, 0.98]
     return unknowns
 
@@ -81,7 +81,7 @@ def only(part: str, change: Unknowns) -> Unknowns:
     return change if part == "all" else change.zeros()._replace(**{part: getattr(change, part)})
 
 
-@pytest.mark.parametrize("part", ["potentials", "beam", "gains", "frames", "all"])
+@pytest.mark.parametrize("part", ["potentials", "beam", "brightness", "frames", "all"])
 def test_the_gradient_is_that_of_the_value(scene: Scene, part: str) -> None:
     unknowns = some(scene)
     counts = scene.ray_counts(unknowns)
@@ -114,16 +114,16 @@ def test_the_value_is_half_of_what_the_residuals_and_the_prior_add_up_to(scene: 
 def test_what_is_not_free_has_no_slope(scene: Scene) -> None:
     fixed = replace(
         scene,
-        free_gains=False,
+        free_brightness=False,
         free_frames=np.array([True, False, False] * 2),
         fiducials=None,
     )
     unknowns = some(fixed)
     _, slope = fixed.value_and_gradient(unknowns, fixed.ray_counts(unknowns))
-    assert not slope.gains.any()
+    assert not slope.brightness.any()
     assert not slope.frames[0].any()
     np.testing.assert_array_equal(slope.frames[1] != 0, fixed.free_frames)
-    assert slope.beam[0, 0] == 0  # the mean is for the gains to tell
+    assert slope.beam[0, 0] == 0  # the mean is for the brightness to tell
     assert slope.beam[0, 1] != 0
 
 
@@ -216,7 +216,7 @@ def test_gains_and_beam_multiply_the_image(scene: Scene) -> None:
     unknowns = scene.nothing()
     counts = scene.ray_counts(unknowns)
     plain = scene.model(unknowns, counts)
-    unknowns.gains[1], unknowns.beam[0, 0] = np.log(1.5), np.log(1.2)
+    unknowns.brightness[1], unknowns.beam[0, 0] = np.log(1.5), np.log(1.2)
     images = scene.model(unknowns, counts)
     np.testing.assert_allclose(images[0], 1.2 * plain[0], rtol=1e-12)
     np.testing.assert_allclose(images[1], 1.8 * plain[1], rtol=1e-12)

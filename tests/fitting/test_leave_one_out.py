@@ -68,7 +68,7 @@ def test_each_image_of_a_static_object_is_predicted_to_the_noise(static: LeaveOn
     assert static.explained.all()
     np.testing.assert_allclose(static.chi2, levels(5), atol=0.06)
     assert_follows_noise_a_little(static)
-    np.testing.assert_allclose(static.gains, 1, atol=0.01)
+    np.testing.assert_allclose(static.brightness, 1, atol=0.01)
     # The noise is that of the images, and the mean is 1.
     np.testing.assert_allclose(static.rms, NOISE * np.sqrt(static.chi2), rtol=0.01)
     np.testing.assert_array_equal(static.residual, static.images - static.predicted)
@@ -100,13 +100,13 @@ def test_the_images_of_a_changed_object_are_named_and_no_others(
 
 
 def test_neither_gains_nor_noise_given_too_small_are_taken_for_a_change() -> None:
-    gains = np.array([1.0, 1.4, 0.8])
-    images = images_of([1] * 3) * gains[:, None, None]
-    known = {"source": np.ones(SHAPE), "noise": 0.85 * NOISE * gains, "gains": "free"}
+    brightness = np.array([1.0, 1.4, 0.8])
+    images = images_of([1] * 3) * brightness[:, None, None]
+    known = {"source": np.ones(SHAPE), "noise": 0.85 * NOISE * brightness, "brightness": "free"}
     found = checked(images, setups=SETUPS[:3], **known)
     assert found.chi2.min() > 1.3
     assert found.explained.all()
-    np.testing.assert_allclose(found.gains, gains, rtol=0.01)
+    np.testing.assert_allclose(found.brightness, brightness, rtol=0.01)
 
 
 def test_an_unknown_beam_is_that_of_the_others() -> None:
@@ -179,7 +179,7 @@ def test_images_without_energies_are_told() -> None:
 
 def test_it_survives_its_dataset(static: LeaveOneOut) -> None:
     again = LeaveOneOut.from_dataset(static.to_dataset())
-    for name in ("predicted", "residual", "chi2", "alone", "limit", "rms", "gains", "mask"):
+    for name in ("predicted", "residual", "chi2", "alone", "limit", "rms", "brightness", "mask"):
         np.testing.assert_array_equal(getattr(again, name), getattr(static, name))
     assert again.explanation == static.explanation
     with pytest.raises(InputError, match="left_out_chi2"):

@@ -38,7 +38,7 @@ def given(**changes: Any) -> Measured:
         "noise": 0.1,
         "psf": 0.0,
         "mask": None,
-        "gains": "known",
+        "brightness": "known",
         "fiducials": None,
         "options": FitOptions(),
     }
@@ -122,10 +122,16 @@ def nearly_all_masked() -> FloatArray:
         ({"noise": [0.1, "little"]}, "noise is .*: expected numbers"),
         ({"fiducials": [[1, 2, 3], [4]]}, "fiducials is .*: expected numbers"),
         ({"mask": [[True], [True, False]]}, "mask is .*: expected numbers"),
-        ({"gains": [1, None, "x"]}, "gains is .*: expected numbers"),
-        ({"gains": "some"}, "gains are 'some': expected 'known', 'free' or a number an image"),
-        ({"gains": [1, -2]}, r"gains are \[1, -2\]: expected a positive number for each of 2"),
-        ({"gains": [1, 1, 1]}, "expected a positive number for each of 2 images"),
+        ({"brightness": [1, None, "x"]}, "brightness is .*: expected numbers"),
+        (
+            {"brightness": "some"},
+            "brightness is 'some': expected 'known', 'free' or a number for each image",
+        ),
+        (
+            {"brightness": [1, -2]},
+            r"brightness is \[1, -2\]: expected a positive number for each of 2",
+        ),
+        ({"brightness": [1, 1, 1]}, "expected a positive number for each of 2 images"),
         ({"fiducials": np.ones((2, 4))}, r"fiducials have shape \(2, 4\): expected rows of y, x"),
         ({"fiducials": [[45, 5, 0, 0, 1]]}, "fiducials lie outside the image or have no positive"),
         ({"fiducials": [[5, 5, 0, 0, 0]]}, "fiducials lie outside the image or have no positive"),
@@ -149,13 +155,13 @@ def test_one_image_and_an_unknown_source_are_taken_if_asked_for() -> None:
     )
     assert alone.single
     assert alone.scene.beam_modes == 5
-    assert alone.scene.free_gains
+    assert alone.scene.free_brightness
 
 
 def test_a_known_source_leaves_no_beam_to_be_found() -> None:
     data = given(source=np.full(SIZE, 4.0))
     assert data.scene.beam_modes == 0
-    assert not data.scene.free_gains
+    assert not data.scene.free_brightness
 
 
 def test_a_source_in_other_units_is_refused_unless_gains_are_free() -> None:
@@ -163,11 +169,11 @@ def test_a_source_in_other_units_is_refused_unless_gains_are_free() -> None:
     source = np.full(SIZE, images()[0].mean() / 10)
     with pytest.raises(InputError, match="image 1 is 10 times as bright as its source"):
         given(source=source)
-    free = given(source=source, gains="free")
+    free = given(source=source, brightness="free")
     expected = images().mean(axis=(1, 2)) / source.mean()
-    np.testing.assert_allclose(free.gains, expected)
+    np.testing.assert_allclose(free.brightness, expected)
     np.testing.assert_allclose(free.units, images().mean(axis=(1, 2)))
-    np.testing.assert_allclose(given(source=source, gains=expected).gains, expected)
+    np.testing.assert_allclose(given(source=source, brightness=expected).brightness, expected)
 
 
 @pytest.mark.parametrize(("second", "single"), [(1.0, True), (0.95, True), (0.8, False)])
@@ -177,7 +183,7 @@ def test_images_at_nearly_one_energy_are_one_image(second: float, single: bool) 
 
 def test_images_are_in_units_of_their_beams() -> None:
     source = np.random.default_rng(1).uniform(3, 5, SIZE)
-    data = given(source=source, gains=[1, 2], noise=[0.1, 0.3])
+    data = given(source=source, brightness=[1, 2], noise=[0.1, 0.3])
     pad = data.scene.pad
     np.testing.assert_allclose(data.units, [source.mean(), 2 * source.mean()])
     for k, stack in enumerate(images()):
@@ -276,13 +282,13 @@ def test_alignment_frees_the_numbers_of_a_frame(align: Any, free: int) -> None:
 
 def test_a_free_edge_has_a_wider_strip_and_fades() -> None:
     stack = np.ones((1, 240, 280))
-    free = given(images=stack, strengths=[1], options=FitOptions(edge="free"))
+    free = given(images=stack, strengths=[1], options=FitOptions(boundary="free"))
     assert free.scene.pad == 24  # a tenth of the shorter side in blocks
     assert free.scene.decay == 24
     fading = given(images=stack, strengths=[1])
     assert fading.scene.pad == 16
     assert fading.scene.decay == np.inf
-    open_edge = given(options=FitOptions(edge="free", strip=40, fade_length=9.0))
+    open_edge = given(options=FitOptions(boundary="free", margin=40, decay_length=9.0))
     assert (open_edge.scene.pad, open_edge.scene.decay) == (40, 9)
 
 

@@ -30,7 +30,7 @@ def weak_scene(size: tuple[int, int], smoothness: tuple[float, float]) -> Scene:
         smoothness=np.array([smoothness]),
         pad=pad,
         beam_modes=2,
-        free_gains=True,
+        free_brightness=True,
         free_frames=np.array([True, False, False] * 2),
         threads=1,
     )
@@ -70,7 +70,7 @@ def test_samples_have_the_inverse_hessian_as_covariance(
     samples = np.stack([posterior.drawn().flat() for _ in range(DRAWS)])
     covariance = np.linalg.pinv(matrix[np.ix_(free, free)], rcond=1e-10, hermitian=True)
     tolerance = 4 * np.sqrt(2 / DRAWS)
-    # What a measurement reads: displacements, gains, frames; not the potential's free constant.
+    # Observables: displacements, brightness, frames; not the potential's free constant.
     size = unknowns.potentials.size
     place = np.arange(size).reshape(scene.rays.shape)
     ways = []
@@ -80,7 +80,7 @@ def test_samples_have_the_inverse_hessian_as_covariance(
         ways.append(way)
     ways.append(np.zeros(unknowns.flat().size))
     ways[-1][place[6, 7]], ways[-1][place[6, 8]], ways[-1][place[6, 6]] = 2, -1, -1
-    for part in ("beam", "gains", "frames"):
+    for part in ("beam", "brightness", "frames"):
         like = unknowns.zeros()
         getattr(like, part)[-1, ...] = 1
         ways.append(like.flat())
@@ -137,7 +137,7 @@ def test_the_likeliest_smoothness_is_that_of_the_field(true: float) -> None:
     scene = replace(
         weak_scene((48, 48), (true, 0.0)),
         beam_modes=0,
-        free_gains=False,
+        free_brightness=False,
         free_frames=np.zeros(6, bool),
         spacing=1 / 3,
         tie=1e-3,
@@ -206,7 +206,7 @@ def test_with_free_beam_spreads_beams_by_the_variation(modes: int) -> None:
 
 def test_open_beams_are_those_that_several_energies_cannot_exclude() -> None:
     """One image excludes none; images of different strengths exclude those that show."""
-    scene = replace(weak_scene((24, 32), (0.1, 1.0)), beam_modes=0, free_gains=False)
+    scene = replace(weak_scene((24, 32), (0.1, 1.0)), beam_modes=0, free_brightness=False)
     unknowns = scene.nothing()
 
     def spread(strengths: list[float]) -> float:

@@ -139,7 +139,7 @@ def test_the_strip_ties_the_potential_and_the_image_does_not() -> None:
 
 
 def test_gains_frames_and_beam_are_held_with_their_spreads(prior: Prior) -> None:
-    """A shift by 5 recorded px, a stretch by 5 %, a gain of e cost ½ each."""
+    """A shift by 5 recorded px, a stretch by 5 %, a brightness of e cost ½ each."""
     free = replace(prior, fiducials=None)
     for number, change in ((0, 5 / 2), (3, 5 / 2), (1, 0.05), (5, 0.05)):
         moved = nothing(prior)
@@ -150,7 +150,7 @@ def test_gains_frames_and_beam_are_held_with_their_spreads(prior: Prior) -> None
     moved.frames[1, 0] += 0.2 / 2
     assert spread.value_and_slope(moved)[0] == pytest.approx(0.5)
     brighter = nothing(prior)
-    brighter.gains[2] = 1
+    brighter.brightness[2] = 1
     assert free.value_and_slope(brighter)[0] == pytest.approx(0.5)
     uneven = nothing(prior)
     uneven.beam[1, 2] = 0.3 / np.sqrt(5)

@@ -178,7 +178,7 @@ def test_a_field_that_the_edge_cuts_is_told(
     displacement = blob((24, column)) + np.array([0, uniform])[:, None, None]
     verdict, why = judged(**GOOD | {"displacement": displacement, "edge_is_free": free})
     assert verdict is expected
-    assert ("edge='free'" in why) == (expected is Verdict.EDGE and not free)
+    assert ("boundary='free'" in why) == (expected is Verdict.EDGE and not free)
 
 
 def test_an_object_that_the_edge_cuts_is_told_where_its_field_comes_out_too_weak() -> None:
@@ -192,7 +192,7 @@ def test_an_object_that_the_edge_cuts_is_told_where_its_field_comes_out_too_weak
 def test_a_search_that_was_cut_short_determines_nothing() -> None:
     verdict, why = judged(**GOOD | {"ended": False})
     assert verdict is Verdict.UNCERTAIN
-    assert "--steps" in why
+    assert "--max-iterations" in why
 
 
 def test_rays_that_one_image_has_lost_leave_it_open() -> None:

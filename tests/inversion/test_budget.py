@@ -119,7 +119,7 @@ def test_given_noise_is_used_and_scales(image):
         for name, choices in {
             "weak": {"noise_level": 0.07},
             "strong": {"noise_level": 0.21},
-            "counts": {"quantum": 0.01},
+            "counts": {"units_per_quantum": 0.01},
         }.items()
     }
     assert noise_errors["strong"] == pytest.approx(3 * noise_errors["weak"])
@@ -393,7 +393,7 @@ def test_noise_that_was_smoothed_is_not_passed_off_as_measured():
     smooth = LowPassFilter(width=1.5)
     plain = run(Recipe(options=options), image)
     filtered = run(Recipe(options=options, steps=(smooth,)), image)
-    stated_options = options.model_copy(update={"quantum": 1.0})
+    stated_options = options.model_copy(update={"units_per_quantum": 1.0})
     stated = run(Recipe(options=stated_options, steps=(smooth,)), image)
     assert stated.errors.noise.rms == pytest.approx(plain.errors.noise.rms, rel=0.2)
     assert 1 / 1.6 < filtered.errors.noise.rms / plain.errors.noise.rms < 1.6
@@ -442,7 +442,7 @@ def test_white_noise_is_not_called_correlated(every_image, noise):
 def test_noise_error_does_not_depend_on_the_unit_of_the_image(image):
     """Of f · image; also with a noise level or a quantum that is stated in that unit."""
     shot = counting(image, np.random.default_rng(2))
-    for stated in ({}, {"noise_level": 20.0}, {"quantum": 1.5}):
+    for stated in ({}, {"noise_level": 20.0}, {"units_per_quantum": 1.5}):
         errors = []
         for factor in (1.0, 37.0):
             scaled = {name: factor * value for name, value in stated.items()}

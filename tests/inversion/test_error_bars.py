@@ -120,7 +120,7 @@ def test_small_noise_twice_as_large_gives_error_bars_twice_as_large(clean, plan)
 
 def test_gain_says_how_many_units_a_quantum_makes(counts, plan):
     as_counts = uncertainty(counts, 3, plan=plan)
-    as_units = uncertainty(8.0 * counts, 3, plan=plan, gain=8.0)
+    as_units = uncertainty(8.0 * counts, 3, plan=plan, units_per_quantum=8.0)
     np.testing.assert_allclose(as_units.displacement_std, as_counts.displacement_std, rtol=1e-6)
     mistaken = uncertainty(8.0 * counts, 3, plan=plan)
     ratio = mistaken.displacement_std / as_counts.displacement_std
@@ -203,7 +203,7 @@ def test_values_of_masked_pixels_do_not_matter(counts):
     mask = np.ones(SHAPE, bool)
     mask[:8, :9] = False
     first, second = (
-        uncertainty(np.where(mask, counts, value), 2, mask=mask, gain=1.0)
+        uncertainty(np.where(mask, counts, value), 2, mask=mask, units_per_quantum=1.0)
         for value in (np.nan, 1e30)
     )
     np.testing.assert_array_equal(first.potential_std, second.potential_std)
@@ -281,9 +281,9 @@ def test_cancelling_while_samples_are_prepared_waits_for_nothing(monkeypatch, co
         ({"noise": -1.0}, "negative or not finite"),
         ({"noise": np.full(SHAPE, np.nan)}, "negative or not finite"),
         ({"noise": np.ones((3, 4))}, r"noise has shape \(3, 4\), image \(40, 48\)"),
-        ({"noise": 1.0, "gain": 2.0}, "gain belongs to noise='poisson'"),
-        ({"gain": 0.0}, "gain is 0.0, expected a positive number"),
-        ({"gain": 1e-30}, "more than 1e\\+18 quanta in a pixel"),
+        ({"noise": 1.0, "units_per_quantum": 2.0}, "units_per_quantum belongs to noise='poisson'"),
+        ({"units_per_quantum": 0.0}, "units_per_quantum is 0.0, expected a positive number"),
+        ({"units_per_quantum": 1e-30}, "more than 1e\\+18 quanta in a pixel"),
     ],
 )
 def test_bad_arguments_are_one_clear_sentence(counts, arguments, says):
@@ -292,7 +292,7 @@ def test_bad_arguments_are_one_clear_sentence(counts, arguments, says):
 
 
 def test_an_image_that_is_not_counts_needs_a_gain(clean):
-    with pytest.raises(InputError, match=r"not whole numbers.*give the gain"):
+    with pytest.raises(InputError, match=r"not whole numbers.*give the units_per_quantum"):
         uncertainty(clean)
 
 
@@ -336,7 +336,7 @@ def test_a_file_keeps_the_error_bars(tmp_path: Path, result, optical_setup: Opti
     dataset = read(tmp_path / "shot.shadowinv")
     np.testing.assert_array_equal(dataset["displacement_std"], result.displacement_std)
     np.testing.assert_array_equal(dataset["potential"], result.inversion.potential)
-    assert json.loads(dataset.attrs["uncertainty"])["noise"] == "Poisson, gain 1"
+    assert json.loads(dataset.attrs["uncertainty"])["noise"] == "Poisson, 1 per quantum"
 
 
 def test_the_page_about_error_bars_works_as_it_stands_there(tmp_path: Path, monkeypatch):

@@ -142,8 +142,8 @@ def test_a_setup_beside_those_of_the_images_is_refused(tmp_path: Path, make_fit:
 
 def test_an_incomplete_dataset_is_refused(make_fit: MakeFit) -> None:
     dataset = make_fit().to_dataset()
-    with pytest.raises(InputError, match="no 'gain': expected the result of a fit"):
-        Fit.from_dataset(dataset.drop_vars("gain"))
+    with pytest.raises(InputError, match="no 'brightness': expected the result of a fit"):
+        Fit.from_dataset(dataset.drop_vars("brightness"))
     with pytest.raises(InputError, match="no displacement of the field 'B'"):
         Fit.from_dataset(dataset.drop_vars("displacement"))
     del dataset.attrs["verdict"]

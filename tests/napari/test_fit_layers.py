@@ -52,7 +52,7 @@ def image(setup: ProtonSetup, *, electric: bool) -> Any:
 def found(fields: tuple[str, ...]) -> Fit:
     """A fit with an alternative solution, and the verdict on it."""
     images = [image(setup, electric=len(fields) > 1) for setup in SETUPS]
-    options = FitOptions(steps=3, samples=2)
+    options = FitOptions(max_iterations=3, samples=2)
     best = fit(images, setups=SETUPS, fields=fields, noise=0.01, options=options)
     (first, *_) = best.basins
     alternative = replace(

@@ -20,7 +20,9 @@ SETUPS = [
 ]
 
 
-@pytest.mark.parametrize(("options", "stages"), [(OPTIONS, 4), (FitOptions(samples=0, steps=3), 3)])
+@pytest.mark.parametrize(
+    ("options", "stages"), [(OPTIONS, 4), (FitOptions(samples=0, max_iterations=3), 3)]
+)
 def test_the_bar_never_goes_back_and_names_the_stages(options: FitOptions, stages: int) -> None:
     truth = gaussian_blob((48, 48), 15.0, 8.0).displacement
     progress = FitProgress(estimate_fit_time((48, 48), 2, 1, None, options))

@@ -240,7 +240,7 @@ OTHER = {
     "readout": "centroid", "integration": "y", "solver": "lbfgs", "stages": "single",
     "max_iterations": 9, "negative": "clip", "boundary": "free", "margin": 9, "decay_length": 3.0,
     "flux": "known", "caustic_jacobian": 0.5, "seed": 4, "threads": 1, "accuracy": 0.3,
-    "noise_level": 0.1, "quantum": 2.0, "beam_variation": 0.1, "beam_scale": 0.5,
+    "noise_level": 0.1, "units_per_quantum": 2.0, "beam_variation": 0.1, "beam_scale": 0.5,
 }  # fmt: skip
 
 

@@ -36,7 +36,7 @@ SETUPS = [
     for energy in (14.7, 5.0)
 ]
 RATIO = SETUPS[0].momentum / SETUPS[1].momentum
-HASTY = FitOptions(samples=0, steps=3, spacing=0.25, threads=1)
+HASTY = FitOptions(samples=0, max_iterations=3, spacing=0.25, threads=1)
 STEPS = (Crop(y=(4, 84), x=(0, 80)), Bin(factor=2))
 
 
@@ -62,7 +62,7 @@ def test_run_fit_equals_a_fit_of_the_prepared_images(images: list[FloatArray]) -
     mask = np.ones(SHAPE, bool)
     mask[10:14, 20:24] = False
     source = np.full(SHAPE, 1.0)
-    choices = FitChoices(noise=0.04, source_size=1e-5, gains="free", options=HASTY)
+    choices = FitChoices(noise=0.04, source_size=1e-5, brightness="free", options=HASTY)
     shots = [
         FitShot(image, setup, source=source, mask=mask)
         for image, setup in zip(images, SETUPS, strict=True)
@@ -77,7 +77,7 @@ def test_run_fit_equals_a_fit_of_the_prepared_images(images: list[FloatArray]) -
         noise=0.04,
         psf=[spread, spread],
         mask=binned(mask) == 4,
-        gains="free",
+        brightness="free",
         options=HASTY,
     )
     assert_same_fields(result, by_hand)
@@ -92,8 +92,8 @@ def test_provenance_is_complete_and_survives_its_file(
         tifffile.imwrite(path, image.astype(np.float32))
     mask = np.random.default_rng(1).random(SHAPE) > 0.1
     shots = [
-        FitShot(paths[0], SETUPS[0], mask=mask, noise="poisson", gain=1.0),
-        FitShot(paths[1], SETUPS[1], mask=mask, noise="poisson", gain=1.5, psf=0.5),
+        FitShot(paths[0], SETUPS[0], mask=mask, noise="poisson", brightness=1.0),
+        FitShot(paths[1], SETUPS[1], mask=mask, noise="poisson", brightness=1.5, psf=0.5),
     ]
     recipe = Recipe(steps=(Crop(y=(0, 40), x=(0, 48)),), fit=FitChoices(options=HASTY))
     result = run_fit(recipe, shots, fiducials=[[5, 6, 0.1, 0.2, 0.5]])
@@ -105,7 +105,7 @@ def test_provenance_is_complete_and_survives_its_file(
     assert provenance.recipe.fit == FitChoices(fields=("B",), options=HASTY)
     assert provenance.recipe.steps == recipe.steps
     assert [origin.image.file for origin in provenance.images] == ["a.tif", "b.tif"]
-    assert [origin.gain for origin in provenance.images] == [1.0, 1.5]
+    assert [origin.brightness for origin in provenance.images] == [1.0, 1.5]
     assert [origin.psf for origin in provenance.images] == [None, 0.5]
     assert [origin.noise for origin in provenance.images] == ["poisson", "poisson"]
     assert [origin.setup for origin in provenance.images] == SETUPS
@@ -154,7 +154,7 @@ def test_an_unknown_beam_takes_no_source(images: list[FloatArray]) -> None:
 
 CHOICES = (
     FitChoices(),
-    FitChoices(fields=("B", "E"), beam="unknown", gains="free", noise="poisson"),
+    FitChoices(fields=("B", "E"), beam="unknown", brightness="free", noise="poisson"),
     FitChoices(noise=3.5, psf=0.0, options=FitOptions(align="affine", smoothness=2.0)),
     FitChoices(source_size=1e-5, resolution=3e-5, options=FitOptions(threads=2, seed=7)),
 )

@@ -24,7 +24,7 @@ SETUPS = [ProtonSetup(energy=energy, **LENGTHS) for energy in (5, 7, 10, 14, 20)
 STRENGTHS = [SETUPS[0].momentum / setup.momentum for setup in SETUPS]
 TRUTH = gaussian_blob(SHAPE, 40.0, 8.0, (28, 33)).displacement
 FACTORS = (1.0, 1.0, 1.0, 1.25, 1.25)
-HASTY = FitOptions(samples=0, steps=3, spacing=0.5)
+HASTY = FitOptions(samples=0, max_iterations=3, spacing=0.5)
 PLAIN = FitOptions(samples=0, spacing=0.2)
 RECIPE = Recipe(fit=FitChoices(noise=NOISE, options=PLAIN))
 
@@ -111,7 +111,7 @@ def test_nothing_depends_on_the_order_of_images_or_on_threads() -> None:
     calls = list(zip(recipes, (shots, [shots[k] for k in order]), strict=True))
     first, second = (run_leave_one_out(*each) for each in calls)
     assert second.explanation == first.explanation
-    for name in ("predicted", "residual", "chi2", "alone", "limit", "rms", "gains"):
+    for name in ("predicted", "residual", "chi2", "alone", "limit", "rms", "brightness"):
         np.testing.assert_array_equal(getattr(second, name), getattr(first, name)[order])
     film, again = (run_windows(*each, 2) for each in calls)
     np.testing.assert_array_equal(film.displacement, again.displacement)

@@ -33,7 +33,7 @@ SETUPS = [
     for energy in (14.7, 5.0)
 ]
 RATIO = SETUPS[0].momentum / SETUPS[1].momentum
-HASTY = FitOptions(samples=0, steps=5, spacing=0.25)
+HASTY = FitOptions(samples=0, max_iterations=5, spacing=0.25)
 CHOICES = FitChoices(noise=0.02, options=HASTY)
 
 

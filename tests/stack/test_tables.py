@@ -1,4 +1,4 @@
-"""Tables of shots that are inverted: each with its own energy, gain, mask and source."""
+"""Tables of shots that are inverted: each with its own energy, brightness, mask and source."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_a_row_is_inverted_as_alone(pack: Path, out: Path) -> None:
     usable[5:9, 40:50] = False
     np.save("mask.npy", usable.astype(np.uint8))
     np.save("other.npy", beam()[:, ::-1])
-    header = "file,energy,gain,mask,source"
+    header = "file,energy,brightness,mask,source"
     rows = ("film0.npy,5,1.25,mask.npy,", "film1.npy,,,,other.npy")
     free = InversionOptions(tolerance=1e-3, boundary="free", flux="known")
     recipe = Recipe(steps=(Bin(factor=2),), setup=SETUP, options=free)
@@ -133,7 +133,7 @@ def test_a_row_is_inverted_as_alone(pack: Path, out: Path) -> None:
     assert provenance.source.file == "other.npy"
     assert "source other.npy" in flat(shadowinv("status", out).stdout)
     first = StackStore(out).report(0)["provenance"]
-    assert first["gain"] == 1.25
+    assert first["brightness"] == 1.25
     assert first["mask"]["file"] == "mask.npy"
 
 
@@ -331,7 +331,7 @@ def test_films_at_their_own_distance_have_pixels_of_their_own(pack: Path, out: P
 
 def test_a_row_is_made_again_by_its_provenance(pack: Path) -> None:
     options = InversionOptions(tolerance=1e-3, boundary="free", flux="known")
-    pack = table("film0.npy,5,1.25,beam.npy", header="file,energy,gain,source")
+    pack = table("film0.npy,5,1.25,beam.npy", header="file,energy,brightness,source")
     stack = describe_stack(
         pack,
         variables=None,
@@ -352,7 +352,9 @@ def test_a_row_is_made_again_by_its_provenance(pack: Path) -> None:
     assert again.exit_code == 0, again.output
     assert "none: the same result, bit for bit" in flat(again.stdout)
     for name in ("film0.shadowinv", "again.shadowinv"):
-        assert "gain 1.25 (the image was divided by it)" in flat(shadowinv("info", name).stdout)
+        assert "brightness 1.25 (the image was divided by it)" in flat(
+            shadowinv("info", name).stdout
+        )
 
 
 def test_rows_may_be_given_in_python(pack: Path, out: Path) -> None:

@@ -484,7 +484,7 @@ def test_watch_command_prints_a_line_for_each_shot(folder, out, tmp_path, monkey
 def test_it_is_said_once_that_the_folder_is_watched(folder, out):
     put(folder, 0, 1)
     result = shadowinv(
-        "watch", folder, "--pattern", "*.npy", "--out", out, "--shots", 2, "--settle", SETTLE
+        "watch", folder, "--pattern", "*.npy", "--out", out, "--max-shots", 2, "--settle", SETTLE
     )
     assert result.stdout.count("Watching") == 1
     assert "How many sites the first shots need" in result.stderr

@@ -79,7 +79,7 @@ INVERT: dict[str, Callable[..., Any]] = {
 def _measured(images: Any, mask: Any = None, **keywords: Any) -> np.ndarray[Any, Any]:
     """Images and weights that a fit sees."""
     inputs = {"strengths": None, "setups": None, "source": None, "noise": None, "psf": 0.0}
-    inputs |= {"gains": "known", "fiducials": None, "fields": ("B",), "options": FitOptions()}
+    inputs |= {"brightness": "known", "fiducials": None, "fields": ("B",), "options": FitOptions()}
     scene = measured(images, mask=mask, **(inputs | keywords)).scene
     return np.stack([scene.images, scene.weights])
 

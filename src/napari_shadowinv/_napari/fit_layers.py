@@ -159,7 +159,7 @@ def _image_layers(
     percent = np.where(fit.mask, 100 * fit.residual / np.array(means)[:, None, None], np.nan)
     content = {"reprojection": (fit.reprojection, grey), "residual": (percent, None)}
     if np.ptp(fit.source[0]):
-        content = {"source": (_without_gains(fit.source), grey), **content}
+        content = {"source": (_without_brightness(fit.source), grey), **content}
     if with_images:
         content = {"image": (fit.images, grey), **content}
     layers: list[FullLayerData] = []
@@ -180,7 +180,7 @@ def _image_layers(
     return layers
 
 
-def _without_gains(beams: FloatArray) -> FloatArray:
+def _without_brightness(beams: FloatArray) -> FloatArray:
     """Return the first beam only if all beams are proportional to each other."""
     normalised = beams / beams.mean(axis=(1, 2), keepdims=True)
     return beams[:1] if np.abs(normalised - normalised[0]).max() < _MAX_BEAM_DIFFERENCE else beams

@@ -37,7 +37,7 @@ EPILOG = r"""
 [bold]Examples[/bold]
 shadowinv film --new scans
 shadowinv film scans/pack.toml --layers layers
-shadowinv fit layers/layers.csv --gains free --source unknown
+shadowinv fit layers/layers.csv --brightness free --source unknown
 
 [bold]pack.toml[/bold] (paths are relative to this file)
 seen_from = "source"                          # or detector: sets the sign of B
@@ -69,7 +69,7 @@ def film(
     ] = "tiff",
     corners: Annotated[Path | None, typer.Option("--save-corners", help=HELP["corners"])] = None,
     out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
-    report: _flags.Figure = None,
+    figure: _flags.Figure = None,
     new: Annotated[Path | None, typer.Option("--new", help=HELP["new"])] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
@@ -92,7 +92,7 @@ def film(
         raise InputError(
             "received no pack file: name one, or write one for a folder of scans with --new"
         )
-    result, figure = _outputs.result_and_figure(pack, out, report)
+    result, figure = _outputs.result_and_figure(pack, out, figure)
     outputs: dict[Path, tuple[str, ...]] = {
         result: tuple(PACK_WRITERS),
         figure: FIGURE_SUFFIXES,

@@ -23,10 +23,10 @@ HELP = {
     "setups. Writes the likeliest fit, or the one that --fields names.",
     "leave_one_out": "Also predict each image from a fit of the others, and list the images that "
     "one static field does not explain.",
-    "window": "Also fit each group of N neighbouring images, in order of energy, for a movie of "
-    "the field.",
-    "gains": "known: images are as bright as the source; free: fit the brightness of each image; "
-    "or the brightness of each relative to the source, separated by commas.",
+    "energy_window": "Also fit each group of N neighbouring images, in order of energy, for a "
+    "movie of the field.",
+    "brightness": "known: images are as bright as the source; free: fit the brightness of each "
+    "image; or the brightness of each relative to the source, separated by commas.",
     "mask": "Image of the same size, 0 at pixels to ignore in all images.",
     "fiducials": "Table (.csv) of known displacements in the first image, with columns y, x, dy, "
     "dx and sigma, in px after --bin.",
@@ -36,19 +36,19 @@ HELP = {
 EPILOG = r"""
 [bold]Examples[/bold]
 shadowinv fit a.tif b.tif --energies 14.7,30 --setup setup.toml
-shadowinv fit a.tif b.tif --energies 14.7,30 --setup setup.toml --fields B,E --gains free
+shadowinv fit a.tif b.tif --energies 14.7,30 --setup setup.toml --fields B,E --brightness free
 shadowinv fit a.tif b.tif --strengths 1,0.68 --source unknown --noise poisson
 shadowinv fit shots.csv --source-size 10e-6 --resolution 30e-6 --bin 2
 shadowinv fit shots.csv --setup setup.toml --compare
-shadowinv fit shots.csv --setup setup.toml --leave-one-out --window 3
+shadowinv fit shots.csv --setup setup.toml --leave-one-out --energy-window 3
 shadowinv fit next.csv --recipe recipe.toml
 
 [bold]shots.csv[/bold] (paths are relative to this file; flags apply where a cell is empty)
-file, energy, setup, source, gain
+file, energy, setup, source, brightness
 a.tif, 14.7, setup.toml, beam.tif, 1
 b.tif, 30, setup.toml, beam.tif, 1.2
-Columns: file, setup, energy, strength, gain, psf, mask, source, noise; exclude (yes to skip the
-image); shot, for shadowinv batch.
+Columns: file, setup, energy, strength, brightness, psf, mask, source, noise; exclude (yes to
+skip the image); shot, for shadowinv batch.
 
 [bold]Verdict[/bold]
 Each result states whether its field can be trusted: "determined", "one of several",
@@ -75,8 +75,8 @@ def fit(
     source: Annotated[
         str | None, typer.Option("--source", metavar="PATH|unknown", help=HELP["source"])
     ] = None,
-    gains: Annotated[
-        str | None, typer.Option(metavar="known|free|NUMBERS", help=HELP["gains"])
+    brightness: Annotated[
+        str | None, typer.Option(metavar="known|free|NUMBERS", help=HELP["brightness"])
     ] = None,
     mask: Annotated[Path | None, typer.Option("--mask", help=HELP["mask"])] = None,
     fiducials: Annotated[Path | None, typer.Option(help=HELP["fiducials"])] = None,
@@ -84,7 +84,9 @@ def fit(
     leave_one_out: Annotated[
         bool, typer.Option("--leave-one-out", help=HELP["leave_one_out"])
     ] = False,
-    window: Annotated[int | None, typer.Option("--window", help=HELP["window"])] = None,
+    energy_window: Annotated[
+        int | None, typer.Option("--energy-window", help=HELP["energy_window"])
+    ] = None,
     recipe: _flags.RecipeFile = None,
     save_recipe: _flags.SaveRecipe = None,
     options: Annotated[
@@ -93,7 +95,7 @@ def fit(
     channel: _flags.Channel = None,
     variable: _flags.Variable = None,
     out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
-    report: _flags.Figure = None,
+    figure: _flags.Figure = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.QuietInversion = False,
     *,
@@ -111,13 +113,13 @@ def fit(
     from napari_shadowinv.pipeline.shot_table import shot_rows
 
     lists = {"energy": energies, "strength": strengths}
-    if gains not in (None, "known", "free"):
-        lists["gain"], gains = gains, None
+    if brightness not in (None, "known", "free"):
+        lists["brightness"], brightness = brightness, None
     rows = shot_rows(images, {"setup": setup}, lists)
     first = rows[0].file
     target = Path(f"{first.stem}_fit{next(iter(FIT_WRITERS))}") if out is None else out
-    result, figure = _outputs.result_and_figure(first, target, report)
-    checks: dict[str, Any] = {"left_out": leave_one_out, "window": window}
+    result, figure = _outputs.result_and_figure(first, target, figure)
+    checks: dict[str, Any] = {"left_out": leave_one_out, "window": energy_window}
     _static_result.check_requests(len(rows), **checks, fiducials=fiducials, result=result)
     figures = [figure, *_static_result.static_figures(figure, **checks)]
     outputs = {result: tuple(FIT_WRITERS), **dict.fromkeys(figures, FIGURE_SUFFIXES)}
@@ -126,7 +128,9 @@ def fit(
     _outputs.check_outputs(outputs, overwrite)
     row_files = [file for row in rows for file in row.files.values()]
     _outputs.protect(list(outputs), [*images, fiducials, options, recipe, *row_files])
-    chosen = _inputs.fit_recipe_from(flags, recipe, options, source=source, gains=gains, mask=mask)
+    chosen = _inputs.fit_recipe_from(
+        flags, recipe, options, source=source, brightness=brightness, mask=mask
+    )
     _outputs.protect_files_of(chosen, list(outputs))
     shots = read_rows(rows, chosen, channel=channel, variable=variable)
     _outputs.check_setup(result, shots[0].setup, chosen.fit.fields if chosen.fit else None)

@@ -182,8 +182,8 @@ def _recipe_flags() -> Flags:
 def _fit_flags() -> Flags:
     return [
         *_step_flags(FIT_STEPS.values(), _FIT_STEPS),
-        # The command has its own --source and --gains.
-        *_option_flags(FitChoices, _FIT_CHOICES, without=("beam", "gains", "options")),
+        # The command has its own --source and --brightness.
+        *_option_flags(FitChoices, _FIT_CHOICES, without=("beam", "brightness", "options")),
         *_option_flags(FitOptions, _FIT_OPTIONS),
     ]
 

@@ -64,7 +64,7 @@ def fit_recipe_from(
     options: Path | None,
     *,
     source: str | None,
-    gains: str | None,
+    brightness: str | None,
     mask: Path | None,
 ) -> Recipe:
     """Read the recipe of a fit, and override it with an options file and flags."""
@@ -75,7 +75,7 @@ def fit_recipe_from(
 
     base = Recipe() if recipe is None else read_recipe(recipe)
     content = {} if options is None else read_toml(options)
-    choices = {} if gains is None else {"gains": gains}
+    choices = {} if brightness is None else {"brightness": brightness}
     changes: dict[str, Any] = {} if mask is None else {"mask": mask}
     if source is not None:
         is_unknown = source == "unknown"

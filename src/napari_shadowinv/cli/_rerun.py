@@ -145,14 +145,14 @@ def repeat_inversion(
     origins = {"mask": provenance.mask, "source_mask": provenance.source_mask}
     masks = {name: _mask(origin, name.replace("_", " ")) for name, origin in origins.items()}
     # The provenance says which other contents of the file were used.
-    pixels = shot.image if provenance.gain is None else shot.image / provenance.gain
+    pixels = shot.image if provenance.brightness is None else shot.image / provenance.brightness
     alone = replace(shot, image=pixels, setup=None, mask=None, source_mask=None)
     recipe = provenance.recipe
     if provenance.dark is not None:
         recipe = recipe.with_dark_file(files.find(provenance.dark, "the dark frame"))
     inversion = invert_shot(recipe, alone, beam, quiet, **masks)
     if inversion.provenance is not None:
-        completed = inversion.provenance.model_copy(update={"gain": provenance.gain})
+        completed = inversion.provenance.model_copy(update={"brightness": provenance.brightness})
         inversion = replace(inversion, provenance=completed)
     return inversion, shot, _changes(provenance, inversion)
 

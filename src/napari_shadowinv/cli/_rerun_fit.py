@@ -122,7 +122,7 @@ class _FitInputs:
             mask=self._mask(origin.mask, image.mask),
             source_mask=self._mask(origin.source_mask, image.source_mask),
             strength=origin.strength,
-            gain=origin.gain,
+            brightness=origin.brightness,
             psf=origin.psf,
             noise=origin.noise,
         )
@@ -177,7 +177,7 @@ def _difference(before: Fit, again: Fit) -> str:
     if before.images.shape != again.images.shape:
         return f"different size: {again.images.shape[1:]}, before {before.images.shape[1:]}"
     pairs = list(zip(before.fields, again.fields, strict=True))
-    names = ("images", "source", "gains", "frames", "reprojection", "chi2")
+    names = ("images", "source", "brightness", "frames", "reprojection", "chi2")
     is_equal = all(np.array_equal(getattr(before, name), getattr(again, name)) for name in names)
     is_equal = is_equal and all(
         np.array_equal(getattr(old, name), getattr(new, name))

@@ -84,7 +84,7 @@ def invert(
     source_variable: _flags.SourceVariable = None,
     clip_negative: _flags.ClipNegative = False,
     out: _flags.Result = None,
-    report: _flags.Figure = None,
+    figure: _flags.Figure = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.QuietInversion = False,
     *,
@@ -100,7 +100,7 @@ def invert(
     from napari_shadowinv.pipeline import write_recipe
     from napari_shadowinv.pipeline.files import read_part
 
-    result, figure = _outputs.result_and_figure(image, out, report)
+    result, figure = _outputs.result_and_figure(image, out, figure)
     outputs = {result: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}
     if save_recipe is not None:
         outputs[save_recipe] = (".toml",)
@@ -146,7 +146,7 @@ def rerun(
             help="Result file. Default: the result's name with _again, in the current folder."
         ),
     ] = None,
-    report: _flags.Figure = None,
+    figure: _flags.Figure = None,
     other_folders: Annotated[
         bool,
         typer.Option(
@@ -171,7 +171,7 @@ def rerun(
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, FIT_WRITERS, RESULT_WRITERS
 
     target = out or Path(f"{result.stem}_again{result.suffix}")
-    again_out, figure = _outputs.result_and_figure(result, target, report)
+    again_out, figure = _outputs.result_and_figure(result, target, figure)
     written = [again_out, figure]
     _outputs.check_outputs({again_out: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}, overwrite)
     dataset = read_dataset(result)
@@ -270,23 +270,23 @@ def info(
         Path | None, typer.Argument(help="An image or a result.", show_default=False)
     ] = None,
     variable: _flags.Variable = None,
-    report: Annotated[
+    system: Annotated[
         bool,
         typer.Option(
-            "--report", help="Print the versions and the system instead, for a bug report."
+            "--system", help="Print the versions and the system instead, for a bug report."
         ),
     ] = False,
 ) -> None:
     """Describe a file and its contents."""
     from napari_shadowinv.cli import _info
 
-    if report:
+    if system:
         if file is not None or variable is not None:
-            raise InputError("--report describes the installation: it takes no file or variable")
+            raise InputError("--system describes the installation: it takes no file or variable")
         typer.echo(_info.system_report())
         return
     if file is None:
-        raise InputError("no file given: name an image or a result, or use --report")
+        raise InputError("no file given: name an image or a result, or use --system")
     say(_info.file_table(file, variable))
 
 

@@ -37,11 +37,11 @@ shadowinv batch pack.csv --setup setup.toml --out pack.shadowinv.zarr
 shadowinv batch shots.csv --fit --recipe recipe.toml --out fits.shadowinv.zarr
 
 [bold]pack.csv[/bold] (one inversion per row; flags apply where a cell is empty)
-file, energy, gain, mask, exclude
+file, energy, brightness, mask, exclude
 film1.tif, 4.3, 1, mask1.png,
 film2.tif, 6.1, 1.2, mask2.png,
 film3.tif, 7.6, 0.8, , yes
-Columns: file, setup, energy, gain, mask, source, exclude.
+Columns: file, setup, energy, brightness, mask, source, exclude.
 
 [bold]shots.csv[/bold] (one fit per shot; other columns as for shadowinv fit)
 shot, file, energy, setup

@@ -85,7 +85,7 @@ def check_requests(
         check_count(count)
     if window is not None:
         check_window(window, count)
-    flag = "--leave-one-out" if left_out else "--window" if window is not None else None
+    flag = "--leave-one-out" if left_out else "--energy-window" if window is not None else None
     if flag is None:
         return
     if fiducials is not None:

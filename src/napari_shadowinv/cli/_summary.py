@@ -84,8 +84,8 @@ def provenance_rows(provenance: Provenance | None) -> Rows:
     for name, mask in (("mask", provenance.mask), ("source mask", provenance.source_mask)):
         if mask is not None:
             rows.append((name, mask.file or "drawn"))
-    if provenance.gain is not None:
-        rows.append(("gain", f"{provenance.gain:g} (the image was divided by it)"))
+    if provenance.brightness is not None:
+        rows.append(("brightness", f"{provenance.brightness:g} (the image was divided by it)"))
     return rows
 
 

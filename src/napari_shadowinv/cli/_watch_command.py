@@ -76,7 +76,8 @@ def watch(
         typer.Option(metavar="S", help="Stop after this many seconds without a new file."),
     ] = None,
     most: Annotated[
-        int | None, typer.Option("--shots", metavar="N", help="Stop after N shots, done or failed.")
+        int | None,
+        typer.Option("--max-shots", metavar="N", help="Stop after N shots, done or failed."),
     ] = None,
     skip_existing: Annotated[
         bool,

@@ -80,7 +80,7 @@ def fit(
     noise: ArrayLike | KindOfNoise | None = None,
     psf: Any = 0.0,
     mask: ArrayLike | None = None,
-    gains: ArrayLike | Literal["known", "free"] = "known",
+    brightness: ArrayLike | Literal["known", "free"] = "known",
     fiducials: ArrayLike | None = None,
     options: FitOptions | None = None,
     start: ArrayLike | None = None,
@@ -106,7 +106,7 @@ def fit(
         Cause of the deflection. Two fields need images of at least two energies.
     source : array_like or "unknown", optional
         The undisturbed beam, (H, W) or one for each image, in the units of the images; or
-        "unknown": a smooth beam is fitted, the same for all images but for gains. Default:
+        "unknown": a smooth beam is fitted, the same for all images but for its brightness. Default:
         uniform, with the mean of each image.
     noise : array_like, "poisson" or "proportional", optional
         Standard deviation of the noise: one number, one an image, or one a pixel. "poisson" if
@@ -118,7 +118,7 @@ def fit(
         each image. See `point_spread`.
     mask : array_like of bool, shape (H, W) or (L, H, W), optional
         The pixels to use. Default: all.
-    gains : "known", "free" or array_like, default "known"
+    brightness : "known", "free" or array_like, default "known"
         Brightness of each image relative to the source: factors, or "free" to fit them.
     fiducials : array_like, shape (n, 5), optional
         Known displacements in the first image: rows of y, x, dy, dx and their σ, in px.
@@ -167,7 +167,7 @@ def fit(
         noise=noise,
         psf=psf,
         mask=mask,
-        gains=gains,
+        brightness=brightness,
         fiducials=fiducials,
         options=options,
         names=names,
@@ -405,8 +405,8 @@ def _result(
     used = scene.weights[:, :height, :width] > 0
     data = scene.images[:, :height, :width] * units
     model = scene.model(unknowns, counts)[:, :height, :width] * units
-    gains = np.exp(unknowns.gains)
-    beams = scene.beam(unknowns)[:, :height, :width] * units * gains[:, None, None]
+    brightness = np.exp(unknowns.brightness)
+    beams = scene.beam(unknowns)[:, :height, :width] * units * brightness[:, None, None]
     chi2 = scene.chi2(unknowns, counts)
     fields = []
     for m, name in enumerate(names):
@@ -454,7 +454,7 @@ def _result(
         displacement=displacements.sum(axis=0),
         used=np.asarray(used.any(axis=0)),
         hidden=hidden_contrast(model / np.maximum(beams, _DARKEST * units) - 1, used),
-        edge_is_free=options.edge == "free",
+        edge_is_free=options.boundary == "free",
     )
     return Fit(
         images=data,
@@ -462,7 +462,7 @@ def _result(
         strengths=scene.strengths,
         fields=tuple(fields),
         source=beams,
-        gains=gains * given.gains,
+        brightness=brightness * given.brightness,
         frames=unknowns.frames,
         reprojection=model,
         residual=np.where(used, data - model, 0.0),

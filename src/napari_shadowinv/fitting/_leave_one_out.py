@@ -72,8 +72,9 @@ def leave_one_out(
     """Predict each of several images from a fit of the others, to see whether one field fits all.
 
     Images that one field does not explain along with the rest are found first; they are predicted
-    like the others, and no image is predicted from them. Of the image that is left out only a gain
-    is adjusted, and where it lies if the options let images be aligned.
+    like the others, and no image is predicted from them. Only the
+    brightness of the image that is left out is adjusted, and its position if the options let
+    images be aligned.
 
     Parameters
     ----------
@@ -100,7 +101,7 @@ def leave_one_out(
         "noise": None,
         "psf": 0.0,
         "mask": None,
-        "gains": "known",
+        "brightness": "known",
     }
     data = measured(
         images,
@@ -134,7 +135,7 @@ class _Prediction:
     """The prediction of an image by others, in units of its beam, and the limit of its χ²."""
 
     image: FloatArray
-    gain: float
+    brightness: float
     chi2: float
     alone: float
     limit: float
@@ -287,17 +288,19 @@ class _Work:
         unknowns = fit.unknowns
         if scene.free_frames.any():
             unknowns = _placed(scene, unknowns, others[0], k)
-        unknowns = unknowns.only([k])._replace(gains=np.zeros(1))
+        unknowns = unknowns.only([k])._replace(brightness=np.zeros(1))
         scene = scene.only([k])
         (rough,) = scene.model(unknowns, scene.ray_counts(unknowns))
         scene = replace(scene, spacing=_RAY_SPACING_RATIO * scene.spacing)
         (image,) = scene.model(unknowns, scene.ray_counts(unknowns))
-        gain, weights = self._matched(k, image, scene)
-        chi2 = _chi2(gain * image, scene.images[0], weights)
+        brightness, weights = self._matched(k, image, scene)
+        chi2 = _chi2(brightness * image, scene.images[0], weights)
         variance = fit.variance_in(scene, unknowns)
-        variance += _RAY_VARIANCE_RATIO * _chi2(gain * image, gain * rough, weights)
+        variance += _RAY_VARIANCE_RATIO * _chi2(brightness * image, brightness * rough, weights)
         limit = _MAX_NOISE_RATIO + _MAX_VARIANCE_RATIO * variance
-        return _Prediction(gain * image, gain, chi2, own_fit.chi2, limit * own_fit.noise_chi2)
+        return _Prediction(
+            brightness * image, brightness, chi2, own_fit.chi2, limit * own_fit.noise_chi2
+        )
 
     def _own_fit(self, scene: Scene, k: int, common: Found) -> _OwnFit:
         fit = self._sampled_fit(scene, common, [k])
@@ -308,15 +311,15 @@ class _Work:
         return _OwnFit(chi2, chi2 / (1 - share))
 
     def _matched(self, k: int, made: FloatArray, one: Scene) -> tuple[float, FloatArray]:
-        """The gain with which a prediction is nearest to an image, and the weights of pixels."""
+        """Brightness with which a prediction is nearest to an image, and the pixels' weights."""
         (weights,), (data,) = one.weights, one.images
-        gain = _gain(made, data, weights)
+        brightness = _brightness(made, data, weights)
         if self._given.counted:
             unit = self._given.units[k]
-            expected = np.maximum(gain * made * unit, 1.0)
+            expected = np.maximum(brightness * made * unit, 1.0)
             weights = np.where(weights > 0, unit**2 / expected, 0.0)
-            gain = _gain(made, data, weights)
-        return gain, weights
+            brightness = _brightness(made, data, weights)
+        return brightness, weights
 
     def _settled(
         self,
@@ -326,7 +329,7 @@ class _Work:
         name: str,
         least_gain: float = COARSE_GAIN,
     ) -> Found:
-        """Fit some of the images; gains and frames of the others stay."""
+        """Fit some of the images; brightness and frames of the others stay."""
         first = replace(found, unknowns=found.unknowns.only(members))
         end = settled(scene.only(members), first, self._on_step, name, least_gain)
         return replace(end, unknowns=found.unknowns.with_those(members, end.unknowns))
@@ -339,7 +342,7 @@ class _Work:
 
 
 def _placed(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknowns:
-    """Find where an image lies, and its gain, beside one whose place is known."""
+    """Find where an image lies, and its brightness, beside one whose place is known."""
     pair = scene.only([first, k])
     weights = np.append(np.where(scene.free_frames, scene.prior.frame_weights, 0.0), 1.0)
     now = unknowns.only([first, k])
@@ -350,7 +353,7 @@ def _placed(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknowns:
         misfit = (pair.model(now, counts) - pair.images)[1] * np.sqrt(pair.weights[1])
         matrix = np.array([[product(a, b) for b in columns] for a in columns])
         slope = np.array([product(column, misfit.ravel()) for column in columns])
-        about_rest = np.append(now.frames[1] - at_rest(), now.gains[1])
+        about_rest = np.append(now.frames[1] - at_rest(), now.brightness[1])
         free = np.append(scene.free_frames, True)
         step = np.linalg.solve(
             matrix + np.diag(weights[free]), -slope - weights[free] * about_rest[free]
@@ -359,22 +362,22 @@ def _placed(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknowns:
             if place < len(scene.free_frames):
                 now.frames[1, place] += change
             else:
-                now.gains[1] += change
+                now.brightness[1] += change
     return unknowns.with_those([k], now.only([1]))
 
 
 def _moves(unknowns: Unknowns, free: BoolArray) -> list[Unknowns]:
-    """A unit of each number of the second image's frame that is free, and of its gain."""
+    """A unit of each number of the second image's frame that is free, and of its brightness."""
     moves = []
     for place in np.flatnonzero(free):
         moves.append(unknowns.zeros())
         moves[-1].frames[1, place] = 1
     moves.append(unknowns.zeros())
-    moves[-1].gains[1] = 1
+    moves[-1].brightness[1] = 1
     return moves
 
 
-def _gain(made: FloatArray, data: FloatArray, weights: FloatArray) -> float:
+def _brightness(made: FloatArray, data: FloatArray, weights: FloatArray) -> float:
     above = np.einsum("yx,yx,yx", weights, made, data)
     return float(above / max(np.einsum("yx,yx,yx", weights, made, made), 1e-300))
 
@@ -406,7 +409,7 @@ def _result(
         mask=used,
         predicted=models,
         residual=residual,
-        gains=np.array([each.gain for each in predictions]) * given.gains,
+        brightness=np.array([each.brightness for each in predictions]) * given.brightness,
         chi2=chi2,
         alone=alone,
         limit=limit,

@@ -105,12 +105,12 @@ def _rivals(
             "them (align='shift', --align shift)"
         )
         yield _Rival(shifted, best.unknowns, 2 * (len(scene.images) - 1), cause)
-    if several and not scene.free_gains:
+    if several and not scene.free_brightness:
         cause = (
             "the brightness of an image differs from its source's: a factor for each image "
-            "explains them better; free the gains (gains='free', --gains free)"
+            "explains them better; free the brightness (brightness='free', --brightness free)"
         )
-        yield _Rival(replace(scene, free_gains=True), best.unknowns, len(scene.images), cause)
+        yield _Rival(replace(scene, free_brightness=True), best.unknowns, len(scene.images), cause)
     if several and setups and set(names) == {"B"}:
         yield from _with_electric_field(scene, best, setups)
     cause = "the images are blurred by more than the point spread that was given (psf, --psf)"
@@ -140,7 +140,7 @@ def _with_free_beam(scene: Scene, best: Found) -> Iterator[_Rival]:
         beam = np.zeros((modes, modes))
         old = scene.beam_modes
         beam[:old, :old] = best.unknowns.beam
-        freed = replace(scene, beam_modes=modes, beam_spread=_BEAM_SPREAD, free_gains=True)
+        freed = replace(scene, beam_modes=modes, beam_spread=_BEAM_SPREAD, free_brightness=True)
         free_numbers = int((freed.prior.beam_weights > 0).sum())
         yield _Rival(freed, best.unknowns._replace(beam=beam), free_numbers, cause)
 

@@ -25,7 +25,12 @@ _VARIABLES: dict[str, tuple[str, tuple[str, ...], str, str]] = {
     "mask": ("mask", _PLANES, "1", "Pixels that were used"),
     "predicted": ("left_out_prediction", _PLANES, "flux/px²", "Image as the others predict it"),
     "residual": ("left_out_residual", _PLANES, "flux/px²", "Image minus prediction"),
-    "gains": ("left_out_gain", ("image",), "1", "Factor that the image is brighter by than given"),
+    "brightness": (
+        "left_out_brightness",
+        ("image",),
+        "1",
+        "Brightness relative to the expected one",
+    ),
     "chi2": ("left_out_chi2", ("image",), "1", "Mean squared residual over the noise"),
     "alone": ("left_out_alone", ("image",), "1", "The same with a field of the image's own"),
     "limit": ("left_out_limit", ("image",), "1", "Largest χ² that one static field would give"),
@@ -48,7 +53,7 @@ class LeaveOneOut:
         The pixels that were used.
     predicted, residual : ndarray, shape (L, H, W)
         Prediction by the other images, and data minus prediction, 0 where masked.
-    gains : ndarray, shape (L,)
+    brightness : ndarray, shape (L,)
         How much brighter each image is than the source that was given; fitted to the prediction.
     chi2 : ndarray, shape (L,)
         Mean of (residual / σ)² over each image.
@@ -67,7 +72,7 @@ class LeaveOneOut:
     mask: BoolArray
     predicted: FloatArray
     residual: FloatArray
-    gains: FloatArray
+    brightness: FloatArray
     chi2: FloatArray
     alone: FloatArray
     limit: FloatArray

@@ -58,7 +58,7 @@ class Preconditioner:
         pixels = scene.weights.sum(axis=(1, 2))
         used = prior.beam_weights > 0
         self._beam = np.where(used, 1 / np.sqrt(prior.beam_weights + pixels.sum() / 4), 0.0)
-        self._gains = np.where(scene.free_gains, 1 / np.sqrt(pixels + 1), 0.0)
+        self._brightness = np.where(scene.free_brightness, 1 / np.sqrt(pixels + 1), 0.0)
         # Images have contrasts of some tenths over some pixels; stretching moves the edge by more.
         arm = max(scene.rays.size) / 4
         moved = 0.02 * pixels[:, None] * np.array([1, arm, arm, 1, arm, arm]) ** 2
@@ -76,7 +76,7 @@ class Preconditioner:
         return Unknowns(
             idctn(waves, axes=(1, 2), norm="ortho"),
             self._beam * scaled.beam,
-            self._gains * scaled.gains,
+            self._brightness * scaled.brightness,
             self._frames * scaled.frames,
         )
 
@@ -86,13 +86,15 @@ class Preconditioner:
         return Unknowns(
             np.einsum("yxnm,myx->nyx", self._potentials, waves),
             self._beam * slope.beam,
-            self._gains * slope.gains,
+            self._brightness * slope.brightness,
             self._frames * slope.frames,
         )
 
     def log_size(self) -> float:
         """Return log |det S| plus about half the log-determinant of the prior."""
-        scales = np.concatenate([part.ravel() for part in (self._beam, self._gains, self._frames)])
+        scales = np.concatenate(
+            [part.ravel() for part in (self._beam, self._brightness, self._frames)]
+        )
         return -self._log_ratio + float(np.log(scales[scales > 0]).sum())
 
 

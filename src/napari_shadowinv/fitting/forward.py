@@ -2,7 +2,7 @@
 
 The misfit of images f_l to data I_l with noise σ_l, ½ Σ_l |(f_l - I_l) / σ_l|², and the prior. With
 strengths A the potential of image l is ψ_l = Σ_m A_lm φ_m; its rays are traced (`RayModel`), spread
-by the instrument and multiplied by a gain.
+by the instrument and multiplied by its brightness.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class Scene:
         See `Prior`; smoothness has the shape (M, 2).
     pad : int
         Width in px of the strip around the image from which rays may enter.
-    free_gains : bool
-        Whether the gains are unknown.
+    free_brightness : bool
+        Whether the brightness of each image is unknown.
     free_frames : ndarray of bool, shape (6,)
         Which numbers of a frame are unknown, but for the first image.
     shift_spread : float
@@ -72,7 +72,7 @@ class Scene:
     pad: int = 16
     beam_modes: int = 0
     beam_spread: float = 0.3
-    free_gains: bool = False
+    free_brightness: bool = False
     free_frames: BoolArray = field(default_factory=lambda: np.zeros(6, bool))
     shift_spread: float = 5.0
     fiducials: Fiducials | None = None
@@ -137,10 +137,10 @@ class Scene:
     def model(self, unknowns: Unknowns, counts: list[IntArray]) -> FloatArray:
         """Return the images that the unknowns make, shape (L, H, W)."""
         bare = (self._bare(*shot) for shot in self._shots(unknowns, counts))
-        return np.stack([np.exp(gain) * f for gain, f in zip(unknowns.gains, bare, strict=True)])
+        return np.stack([np.exp(log) * f for log, f in zip(unknowns.brightness, bare, strict=True)])
 
     def beam(self, unknowns: Unknowns) -> FloatArray:
-        """Return the beam of each image within it, without gain, shape (L, H, W)."""
+        """Return the beam of each image within it, without brightness, shape (L, H, W)."""
         height, width = self.rays.size
         beams = self.beams * self._beam_shape(unknowns)
         return np.asarray(beams[:, self.pad : self.pad + height, self.pad : self.pad + width])
@@ -158,11 +158,11 @@ class Scene:
         of_shape = np.zeros(self.beams.shape[1:])
         for shot in self._shots(unknowns, counts):
             k, root = shot[0], np.sqrt(self.weights[shot[0]])
-            model = np.exp(unknowns.gains[k]) * self._bare(*shot)
+            model = np.exp(unknowns.brightness[k]) * self._bare(*shot)
             residual = blurred(root * (model - self.images[k]), self.blur)
             value += float(np.einsum("yx,yx", residual, residual)) / 2
             pull = root * blurred(residual, self.blur)
-            slope.gains[k] += np.einsum("yx,yx", pull, model)
+            slope.brightness[k] += np.einsum("yx,yx", pull, model)
             self._add_pulls(slope, of_shape, unknowns, shot, pull)
         slope.beam[:] += self._of_modes(of_shape * self._beam_shape(unknowns))
         return value, self._only_free(slope)
@@ -191,7 +191,7 @@ class Scene:
         changes = np.empty_like(self.images)
         for k, psi, count, beam, frame in self._shots(unknowns, counts):
             bare = self._bare(k, psi, count, variations[k] * beam, frame)
-            changes[k] = np.sqrt(self.weights[k]) * np.exp(unknowns.gains[k]) * bare
+            changes[k] = np.sqrt(self.weights[k]) * np.exp(unknowns.brightness[k]) * bare
         return changes
 
     def linear(self, unknowns: Unknowns, counts: list[IntArray]) -> Linear:
@@ -216,7 +216,7 @@ class Scene:
     def _bare(
         self, k: int, psi: FloatArray, counts: IntArray, beam: FloatArray, frame: FloatArray
     ) -> FloatArray:
-        """An image without its gain."""
+        """An image without its brightness."""
         return self._spread(k, self.rays.image(psi, counts, beam, frame))
 
     def _add_pulls(
@@ -228,7 +228,7 @@ class Scene:
         pull: FloatArray,
     ) -> None:
         k, psi, counts, beam, frame = shot
-        back = self._spread_back(k, np.exp(unknowns.gains[k]) * pull)
+        back = self._spread_back(k, np.exp(unknowns.brightness[k]) * pull)
         pulls = self.rays.gradient(
             psi,
             counts,
@@ -247,7 +247,9 @@ class Scene:
         frames[0] = 0
         return slope._replace(
             beam=np.where(self._free_modes, slope.beam, 0.0),
-            gains=slope.gains if self.free_gains else np.zeros_like(slope.gains),
+            brightness=slope.brightness
+            if self.free_brightness
+            else np.zeros_like(slope.brightness),
             frames=frames,
         )
 
@@ -298,7 +300,7 @@ class Linear:
         As `RayModel.jacobian` returns them, for each image; without the beam's and the frame's
         columns if neither is unknown.
     bare : list of ndarray
-        The images without their gains.
+        The images without their brightness.
     """
 
     scene: Scene
@@ -325,7 +327,7 @@ class Linear:
                 of_beam = scene.beams[k] * of_shape
                 columns = np.concatenate([columns, of_beam.ravel(), change.frames[k]])
             landed = (jacobian @ columns).reshape(scene.rays.seen)
-            bare = scene._spread(k, landed) + change.gains[k] * self.bare[k]
+            bare = scene._spread(k, landed) + change.brightness[k] * self.bare[k]
             np.multiply(self._roots[k], bare, out=changes[k])
         return changes
 
@@ -336,7 +338,7 @@ class Linear:
         of_shape = np.zeros(scene.beams.shape[1:])
         for k, transposed in enumerate(self._transposed):
             pull = self._roots[k] * residuals[k]
-            slope.gains[k] = np.einsum("yx,yx", pull, self.bare[k])
+            slope.brightness[k] = np.einsum("yx,yx", pull, self.bare[k])
             columns = transposed @ scene._spread_back(k, pull).ravel()
             of_potential, of_instrument = np.split(columns, [math.prod(scene.rays.shape)])
             psi = of_potential.reshape(scene.rays.shape)
@@ -363,8 +365,8 @@ class Linear:
 
     @cached_property
     def _roots(self) -> FloatArray:
-        """The gain over the standard deviation of the noise, shape (L, H, W)."""
-        return np.sqrt(self.scene.weights) * np.exp(self.unknowns.gains)[:, None, None]
+        """The brightness over the standard deviation of the noise, shape (L, H, W)."""
+        return np.sqrt(self.scene.weights) * np.exp(self.unknowns.brightness)[:, None, None]
 
 
 _Shot = tuple[int, FloatArray, IntArray, FloatArray, FloatArray]  # number, ψ, rays, beam, frame

@@ -61,7 +61,7 @@ class Measured:
     """Images in units of their beams, with their instrument.
 
     `scene` has the sides of blocks; the images are its first `size` pixels. `units` (L,) are
-    the recorded values of one unit, `gains` (L,) the brightness of each image relative to its
+    the recorded values of one unit, `brightness` (L,) the brightness of each image relative to its
     source, approximate where it is unknown; `counted` is true for Poisson noise. The beam is
     `assumed` if no source was given, and `common` if its source is the same for all images.
     """
@@ -69,7 +69,7 @@ class Measured:
     scene: Scene
     size: tuple[int, int]
     units: FloatArray
-    gains: FloatArray
+    brightness: FloatArray
     counted: bool
     single: bool  # one image, or several with the same information
     assumed: bool
@@ -91,7 +91,7 @@ def measured(
     noise: ArrayLike | KindOfNoise | None,
     psf: Any,
     mask: ArrayLike | None,
-    gains: ArrayLike | Literal["known", "free"],
+    brightness: ArrayLike | Literal["known", "free"],
     fiducials: ArrayLike | None,
     options: FitOptions,
     names: Sequence[str] | None = None,
@@ -113,10 +113,10 @@ def measured(
     if strengths is not None and setups is not None:
         raise InputError("received both strengths and setups, expected one of them")
     _refuse_what_one_image_cannot_tell(matrix, source, options)
-    free_gains, factors = _checked_gains(gains, count)
+    free_brightness, factors = _checked_brightness(brightness, count)
     beams = _checked_source(source, data, used)
     shapes = [beam / beam.mean() for beam in beams]
-    if free_gains:
+    if free_brightness:
         factors = _brightness(data, beams, used)
     beams = factors[:, None, None] * beams
     _refuse_other_units(_brightness(data, beams, used), names)
@@ -129,9 +129,9 @@ def measured(
 
     fill = [(0, 0), *((0, -side % _BLOCK) for side in (height, width))]
     size = height + fill[1][1], width + fill[2][1]
-    free = options.edge == "free"
+    free = options.boundary == "free"
     usual = max(16, 8 * round(_FREE_SHARE * min(height, width) / 8)) if free else 16
-    pad = options.strip or usual
+    pad = options.margin or usual
     around = [(0, 0), *((pad, pad + filled) for _, filled in fill[1:])]
     scene = Scene(
         images=np.pad(scaled, fill),
@@ -142,9 +142,9 @@ def measured(
         smoothness=np.zeros((matrix.shape[1], 2)),
         pad=pad,
         tie=_FREE_TIE if free else 30.0,
-        decay=(options.fade_length or pad) if free else np.inf,
+        decay=(options.decay_length or pad) if free else np.inf,
         beam_modes=options.beam_modes if unknown else 0,
-        free_gains=free_gains or unknown,
+        free_brightness=free_brightness or unknown,
         free_frames=_ALIGNED[options.align],
         shift_spread=options.align_spread,
         fiducials=_checked_fiducials(fiducials, (height, width)),
@@ -156,7 +156,7 @@ def measured(
         scene=scene,
         size=(height, width),
         units=units,
-        gains=factors,
+        brightness=factors,
         counted=_is(noise, "poisson"),
         single=single,
         assumed=source is None,
@@ -363,15 +363,17 @@ def _are_alike(first: FloatArray, second: FloatArray) -> bool:
     )
 
 
-def _checked_gains(gains: ArrayLike | str, count: int) -> tuple[bool, FloatArray]:
-    if isinstance(gains, str):
-        if gains not in ("known", "free"):
-            raise InputError(f"gains are {gains!r}: expected 'known', 'free' or a number an image")
-        return gains == "free", np.ones(count)
-    factors = as_numbers("gains", gains)
+def _checked_brightness(brightness: ArrayLike | str, count: int) -> tuple[bool, FloatArray]:
+    if isinstance(brightness, str):
+        if brightness not in ("known", "free"):
+            raise InputError(
+                f"brightness is {brightness!r}: expected 'known', 'free' or a number for each image"
+            )
+        return brightness == "free", np.ones(count)
+    factors = as_numbers("brightness", brightness)
     if factors.shape != (count,) or not (np.isfinite(factors) & (factors > 0)).all():
         raise InputError(
-            f"gains are {gains}: expected a positive number for each of {count} images"
+            f"brightness is {brightness}: expected a positive number for each of {count} images"
         )
     return False, factors
 
@@ -390,7 +392,7 @@ def _refuse_other_units(brightness: FloatArray, names: Sequence[str]) -> None:
         if not 1 / _OTHER_UNITS < ratio < _OTHER_UNITS:
             raise InputError(
                 f"{name} is {ratio:.3g} times as bright as its source: expected the same units; "
-                "give gains, or let them be free"
+                "state the brightness, or let it be free"
             )
 
 

@@ -1,9 +1,9 @@
-"""The prior of potentials, beam, gains and frames: `Prior`.
+"""The prior of potentials, beam, brightness and frames: `Prior`.
 
     ½ Σ_m (λ_m |∇⁴φ_m|² + κ_m |∇⁶φ_m|²) + ½ µ Σ_pad (|∇φ|² + φ²/ℓ²)
     + ½ Σ (θ_ij / s_ij)² + ½ Σ |d(x_k) - d_k|² / σ_k²
 
-and the same for gains and frames. All of it is quadratic. Of a smooth object the data make λ
+and the same for brightness and frames. All of it is quadratic. Of a smooth object the data make λ
 small and κ large, of one with kinks the other way round.
 """
 
@@ -24,7 +24,7 @@ __all__ = ["POWERS", "Prior"]
 
 POWERS = (4, 6)  # of the wave number squared: |∇⁴φ|² and |∇⁶φ|²
 
-_GAIN_WEIGHT = 1.0  # 1 / s² of their logarithm
+_BRIGHTNESS_WEIGHT = 1.0  # 1 / s² of their logarithm
 _STRETCH_SPREAD = 0.05  # of turns, magnifications and shears
 
 
@@ -93,7 +93,7 @@ class Prior:
         return Unknowns(
             slope,
             self.beam_weights * change.beam,
-            _GAIN_WEIGHT * change.gains,
+            _BRIGHTNESS_WEIGHT * change.brightness,
             self.frame_weights * change.frames,
         )
 
@@ -115,7 +115,7 @@ class Prior:
         return Unknowns(
             potentials,
             np.sqrt(self.beam_weights) * rng.normal(size=like.beam.shape),
-            np.sqrt(_GAIN_WEIGHT) * rng.normal(size=like.gains.shape),
+            np.sqrt(_BRIGHTNESS_WEIGHT) * rng.normal(size=like.brightness.shape),
             np.sqrt(self.frame_weights) * rng.normal(size=like.frames.shape),
         )
 

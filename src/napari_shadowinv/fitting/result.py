@@ -47,7 +47,7 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "residual": (_IMAGES, FLUX_DENSITY, "Image minus re-projection"),
     "mask": (_IMAGES, "1", "Pixels that were used"),
     "chi2": (("image",), "1", "Mean squared residual over the noise"),
-    "gain": (("image",), "1", "Factor that the image is brighter by than given"),
+    "brightness": (("image",), "1", "Brightness relative to the source"),
     "strength": (("image", "field"), "1", "Displacement relative to image 1"),
     "frame": (("image", "frame_term"), "1", "How the image lies on image 1"),
     "smoothness": (
@@ -184,7 +184,7 @@ class FitReport:
 
 @dataclass(frozen=True)
 class Fit:
-    """Fields, beam and gains that explain several images of one object.
+    """Fields, beam and brightness that explain several images of one object.
 
     Attributes
     ----------
@@ -197,8 +197,8 @@ class Fit:
     fields : tuple of FittedField
         The fields.
     source : ndarray, shape (L, H, W)
-        The undisturbed beam of each image, its gain included.
-    gains : ndarray, shape (L,)
+        The undisturbed beam of each image, its brightness included.
+    brightness : ndarray, shape (L,)
         How much brighter each image is than the source that was given.
     frames : ndarray, shape (L, 6)
         Position on each detector of the landing point (y, x), px from the image's middle:
@@ -230,7 +230,7 @@ class Fit:
     strengths: FloatArray
     fields: tuple[FittedField, ...]
     source: FloatArray
-    gains: FloatArray
+    brightness: FloatArray
     frames: FloatArray
     reprojection: FloatArray
     residual: FloatArray
@@ -318,7 +318,11 @@ class Fit:
             parts = [names[k]] if names and names[k] else []
             parts += [self.setups[k].probe] if self.setups else []
             strengths = ", ".join(f"{strength:.3g}" for strength in self.strengths[k])
-            parts += [f"χ² {chi2:.3g}", f"strength {strengths}", f"gain {self.gains[k]:.4g}"]
+            parts += [
+                f"χ² {chi2:.3g}",
+                f"strength {strengths}",
+                f"brightness {self.brightness[k]:.4g}",
+            ]
             if k and self.options.align != "none":
                 dy, dx = self.frames[k][[0, 3]]
                 parts.append(f"shifted by y {dy:+.3g}, x {dx:+.3g} px")
@@ -344,9 +348,9 @@ class Fit:
         if self.folded:
             yield Fact("crossed_rays", "Crossed rays", f"{self.folded:.1%} of the pixels")
         if self.report.converged:
-            yield Fact("converged", "Converged", f"in {self.report.iterations} steps")
+            yield Fact("converged", "Converged", f"in {self.report.iterations} iterations")
         else:
-            text = f"NO, not in {self.report.iterations} steps: allow more (--steps)"
+            text = f"NO, not in {self.report.iterations} iterations: allow more (--max-iterations)"
             yield Fact("converged", "Converged", text, Level.FAILED)
 
     def to_dataset(
@@ -461,7 +465,7 @@ class Fit:
             strengths=arrays["strength"],
             fields=tuple(fields),
             source=arrays["source"],
-            gains=arrays["gain"],
+            brightness=arrays["brightness"],
             frames=arrays["frame"],
             reprojection=arrays["reprojection"],
             residual=arrays["residual"],
@@ -488,7 +492,7 @@ class Fit:
             "residual": self.residual,
             "mask": self.mask,
             "chi2": self.chi2,
-            "gain": self.gains,
+            "brightness": self.brightness,
             "strength": self.strengths,
             "frame": self.frames,
             "smoothness": np.array([field.smoothness for field in self.fields]),

@@ -207,20 +207,20 @@ def refined(
     """
     unknowns, steps = finer(found.unknowns), 0
     denser = list(_SPACINGS) if options.spacing is None else [options.spacing]
-    most = -(-options.steps // len(denser))
+    most = -(-options.max_iterations // len(denser))
     scene = replace(scene, spacing=denser.pop(0))
     while True:
         unknowns, value, taken, ended = settle(
             scene,
             unknowns,
-            steps=min(most, options.steps - steps),
+            steps=min(most, options.max_iterations - steps),
             least_gain=_FINE_GAIN,
             after_step=lambda now: on_step("full size", now),
         )
         steps += taken
         chi2 = scene.chi2(unknowns, scene.ray_counts(unknowns))
         explained = not denser or bool(chi2.max() < _EXPLAINED)
-        if steps >= options.steps or (ended and explained):
+        if steps >= options.max_iterations or (ended and explained):
             return scene, unknowns, value, steps, ended
         if not explained:
             scene = replace(scene, spacing=denser.pop(0))

@@ -17,13 +17,13 @@ class Unknowns(NamedTuple):
     """The unknowns of a fit, or derivatives by them, or changes of them.
 
     `potentials` (M, …) are B-spline coefficients of the fields' potentials, `beam` (n, n) cosine
-    coefficients of the beam's logarithm, `gains` (L,) logarithms, `frames` (L, 6) as a `RayModel`
-    takes them.
+    coefficients of the beam's logarithm, `brightness` (L,) logarithms, `frames` (L, 6) as a
+    `RayModel` takes them.
     """
 
     potentials: FloatArray
     beam: FloatArray
-    gains: FloatArray
+    brightness: FloatArray
     frames: FloatArray
 
     def flat(self) -> FloatArray:
@@ -39,13 +39,13 @@ class Unknowns(NamedTuple):
     def only(self, numbers: Sequence[int]) -> Unknowns:
         """Return the unknowns of some of the images."""
         chosen = list(numbers)
-        return self._replace(gains=self.gains[chosen], frames=self.frames[chosen])
+        return self._replace(brightness=self.brightness[chosen], frames=self.frames[chosen])
 
     def with_those(self, numbers: Sequence[int], found: Unknowns) -> Unknowns:
         """Return the unknowns with those of some images replaced."""
-        gains, frames = self.gains.copy(), self.frames.copy()
-        gains[list(numbers)], frames[list(numbers)] = found.gains, found.frames
-        return found._replace(gains=gains, frames=frames)
+        brightness, frames = self.brightness.copy(), self.frames.copy()
+        brightness[list(numbers)], frames[list(numbers)] = found.brightness, found.frames
+        return found._replace(brightness=brightness, frames=frames)
 
     def plus(self, other: Unknowns) -> Unknowns:
         """Return the sum of both."""

@@ -176,7 +176,8 @@ def judged(
         )
     if not ended:
         return Verdict.UNCERTAIN, (
-            "the search ran out of steps before it ended: allow more (steps, --steps)"
+            "the search reached its maximum number of iterations before it ended: allow more "
+            "(max_iterations, --max-iterations)"
         )
     if hidden > _HIDDEN_STRUCTURE:
         return Verdict.UNCERTAIN, (
@@ -212,7 +213,7 @@ def _pattern_text(pattern: Pattern, names: Sequence[str]) -> str:
     ]
     cause = pattern.cause and f"likely {pattern.cause}"
     cause = cause or (
-        "source, gains, point spread, dark level or registration may be wrong, or the "
+        "source, brightness, point spread, dark level or registration may be wrong, or the "
         "object absorbs"
     )
     return (
@@ -239,7 +240,7 @@ def _edge_text(displacement: FloatArray, used: BoolArray, free: bool) -> str:
             f"by {turned:.0%} of its r.m.s. displacement"
         )
     return f"{sign}: what lies beyond bends the field everywhere; record a larger field of view" + (
-        "" if free else ", or try a free edge (edge='free', --edge free)"
+        "" if free else ", or try a free boundary (boundary='free', --boundary free)"
     )
 
 

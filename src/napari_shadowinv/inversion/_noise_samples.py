@@ -23,7 +23,7 @@ _MOST_QUANTA = 1e18  # numpy draws no larger Poisson numbers
 
 
 def noise_of(
-    image: ArrayLike, noise: object, gain: float | None, mask: ArrayLike | None
+    image: ArrayLike, noise: object, units_per_quantum: float | None, mask: ArrayLike | None
 ) -> tuple[Draw, str]:
     """Return a function that draws a noisy image, and a text that describes the noise."""
     values = np.asarray(unpack_array(image, "image")[0])
@@ -38,32 +38,37 @@ def noise_of(
             raise InputError(
                 f"noise is {noise!r}, expected 'poisson', a standard deviation or an array of them"
             )
-        return _poisson(values, gain)
-    if gain is not None:
+        return _poisson(values, units_per_quantum)
+    if units_per_quantum is not None:
         raise InputError(
-            f"gain is {gain!r} and noise a standard deviation: gain belongs to noise='poisson'"
+            f"units_per_quantum is {units_per_quantum!r} and noise a standard deviation: "
+            "units_per_quantum belongs to noise='poisson'"
         )
     return _gaussian(values, np.asarray(plain_array(noise, "noise")), usable)
 
 
-def _poisson(values: FloatArray, gain: float | None) -> tuple[Draw, str]:
-    if gain is None:
+def _poisson(values: FloatArray, units_per_quantum: float | None) -> tuple[Draw, str]:
+    if units_per_quantum is None:
         if np.any(values != np.rint(values)):
             raise InputError(
                 "image has values that are not whole numbers, so they are not counts: give the "
-                "gain (image units per detected quantum), or the noise as a standard deviation"
+                "units_per_quantum (image units per detected quantum), or the noise as a standard "
+                "deviation"
             )
-        gain = 1.0
-    if not (np.isreal(gain) and 0 < gain < np.inf):
-        raise InputError(f"gain is {gain!r}, expected a positive number: image units")
-    quanta = np.maximum(values, 0) / gain
+        units_per_quantum = 1.0
+    if not (np.isreal(units_per_quantum) and 0 < units_per_quantum < np.inf):
+        raise InputError(
+            f"units_per_quantum is {units_per_quantum!r}, expected a positive number: image units"
+        )
+    quanta = np.maximum(values, 0) / units_per_quantum
     if quanta.max(initial=0) > _MOST_QUANTA:
         raise InputError(
-            f"gain is {gain:g} and the brightest pixel {values.max():g}: that is more than "
-            f"{_MOST_QUANTA:g} quanta in a pixel, expected fewer: check the unit of the gain"
+            f"units_per_quantum is {units_per_quantum:g} and the brightest pixel {values.max():g}: "
+            f"that is more than {_MOST_QUANTA:g} quanta in a pixel, expected fewer: check the unit"
         )
     # A blur leaves the counting noise of many pixels as it was.
-    return lambda rng, blur: gain * rng.poisson(quanta), f"Poisson, gain {gain:g}"
+    text = f"Poisson, {units_per_quantum:g} per quantum"
+    return lambda rng, blur: units_per_quantum * rng.poisson(quanta), text
 
 
 def _gaussian(values: FloatArray, sigma: AnyArray, usable: BoolArray) -> tuple[Draw, str]:

@@ -159,7 +159,7 @@ def uncertainty(
     source: ArrayLike | None = None,
     mask: ArrayLike | None = None,
     noise: Literal["poisson"] | float | ArrayLike = "poisson",
-    gain: float | None = None,
+    units_per_quantum: float | None = None,
     method: Literal["linear", "resolve"] = "linear",
     options: InversionOptions | None = None,
     plan: SitePlan | None = None,
@@ -188,10 +188,10 @@ def uncertainty(
         Gaussian noise is correlated between pixels as measured in the image.
         Samples that it drives below zero are clipped there, whatever `options.negative` says of
         the image.
-    gain : float, optional
+    units_per_quantum : float, optional
         Of Poisson noise only: the image's units that one detected quantum makes; a pixel of
-        value v then scatters by √(gain · v). Default: 1 for an image of whole numbers, which are
-        taken as counts; any other image needs it.
+        value v then scatters by √(units_per_quantum · v). Default: 1 for an image of
+        whole numbers, which are taken as counts; any other image needs it.
     method : {"linear", "resolve"}
         ``"linear"``: by the linear response of the transport, which a few samples that are solved
         as well check. ``"resolve"``: solve the transport of each sample, which takes many times as
@@ -204,7 +204,8 @@ def uncertainty(
     Raises
     ------
     InputError
-        If the image cannot be inverted, or `n`, `noise`, `gain` or `method` make no sense.
+        If the image cannot be inverted, or `n`, `noise`, `units_per_quantum` or `method` make no
+        sense.
     InversionCancelled
         If `should_stop` returned true.
 
@@ -224,7 +225,9 @@ def uncertainty(
     if plan is None:
         image, source, mask = unpack_shot(image, source, mask)
     check_memory(np.shape(image), bytes_per_pixel(options), "an inversion")
-    draw_noise, noise_text = noise_of(image, noise, gain, mask if plan is None else plan.mask)
+    draw_noise, noise_text = noise_of(
+        image, noise, units_per_quantum, mask if plan is None else plan.mask
+    )
     if plan is None:
         beam = prepare(image, source, options, mask).source
         plan = plan_sites(

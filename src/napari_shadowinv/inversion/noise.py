@@ -89,7 +89,9 @@ class ImageNoise:
         quantum = prepared.flux_scale * prepared.unit * mean
         # Terms of the variance: constant, in proportion to the brightness, and to its square.
         self._terms = np.zeros(3)
-        level, counts = (None, None) if options is None else (options.noise_level, options.quantum)
+        level, counts = (
+            (None, None) if options is None else (options.noise_level, options.units_per_quantum)
+        )
         if level is not None:
             self._terms[0] = (level / quantum) ** 2
         elif counts is not None:

@@ -174,11 +174,12 @@ class Inversion:
         rows = self.errors.rows(self.options)
         steps = () if self.provenance is None else self.provenance.recipe.steps
         smoothing = [step.title for step in steps if step.smooths]
-        is_stated = (self.options.noise_level, self.options.quantum) != (None, None)
+        is_stated = (self.options.noise_level, self.options.units_per_quantum) != (None, None)
         if smoothing and not is_stated and not self.errors.noise_correlation:
             caveat = (
                 f"measured after {', '.join(smoothing)}, where most of it cannot be seen: its "
-                "error is larger than stated; give the noise_level or quantum of the recorded image"
+                "error is larger than stated; give the noise_level or units_per_quantum of the "
+                "recorded image"
             )
             rows.append(("noise", caveat))
         return rows

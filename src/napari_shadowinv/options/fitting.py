@@ -48,7 +48,7 @@ class FitOptions(CheckedModel):
 
     Examples
     --------
-    >>> FitOptions(align="shift").edge
+    >>> FitOptions(align="shift").boundary
     'fading'
     """
 
@@ -63,7 +63,7 @@ class FitOptions(CheckedModel):
             "weights of fourth and sixth derivatives estimated from the data, for each field."
         ),
     )
-    edge: Literal["fading", "free"] = Field(
+    boundary: Literal["fading", "free"] = Field(
         default="fading",
         title="Boundary",
         description=(
@@ -71,7 +71,7 @@ class FitOptions(CheckedModel):
             "'free': the object extends beyond the edge, where its potential decays."
         ),
     )
-    strip: int | None = Field(
+    margin: int | None = Field(
         default=None,
         ge=16,
         multiple_of=8,
@@ -81,7 +81,7 @@ class FitOptions(CheckedModel):
             "free boundary a tenth of the image's shorter side."
         ),
     )
-    fade_length: float | None = Field(
+    decay_length: float | None = Field(
         default=None,
         ge=0.1,
         le=1e6,
@@ -142,7 +142,7 @@ class FitOptions(CheckedModel):
             "0.14 if bright lines need it."
         ),
     )
-    steps: int = Field(
+    max_iterations: int = Field(
         default=120,
         ge=1,
         title="Iterations",
@@ -219,12 +219,12 @@ class FitChoices(CheckedModel):
         title="Beam",
         description=(
             "'known': the source is the beam. 'unknown': fit a smooth beam, the same for all "
-            "images apart from their gains."
+            "images apart from its brightness."
         ),
     )
-    gains: Literal["known", "free"] = Field(
+    brightness: Literal["known", "free"] = Field(
         default="known",
-        title="Gains",
+        title="Brightness",
         description=(
             "'known': images are as bright as the source. 'free': fit the brightness of each image "
             "relative to the source."

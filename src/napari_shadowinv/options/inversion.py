@@ -201,10 +201,10 @@ class InversionOptions(CheckedModel):
         ),
         json_schema_extra=_BUDGET,
     )
-    quantum: float | None = Field(
+    units_per_quantum: float | None = Field(
         default=None,
         gt=0,
-        title="Quantum",
+        title="Units per quantum",
         description=(
             "Image units per detected quantum, for the error budget: the noise is then Poisson "
             "noise."
@@ -239,10 +239,11 @@ class InversionOptions(CheckedModel):
                 f"solver is '{self.solver}' and boundary 'free', expected solver='newton': the "
                 "other solvers support closed boundaries only"
             )
-        if self.noise_level is not None and self.quantum is not None:
+        if self.noise_level is not None and self.units_per_quantum is not None:
             raise ValueError(
-                f"noise_level is {self.noise_level:g} and quantum {self.quantum:g}, expected one "
-                "of them: a quantum implies Poisson noise"
+                f"noise_level is {self.noise_level:g} and units_per_quantum "
+                f"{self.units_per_quantum:g}, expected one of them: units_per_quantum implies "
+                "Poisson noise"
             )
         return self
 

@@ -73,7 +73,7 @@ class FitShot:
         True where a pixel can be used, and where the object is not; files are 0 elsewhere.
     strength : tuple of float, optional
         Displacement by each field relative to the first image. Default: from the setups.
-    gain : float, optional
+    brightness : float, optional
         How many times brighter than its source the image is.
     psf : float, optional
         Standard deviation of the point spread in px after all steps.
@@ -87,7 +87,7 @@ class FitShot:
     mask: ArrayLike | Path | None = None
     source_mask: ArrayLike | Path | None = None
     strength: tuple[float, ...] | None = None
-    gain: float | None = None
+    brightness: float | None = None
     psf: float | None = None
     noise: KindOfNoise | float | None = None
 
@@ -163,9 +163,13 @@ class FitInputs:
                 f"strengths have {', '.join(str(len(row)) for row in strengths)} numbers: expected "
                 "one for each field in all images"
             )
-        factors = _common_values(self.names, [shot.gain for shot in self.recorded], "gain")
-        if factors is not None and self.choices.gains == "free":
-            raise InputError("received gains, and that they are free: expected one of them")
+        factors = _common_values(
+            self.names, [shot.brightness for shot in self.recorded], "brightness"
+        )
+        if factors is not None and self.choices.brightness == "free":
+            raise InputError(
+                "received the brightness of each image and brightness='free': expected one of them"
+            )
         keywords = {
             "images": np.stack([shot.image for shot in self.shots]),
             "strengths": strengths,
@@ -175,7 +179,7 @@ class FitInputs:
             "noise": self._noise(),
             "psf": [self._point_spread(k) for k in range(len(self.shots))],
             "mask": self._mask(),
-            "gains": self.choices.gains if factors is None else factors,
+            "brightness": self.choices.brightness if factors is None else factors,
             "fiducials": self.fiducials,
             "names": self.names,
         }
@@ -462,7 +466,7 @@ def _provenance(
             source_mask=place(inputs.provenance.source_mask),
             setup=inputs.shot.setup,
             strength=row.strength,
-            gain=row.gain,
+            brightness=row.brightness,
             psf=row.psf,
             noise=row.noise,
             notes=shot.notes,

@@ -44,7 +44,7 @@ def _read(row: ShotRow, recipe: Recipe, channel: str | None, variable: str | Non
         source="unknown" if row.source == "unknown" else beam,
         mask=row.mask,
         strength=row.strength,
-        gain=row.gain,
+        brightness=row.brightness,
         psf=row.psf,
         noise=row.noise,
     )

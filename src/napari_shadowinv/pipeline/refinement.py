@@ -32,7 +32,7 @@ def run_refinement(
     setup : Setup or None
         The experiment, with the pixels of the inversion.
     choices : FitChoices
-        Such as `refinement_choices`; the source is known, and so is the gain.
+        Such as `refinement_choices`; the source is known, and so is the brightness.
     on_progress, should_stop : callable, optional
         As for `napari_shadowinv.fit`.
 
@@ -75,11 +75,11 @@ def _options(inversion: Inversion, options: FitOptions) -> FitOptions:
 
 
 def refinement_choices(inversion: Inversion, setup: Setup | None, psf: float = 0.0) -> FitChoices:
-    """Return the choices that follow from an inversion: field, edge and seed."""
+    """Return the choices that follow from an inversion: field, boundary and seed."""
     bends = (FIELDS["B"],) if setup is None else setup.deflectors
     (field, *_) = (key for key, deflector in FIELDS.items() if deflector in bends)
-    edge = "free" if inversion.options.boundary == "free" else "fading"
-    options = FitOptions(edge=edge, seed=inversion.options.seed)
+    boundary = "free" if inversion.options.boundary == "free" else "fading"
+    options = FitOptions(boundary=boundary, seed=inversion.options.seed)
     return FitChoices(fields=(field,), psf=psf, options=options)
 
 

@@ -79,10 +79,10 @@ class ShotRow(CheckedModel):
         title="Strength",
         description="Displacement relative to the first image; with two fields '1 0.6'.",
     )
-    gain: float | None = Field(
+    brightness: float | None = Field(
         default=None,
         gt=0,
-        title="Gain",
+        title="Brightness",
         description="How many times brighter than the source the image is.",
     )
     psf: float | None = Field(

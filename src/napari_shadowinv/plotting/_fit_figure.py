@@ -182,7 +182,7 @@ def _header(fit: Fit, letters: int) -> list[tuple[str, str]]:
 def _footer(fit: Fit, fields: list[ShownField], letters: int) -> list[tuple[str, str]]:
     facts = [fit.peak_text(*each) for each in zip(fit.fields, fields, strict=True)]
     facts += [f"{name}: {text}" for name, text in fit.error_rows]
-    facts.append(f"gains {', '.join(f'{gain:.3g}' for gain in fit.gains)}")
+    facts.append(f"brightness {', '.join(f'{factor:.3g}' for factor in fit.brightness)}")
     if not fit.mask.all():
         facts.append(f"hatched: masked, {100 * (1 - fit.mask.mean()):.2g} % of the pixels")
     if fit.folded:

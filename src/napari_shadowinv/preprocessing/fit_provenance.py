@@ -29,7 +29,7 @@ class FitOrigin(CheckedModel):
         Places among the masks of the `FitProvenance`.
     setup : Setup or None
         The experiment, with the pixels as recorded.
-    strength, gain, psf, noise
+    strength, brightness, psf, noise
         Values of this image; None where the recipe counts.
     notes : tuple of str
         Notes of the steps.
@@ -44,7 +44,7 @@ class FitOrigin(CheckedModel):
     source_mask: int | None = None
     setup: Setup | None = None
     strength: tuple[float, ...] | None = None
-    gain: float | None = None
+    brightness: float | None = None
     psf: float | None = None
     noise: Noise | None = None
     notes: tuple[str, ...] = ()

@@ -331,8 +331,8 @@ class Provenance(CheckedModel):
     """Provenance of a result, by which it can be repeated.
 
     The `recipe` includes the setup and the kind of source from the image's file; `setup` describes
-    the result's pixels; the image was divided by its `gain`, if it has one; `notes` are notes of
-    the steps, for people.
+    the result's pixels; the image was divided by its `brightness`, if it has one; `notes` are
+    notes of the steps, for people.
     """
 
     model_config = _CONFIG
@@ -344,7 +344,7 @@ class Provenance(CheckedModel):
     mask: Origin | None = None
     source_mask: Origin | None = None
     setup: Setup | None = None
-    gain: float | None = None
+    brightness: float | None = None
     notes: tuple[str, ...] = ()
 
     @classmethod

@@ -105,7 +105,7 @@ class FitWork:
             "chi2": float(fit.chi2.max()),
             "chi2_images": fit.chi2.tolist(),
             "folded": fit.folded,
-            "gains": fit.gains.tolist(),
+            "brightness": fit.brightness.tolist(),
             "strengths": fit.strengths.tolist(),
             "converged": fit.report.converged,
             "iterations": fit.report.iterations,

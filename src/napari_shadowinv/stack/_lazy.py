@@ -57,7 +57,7 @@ def invert_stack(
         A dask or numpy array; an xarray object with one such variable; paths of one image each;
         a glob such as ``"shots/*.tif"``, sorted so that 2 comes before 10; a TIFF with a page for
         each shot; or a table (CSV) with a row for each shot, which may have its own energy, setup,
-        gain, mask and source. Files are read by the tasks that invert them.
+        brightness, mask and source. Files are read by the tasks that invert them.
     source : array (y, x), path, Estimate, or as `shots`, optional
         The undisturbed beam, one for all shots or one for each, or an estimate of
         `napari_shadowinv.preprocessing` from each shot. Default: uniform, with intensities in the

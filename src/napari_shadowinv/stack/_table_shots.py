@@ -184,14 +184,14 @@ class RowWork(Work):
     estimate: Estimate | None = None  # of the source of rows without one
 
     def collect_inputs(self, content: Any, beam: Beam | None, source: AnyArray | None) -> Inputs:
-        """Return the image of a row, divided by its gain, with its own source, mask and setup."""
+        """Return the image of a row over its brightness, with its own source, mask and setup."""
         row: FitShot = content
         common = self.inputs
         self._check_setup(row.setup)
         assert isinstance(row.image, Radiograph)
         bare = dataclasses.replace(
             row.image,
-            image=row.image.image / (row.gain or 1.0),
+            image=row.image.image / (row.brightness or 1.0),
             setup=None,
             source=None,
             mask=None,
@@ -213,7 +213,7 @@ class RowWork(Work):
         )
         if beam is None:
             inputs.recipe.check(inputs.shot)
-        entries: dict[str, Any] = {"gain": row.gain}
+        entries: dict[str, Any] = {"brightness": row.brightness}
         if row.source is None:
             entries["source"] = common.provenance.source
         provenance = inputs.provenance.model_copy(update=entries)

@@ -52,7 +52,7 @@ ENERGIES = (14.7, 6.0)
 SETUPS = tuple(ProtonSetup(energy=energy, **LENGTHS) for energy in ENERGIES)
 TRUTH = gaussian_blob(SHAPE, 20.0, 8.0, (22.0, 35.0)).displacement
 BEAM, GAIN, PSF = 1, 2, 3
-QUICK = {"samples": 0, "steps": 5, "spacing": 0.25, "smoothness": 5.0}
+QUICK = {"samples": 0, "max_iterations": 5, "spacing": 0.25, "smoothness": 5.0}
 MIDDLE = np.s_[2:42, 11:59]  # of an image, with the whole object
 
 
@@ -81,7 +81,7 @@ def tool(window: Any, open_widget: Callable[[str], Any]) -> Any:
 @pytest.fixture(scope="session")
 def fitted() -> Fit:
     """The fit of the widget to its two images, without the window."""
-    options = FitOptions(samples=2, steps=5, spacing=0.25)
+    options = FitOptions(samples=2, max_iterations=5, spacing=0.25)
     return fit(np.stack(images()), setups=SETUPS, psf=[0, 0], options=options)
 
 
@@ -159,7 +159,7 @@ def test_what_is_asked_for_is_what_the_controls_show(window: Any, tool: Any) -> 
     tool.noise.restore("poisson")
     inputs = inputs_of(tool)
     assert [setup.energy for setup in inputs.setups] == [14.7, 7.0]
-    assert inputs.keywords["gains"] == (1.0, 1.2)
+    assert inputs.keywords["brightness"] == (1.0, 1.2)
     assert inputs.keywords["psf"] == [0.0, 0.8]
     assert inputs.keywords["noise"] == "poisson"
     assert "source" not in inputs.keywords
@@ -168,8 +168,8 @@ def test_what_is_asked_for_is_what_the_controls_show(window: Any, tool: Any) -> 
     assert setup_of(window.layers["6.0 MeV"]) == SETUPS[1]
     window.add_image(np.ones((20, 30)))
     assert texts(tool, BEAM)[:2] == ["14.7", "7"]
-    tool.gains.restore("free")
-    assert inputs_of(tool).keywords["gains"] == "free"
+    tool.brightness.restore("free")
+    assert inputs_of(tool).keywords["brightness"] == "free"
     assert texts(tool, GAIN)[:2] == ["free", "free"]
     # The energy of the first image is that of the setup below, whichever is edited.
     type_in(tool, 0, BEAM, "15")
@@ -180,7 +180,7 @@ def test_what_is_asked_for_is_what_the_controls_show(window: Any, tool: Any) -> 
 
 def test_the_field_is_recovered_in_si_units(window: Any, tool: Any, run: Any, qtbot: Any) -> None:
     flat = {"beam_variation": 0.0}
-    tool.options.set_values({"samples": 2, "steps": 5, "spacing": 0.25} | flat)
+    tool.options.set_values({"samples": 2, "max_iterations": 5, "spacing": 0.25} | flat)
     result = run(tool)
     assert result.verdict is Verdict.DETERMINED
     error = result.fields[0].displacement - TRUTH
@@ -460,7 +460,7 @@ def enlarged(window: Any, times: int) -> None:
         layer.data = large * rng.normal(1, 0.01, large.shape)
 
 
-BEFORE = {"full size": {"smoothness": 5.0}, "samples": {"smoothness": 5.0, "steps": 1}}
+BEFORE = {"full size": {"smoothness": 5.0}, "samples": {"smoothness": 5.0, "max_iterations": 1}}
 """Options that make the stages before one shorter."""
 
 
@@ -494,7 +494,7 @@ def test_each_stage_ends_soon_after_cancel(
     tool.panel.runner._patience = math.inf  # the fit has to end by itself
     enlarged(window, 4 if stage == "transport" else 3)
     tool.view._redraw_timer.setInterval(REDRAW_MS)
-    tool.options.set_values({"samples": 1000, "steps": 100} | BEFORE.get(stage, {}))
+    tool.options.set_values({"samples": 1000, "max_iterations": 100} | BEFORE.get(stage, {}))
     before = list(window.layers)
     tool.panel.button.click()
     course = tool.panel.runner.tag.progress
@@ -719,19 +719,19 @@ def test_a_saved_fit_comes_back_as_it_was(
 
 def test_choices_are_kept_between_sessions(window: Any, tool: Any, open_widget: Any) -> None:
     tool.fields.restore("B and E")
-    tool.gains.restore("free")
+    tool.brightness.restore("free")
     tool.noise.restore("poisson")
     state = json.loads(json.dumps(tool.state()))
     tool.fields.restore("B")
-    tool.gains.restore("known")
+    tool.brightness.restore("known")
     tool.noise.restore("")
     del state["setup"]  # a matter of the image
     tool.restore(state)
     choices = tool.request().choices
     assert choices.fields == ("B", "E")
-    assert choices.gains == "free"
+    assert choices.brightness == "free"
     assert choices.noise == "poisson"
-    assert choices.options.steps == QUICK["steps"]
+    assert choices.options.max_iterations == QUICK["steps"]
 
 
 def command(*words: Any) -> str:
@@ -993,7 +993,7 @@ def test_a_recipe_is_the_same_for_window_and_command(
     tool = opened(window, open_widget, files)
     for row in (0, 1):
         type_in(tool, row, PSF, "0.6")
-    tool.gains.restore("free")
+    tool.brightness.restore("free")
     tool.noise.restore("poisson")
     tool.steps.add("crop", {"y": (0, 48), "x": (4, 64)})
     painted = np.zeros(SHAPE, np.uint8)
@@ -1009,7 +1009,7 @@ def test_a_recipe_is_the_same_for_window_and_command(
     tool.source.picker.set_kind("unknown")
     for row in (0, 1):
         type_in(tool, row, PSF, "0")
-    tool.gains.restore("known")
+    tool.brightness.restore("known")
     tool.noise.restore("")
     tool.steps.show_steps([])
     tool.masks.layer = None

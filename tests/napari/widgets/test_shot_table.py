@@ -39,7 +39,12 @@ def pack(tmp_path: Path) -> Path:
         displacement = toroid(SHAPE, at(energy), 25.0, 80e-6).displacement
         np.save(tmp_path / f"film{number}.npy", synthetic_image(displacement))
     np.save(tmp_path / "mask.npy", np.ones(SHAPE))
-    rows = ["file,energy,gain,mask", "film0.npy,9,1.5,mask.npy", "film1.npy,,,", "film2.npy,30,,"]
+    rows = [
+        "file,energy,brightness,mask",
+        "film0.npy,9,1.5,mask.npy",
+        "film1.npy,,,",
+        "film2.npy,30,,",
+    ]
     (tmp_path / "pack.csv").write_text("\n".join(rows))
     return tmp_path / "pack.csv"
 
@@ -98,7 +103,7 @@ def test_a_table_is_shown_changed_and_inverted(
     stack = read(tool.store.store)
     assert [setup_from_dataset(stack.isel(shot=k)) for k in range(2)] == [at(6.0), SETUP]
     assert "mask" not in store.report(0)["provenance"]
-    assert store.report(0)["provenance"]["gain"] == 1.5
+    assert store.report(0)["provenance"]["brightness"] == 1.5
     # The layer is in the units of each shot's own energy: the same field twice.
     (field,) = [layer for layer in window.layers if role_of(layer) == "field"]
     first, second = (np.asarray(field.data[k]) for k in range(2))
@@ -139,7 +144,7 @@ def test_mistakes_are_told(tool: Any, qtbot: Any, messages: list[str]) -> None:
     expect("'film1.npy': 'much' is not a number")
     write(tool, 1, ENERGY, "")
     write(tool, 1, GAIN, "-1")
-    expect("'film1.npy': 'gain' is -1.0: gain must be greater than 0")
+    expect("'film1.npy': 'brightness' is -1.0: brightness must be greater than 0")
     write(tool, 1, GAIN, "")
     for row in range(3):
         use(tool, row, used=False)
@@ -169,7 +174,7 @@ def test_the_rows_are_saved_as_they_are_shown(
     tool.shots.table.save_button.click()
     rows = table_rows(folder / "new.csv")
     assert [row.energy for row in rows] == [6.0, None, 30.0]
-    assert [row.gain for row in rows] == [1.5, 0.8, None]
+    assert [row.brightness for row in rows] == [1.5, 0.8, None]
     assert [row.exclude for row in rows] == [False, False, True]
     assert [row.file.resolve() for row in rows] == [
         pack.with_name(f"film{k}.npy") for k in range(3)

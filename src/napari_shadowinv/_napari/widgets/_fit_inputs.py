@@ -48,7 +48,7 @@ class BeamPicker(forms.RowPicker):
                 UNKNOWN: ("unknown (fit it)", None),
             },
             "The beam without the object. An unknown beam is fitted as a smooth beam, the same in "
-            "all images except for the gains.",
+            "all images except for its brightness.",
             {_LAYER: forms.labelled("", self.layers)},
         )
         self.layers.picked.connect(self.changed)

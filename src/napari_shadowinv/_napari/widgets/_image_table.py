@@ -1,4 +1,4 @@
-"""The images of a fit in a table, with beam, gain and blur of each: `ImageTable`."""
+"""The images of a fit in a table, with beam, brightness and blur of each: `ImageTable`."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup import SETUPS, Setup
 
 _METADATA_KEY = "fit"  # entries of the rows in a layer's metadata
-_NAME, _BEAM, _GAIN, _PSF = range(4)
-_COLUMNS = {_GAIN: ("gain", "Gain", 1.0), _PSF: ("psf", "PSF σ (px)", 0.0)}
-_WIDTHS = {_BEAM: 90, _GAIN: 44, _PSF: 72}
+_NAME, _BEAM, _BRIGHTNESS, _PSF = range(4)
+_COLUMNS = {_BRIGHTNESS: ("brightness", "Brightness", 1.0), _PSF: ("psf", "PSF σ (px)", 0.0)}
+_WIDTHS = {_BEAM: 90, _BRIGHTNESS: 76, _PSF: 72}
 _BEAM_FIELDS = {"proton": "energy", "optical": "wavelength"}
 
 
@@ -148,7 +148,7 @@ class ImageTable(QWidget):
         # a layer's setup.
         self.fill()
 
-    def show_beams(self, kind: str, value: Any, gains_known: bool) -> None:
+    def show_beams(self, kind: str, value: Any, is_brightness_known: bool) -> None:
         """Fill the cells; `value` is the reference's energy or wavelength in the shown setup."""
         self.beam = beam_column(kind)
         reference = self._reference
@@ -168,11 +168,11 @@ class ImageTable(QWidget):
                 for column, (name, _, default) in _COLUMNS.items():
                     entry = row.entries().get(name, default)
                     self.table.write(number, column, entry, "", _TIPS[name])
-                gain = self.table.item(number, _GAIN)
+                cell = self.table.item(number, _BRIGHTNESS)
                 editable = Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsEditable
-                gain.setFlags(editable if gains_known else Qt.ItemFlag.NoItemFlags)
-                if not gains_known:
-                    gain.setText("free")
+                cell.setFlags(editable if is_brightness_known else Qt.ItemFlag.NoItemFlags)
+                if not is_brightness_known:
+                    cell.setText("free")
 
     def beam_value(self, row: ImageRow) -> float:
         """Return energy, wavelength or strength of a row, or raise an `InputError`."""
@@ -184,8 +184,8 @@ class ImageTable(QWidget):
             )
         return value
 
-    def gain(self, row: ImageRow) -> float:
-        value = self._value(row, _GAIN, "")
+    def brightness(self, row: ImageRow) -> float:
+        value = self._value(row, _BRIGHTNESS, "")
         return 1.0 if value is None else value
 
     def psf(self, row: ImageRow) -> float:
@@ -259,6 +259,6 @@ def _setup_summary(row: ImageRow) -> str:
 
 
 _TIPS = {
-    "gain": "Brightness of the image relative to the source; 1 if they are equally bright.",
+    "brightness": "Brightness of the image relative to the source; 1 if they are equally bright.",
     "psf": "Standard deviation of the image's blur, in pixels after the steps; 0 without blur.",
 }

@@ -1,4 +1,4 @@
-"""The shots of a table (CSV), with energy, gain and mask of each: `ShotTable`."""
+"""The shots of a table (CSV), with energy, brightness and mask of each: `ShotTable`."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import SITES
 from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table
 
-_ENERGY, _GAIN, _MASK = 1, 2, 3
-_NUMBERS = {_ENERGY: ("energy", "MeV"), _GAIN: ("gain", "")}
-_WIDTHS_PX = {_ENERGY: 92, _GAIN: 44, _MASK: 90}
-_TITLES = ["Shot", "Energy (MeV)", "Gain", "Mask"]
+_ENERGY, _BRIGHTNESS, _MASK = 1, 2, 3
+_NUMBERS = {_ENERGY: ("energy", "MeV"), _BRIGHTNESS: ("brightness", "")}
+_WIDTHS_PX = {_ENERGY: 92, _BRIGHTNESS: 76, _MASK: 90}
+_TITLES = ["Shot", "Energy (MeV)", "Brightness", "Mask"]
 _TIPS = {
     _ENERGY: "Energy of the particles; empty for the setup's energy.",
-    _GAIN: "Brightness of the image relative to the source, by which it is divided; empty for 1.",
+    _BRIGHTNESS: "Brightness of the image relative to the source, by which it is divided; empty "
+    "for 1.",
     _MASK: "Image of the same size, 0 at unusable pixels, with a path relative to the table; empty "
     "for the common mask.",
 }
@@ -48,7 +49,7 @@ class ShotTable(QWidget):
         self.file = _TableEdit("Table of the shots", "shots.csv")
         self.file.edit.setToolTip(
             "<qt>A table (.csv) with a row for each shot and the columns file, energy, setup, "
-            "gain, mask, source, exclude.</qt>"
+            "brightness, mask, source, exclude.</qt>"
         )
         self.save_button = small_button("Save…", "Save the rows as a table (.csv).", self._save)
         self.table = NumberTable(len(_TITLES), _WIDTHS_PX)

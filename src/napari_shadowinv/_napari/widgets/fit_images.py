@@ -95,10 +95,10 @@ class FitImages(ToolPanel):
             "Labels or shapes on bad detector pixels, for all images. The fit ignores masked "
             "pixels.",
         )
-        self.gains = ChoiceBox(
-            {"known": "known (in the table)", "free": "unknown (fit them)"},
+        self.brightness = ChoiceBox(
+            {"known": "known (in the table)", "free": "unknown (fit it)"},
             "Brightness of each image relative to the source: known, or fitted. With an unknown "
-            "source, gains are always fitted.",
+            "source, it is always fitted.",
         )
         self.noise = ChoiceBox(
             NOISES,
@@ -108,7 +108,7 @@ class FitImages(ToolPanel):
         self.setup = SetupPicker()
         self.setup_section = forms.titled_section(self.setup)
         self.steps = StepsSection(FIT_STEPS)
-        self.options = OptionsForm(FitOptions, {"smoothness": 1.0, "strip": 16, "threads": 1})
+        self.options = OptionsForm(FitOptions, {"smoothness": 1.0, "margin": 16, "threads": 1})
         self.recipes = FitRecipeButton(self)
         self.cost = forms.wrapping_label()
         self.view = FitView(self.viewer, self.panel)
@@ -124,7 +124,7 @@ class FitImages(ToolPanel):
             forms.labelled("Fields", self.fields),
             self.source,
             self.masks,
-            forms.labelled("Gains", self.gains),
+            forms.labelled("Brightness", self.brightness),
             forms.labelled("Noise", self.noise),
             self.setup_section,
             self.steps,
@@ -143,7 +143,7 @@ class FitImages(ToolPanel):
         self.images.changed.connect(self._show_beams)
         self.source.changed.connect(self.images.fill)
         self.setup.changed.connect(self._on_setup)
-        self.gains.currentIndexChanged.connect(self._show_beams)
+        self.brightness.currentIndexChanged.connect(self._show_beams)
         for signal in (
             self.source.changed,
             self.options.changed,
@@ -151,7 +151,7 @@ class FitImages(ToolPanel):
             self.steps.changed,
             self.masks.changed,
             self.fields.currentIndexChanged,
-            self.gains.currentIndexChanged,
+            self.brightness.currentIndexChanged,
             self.noise.currentIndexChanged,
         ):
             signal.connect(lambda *_: self.keep())
@@ -164,7 +164,7 @@ class FitImages(ToolPanel):
             "source": self.source,
             "setup": self.setup,
             "fields": self.fields,
-            "gains": self.gains,
+            "brightness": self.brightness,
             "noise": self.noise,
             "steps": self.steps,
             "options": self.options,
@@ -180,7 +180,7 @@ class FitImages(ToolPanel):
         choices = FitChoices(
             fields=fields,
             beam=beam,
-            gains=self.gains.state(),
+            brightness=self.brightness.state(),
             noise=self.noise.state() or None,
             options=self.options.model(),
         )
@@ -222,7 +222,7 @@ class FitImages(ToolPanel):
         """Show the choices of a recipe."""
         if choices.fields is not None:
             self.fields.restore(field_key(choices.fields))
-        self.gains.restore(choices.gains)
+        self.brightness.restore(choices.brightness)
         noise = "" if choices.noise is None else str(choices.noise)
         self.noise.offer(NOISES | {noise: NOISES.get(noise, f"σ = {noise} in each pixel")})
         self.noise.restore(noise)
@@ -283,7 +283,7 @@ class FitImages(ToolPanel):
         """Return the images, lazy if their layers are, with all their settings."""
         images = [radiograph_of(row.layer, row.data, row.plane) for row in rows]
         sources = self.source.measured(images)
-        gains = self._known_gains(rows)
+        factors = self._known_brightness(rows)
         return tuple(
             FitShot(
                 image,
@@ -291,10 +291,10 @@ class FitImages(ToolPanel):
                 source=source,
                 mask=self.masks.usable(row.layer),
                 strength=(self.images.beam_value(row),) if setup is None else None,
-                gain=gain,
+                brightness=factor,
                 psf=self.images.psf(row),
             )
-            for row, image, source, gain in zip(rows, images, sources, gains, strict=True)
+            for row, image, source, factor in zip(rows, images, sources, factors, strict=True)
         )
 
     def show_result(self, value: FinishedFit, request: FitJob) -> None:
@@ -336,12 +336,12 @@ class FitImages(ToolPanel):
                 )
         return rows
 
-    def _known_gains(self, rows: list[ImageRow]) -> list[float] | list[None]:
-        """Return the gains in the table, or None for each if they are fitted or all are 1."""
-        if self.gains.state() == "free":
+    def _known_brightness(self, rows: list[ImageRow]) -> list[float] | list[None]:
+        """Return the brightness of each image, or None for each if it is fitted or 1 for all."""
+        if self.brightness.state() == "free":
             return [None] * len(rows)
-        gains = [self.images.gain(row) for row in rows]
-        return [None] * len(rows) if gains == [1.0] * len(rows) else gains
+        factors = [self.images.brightness(row) for row in rows]
+        return [None] * len(rows) if factors == [1.0] * len(rows) else factors
 
     def _setup_of(self, row: ImageRow, setup: Setup) -> Setup:
         """Return the setup of an image, its own or the reference's, with the beam of its row."""
@@ -423,4 +423,4 @@ class FitImages(ToolPanel):
     def _show_beams(self) -> None:
         form = self.setup.picker.form
         beam = None if form is None else form.values().get(self.images.beam.name)
-        self.images.show_beams(self.setup.picker.kind, beam, self.gains.state() == "known")
+        self.images.show_beams(self.setup.picker.kind, beam, self.brightness.state() == "known")
