@@ -37,7 +37,7 @@ from napari_shadowinv.preprocessing import (
     total_variation_source,
     uniform_source,
 )
-from napari_shadowinv.preprocessing.isotropic import point_distance
+from napari_shadowinv.preprocessing.estimates import point_distance
 
 SHOT = "Image_20241017221829851.bmp"
 SHAPE = (160, 200)

@@ -3,8 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from napari_shadowinv.geometry.interpolation import CloughTocher, fit_gradients
-from napari_shadowinv.geometry.linear_surface import WIDTH, corner_weights, with_gradients
+from napari_shadowinv.geometry.interpolation import (
+    WIDTH,
+    CloughTocher,
+    corner_weights,
+    fit_gradients,
+    with_gradients,
+)
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from polygons import clipped, power_cell, shoelace
 
-from napari_shadowinv.geometry.natural_neighbor import natural_neighbor
+from napari_shadowinv.geometry.interpolation import natural_neighbor
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 FAR = ((-1e3, -1e3), (1e3, 1e3))

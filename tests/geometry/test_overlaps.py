@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv.geometry.density import Density
-from napari_shadowinv.geometry.overlaps import pixel_shares
-from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.power_diagram import PowerDiagram, pixel_shares
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 SHAPE = (23, 31)

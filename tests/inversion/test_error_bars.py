@@ -22,8 +22,8 @@ from napari_shadowinv import (
     uncertainty,
     write,
 )
-from napari_shadowinv.geometry.linear_surface import WIDTH
-from napari_shadowinv.inversion import _sampling, error_bars
+from napari_shadowinv.geometry.interpolation import WIDTH
+from napari_shadowinv.inversion import error_bars
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.poisson import border_mean
 
@@ -142,7 +142,7 @@ def test_an_array_gives_each_pixel_its_own_noise(clean, plan):
 def test_solving_samples_loosely_does_not_change_the_error_bars(monkeypatch, clean, plan, noise):
     choices = {"plan": plan, "noise": noise, "method": "resolve"}
     loose = uncertainty(clean, 6, **choices, options=OPTIONS)
-    monkeypatch.setattr(_sampling, "_SAMPLE_SHARE", 0.0)
+    monkeypatch.setattr(error_bars, "_SAMPLE_SHARE", 0.0)
     strict = OPTIONS.model_copy(update={"tolerance": 1e-6})
     exact = uncertainty(clean, 6, **choices, options=strict)
     assert loose.tolerance > 1e-3 > exact.tolerance

@@ -8,12 +8,15 @@ import pytest
 from napari_shadowinv import InversionOptions, invert, plan_sites, synthetic_image, uncertainty
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv.geometry.density import Density
-from napari_shadowinv.geometry.interpolation import CloughTocher
-from napari_shadowinv.geometry.linear_surface import WIDTH, with_gradients
+from napari_shadowinv.geometry.interpolation import WIDTH, CloughTocher, with_gradients
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
-from napari_shadowinv.inversion import _sampling
-from napari_shadowinv.inversion._noise_samples import noise_of
-from napari_shadowinv.inversion._sampling import FullResampling, LinearResampling, Scatter
+from napari_shadowinv.inversion import error_bars
+from napari_shadowinv.inversion.error_bars import (
+    FullResampling,
+    LinearResampling,
+    Scatter,
+    noise_of,
+)
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.readout import read_dual
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
@@ -95,7 +98,7 @@ def test_a_sample_is_the_same_in_any_block(case):
 def test_too_many_sites_for_factors_are_left_to_the_multigrid(monkeypatch, image):
     options = InversionOptions(n_sites=1000, negative="clip")
     factorised = uncertainty(image, WIDTH + 2, noise=NOISE, options=options)
-    monkeypatch.setattr(_sampling, "_MOST_FACTORISED", 0)
+    monkeypatch.setattr(error_bars, "_MOST_FACTORISED", 0)
     iterative = uncertainty(image, WIDTH + 2, noise=NOISE, options=options)
     assert not np.array_equal(iterative.potential_std, factorised.potential_std)
     for name in ("potential_std", "displacement_std"):

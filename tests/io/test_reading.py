@@ -12,8 +12,8 @@ from PIL import Image
 
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io import read, read_dataset, read_radiograph, read_toml
-from napari_shadowinv.io.colours import film_warnings
 from napari_shadowinv.io.files import sha256
+from napari_shadowinv.io.images import film_warnings
 from napari_shadowinv.preprocessing import Radiograph
 
 RAMP = np.arange(6 * 9).reshape(6, 9)

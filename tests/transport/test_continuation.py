@@ -10,7 +10,7 @@ from napari_shadowinv.geometry.density import Density, split_pixels
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.physics.forward import jacobian_determinant
-from napari_shadowinv.transport.continuation import blurred
+from napari_shadowinv.transport.minimise import blurred
 from napari_shadowinv.transport.sites import plan_levels
 from napari_shadowinv.transport.solvers import solve
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.sparse import block_diag, csr_array, diags_array
 
-from napari_shadowinv.geometry.linear_surface import WIDTH
-from napari_shadowinv.transport.factorised import FactorisedLaplacian
+from napari_shadowinv.geometry.interpolation import WIDTH
+from napari_shadowinv.transport.linear import FactorisedLaplacian
 
 
 @pytest.fixture(scope="module")

@@ -81,7 +81,7 @@ def _matlab_rows(path: Path, variable: str | None) -> _summary.Rows:
 
 
 def _picture_rows(path: Path, form: Format) -> _summary.Rows:
-    from napari_shadowinv.io.colours import film_warnings
+    from napari_shadowinv.io.images import film_warnings
 
     array, metadata = form.read(path)
     warnings = film_warnings(array, None) if array.ndim == 2 else ()

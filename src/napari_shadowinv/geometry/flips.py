@@ -6,19 +6,23 @@ import numpy as np
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.geometry import triangle_mesh
-from napari_shadowinv.geometry._hilbert import insertion_order
-from napari_shadowinv.geometry._predicates import (
+from napari_shadowinv.geometry.compiler import kernel, kernel_that_allocates
+from napari_shadowinv.geometry.triangle_mesh import (
     FLIP,
     LEGAL,
     LIFT_BOUND,
     REFLEX_A,
+    Mesh,
+    after,
+    around,
+    before,
     edge_state,
     excess,
+    insertion_order,
     precise_excess,
+    push,
     turn,
 )
-from napari_shadowinv.geometry.compiler import kernel, kernel_that_allocates
-from napari_shadowinv.geometry.triangle_mesh import Mesh, after, around, before, push
 
 # What to do with a vertex that is proven hidden.
 REMOVE, STOP, RAISE, KEEP = 0, 1, 2, 3

@@ -1,24 +1,32 @@
-"""A C¹ surface through scattered values with gradients.
+"""Surfaces through scattered values.
 
-- interpolate: `CloughTocher`
+- a C¹ surface through values with gradients: `CloughTocher`; the same for many sets of values at
+  the same sites, `WIDTH` at a time: `corner_weights`, with gradients by `with_gradients`
 - better gradients from rough ones: `fit_gradients`
+- Sibson's interpolation, without gradients: `natural_neighbor`
 
 Clough and Tocher's triangle: each Delaunay triangle is cut at its centroid into three
 cubic Bézier patches. Values and gradients are met at the sites, and the derivative
 across each edge is linear along it, so neighbours join with continuous gradients. To
-reach beyond the outermost sites, those near the border can be mirrored across it.
+reach beyond the outermost sites, those near the border can be mirrored across it. The surface is
+linear in the values, so the geometry of each triangle and edge is computed once for many sets.
+
+Sibson's natural neighbours: a point that is added to a Voronoi diagram takes its cell from its
+neighbours; the shares of the area that each of them gives are the weights of their values. The
+result is continuous, smooth except at the sites, and exact for linear functions.
 
 References
 ----------
 R. W. Clough and J. L. Tocher, "Finite element stiffness matrices for analysis of plates
 in bending" (1965); P. Alfeld, Computer Aided Geometric Design 1, 169 (1984); for the
-gradients G. M. Nielson, Mathematics of Computation 40, 253 (1983).
+gradients G. M. Nielson, Mathematics of Computation 40, 253 (1983). R. Sibson, "A brief description
+of natural neighbour interpolation" (1981); paper, section III.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
@@ -29,15 +37,349 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation
 __all__ = [
     "BLOCK",
     "PATCH",
+    "WIDTH",
     "CloughTocher",
+    "corner_weights",
     "fill_patch",
     "fit_gradients",
     "locate",
     "mesh_arrays",
+    "natural_neighbor",
     "nearest_corner",
     "value_on_patch",
+    "with_gradients",
     "with_mirror_images",
 ]
+
+
+_LARGEST_CAVITY = 256
+
+
+@njit(nogil=True, cache=True)
+def _circumcentre(
+    ay: float, ax: float, by: float, bx: float, cy: float, cx: float
+) -> tuple[float, float]:
+    """Return the circumcentre relative to a; far away where the points are in line."""
+    by, bx, cy, cx = by - ay, bx - ax, cy - ay, cx - ax
+    double_area = by * cx - bx * cy
+    if double_area == 0.0:
+        double_area = 1e-300
+    b2 = 0.5 * (by * by + bx * bx)
+    c2 = 0.5 * (cy * cy + cx * cx)
+    return (b2 * cx - c2 * bx) / double_area, (c2 * by - b2 * cy) / double_area
+
+
+@njit(nogil=True, cache=True)
+def _circle_holds(points: FloatArray, corners: Indices, y: float, x: float) -> bool:
+    """Return whether (y, x) lies inside the circumcircle of a counter-clockwise triangle."""
+    a, b, c = corners[0], corners[1], corners[2]
+    ay, ax = points[a, 0] - y, points[a, 1] - x
+    by, bx = points[b, 0] - y, points[b, 1] - x
+    cy, cx = points[c, 0] - y, points[c, 1] - x
+    a2, b2, c2 = ay * ay + ax * ax, by * by + bx * bx, cy * cy + cx * cx
+    signed = a2 * (by * cx - bx * cy) + b2 * (cy * ax - cx * ay) + c2 * (ay * bx - ax * by)
+    return bool(signed > 0)
+
+
+@njit(nogil=True, cache=True)
+def _cavity(
+    vertices: Indices,
+    neighbors: Indices,
+    points: FloatArray,
+    start: int,
+    y: float,
+    x: float,
+    cavity: Indices,
+) -> int:
+    """List the triangles whose circumcircles hold (y, x), from the one around it."""
+    cavity[0] = start
+    count, done = 1, 0
+    while done < count and count < cavity.shape[0]:
+        t = cavity[done]
+        done += 1
+        for k in range(3):
+            neighbour = neighbors[t, k]
+            if neighbour < 0 or _index_of(cavity, count, neighbour) >= 0:
+                continue
+            if count < cavity.shape[0] and _circle_holds(points, vertices[neighbour], y, x):
+                cavity[count] = neighbour
+                count += 1
+    return count
+
+
+@njit(nogil=True, cache=True)
+def _index_of(items: Indices, count: int, item: int) -> int:
+    for i in range(count):
+        if items[i] == item:
+            return i
+    return -1
+
+
+@njit(nogil=True, cache=True)
+def _stolen_area(
+    vertices: Indices,
+    neighbors: Indices,
+    points: FloatArray,
+    cavity: Indices,
+    count: int,
+    t: int,
+    k: int,
+    y: float,
+    x: float,
+) -> tuple[int, float]:
+    """Return the end b of a rim edge of the cavity, and the area that it gives to (y, x)."""
+    # The edge is the one opposite corner k of triangle t. Around b lie the centre of the new
+    # triangle on this edge, those of the cavity's triangles at b, and the centre of the new
+    # triangle on the next rim edge.
+    a, b = vertices[t, (k + 1) % 3], vertices[t, (k + 2) % 3]
+    by, bx = points[b, 0], points[b, 1]
+    first_y, first_x = _circumcentre(by, bx, y, x, points[a, 0], points[a, 1])
+    last_y, last_x = first_y, first_x
+    double_area = 0.0
+    pivot = (k + 2) % 3
+    while True:
+        i, j = (pivot + 1) % 3, (pivot + 2) % 3
+        c, d = vertices[t, i], vertices[t, j]
+        centre_y, centre_x = _circumcentre(
+            by, bx, points[c, 0], points[c, 1], points[d, 0], points[d, 1]
+        )
+        double_area += last_y * centre_x - last_x * centre_y
+        last_y, last_x = centre_y, centre_x
+        # cross the edge from b to corner i, towards the rest of b's cavity triangles
+        neighbour = neighbors[t, j]
+        if neighbour < 0 or _index_of(cavity, count, neighbour) < 0:
+            break
+        t = neighbour
+        pivot = 0
+        while vertices[t, pivot] != b:
+            pivot += 1
+    new_y, new_x = _circumcentre(by, bx, y, x, points[c, 0], points[c, 1])
+    double_area += last_y * new_x - last_x * new_y
+    double_area += new_y * first_x - new_x * first_y
+    return b, abs(double_area)
+
+
+@njit(nogil=True, cache=True)
+def _interpolate_blocks(
+    start: int,
+    stop: int,
+    queries: FloatArray,
+    vertices: Indices,
+    neighbors: Indices,
+    points: FloatArray,
+    values: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Interpolate blocks `start` to `stop` of the queries."""
+    n = values.shape[0]
+    cavity = np.empty(_LARGEST_CAVITY, np.int32)
+    for block in range(start, stop):
+        t = 0
+        for q in range(block * BLOCK, min((block + 1) * BLOCK, queries.shape[0])):
+            y, x = queries[q]
+            t = locate(vertices, neighbors, points, t, y, x)
+            met = -1
+            for k in range(3):
+                corner = vertices[t, k]
+                if corner < n and points[corner, 0] == y and points[corner, 1] == x:
+                    met = corner
+            if met >= 0:
+                out[q] = values[met]
+                continue
+            count = _cavity(vertices, neighbors, points, t, y, x, cavity)
+            total = 0.0
+            out[q] = 0.0
+            for c in range(count):
+                for k in range(3):
+                    neighbour = neighbors[cavity[c], k]
+                    if neighbour >= 0 and _index_of(cavity, count, neighbour) >= 0:
+                        continue
+                    site, area = _stolen_area(
+                        vertices, neighbors, points, cavity, count, cavity[c], k, y, x
+                    )
+                    if site < n:
+                        total += area
+                        out[q] += area * values[site]
+            if total > 0:
+                out[q] /= total
+
+
+def natural_neighbor(
+    triangulation: RegularTriangulation,
+    values: ArrayLike,
+    queries: ArrayLike,
+    *,
+    threads: int | None = None,
+) -> FloatArray:
+    """Interpolate values, shape (n, ...), at the sites of a mesh, at points (y, x) in their hull.
+
+    The mesh is a Delaunay triangulation.
+
+    >>> corners = np.array([[0.0, 0.0], [0.0, 4.0], [4.0, 0.0], [4.0, 4.0]])
+    >>> natural_neighbor(RegularTriangulation(corners), corners[:, 0], [[1.0, 2.5]])
+    array([1.])
+    """
+    at_sites = np.asarray(values, dtype=np.float64)
+    points = np.ascontiguousarray(queries, dtype=np.float64)
+    columns = at_sites.reshape(len(at_sites), -1)
+    out = np.empty((len(points), columns.shape[1]))
+    for column in range(columns.shape[1]):
+        result = np.empty(len(points))
+        surface = (*mesh_arrays(triangulation), np.ascontiguousarray(columns[:, column]))
+        work = -(-len(points) // BLOCK), available_threads(threads), points
+        in_ranges(_interpolate_blocks, *work, *surface, result, smallest=2)
+        out[:, column] = result
+    return out.reshape(len(points), *at_sites.shape[1:])
+
+
+WIDTH = 8  # numbers in a cache line; a constant, so that loops are unrolled
+
+
+@njit(nogil=True, cache=True)
+def _mean_slopes(
+    vertices: Indices, points: FloatArray, values: FloatArray, gradients: FloatArray
+) -> None:
+    """Find the mean gradient of the triangles around each site, by their areas."""
+    n = values.shape[0]
+    areas = np.zeros(n)
+    slope = np.empty((2, WIDTH))
+    for a, b, c in vertices:
+        if a >= n or b >= n or c >= n:
+            continue
+        by, bx = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
+        cy, cx = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1]
+        area = by * cx - bx * cy
+        sign = 1.0 if area > 0 else -1.0
+        for s in range(WIDTH):
+            to_b, to_c = values[b, s] - values[a, s], values[c, s] - values[a, s]
+            slope[0, s] = sign * (to_b * cx - to_c * bx)
+            slope[1, s] = sign * (to_c * by - to_b * cy)
+        for i in (a, b, c):
+            areas[i] += abs(area)
+            for s in range(WIDTH):
+                gradients[i, 0, s] += slope[0, s]
+                gradients[i, 1, s] += slope[1, s]
+    for i in range(n):
+        share = 1.0 / max(areas[i], 1e-300)
+        for s in range(WIDTH):
+            gradients[i, 0, s] *= share
+            gradients[i, 1, s] *= share
+
+
+@njit(nogil=True, cache=True)
+def _minimise_bending(
+    vertices: Indices,
+    neighbors: Indices,
+    points: FloatArray,
+    values: FloatArray,
+    gradients: FloatArray,
+    surface: FloatArray,
+) -> None:
+    """Do the sweep of `fit_gradients`, starting from `gradients`; write values and gradients."""
+    n = values.shape[0]
+    system = np.zeros((n, 3))
+    for t in range(vertices.shape[0]):
+        for k in range(3):
+            a, b = vertices[t, (k + 1) % 3], vertices[t, (k + 2) % 3]
+            if neighbors[t, k] < t or a >= n or b >= n:
+                continue
+            ey, ex = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
+            length2 = ey * ey + ex * ex
+            stiffness = 1.0 / (length2 * np.sqrt(length2))
+            for i, j in ((a, b), (b, a)):
+                system[i, 0] += stiffness * ey * ey
+                system[i, 1] += stiffness * ey * ex
+                system[i, 2] += stiffness * ex * ex
+                for s in range(WIDTH):
+                    rise = 3 * (values[b, s] - values[a, s])
+                    slope_there = gradients[j, 0, s] * ey + gradients[j, 1, s] * ex
+                    pull = stiffness * (rise - slope_there) / 2
+                    surface[i, 1, s] += pull * ey
+                    surface[i, 2, s] += pull * ex
+    for i in range(n):
+        yy, yx, xx = system[i]
+        determinant = yy * xx - yx * yx
+        fitted = determinant > 1e-12 * (yy + xx) ** 2
+        for s in range(WIDTH):
+            surface[i, 0, s] = values[i, s]
+            ry, rx = surface[i, 1, s], surface[i, 2, s]
+            if fitted:
+                surface[i, 1, s] = (ry * xx - rx * yx) / determinant
+                surface[i, 2, s] = (rx * yy - ry * yx) / determinant
+            else:
+                surface[i, 1, s], surface[i, 2, s] = gradients[i, 0, s], gradients[i, 1, s]
+
+
+def with_gradients(triangulation: RegularTriangulation, values: FloatArray) -> FloatArray:
+    """Return `WIDTH` sets of values at n sites, (n, WIDTH), and their gradients: (n, 3, WIDTH).
+
+    The gradients equal `fit_gradients`, started from the mean of the triangles around each site.
+    """
+    vertices, neighbors, points = mesh_arrays(triangulation)
+    gradients = np.zeros((len(values), 2, WIDTH))
+    _mean_slopes(vertices, points, values, gradients)
+    surface = np.zeros((len(values), 3, WIDTH))
+    _minimise_bending(vertices, neighbors, points, values, gradients, surface)
+    return surface
+
+
+@njit(nogil=True, cache=True)
+def _weigh_corners(
+    start: int,
+    stop: int,
+    queries: FloatArray,
+    vertices: Indices,
+    neighbors: Indices,
+    points: FloatArray,
+    n: int,
+    corners: Indices,
+    weights: FloatArray,
+) -> None:
+    """Do blocks `start` to `stop` of the queries."""
+    p, f, g, patch = np.empty((3, 2)), np.zeros(3), np.zeros((3, 2)), np.empty(PATCH)
+    for block in range(start, stop):
+        t = 0
+        for q in range(block * BLOCK, min((block + 1) * BLOCK, queries.shape[0])):
+            y, x = queries[q]
+            t = locate(vertices, neighbors, points, t, y, x)
+            a, b, c = vertices[t]
+            if a < n and b < n and c < n:
+                p[0], p[1], p[2] = points[a], points[b], points[c]
+                corners[q, 0], corners[q, 1], corners[q, 2] = a, b, c
+                for k in range(3):
+                    f[k] = 1.0
+                    fill_patch(p, f, g, patch)
+                    weights[q, k, 0], _ = value_on_patch(patch, y, x)
+                    f[k] = 0.0
+                    for axis in range(2):
+                        g[k, axis] = 1.0
+                        fill_patch(p, f, g, patch)
+                        weights[q, k, 1 + axis], _ = value_on_patch(patch, y, x)
+                        g[k, axis] = 0.0
+                continue
+            nearest = nearest_corner(vertices[t], points, n, y, x)
+            if nearest >= 0:
+                corners[q] = nearest
+                weights[q, 0, 0] = 1.0
+                weights[q, 0, 1] = y - points[nearest, 0]
+                weights[q, 0, 2] = x - points[nearest, 1]
+
+
+def corner_weights(
+    triangulation: RegularTriangulation, queries: FloatArray, threads: int | None = None
+) -> tuple[Indices, FloatArray]:
+    """Return the three sites that determine the surface at each of m points, and their weights.
+
+    The sites have shape (m, 3). The weights, (m, 3, 3), multiply each site's value and its
+    gradient along y and x. Neighbours in the list should be neighbours in the plane.
+    """
+    corners, weights = np.zeros((len(queries), 3), np.int32), np.zeros((len(queries), 3, 3))
+    mesh = *mesh_arrays(triangulation), len(triangulation.sites)
+    blocks = -(-len(queries) // BLOCK)
+    operands = queries, *mesh, corners, weights
+    in_ranges(_weigh_corners, blocks, available_threads(threads), *operands, smallest=2)
+    return corners, weights
+
 
 BLOCK = 2048  # queries that share one walk; fixed, so that threads change nothing
 PATCH = 31  # numbers that describe the surface over a triangle

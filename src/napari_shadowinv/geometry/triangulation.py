@@ -31,8 +31,15 @@ from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry import flips
-from napari_shadowinv.geometry._hilbert import hilbert_permutation, insertion_order
-from napari_shadowinv.geometry.triangle_mesh import LIMIT, N_COUNTERS, SIZE, Indices, Mesh
+from napari_shadowinv.geometry.triangle_mesh import (
+    LIMIT,
+    N_COUNTERS,
+    SIZE,
+    Indices,
+    Mesh,
+    hilbert_permutation,
+    insertion_order,
+)
 
 __all__ = ["RegularTriangulation", "hilbert_order"]
 

@@ -23,10 +23,10 @@ from scipy.spatial import KDTree
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.inversion._linear_response import LinearResponse
 from napari_shadowinv.inversion.beam import beam_difference
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared
+from napari_shadowinv.inversion.readout import LinearResponse
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.units import PeakError
 from napari_shadowinv.transport.minimise import with_full_cells

@@ -39,8 +39,7 @@ def compile_rest() -> None:
     from napari_shadowinv.geometry.interpolation import CloughTocher, fit_gradients
     from napari_shadowinv.geometry.power_diagram import PowerDiagram
     from napari_shadowinv.physics.forward import synthetic_image
-    from napari_shadowinv.transport.factorised import FactorisedLaplacian
-    from napari_shadowinv.transport.linear import LaplacianSolver
+    from napari_shadowinv.transport.linear import FactorisedLaplacian, LaplacianSolver
 
     synthetic_image(np.zeros((2, 8, 8)), np.ones((8, 8)))
     sites = np.random.default_rng(0).uniform(0, 19, (_NODES, 2))

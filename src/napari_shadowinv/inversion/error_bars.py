@@ -2,11 +2,15 @@
 
 - error bars for the potential and the displacement at every pixel: `uncertainty`
 - result: `Uncertainty`
+- random samples of an image with noise: `noise_of`
+- inversion of each sample, by a new solution of its transport: `FullResampling`; by the linear
+  response of the image's own transport: `LinearResampling`
 
-Each sample is the image with another draw of noise, and is inverted on the same sites: by the
-linear response of the image's own transport, or by solving the transport anew from its weights. The
+Each sample is the image with another draw of noise, and is inverted on the same sites. The
 scatter of the samples is the scatter of repeated shots of the same object (the parametric
-bootstrap).
+bootstrap). The linear response of the solved transport to a small change of the image costs one
+linear system with a matrix that all samples share; to solve the transport again costs a few, each
+with its own.
 
 References
 ----------
@@ -17,42 +21,299 @@ chapter 6.
 from __future__ import annotations
 
 import json
+import math
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import reduce
+from functools import cached_property, reduce
 from operator import add
 from threading import Event
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import ndimage
 
-from napari_shadowinv._system.arrays import unpack_shot
+from napari_shadowinv._system.arrays import plain_array, unpack_array, unpack_shot
 from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.geometry.linear_surface import WIDTH
+from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.interpolation import WIDTH
+from napari_shadowinv.geometry.power_diagram import pixel_shares
 from napari_shadowinv.inversion._invert import invert, plan_sites
-from napari_shadowinv.inversion._noise_samples import noise_of
-from napari_shadowinv.inversion._sampling import FullResampling, LinearResampling, Scatter, Seed
-from napari_shadowinv.inversion.normalise import bytes_per_pixel, prepare
+from napari_shadowinv.inversion.normalise import bytes_per_pixel, floored_by, prepare
+from napari_shadowinv.inversion.readout import LinearReadout, read_out
 from napari_shadowinv.inversion.result import Inversion
 from napari_shadowinv.inversion.variables import dataset_from_field, label
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.poisson import border_mean
+from napari_shadowinv.transport.linear import FactorisedLaplacian, LaplacianSolver
+from napari_shadowinv.transport.objective import TransportObjective
 from napari_shadowinv.transport.sites import SitePlan
+from napari_shadowinv.transport.solvers import LevelSolution, Target, solve
 
 if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["Uncertainty", "uncertainty"]
+__all__ = [
+    "Draw",
+    "FullResampling",
+    "LinearResampling",
+    "Sample",
+    "Scatter",
+    "Seed",
+    "Uncertainty",
+    "noise_of",
+    "uncertainty",
+]
+
+
+Draw = Callable[[np.random.Generator, float], FloatArray]
+"""Returns a noisy image, with noise that a Gaussian of some standard deviation (px) correlates."""
+
+_BLUR_REACH = 4.0  # standard deviations
+_MOST_QUANTA = 1e18  # numpy draws no larger Poisson numbers
+
+
+def noise_of(
+    image: ArrayLike, noise: object, units_per_quantum: float | None, mask: ArrayLike | None
+) -> tuple[Draw, str]:
+    """Return a function that draws a noisy image, and a text that describes the noise."""
+    values = np.asarray(unpack_array(image, "image")[0])
+    if values.dtype.kind not in "buif":
+        raise InputError(f"image has values of type {values.dtype}, expected real numbers")
+    usable = np.isfinite(values)
+    if mask is not None and np.shape(mask) == values.shape:
+        usable &= np.asarray(mask, dtype=bool)
+    values = np.where(usable, values, 0.0)
+    if isinstance(noise, str):
+        if noise != "poisson":
+            raise InputError(
+                f"noise is {noise!r}, expected 'poisson', a standard deviation or an array of them"
+            )
+        return _poisson(values, units_per_quantum)
+    if units_per_quantum is not None:
+        raise InputError(
+            f"units_per_quantum is {units_per_quantum!r} and noise a standard deviation: "
+            "units_per_quantum belongs to noise='poisson'"
+        )
+    return _gaussian(values, np.asarray(plain_array(noise, "noise")), usable)
+
+
+def _poisson(values: FloatArray, units_per_quantum: float | None) -> tuple[Draw, str]:
+    if units_per_quantum is None:
+        if np.any(values != np.rint(values)):
+            raise InputError(
+                "image has values that are not whole numbers, so they are not counts: give the "
+                "units_per_quantum (image units per detected quantum), or the noise as a standard "
+                "deviation"
+            )
+        units_per_quantum = 1.0
+    if not (np.isreal(units_per_quantum) and 0 < units_per_quantum < np.inf):
+        raise InputError(
+            f"units_per_quantum is {units_per_quantum!r}, expected a positive number: image units"
+        )
+    quanta = np.maximum(values, 0) / units_per_quantum
+    if quanta.max(initial=0) > _MOST_QUANTA:
+        raise InputError(
+            f"units_per_quantum is {units_per_quantum:g} and the brightest pixel {values.max():g}: "
+            f"that is more than {_MOST_QUANTA:g} quanta in a pixel, expected fewer: check the unit"
+        )
+    # A blur leaves the counting noise of many pixels as it was.
+    text = f"Poisson, {units_per_quantum:g} per quantum"
+    return lambda rng, blur: units_per_quantum * rng.poisson(quanta), text
+
+
+def _gaussian(values: FloatArray, sigma: AnyArray, usable: BoolArray) -> tuple[Draw, str]:
+    if sigma.dtype.kind not in "uif":
+        raise InputError(
+            f"noise has values of type {sigma.dtype}, expected 'poisson', a standard deviation "
+            "or an array of them"
+        )
+    if sigma.ndim > 0 and sigma.shape != values.shape:
+        raise InputError(
+            f"noise has shape {sigma.shape}, image {values.shape}: they must match, or give one "
+            "number for all pixels"
+        )
+    deviation = np.where(usable, sigma, 0.0)
+    if not (np.isfinite(deviation).all() and (deviation >= 0).all() and deviation.any()):
+        raise InputError(
+            "noise is zero everywhere, or somewhere negative or not finite: expected standard "
+            "deviations in the image's units"
+        )
+    described = f"Gaussian, {sigma:g}" if sigma.ndim == 0 else "Gaussian, pixel by pixel"
+    return lambda rng, blur: values + deviation * _normal(rng, values.shape, blur), described
+
+
+def _normal(rng: np.random.Generator, shape: tuple[int, ...], blur: float) -> FloatArray:
+    """Normal noise of deviation 1, correlated as by a Gaussian blur (px)."""
+    if not blur > 0:
+        return rng.normal(size=shape)
+    reach = math.ceil(_BLUR_REACH * blur)
+    kernel = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * blur**2))
+    kernel /= np.sqrt((kernel**2).sum())
+    noise: FloatArray = rng.normal(size=[side + 2 * reach for side in shape])
+    for axis in (0, 1):
+        noise = ndimage.correlate1d(noise, kernel, axis)
+    return noise[reach:-reach, reach:-reach]
+
+
+Seed = np.random.SeedSequence
+
+_SAMPLE_SHARE = 0.2  # of the noise's flux errors that a sample may leave unsolved
+_LOOSEST_TOLERANCE = 0.1
+_MOST_FACTORISED = 300_000  # sites; their factors take 0.2 GB and two seconds
+_LINEAR_TOLERANCE = 0.02
+_ROWS = 64  # read out between two calls of `should_stop`
+
+
+class Sample(NamedTuple):
+    """One noisy image, inverted."""
+
+    field: FloatArray  # potential and displacement, (3, H, W)
+    solution: LevelSolution
+
+
+@dataclass(frozen=True)
+class FullResampling:
+    """Solution of the transport of each sample on a plan's finest level, from start weights."""
+
+    plan: SitePlan
+    start: FloatArray
+    draw: Callable[[np.random.Generator], FloatArray]
+    options: InversionOptions
+
+    def sample(self, seeds: list[Seed], report: Reporter) -> Sample:
+        """Invert the noisy image of one seed, without caustics and other results."""
+        (seed,) = seeds
+        image = self.image(seed)
+        plan = self.plan
+        solution = solve(
+            plan.levels, image, self.options, report, start=self.start, margin=plan.margin
+        )[-1]
+        potential, displacement = (
+            plan.within(values) for values in read_out(solution, self.options)
+        )
+        return Sample(np.stack([potential - border_mean(potential), *displacement]), solution)
+
+    def to_tolerance_of_noise(self, seed: Seed) -> FullResampling:
+        """Loosen the tolerance to a share of the flux errors by noise."""
+        # The remaining error is white, and moves the field far less than the flux that the solver
+        # has moved: where a fifth remains in the worst cell, a sample's field is within 3 % of
+        # its change, and the deviation of many within 0.2 %.
+        level = self.plan.levels[-1]
+        objective = TransportObjective(
+            level.triangulation.copy(),
+            level.mass,
+            Density.from_image(self.image(seed)),
+            threads=self.options.threads,
+        )
+        by_noise = objective.residual(objective.diagram(self.start))
+        loosest = min(_SAMPLE_SHARE * by_noise, _LOOSEST_TOLERANCE)
+        tolerance = max(loosest, self.options.tolerance)
+        return replace(self, options=self.options.model_copy(update={"tolerance": tolerance}))
+
+    def image(self, seed: Seed) -> FloatArray:
+        """Draw a noisy image, as the transport sees it."""
+        return self._floored(self.draw(np.random.default_rng(seed)))
+
+    @cached_property
+    def _floored(self) -> Callable[[FloatArray], FloatArray]:
+        return floored_by(self.plan.source, self.options, self.plan.mask)
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Sums over samples of changes of (potential, displacement), (3, H, W)."""
+
+    # Changes are relative to the image's field, so sums of squares lose no digits.
+    count: int
+    sums: FloatArray
+    squares: FloatArray
+
+    @classmethod
+    def of(cls, change: FloatArray) -> Scatter:
+        return cls(1, change, change**2)
+
+    def __add__(self, other: Scatter) -> Scatter:
+        return Scatter(
+            self.count + other.count, self.sums + other.sums, self.squares + other.squares
+        )
+
+    @property
+    def mean(self) -> FloatArray:
+        return self.sums / self.count
+
+    @property
+    def std(self) -> FloatArray:
+        variance = (self.squares - self.sums * self.mean) / (self.count - 1)
+        return np.sqrt(np.maximum(variance, 0))
+
+
+class LinearResampling:
+    """Linear response of an inversion to the changes of the image in its samples."""
+
+    def __init__(self, samples: FullResampling, image: FloatArray, threads: int | None) -> None:
+        self._samples, self._image = samples, image
+        plan, level = samples.plan, samples.plan.levels[-1]
+        objective = Target.of(image, plan.margin, samples.options).objective(level)
+        diagram = objective.diagram(samples.start)
+        self._shares = pixel_shares(diagram, level.shape, threads=threads)
+        self._network = diagram.laplacian(), objective.ground(samples.start)
+        self._factors = None
+        if len(level.sites) <= _MOST_FACTORISED:
+            with suppress(RuntimeError):  # the multigrid reports it if it fails as well
+                self._factors = FactorisedLaplacian(*self._network)
+        self._readout = LinearReadout(plan, level, threads)
+        self._solvers = threading.local()  # each has vectors of its own
+
+    def scatter(self, seeds: list[Seed], report: Reporter) -> Scatter:
+        """Sum the changes by up to `WIDTH` noisy images, in order."""
+        values = self._at_sites(seeds, report)
+        sums, squares = np.zeros((2, 3, *self._image.shape))
+        for start in range(0, len(self._image), _ROWS):
+            report("samples", 0)
+            self._readout.add(values, sums, squares, start, _ROWS)
+        return Scatter(len(seeds), sums, squares)
+
+    def changes(self, seeds: list[Seed]) -> FloatArray:
+        """Return changes of potential and displacement by up to `WIDTH` images, (k, 3, H, W)."""
+        values = self._at_sites(seeds, Reporter())
+        return np.array([self._readout.field(values[..., k]) for k in range(len(seeds))])
+
+    def _at_sites(self, seeds: list[Seed], report: Reporter) -> FloatArray:
+        plan = self._samples.plan
+        change = np.zeros(plan.levels[-1].shape)
+        lacking = np.zeros((self._shares.shape[0], WIDTH))
+        for sample, seed in enumerate(seeds):
+            report("samples", 0)
+            plan.within(change)[:] = self._image - self._samples.image(seed)
+            lacking[:, sample] = self._shares @ change.ravel()
+        return self._readout.at_sites(self._solve(lacking, report))
+
+    def _solve(self, right: FloatArray, report: Reporter) -> FloatArray:
+        if self._factors is not None:
+            return self._factors.solve(right)
+        if not hasattr(self._solvers, "multigrid"):
+            self._solvers.multigrid = LaplacianSolver(*self._network)
+        weights = np.zeros_like(right)
+        for sample in np.flatnonzero(right.any(axis=0)):
+            report("samples", 0)
+            weights[:, sample], _, _ = self._solvers.multigrid.solve(
+                right[:, sample].copy(), _LINEAR_TOLERANCE
+            )
+        return weights
+
 
 Result = TypeVar("Result")
 

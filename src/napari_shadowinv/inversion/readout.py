@@ -1,31 +1,252 @@
 """From the weights of the sites to the potential and displacement at every pixel.
 
 - by the method of the options: `read_out`
-- from the dual variables, without any integration: `read_dual` (default)
+- from the dual variables, without any integration: `read_dual` (default); as a linear map, for
+  many weights of one level, and for sums over many samples: `LinearReadout`
 - by the paper's method, from the cells' centroids: `read_centroids`
+- linear response of the field to small changes of flux: `LinearResponse`
 
 Each returns the potential, shape (H, W), px², zero in the mean over the border; and the
 displacement, shape (2, H, W), px. With a margin these cover it too.
+
+Around a solved transport the weights answer a change of flux linearly, by the Hessian that
+Newton's step has: H δw = δS - δT, and the displacement by -½ ∇δw. A level of a few thousand sites
+is enough for noise, whose displacement is mostly of long waves (its spectrum falls as 1/k²); the
+contribution of finer waves, 1 / 2π of the noise's variance for each power of e, needs no solving.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
+from scipy.sparse import csr_array
 
-from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.geometry.interpolation import BLOCK, CloughTocher
-from napari_shadowinv.geometry.natural_neighbor import natural_neighbor
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.geometry.compiler import njit
+from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.interpolation import (
+    BLOCK,
+    WIDTH,
+    CloughTocher,
+    corner_weights,
+    natural_neighbor,
+    with_gradients,
+)
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.poisson import border_mean
-from napari_shadowinv.transport.sites import Level
-from napari_shadowinv.transport.solvers import LevelSolution
+from napari_shadowinv.transport.linear import FactorisedLaplacian
+from napari_shadowinv.transport.sites import Level, SitePlan
+from napari_shadowinv.transport.solvers import LevelSolution, Target
 
-__all__ = ["read_centroids", "read_dual", "read_out"]
+__all__ = [
+    "LinearReadout",
+    "LinearResponse",
+    "read_centroids",
+    "read_dual",
+    "read_out",
+]
+
+
+@njit(nogil=True, cache=True)
+def _add_rows(
+    start: int,
+    stop: int,
+    corners: Indices,
+    weights: FloatArray,
+    values: FloatArray,
+    sums: FloatArray,
+    squares: FloatArray,
+) -> None:
+    """Add to the sums over samples of potential and displacement in rows `start` to `stop`."""
+    width = corners.shape[1]
+    potential = np.empty((3, width, WIDTH))  # of three rows, in turns
+    for row in range(start, stop + 2):
+        current = potential[row % 3]
+        for column in range(width):
+            for s in range(WIDTH):
+                current[column, s] = 0.0
+            for k in range(3):
+                corner = corners[row, column, k]
+                of_value, of_y, of_x = weights[row, column, k]
+                for s in range(WIDTH):
+                    current[column, s] += (
+                        of_value * values[corner, 0, s]
+                        + of_y * values[corner, 1, s]
+                        + of_x * values[corner, 2, s]
+                    )
+        y = row - 2
+        if y < start:
+            continue
+        above, level, below = potential[y % 3], potential[(y + 1) % 3], current
+        for x in range(width - 2):
+            p = p2 = dy = dy2 = dx = dx2 = 0.0
+            for s in range(WIDTH):
+                at = level[x + 1, s]
+                along_y = 0.5 * (above[x + 1, s] - below[x + 1, s])
+                along_x = 0.5 * (level[x, s] - level[x + 2, s])
+                p += at
+                p2 += at * at
+                dy += along_y
+                dy2 += along_y * along_y
+                dx += along_x
+                dx2 += along_x * along_x
+            sums[0, y, x] += p
+            sums[1, y, x] += dy
+            sums[2, y, x] += dx
+            squares[0, y, x] += p2
+            squares[1, y, x] += dy2
+            squares[2, y, x] += dx2
+
+
+class LinearReadout:
+    """Read-out of a level at the pixels of a plan's image."""
+
+    def __init__(self, plan: SitePlan, level: Level, threads: int | None = None) -> None:
+        n = len(level.sites)
+        self._triangulation = level.triangulation
+        # One pixel more at each side; beyond the level's border the potential is its mirror image.
+        beyond = [
+            np.clip(np.arange(-1, size + 1) + plan.margin_width, 0, padded_size - 1)
+            for size, padded_size in zip(plan.source.shape, level.shape, strict=True)
+        ]
+        pixels = np.stack(np.meshgrid(*beyond, indexing="ij"), axis=-1)
+        mirrored = level.mirrored()
+        queries = pixels.reshape(-1, 2).astype(np.float64)
+        corners, weights = corner_weights(mirrored.triangulation, queries, threads)
+        weights[..., 1:] *= mirrored.sense[corners]
+        self._corners = mirrored.origin[corners].reshape(*pixels.shape[:2], 3)
+        self._weights = weights.reshape(*pixels.shape[:2], 3, 3)
+        border = np.ones(plan.source.shape, bool)
+        border[1:-1, 1:-1] = False
+        border = np.pad(border, 1)
+        columns = 3 * self._corners[border][..., None] + np.arange(3)
+        mean = np.bincount(columns.ravel(), self._weights[border].ravel(), 3 * n) / border.sum()
+        self._border_mean = csr_array(mean[None])
+
+    def at_sites(self, weights: FloatArray) -> FloatArray:
+        """Return the potential's values and gradients, (n, 3, WIDTH), for weights (n, WIDTH)."""
+        # Half the weights are the potential.
+        at_sites = with_gradients(self._triangulation, 0.5 * weights)
+        at_sites[:, 0] -= self._border_mean @ at_sites.reshape(-1, WIDTH)
+        return at_sites
+
+    def add(
+        self, values: FloatArray, sums: FloatArray, squares: FloatArray, start: int, rows: int
+    ) -> None:
+        """Add potential and displacement, and their squares, to sums (3, H, W) in some rows."""
+        stop = min(start + rows, sums.shape[1])
+        _add_rows(start, stop, self._corners, self._weights, values, sums, squares)
+
+    def field(self, values: FloatArray) -> FloatArray:
+        """Return potential and displacement, (3, H, W), of one sample's values at sites, (n, 3)."""
+        padded = np.einsum("yxkc,yxkc->yx", self._weights, values[self._corners])
+        return np.stack([padded, *-np.array(np.gradient(padded))])[:, 1:-1, 1:-1]
+
+
+_RESOLUTION = 2.5  # spacing over the finest wave that a level resolves within 5 %
+_MIN_ROUNDNESS = 0.3  # double area by the longest side's square; of an equilateral triangle 0.87
+
+
+class LinearResponse:
+    """Response of one level's solution.
+
+    Attributes
+    ----------
+    level : Level
+        The level, of n sites.
+    spacing : float
+        Distance between its sites, px.
+    flux, area : ndarray, shape (n,)
+        The image's flux in each cell, and its area in pixels.
+    """
+
+    def __init__(self, solution: LevelSolution, target: Target, plan: SitePlan) -> None:
+        self.level, self._plan = solution.level, plan
+        self.spacing = solution.level.spacing
+        objective = target.objective(solution.level)
+        diagram = objective.diagram(solution.weights)
+        self.flux = diagram.masses
+        ones = Density.from_image(np.ones(solution.level.shape), threads=solution.threads)
+        self.area = PowerDiagram(objective.triangulation, ones, threads=solution.threads).masses
+        ground = objective.ground(solution.weights)
+        self._factors = FactorisedLaplacian(diagram.laplacian(), ground)
+
+    def to(self, changes: FloatArray) -> FloatArray:
+        """Return each triangle's displacement (t, k, 2), px, by flux changes of cells (k, n)."""
+        potential = -0.5 * self._factors.solve(changes.T)
+        corners, slopes = self._slopes
+        return np.asarray(-np.swapaxes(potential[corners], 1, 2) @ slopes)
+
+    def finer(self, variance: FloatArray, spacing: float, grain: float = 0.0) -> FloatArray:
+        """Return each triangle's mean square displacement, px², by waves too fine for this level.
+
+        Only waves count that sites with this `spacing` resolve. `variance` is the variance of the
+        flux in each cell, by noise that is independent between pixels, or above a `grain`, px. The
+        result is negative if this level resolves finer waves than the noise has.
+        """
+        finest = self.spacing / _RESOLUTION
+        powers = math.log(finest / max(min(finest, max(spacing, 1.0)), grain))
+        of_cell = variance * self.area / self.flux**2
+        corners, _ = self._slopes
+        return np.asarray(of_cell[corners].mean(axis=1) * powers / (2 * np.pi))
+
+    @property
+    def places(self) -> FloatArray:
+        """Middles of the triangles, px of the image, shape (t, 2)."""
+        corners, _ = self._slopes
+        return np.asarray(self.level.sites[corners].mean(axis=1) - self._plan.margin_width)
+
+    @cached_property
+    def shares(self) -> FloatArray:
+        """Area of each triangle as a share of the used image."""
+        corners, _ = self._slopes
+        a, b, c = np.moveaxis(self.level.sites[corners], 1, 0)
+        double = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+        used = _within(self.places, self._plan)
+        return np.asarray(double * used / max((double * used).sum(), 1e-300))
+
+    @cached_property
+    def _slopes(self) -> tuple[Indices, FloatArray]:
+        """Corners of the triangles between sites, and the gradient by each corner's value."""
+        corners, edges, double = _triangles(self.level.triangulation)
+        # Slivers along the border are too thin for a gradient by three values.
+        longest = (edges**2).sum(axis=2).max(axis=1)
+        is_round = np.abs(double) > _MIN_ROUNDNESS * longest
+        corners, edges, double = corners[is_round], edges[is_round], double[is_round]
+        return corners, _normals(edges) / double[:, None, None]
+
+
+def _triangles(triangulation: RegularTriangulation) -> tuple[Indices, FloatArray, FloatArray]:
+    """Return corners of the triangles between sites, opposite edges, and double areas."""
+    corners = triangulation.vertices
+    corners = corners[(corners < len(triangulation.sites)).all(axis=1)]
+    points = triangulation.sites[corners]
+    edges = np.roll(points, -2, axis=1) - np.roll(points, -1, axis=1)
+    return corners, edges, edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
+
+
+def _normals(edges: FloatArray) -> FloatArray:
+    return np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
+
+
+def _within(places: FloatArray, plan: SitePlan) -> BoolArray:
+    """Return which places are within the image and its mask."""
+    height, width = plan.source.shape
+    rows, columns = np.rint(places).astype(np.int64).T
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    if plan.mask is None:
+        return np.asarray(inside)
+    rows, columns = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
+    return np.asarray(inside & plan.mask[rows, columns])
+
 
 OnShare = Callable[[float], None]
 

@@ -1,4 +1,8 @@
-"""Pictures (TIFF with 8, 16 or 32 bits, PNG, BMP, JPEG) and numpy's arrays, one plane each."""
+"""Pictures (TIFF with 8, 16 or 32 bits, PNG, BMP, JPEG) and numpy's arrays, one plane each.
+
+- colour images: reduction to one plane (`to_grey`), signs of a film scan (`film_warnings`)
+- scans of film in colour: `read_scan`
+"""
 
 from __future__ import annotations
 
@@ -11,16 +15,132 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from napari_shadowinv._system.safety import as_file_errors, check_regular, check_size
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io.colours import film_warnings, to_grey
-from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise, sha256
+from napari_shadowinv.io.formats import format_of
+
+__all__ = [
+    "Scan",
+    "read_scan",
+]
+
+
+CHANNELS = ("red", "green", "blue", "mean")
+
+# Of a picture of film that is exposed in its middle: the rim's width over the shorter side, its
+# least brightness over the brightest, and the middle's greatest over the rim's.
+_RIM, _AS_BRIGHT, _DARKER = 0.05, 0.9, 0.8
+
+
+def to_grey(array: AnyArray, channel: str | int | None, where: str | Path) -> FloatArray:
+    """Reduce an image, which may have channels and alpha last, to one plane of float64."""
+    if array.ndim == 2:
+        return np.ascontiguousarray(array, dtype=np.float64)
+    colours = array[..., : {2: 1, 4: 3}.get(array.shape[-1], array.shape[-1])]
+    if (colours == colours[..., :1]).all():
+        return np.ascontiguousarray(colours[..., 0], dtype=np.float64)
+    if channel is None:
+        raise InputError(
+            f"{where} is a colour image with {colours.shape[-1]} channels: if it is a scan of "
+            "film, which darkens with dose, convert it to dose first "
+            "(napari_shadowinv.film); "
+            'otherwise choose a channel that is linear in fluence, "red", "green", "blue" or '
+            '"mean", or its number'
+        )
+    if channel == "mean":
+        return np.ascontiguousarray(colours.mean(axis=-1, dtype=np.float64))
+    text, count = str(channel), colours.shape[-1]
+    index = CHANNELS.index(text) if text in CHANNELS else int(text) if text.isdecimal() else -1
+    if not 0 <= index < count:
+        raise InputError(
+            f"{where} has no channel {text!r}: expected "
+            f'"red", "green", "blue", "mean" or a number from 0 to {count - 1}'
+        )
+    return np.ascontiguousarray(colours[..., index], dtype=np.float64)
+
+
+def film_warnings(array: AnyArray, channel: str | int | None) -> tuple[Caution, ...]:
+    """Warn of a picture in colour, or with a bright rim: it may be a film, dark with dose."""
+    grey = to_grey(array, "mean", "")
+    is_colour = array.ndim == 3 and not np.array_equal(grey, to_grey(array, 0, ""))
+    if is_colour:
+        sign = f"channel {channel!r} of a colour image was used as the fluence"
+    elif array.dtype.kind in "iu" and _is_lit_around(grey):
+        sign = (
+            "the rim is as bright as anything in the image and the centre is darker, which "
+            "suggests a film scan"
+        )
+    else:
+        return ()
+    text = (
+        f"{sign}: film darkens with dose, so a scan gives a field of the wrong sign unless it is "
+        "converted to dose first (napari_shadowinv.film)"
+    )
+    return (Caution("film-scan", text),)
+
+
+def _is_lit_around(image: FloatArray) -> bool:
+    """Return whether all four sides are as bright as the brightest part, the middle darker."""
+    # Light or particles that are deflected out of the middle make something else brighter.
+    height, width = image.shape
+    rim = max(1, round(_RIM * min(height, width)))
+    sides = (image[:rim], image[-rim:], image[:, :rim], image[:, -rim:])
+    dimmest = min(float(np.median(side)) for side in sides)
+    middle = image[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    return bool(
+        np.median(middle) < _DARKER * dimmest and _AS_BRIGHT * np.percentile(image, 99) < dimmest
+    )
+
+
+_TO_METRES = {2: 0.0254, 3: 0.01}  # by TIFF's unit of resolution
+
+
+class Scan(NamedTuple):
+    """A colour scan: pixels of shape (H, W, 3), their size in m if it is known, its checksum."""
+
+    pixels: AnyArray
+    pixel_size: float | None
+    checksum: str
+
+
+@as_file_errors
+def read_scan(path: Path) -> Scan:
+    """Read a colour scan of film in its own dtype.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing or cannot be read.
+    InputError
+        If it has no colours.
+    """
+    file_format = format_of(path)
+    content = file_format.read(path) if file_format.is_scan else None
+    if not isinstance(content, tuple) or content[0].ndim != 3 or content[0].shape[-1] not in (3, 4):
+        raise InputError(f"{path} is no picture in colour: expected a scan in red, green and blue")
+    return Scan(content[0][..., :3], _pixel_size(path), sha256(path))
+
+
+def _pixel_size(path: Path) -> float | None:
+    """Return the pixel size by a TIFF's resolution; scanners set none in other formats."""
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as tiff:
+            tags = tiff.pages[0].aspage().tags
+            count, per = tags["XResolution"].value
+            unit = _TO_METRES[int(tags["ResolutionUnit"].value)]
+    except (tifffile.TiffFileError, KeyError):
+        return None
+    return unit * per / count if count > 0 and count / per > 1 else None
+
 
 _TIFF_RATIO = 3 * DEFLATE_RATIO  # LZW at its best packs two and a half times as well as zlib
 

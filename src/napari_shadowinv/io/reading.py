@@ -18,9 +18,9 @@ from napari_shadowinv._system.safety import as_file_errors, small_text
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.variables import is_pack
-from napari_shadowinv.io.colours import film_warnings, to_grey
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.formats import CPSA, Format, format_of
+from napari_shadowinv.io.images import film_warnings, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
 from napari_shadowinv.preprocessing import Radiograph
 

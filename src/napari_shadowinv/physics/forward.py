@@ -7,6 +7,12 @@ The source is cut into small tiles, a few per pixel. The corners of a tile are r
 the tile's flux lands in the quadrilateral between them and is shared among the
 pixels by exact overlap of areas. Neighbouring tiles have their corners in common, so
 the image has neither gaps nor ripples, and no blur beyond the pixels' own.
+
+A tile's flux is spread evenly over its quadrilateral. Its share of each pixel follows from its
+edges: to the right along a row of pixels, the density rises at an edge by the difference between
+its two sides. So an edge, which two tiles share, is processed once, and running sums along the
+rows give the image. A tile that is nearly a line, or that a fold crosses, would leave rounding
+errors in the rest of its rows; its overlaps are computed pixel by pixel.
 """
 
 from __future__ import annotations
@@ -25,9 +31,325 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics._deposit import deposit_band
+from napari_shadowinv.geometry.compiler import njit
 
-__all__ = ["jacobian_determinant", "synthetic_image"]
+__all__ = [
+    "deposit_band",
+    "jacobian_determinant",
+    "synthetic_image",
+]
+
+
+# Of a tile: y0, x0, y1, x1, y2, x2, y3, x3.
+Corners = tuple[float, float, float, float, float, float, float, float]
+
+_ONE = np.uint32(1)
+# Area relative to squared diameter below which a tile is a line and shares of its area are noise.
+_MIN_TILE_SHAPE = 1e-9
+# Area relative to that in the source below which a tile is deposited pixel by pixel.
+_MIN_AREA_RATIO = 1e-3
+# Flux relative to the brightest pixel's below which it is a rounding error.
+_MIN_FLUX_SHARE = 1e-12
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def deposit_band(
+    coefficients: FloatArray,
+    knots: IntArray,
+    weights: FloatArray,
+    flux: FloatArray,
+    first: int,
+    last: int,
+    top: int,
+    window: FloatArray,
+) -> None:
+    """Add the image of the source's rows ``first`` to ``last`` to a window of the image.
+
+    `knots` and `weights` belong to the spline at each of the lines that cut a pixel.
+    """
+    # Positions count from the window's corner: its pixel (i, j) covers [i, i + 1] × [j, j + 1].
+    tiles = knots.size
+    corners = flux.shape[1] * tiles + 1
+    upper, lower = np.empty((2, corners)), np.empty((2, corners))
+    pixels_above, pixels = np.empty((2, corners), np.int32), np.empty((2, corners), np.int32)
+    # Tile b lies between corners b and b + 1; before the first and after the last there is none.
+    above, current = np.zeros(corners + 1), np.zeros(corners + 1)
+    rises = np.zeros((window.shape[0], window.shape[1] + 1))
+    for a in range(first * tiles, last * tiles + 1):
+        upper, lower = lower, upper
+        pixels_above, pixels = pixels, pixels_above
+        _land_corners(coefficients, knots, weights, a, top, lower)
+        _find_pixels(lower, window, pixels)
+        if a > first * tiles:
+            above, current = current, above
+            _spread_flux(flux[(a - 1) // tiles], tiles, upper, lower, window, current)
+            steps = above[1:-1] - current[1:-1]
+            _add_edges(rises, steps, upper, pixels_above, upper, pixels_above, 1)
+            _add_edges(rises, current[1:] - current[:-1], upper, pixels_above, lower, pixels, 0)
+    _add_edges(rises, current[1:-1].copy(), lower, pixels, lower, pixels, 1)
+    _add_sums(rises, window)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _land_corners(
+    coefficients: FloatArray,
+    knots: IntArray,
+    weights: FloatArray,
+    a: int,
+    top: int,
+    out: FloatArray,
+) -> None:
+    """Compute the landed corners of line `a` by the spline along y, then along x."""
+    tiles = knots.size
+    row, phase = a // tiles, a % tiles
+    start = row + knots[phase]
+    v0, v1, v2, v3 = weights[phase]
+    line = np.empty(coefficients.shape[2])
+    for component in range(2):
+        rows = coefficients[component, start : start + 4]
+        for j in range(line.size):
+            line[j] = v0 * rows[0, j] + v1 * rows[1, j] + v2 * rows[2, j] + v3 * rows[3, j]
+        at = out[component]
+        for k in range(tiles):
+            w0, w1, w2, w3 = weights[k]
+            origin = k / tiles if component else a / tiles - top
+            for c in range((at.size - k + tiles - 1) // tiles):
+                j = c + knots[k]
+                moved = w0 * line[j] + w1 * line[j + 1] + w2 * line[j + 2] + w3 * line[j + 3]
+                at[c * tiles + k] = origin + component * c + moved
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _find_pixels(corners: FloatArray, window: FloatArray, out: IntArray) -> None:
+    """Row and column of the pixel that holds each corner, -1 outside the window."""
+    for component in range(2):
+        size = float(window.shape[component])
+        for b in range(out.shape[1]):
+            at = corners[component, b]
+            out[component, b] = np.int32(at) if 0.0 <= at < size else -1
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _spread_flux(
+    flux: FloatArray,
+    tiles: int,
+    upper: FloatArray,
+    lower: FloatArray,
+    window: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Flux per area of a line of tiles as they land; 0 for those that are deposited right away."""
+    thin = 2 * _MIN_AREA_RATIO / (tiles * tiles)
+    for b in range(upper.shape[1] - 1):
+        share = flux[b // tiles] / (tiles * tiles)
+        y0, x0 = upper[0, b], upper[1, b]
+        y1, x1 = upper[0, b + 1], upper[1, b + 1]
+        y2, x2 = lower[0, b + 1], lower[1, b + 1]
+        y3, x3 = lower[0, b], lower[1, b]
+        area_012 = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
+        area_023 = (x2 - x0) * (y3 - y0) - (y2 - y0) * (x3 - x0)
+        out[b + 1] = 0.0
+        if share <= 0:
+            continue
+        if area_012 * area_023 < 0:
+            # A fold crosses it: its two triangles lie on top of each other.
+            _deposit(window, share / 2, area_012, (y0, x0, y1, x1, y2, x2, y2, x2))
+            _deposit(window, share / 2, area_023, (y0, x0, y2, x2, y3, x3, y3, x3))
+        elif abs(area_012 + area_023) < thin:
+            _deposit(window, share, area_012 + area_023, (y0, x0, y1, x1, y2, x2, y3, x3))
+        else:
+            out[b + 1] = 2 * share / (area_012 + area_023)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _add_edges(
+    rises: FloatArray,
+    steps: FloatArray,
+    starts: FloatArray,
+    start_pixels: IntArray,
+    ends: FloatArray,
+    end_pixels: IntArray,
+    ahead: int,
+) -> None:
+    """Add the rise of the density at edges, from corners b to b + `ahead`, by `steps`."""
+    far = np.empty(steps.size, np.int64)
+    count = 0
+    for b in range(steps.size):
+        e = b + ahead
+        ia, ja, ib, jb = start_pixels[0, b], start_pixels[1, b], end_pixels[0, e], end_pixels[1, e]
+        ya, xa, yb, xb = starts[0, b], starts[1, b], ends[0, e], ends[1, e]
+        step = steps[b]
+        if min(ia, ja, ib, jb) < 0 or abs(ia - ib) + abs(ja - jb) > 1:
+            far[count] = b
+            count += 1
+        elif ia == ib and ja == jb:
+            _add_piece(rises, ia, ja, step * (yb - ya), 0.5 * (xa + xb))
+        elif ia == ib:
+            # Over the side between two pixels of a row
+            x = float(max(ja, jb))
+            y = ya + (x - xa) * (yb - ya) / (xb - xa)
+            _add_piece(rises, ia, ja, step * (y - ya), 0.5 * (xa + x))
+            _add_piece(rises, ib, jb, step * (yb - y), 0.5 * (x + xb))
+        else:
+            # From one row of pixels to the next
+            y = float(max(ia, ib))
+            x = xa + (y - ya) * (xb - xa) / (yb - ya)
+            _add_piece(rises, ia, ja, step * (y - ya), 0.5 * (xa + x))
+            _add_piece(rises, ib, jb, step * (yb - y), 0.5 * (x + xb))
+    # Apart, because a call in the loop above slows it down twofold.
+    for b in far[:count]:
+        if steps[b] != 0:
+            e = b + ahead
+            _add_long_edge(rises, steps[b], starts[0, b], starts[1, b], ends[0, e], ends[1, e])
+
+
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+def _add_piece(rises: FloatArray, row: int, column: int, flow: float, x: float) -> None:
+    """Add a part of an edge within a pixel; x is the part's middle."""
+    i, j = np.uint32(row), np.uint32(column)
+    later = flow * (x - column)
+    rises[i, j] += flow - later
+    rises[i, j + _ONE] += later
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _add_long_edge(
+    rises: FloatArray, step: float, ya: float, xa: float, yb: float, xb: float
+) -> None:
+    """Add an edge that crosses from pixel to pixel, row by row."""
+    if ya > yb:
+        ya, xa, yb, xb, step = yb, xb, ya, xa, -step
+    y, end = max(ya, 0.0), min(yb, float(rises.shape[0]))
+    if y >= end:
+        return
+    slope = (xb - xa) / (yb - ya)
+    x = xa + (y - ya) * slope
+    for i in range(int(y), math.ceil(end)):
+        next_y = min(i + 1.0, end)
+        next_x = xb if next_y == yb else xa + (next_y - ya) * slope
+        _add_in_row(rises[i], step * (next_y - y), min(x, next_x), max(x, next_x))
+        y, x = next_y, next_x
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _add_in_row(row: FloatArray, flow: float, x_min: float, x_max: float) -> None:
+    """Add a part of an edge within a row of pixels; left of the image it fills the whole row."""
+    width = row.size - 1
+    if x_max <= 0:
+        row[0] += flow
+        return
+    if x_min >= width:
+        return
+    rate = flow / (x_max - x_min) if x_max > x_min else 0.0
+    if x_min < 0:
+        row[0] -= rate * x_min
+        x_min = 0.0
+    for j in range(int(x_min), min(int(min(x_max, float(width))) + 1, width)):
+        part = flow if rate == 0 else rate * (min(x_max, j + 1.0) - max(x_min, float(j)))
+        later = part * (0.5 * (max(x_min, float(j)) + min(x_max, j + 1.0)) - j)
+        row[j] += part - later
+        row[j + 1] += later
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _add_sums(rises: FloatArray, window: FloatArray) -> None:
+    """Add the running sums of the rises, but no rounding errors where no flux landed."""
+    brightest = 0.0
+    for i in range(window.shape[0]):
+        total = 0.0
+        for j in range(window.shape[1]):
+            total += rises[i, j]
+            rises[i, j] = total
+            brightest = max(brightest, total)
+    for i in range(window.shape[0]):
+        for j in range(window.shape[1]):
+            if rises[i, j] > _MIN_FLUX_SHARE * brightest:
+                window[i, j] += rises[i, j]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _deposit(window: FloatArray, share: float, double_area: float, corners: Corners) -> None:
+    """Share flux among the pixels by their overlap with a quadrilateral of uniform density."""
+    y0, x0, y1, x1, y2, x2, y3, x3 = corners
+    height, width = window.shape
+    y_min, y_max = min(y0, y1, y2, y3), max(y0, y1, y2, y3)
+    x_min, x_max = min(x0, x1, x2, x3), max(x0, x1, x2, x3)
+    if y_max <= 0 or y_min >= height or x_max <= 0 or x_min >= width:
+        return
+    inside = y_min >= 0 and y_max <= height and x_min >= 0 and x_max <= width
+    i0 = math.floor(max(y_min, 0.0))
+    j0 = math.floor(max(x_min, 0.0))
+    i1 = max(math.ceil(min(y_max, height)) - 1, i0)
+    j1 = max(math.ceil(min(x_max, width)) - 1, j0)
+    if inside and i0 == i1 and j0 == j1:
+        window[i0, j0] += share
+        return
+    if abs(double_area) < _MIN_TILE_SHAPE * ((y_max - y_min) ** 2 + (x_max - x_min) ** 2):
+        _deposit_line(window, share, corners)
+        return
+
+    scale = 2 * share / double_area
+    remainder = share
+    for i in range(i0, i1 + 1):
+        before = 0.0
+        if x_min < 0:
+            before = _area_left(i, 0.0, corners)
+        for j in range(j0, j1 + 1):
+            if inside and i == i1 and j == j1:
+                window[i, j] += remainder
+                return
+            area = _area_left(i, j + 1.0, corners)
+            amount = min(max(scale * (area - before), 0.0), remainder)
+            window[i, j] += amount
+            remainder -= amount
+            before = area
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _deposit_line(window: FloatArray, share: float, corners: Corners) -> None:
+    """Add a quadrilateral without area as four points, halfway from its corners to its middle."""
+    y0, x0, y1, x1, y2, x2, y3, x3 = corners
+    height, width = window.shape
+    middle_y, middle_x = (y0 + y1 + y2 + y3) / 4, (x0 + x1 + x2 + x3) / 4
+    for corner_y, corner_x in ((y0, x0), (y1, x1), (y2, x2), (y3, x3)):
+        y, x = (corner_y + middle_y) / 2, (corner_x + middle_x) / 2
+        if 0 <= y <= height and 0 <= x <= width:
+            window[min(int(y), height - 1), min(int(x), width - 1)] += share / 4
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _area_left(row: int, cut: float, corners: Corners) -> float:
+    """Signed area of a quadrilateral within a row of pixels, left of ``x = cut``."""
+    # Green's theorem: it is ∮ min(x - cut, 0) dy along the boundary within the row.
+    y0, x0, y1, x1, y2, x2, y3, x3 = corners
+    return (
+        _edge_integral(row, cut, y0, x0, y1, x1)
+        + _edge_integral(row, cut, y1, x1, y2, x2)
+        + _edge_integral(row, cut, y2, x2, y3, x3)
+        + _edge_integral(row, cut, y3, x3, y0, x0)
+    )
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _edge_integral(row: int, cut: float, ya: float, xa: float, yb: float, xb: float) -> float:
+    """Integral of min(x - cut, 0) dy along an edge, where it is within the row."""
+    u, v = xa - cut, xb - cut
+    if u >= 0 and v >= 0:
+        return 0.0
+    start = min(max(ya, row), row + 1.0)
+    end = min(max(yb, row), row + 1.0)
+    if start == end:
+        return 0.0
+    if start != ya or end != yb:
+        slope = (xb - xa) / (yb - ya)
+        u += (start - ya) * slope
+        v = xa + (end - ya) * slope - cut
+        if u >= 0 and v >= 0:
+            return 0.0
+    if u <= 0 and v <= 0:
+        return 0.5 * (u + v) * (end - start)
+    return 0.5 * min(u, v) ** 2 / -abs(u - v) * (end - start)
+
 
 # A cubic spline without knots next to the border needs four samples.
 _MIN_SIDE_PX = 4

@@ -34,7 +34,7 @@ from napari_shadowinv.film.registration import EDGES
 from napari_shadowinv.film.scans import common_shape, upright
 from napari_shadowinv.fitting.measurements import estimated_noise
 from napari_shadowinv.inversion.variables import PACK_FORMAT, PIXEL, place_coordinates
-from napari_shadowinv.io.scans import Scan
+from napari_shadowinv.io.images import Scan
 from napari_shadowinv.pipeline._film_inputs import Film, in_parallel, read_films, to_scan_frame
 
 if TYPE_CHECKING:

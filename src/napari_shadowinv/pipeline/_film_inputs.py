@@ -25,7 +25,7 @@ from napari_shadowinv.film import (
 )
 from napari_shadowinv.film.scans import upright
 from napari_shadowinv.io import read_radiograph
-from napari_shadowinv.io.scans import Scan, read_scan
+from napari_shadowinv.io.images import Scan, read_scan
 from napari_shadowinv.pipeline.shot_table import rows_of
 
 __all__ = ["Film", "in_parallel", "read_films", "to_scan_frame"]

@@ -45,7 +45,7 @@ from napari_shadowinv.preprocessing import (
     estimated_source,
     uniform_warnings,
 )
-from napari_shadowinv.preprocessing.isotropic import centre_within
+from napari_shadowinv.preprocessing.estimates import centre_within
 
 __all__ = ["PREVIEW_PIXELS", "PREVIEW_SITES", "Inputs", "collect_inputs", "run", "run_prepared"]
 

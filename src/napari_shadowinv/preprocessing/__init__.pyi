@@ -1,16 +1,20 @@
 from .estimates import (
     Estimate,
+    GaussianEstimate,
     InterpolatedEstimate,
+    IsotropicEstimate,
     LowPassEstimate,
     PolynomialEstimate,
     TotalVariationEstimate,
     UniformEstimate,
+    gaussian_source,
+    isotropic_source,
     low_pass_source,
     polynomial_source,
     total_variation_source,
     uniform_source,
+    uniform_warnings,
 )
-from .filling import interpolated_source
 from .filters import (
     BackgroundFilter,
     ButterworthFilter,
@@ -23,11 +27,9 @@ from .filters import (
     remove_background,
 )
 from .fit_provenance import FitOrigin, FitProvenance
-from .gaussian import GaussianEstimate, gaussian_source
 from .hot_pixels import HotPixelFilter, remove_hot_pixels
 from .image_checks import ReferencePair, image_warnings
-from .isotropic import IsotropicEstimate, isotropic_source, uniform_warnings
-from .pixels import fit_polynomial
+from .pixels import fit_polynomial, interpolated_source
 from .radiograph import Radiograph
 from .recipe import (
     ESTIMATES,

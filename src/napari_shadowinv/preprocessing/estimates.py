@@ -9,7 +9,7 @@ none was recorded, or the beam changes from shot to shot, it must be estimated f
 - the beam varies slowly, in no known way: `polynomial_source`, `low_pass_source`
 - the beam has edges that matter: `total_variation_source`
 - the object covers a known part of the image: `interpolated_source`
-- their base class in a recipe: `Estimate`
+- in a recipe: `Estimate` and the classes derived from it
 
 Each takes an image ``[y, x]``, counts or any linear measure of fluence, and returns float64
 of the same shape and unit that is positive everywhere and has the same flux over the usable
@@ -27,25 +27,33 @@ choice decides most of the error on large scales: Kasim et al., arXiv:1607.04179
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.cautions import OnCaution
+from napari_shadowinv.cautions import Caution, OnCaution, warn_of
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.setup import Setup, binned_setup
 from napari_shadowinv.preprocessing import pixels
-from napari_shadowinv.preprocessing.filling import FILL_WIDTH, fill_masked, interpolated_source
 from napari_shadowinv.preprocessing.filters import low_pass
+from napari_shadowinv.preprocessing.pixels import (
+    FILL_WIDTH,
+    beam_pixels,
+    fill_masked,
+    interpolated_source,
+)
 from napari_shadowinv.preprocessing.steps import Choice, degree_field, width_field
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
+
 
 _LEAST_SUPPORT = 1e-6
 _NARROWEST_WAVES = 2.0  # px; a Gaussian that is narrower has waves too short for the pixels
@@ -332,3 +340,359 @@ class InterpolatedEstimate(Estimate):
             "gaps at the edge."
         ),
     )
+
+
+_MOST_FITTED_PIXELS = 2**16
+_MOST_FITS = 10
+_NOTABLE_EXTRAPOLATION = 1.5  # times the brightest pixel seen
+# Of a fitted Gaussian: height over the image's mean, and sides from the image's middle.
+_MAX_HEIGHT = 1e3
+_MAX_DISTANCE = 3.0
+
+
+class GaussianEstimate(Estimate):
+    """A fitted elliptical spot."""
+
+    title = "fitted Gaussian"
+    place = 30
+    method: Literal["gaussian"] = "gaussian"
+
+    def _source(
+        self,
+        image: FloatArray,
+        mask: BoolArray | None,
+        should_stop: ShouldStop | None,
+        on_caution: OnCaution | None,
+    ) -> FloatArray:
+        return gaussian_source(image, mask=mask, should_stop=should_stop, on_caution=on_caution)
+
+
+def gaussian_source(
+    image: ArrayLike,
+    *,
+    mask: ArrayLike | None = None,
+    should_stop: ShouldStop | None = None,
+    on_caution: OnCaution | None = None,
+) -> FloatArray:
+    """Elliptical Gaussian plus a constant, fitted to the image.
+
+    It is an estimate as in `napari_shadowinv.preprocessing.estimates`.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+    mask, should_stop : optional
+    on_caution : callable, optional
+        Receives a `Caution` if the fit is doubtful. Default: `warnings.warn` with its text.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        Uniform if the fit rises under the mask to ten times the brightest usable pixel.
+
+    Notes
+    -----
+    Least squares with the soft L1 loss, whose unit is the median absolute deviation of the
+    residuals, found by fitting again until it stays: modulation stronger than that counts
+    in proportion, not squared. Centre, both widths, tilt, height and constant are free; the
+    last two are not negative. Large images are averaged in blocks for the fit. A Gaussian
+    narrower than 1/256 of the image, higher than 1000 times the mean, or more than three sides
+    away from the middle of the usable pixels is not considered.
+    """
+    values, usable = pixels.beam_pixels(image, mask)
+    side, mean = max(values.shape), values[usable].mean()
+    y, x, sample = _block_samples(values / mean, usable)
+    report = Reporter(None, should_stop)
+    parameters = _fit_gaussian(y / side, x / side, sample, report)
+    rows, columns = (np.arange(n) / side for n in values.shape)
+    beam = _gaussian(parameters, rows[:, None], columns)
+    rise = float(beam.max() / sample.max())
+    report_caution = on_caution or warn_of
+    if rise > pixels.MOST_EXTRAPOLATION:
+        text = (
+            "no Gaussian beam can be fitted to the unmasked pixels, so the source is assumed "
+            "uniform: mask less, or choose another estimate"
+        )
+        report_caution(Caution("source", text))
+        return uniform_source(image, mask=mask)
+    if rise > _NOTABLE_EXTRAPOLATION:
+        text = (
+            f"the Gaussian beam rises to {rise:.2g} times the fitted data under the mask: "
+            "compare it with another estimate, or mask less"
+        )
+        report_caution(Caution("source", text))
+    return pixels.with_flux_of(mean * beam, values, usable)
+
+
+def _block_samples(
+    values: FloatArray, usable: BoolArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return positions y, x and means of blocks of usable pixels, few enough for a fit."""
+    block = int(np.ceil(np.sqrt(values.size / _MOST_FITTED_PIXELS)))
+    share = pixels.block_means(usable.astype(np.float64), block)
+    means = pixels.block_means(np.where(usable, values, 0.0), block)
+    # A block is used only if it is complete, since a part of it has another middle.
+    # Under a mask so fine that no block is complete, the fullest are used.
+    y, x = np.nonzero(share >= share.max())
+    middle = (block - 1) / 2
+    rows, columns = (np.asarray(axis * block + middle, dtype=np.float64) for axis in (y, x))
+    return rows, columns, np.asarray(means[y, x] / share[y, x])
+
+
+def _fit_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray, report: Reporter) -> FloatArray:
+    """Fit the parameters of `_gaussian` to samples, by repeated robust least squares."""
+    bounds = _bounds(y, x)
+
+    def excess(p: FloatArray) -> FloatArray:
+        report("source", 0)
+        return _gaussian(p, y, x) - sample
+
+    def fitted(start: FloatArray, loss: str, scale: float) -> FloatArray:
+        fit = scipy.optimize.least_squares(
+            excess, start, lambda p: _gaussian_slopes(p, y, x), bounds,
+            loss=loss, f_scale=scale, x_scale="jac", max_nfev=200,
+        )  # fmt: skip
+        return np.asarray(fit.x)
+
+    # A plain fit first: the robust loss, from far away, would call the whole beam an outlier.
+    parameters = fitted(np.clip(_guess_gaussian(y, x, sample), *bounds), "linear", 1.0)
+    scale = 0.0
+    for _ in range(_MOST_FITS):
+        residual = _gaussian(parameters, y, x) - sample
+        previous, scale = scale, max(pixels.NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
+        if abs(scale - previous) < 1e-2 * scale:
+            break
+        parameters = fitted(parameters, "soft_l1", scale)
+    return parameters
+
+
+def _bounds(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return bounds of the parameters of `_gaussian`, without which it may hide behind a mask."""
+    steepest = math.sqrt(_MOST_FITTED_PIXELS)  # one over the width of a block of pixels
+    ranges = [
+        (0, _MAX_HEIGHT),
+        (0, _MAX_HEIGHT),
+        *((axis.mean() - _MAX_DISTANCE, axis.mean() + _MAX_DISTANCE) for axis in (y, x)),
+        *[(-steepest, steepest)] * 3,
+    ]
+    least, most = np.transpose(ranges)
+    return least, most
+
+
+def _guess_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatArray:
+    """Return parameters of `_gaussian` by the moments of the image above its dark corners."""
+    constant, peak = (float(level) for level in np.percentile(sample, [2, 98]))
+    weights = np.maximum(sample - constant, 0) + 1e-9
+    centre_y, centre_x = np.average(y, weights=weights), np.average(x, weights=weights)
+    widths = [
+        max(float(np.sqrt(np.average((axis - centre) ** 2, weights=weights))), 1e-3)
+        for axis, centre in ((y, centre_y), (x, centre_x))
+    ]
+    height = max(peak - constant, 1e-3)
+    return np.array(
+        [height, max(constant, 1e-3), centre_y, centre_x, 1 / widths[0], 0.0, 1 / widths[1]]
+    )
+
+
+def _gaussian(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArray:
+    """Return height · exp(-½(u² + v²)) + constant, with u = a·dy + b·dx and v = c·dx."""
+    # The factors of the inverse covariance, unlike its entries, may take any value.
+    height, constant, centre_y, centre_x, a, b, c = parameters
+    u = a * (y - centre_y) + b * (x - centre_x)
+    v = c * (x - centre_x)
+    return np.asarray(height * np.exp(-0.5 * (u**2 + v**2)) + constant)
+
+
+def _gaussian_slopes(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArray:
+    """Return the derivatives of `_gaussian` by its parameters, shape (samples, 7)."""
+    height, _, centre_y, centre_x, a, b, c = parameters
+    dy, dx = y - centre_y, x - centre_x
+    u, v = a * dy + b * dx, c * dx
+    bell = np.exp(-0.5 * (u**2 + v**2))
+    slopes = [
+        bell,
+        np.ones_like(bell),
+        height * bell * u * a,
+        height * bell * (u * b + v * c),
+        -height * bell * u * dy,
+        -height * bell * u * dx,
+        -height * bell * v * dx,
+    ]
+    return np.stack(slopes, axis=1)
+
+
+_NOTABLE_FALL = 0.01  # of the fluence, from the brightest pixel to the dimmest
+
+
+def _centre_field(axis: str, line: str) -> Any:
+    return Field(
+        default=None,
+        allow_inf_nan=False,
+        title=f"Centre {axis} (px)",
+        description=(
+            f"{line} of the recorded image at which the detector faces the source. Default: its "
+            "centre."
+        ),
+    )
+
+
+class IsotropicEstimate(Estimate):
+    """A point that shines evenly in all directions, on a flat detector."""
+
+    title = "isotropic point source"
+    uses_mask = False
+    place = 20
+    method: Literal["isotropic"] = "isotropic"
+    centre_y: float | None = _centre_field("y", "Row")
+    centre_x: float | None = _centre_field("x", "Column")
+    # Not a parameter: the user gives the setup elsewhere.
+    _setup: Any = PrivateAttr(default=None)
+
+    def placed(
+        self, setup: Setup | None, shape: tuple[int, int], matrix: FloatArray | None = None
+    ) -> Estimate:
+        if setup is None:
+            raise _without_setup()
+        point_distance(setup)  # refuses a collimated beam before any work
+        return self._at(*centre_within(shape, matrix, self.centre_y, self.centre_x), setup)
+
+    def coarser(self, factor: int) -> Estimate:
+        if self._setup is None or self.centre_y is None or self.centre_x is None:
+            return self
+        y, x = ((c + 0.5) / factor - 0.5 for c in (self.centre_y, self.centre_x))
+        return self._at(y, x, binned_setup(self._setup, factor))
+
+    def _source(self, image: FloatArray, mask: BoolArray | None, *_: Any) -> FloatArray:
+        if self._setup is None:
+            raise _without_setup()
+        return isotropic_source(image, self._setup, mask=mask, **self.values())
+
+    def _at(self, y: float, x: float, setup: Setup) -> Self:
+        estimate = self.model_copy(update={"centre_y": y, "centre_x": x})
+        estimate._setup = setup
+        return estimate
+
+
+def centre_within(
+    shape: tuple[int, int],
+    matrix: FloatArray | None = None,
+    y: float | None = None,
+    x: float | None = None,
+) -> tuple[float, float]:
+    """Return the coordinates of a pixel of the recorded image, by default its centre, in a part."""
+    middle = [(side - 1) / 2 for side in shape]
+    recorded = [m if c is None else c for m, c in zip(middle, (y, x), strict=True)]
+    if matrix is not None:
+        recorded = [float(v) for v in np.linalg.solve(matrix, [*recorded, 1.0])[:2]]
+    return recorded[0], recorded[1]
+
+
+def _without_setup() -> InputError:
+    return InputError(
+        "got the source 'isotropic' without a setup, which is needed for the distance of the "
+        "point source and the pixel size: give a setup, or choose the source 'uniform'"
+    )
+
+
+def uniform_warnings(
+    shape: tuple[int, int], setup: Setup | None, *, centre: tuple[float, float] | None = None
+) -> tuple[Caution, ...]:
+    """Warn if a point source would light an image too unevenly to count as uniform.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Height and width of the image.
+    setup : Setup or None
+        The experiment; no warning if it is unknown.
+    centre : tuple of float, optional
+        Pixel (y, x) in which the detector faces the point. Default: the middle of the image.
+
+    Returns
+    -------
+    tuple of Caution
+        Empty where the fluence of an isotropic point source varies by 1 % at most.
+    """
+    if setup is None or setup.collimated:
+        return ()
+    distance = point_distance(setup)
+    axis = [(side - 1) / 2 for side in shape] if centre is None else centre
+    near = [max(0.0, place - (side - 1), -place) for place, side in zip(axis, shape, strict=True)]
+    far = [max(place, side - 1 - place) for place, side in zip(axis, shape, strict=True)]
+    highest, lowest = ((1 + (math.hypot(*r) / distance) ** 2) ** -1.5 for r in (near, far))
+    fall = 1 - lowest / highest
+    if fall <= _NOTABLE_FALL:
+        return ()
+    text = (
+        f"the source is assumed uniform, but a point source {setup.source_object_distance:.3g} m "
+        f"from the object lights this image unevenly, by {fall:.1%} between brightest and "
+        "dimmest pixel: if yours emits isotropically, choose the source 'isotropic'"
+    )
+    return (Caution("source", text),)
+
+
+def isotropic_source(
+    image: ArrayLike,
+    setup: Setup,
+    *,
+    centre_y: float | None = None,
+    centre_x: float | None = None,
+    mask: ArrayLike | None = None,
+) -> FloatArray:
+    """Beam of a point that shines evenly in all directions, on a flat detector.
+
+    It is an estimate as in `napari_shadowinv.preprocessing.estimates`; an `InputError` also refuses
+    a setup with a collimated beam.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+        The shot; only its flux is used.
+    setup : Setup
+        The experiment: distance of the point, and side of a pixel.
+    centre_y, centre_x : float, optional
+        Pixel in which the detector faces the point. Default: the middle of the image.
+    mask : array_like of bool, shape (H, W), optional
+
+    Notes
+    -----
+    A pixel receives its share of the solid angle; for small pixels that is proportional to
+    cos³θ, with θ the angle between its line of sight to the point and the detector's normal.
+
+    Examples
+    --------
+    >>> from napari_shadowinv.physics.phantoms import paper_setup
+    >>> beam = isotropic_source(np.ones((201, 201)), paper_setup())
+    >>> float(round(beam[0, 0] / beam[100, 100], 3))  # the corner, 9.3 degrees from the axis
+    0.961
+    """
+    values, usable = beam_pixels(image, mask)
+    distance = point_distance(setup)
+    y, x = (
+        _edges(side, "centre_" + axis, centre) / distance
+        for side, axis, centre in zip(values.shape, "yx", (centre_y, centre_x), strict=True)
+    )
+    y = y[:, None]
+    # Solid angle of the rectangle between the axis and each corner of the pixels.
+    angles = np.arctan2(y * x, np.sqrt(1 + y**2 + x**2))
+    beam = np.diff(np.diff(angles, axis=0), axis=1)
+    return np.asarray(beam * (values[usable].mean() / beam[usable].mean()))
+
+
+def point_distance(setup: Setup) -> float:
+    """Return the distance from the point source to the detector, in px of the detector."""
+    if setup.collimated:
+        raise InputError(
+            "got the source 'isotropic' and a setup with a collimated beam "
+            "(source_object_distance is inf): give the distance of the point source, or choose "
+            "the source 'uniform'"
+        )
+    # The magnification enlarges distance and pixel alike.
+    return setup.source_object_distance / setup.object_pixel_size
+
+
+def _edges(side: int, name: str, centre: float | None) -> FloatArray:
+    """Return the edges of `side` pixels, relative to the centre, by default their middle."""
+    if centre is not None and not math.isfinite(centre):
+        raise InputError(f"{name} is {centre!r}, expected a finite number of px")
+    return np.arange(-0.5, side) - ((side - 1) / 2 if centre is None else centre)

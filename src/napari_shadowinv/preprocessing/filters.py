@@ -32,7 +32,7 @@ from pydantic import Field
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import pixels
-from napari_shadowinv.preprocessing.filling import without_masked
+from napari_shadowinv.preprocessing.pixels import without_masked
 from napari_shadowinv.preprocessing.steps import Step, degree_field, width_field
 
 if TYPE_CHECKING:

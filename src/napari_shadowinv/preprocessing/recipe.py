@@ -24,7 +24,7 @@ from napari_shadowinv.cautions import Caution, warn_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.preprocessing import gaussian, hot_pixels, isotropic  # noqa: F401
+from napari_shadowinv.preprocessing import estimates, hot_pixels  # noqa: F401
 from napari_shadowinv.preprocessing.estimates import Estimate
 from napari_shadowinv.preprocessing.filters import Filter
 from napari_shadowinv.preprocessing.radiograph import Radiograph

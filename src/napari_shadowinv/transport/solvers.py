@@ -25,9 +25,8 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.density import Density, split_pixels
 from napari_shadowinv.geometry.interpolation import CloughTocher, fit_gradients
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.transport.continuation import blurred, sharpen
 from napari_shadowinv.transport.margin import Margin
-from napari_shadowinv.transport.minimise import descend, newton
+from napari_shadowinv.transport.minimise import blurred, descend, newton, sharpen
 from napari_shadowinv.transport.objective import OpenObjective, Solution, TransportObjective
 from napari_shadowinv.transport.sites import RATIO, Level, Levels
 

@@ -15,7 +15,7 @@ from napari_shadowinv._napari.widgets._qt import notify_errors, timer, while_ali
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.scans import checked_corners
-from napari_shadowinv.io.scans import Scan, read_scan
+from napari_shadowinv.io.images import Scan, read_scan
 
 if TYPE_CHECKING:
     from pathlib import Path

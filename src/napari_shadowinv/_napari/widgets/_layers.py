@@ -17,8 +17,8 @@ from napari_shadowinv._napari.widgets._qt import column, notify_errors, while_al
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io.colours import film_warnings
 from napari_shadowinv.io.formats import SCAN_SUFFIXES
+from napari_shadowinv.io.images import film_warnings
 
 
 def kind_of(layer: Any) -> str:
