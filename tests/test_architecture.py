@@ -31,6 +31,7 @@ ROOMS = (
     ("physics",),
     ("preprocessing",),
     ("film",),
+    ("provenance",),
     ("transport",),
     ("inversion",),
     ("fitting",),

@@ -46,12 +46,11 @@ from napari_shadowinv.preprocessing import (
     Crop,
     HotPixelFilter,
     LowPassFilter,
-    Origin,
-    Provenance,
     Radiograph,
     Recipe,
     UniformEstimate,
 )
+from napari_shadowinv.provenance import ImageOrigin, Provenance
 
 BLOB = gaussian_blob((24, 32), 6.0, 4.0, (10, 18))
 
@@ -99,7 +98,7 @@ def prepared(
 ) -> Radiograph:
     """Return a shot and its source after the steps that flags ask for."""
     recipe = recipe_of(flags, Recipe(mask=None if mask is None else Path(mask)), {})
-    return collect_inputs(recipe, image, source=source).prepared()
+    return collect_inputs(recipe, image, source=source).prepare()
 
 
 def dataset(path: str | Path) -> xr.Dataset:
@@ -178,7 +177,7 @@ def test_invert_writes_the_result_of_the_library(folder: Path, shot: Path) -> No
     assert Inversion.from_dataset(saved).options == options
     provenance = Provenance.of(saved.attrs)
     assert provenance is not None
-    assert provenance.image == Origin(file="shot.npy", sha256=sha256(shot), shape=(24, 32))
+    assert provenance.image == ImageOrigin(file="shot.npy", sha256=sha256(shot), shape=(24, 32))
     assert provenance.recipe == Recipe(source=UniformEstimate(), options=options)
     assert iio.imread("shot.png").ndim == 3
     for word in ("300", "converged", "peak |d|", "shot.shadowinv", "shot.png"):
@@ -202,8 +201,8 @@ def test_source_setup_and_options_are_used(folder: Path, shot: Path) -> None:
     np.testing.assert_array_equal(saved["source"], source.astype(np.float32))
     provenance = Provenance.of(saved.attrs)
     assert provenance is not None
-    assert provenance.source is not None
-    assert provenance.source.file == "beam.tif"
+    assert provenance.image.source is not None
+    assert provenance.image.source.file == "beam.tif"
     # A flag wins over the file.
     assert Inversion.from_dataset(saved).options == InversionOptions(n_sites=200, tolerance=0.01)
     assert setup_from_dataset(saved) == ProtonSetup(
@@ -927,12 +926,12 @@ def test_a_damaged_mask_in_a_result_is_reported(
     saved = dataset("shot.shadowinv")
     provenance = Provenance.of(saved.attrs)
     assert provenance is not None
-    assert provenance.mask is not None
+    (original,) = provenance.masks
     for change in ({"pixels": "nonsense"}, {"pixels": "\N{BULLET}"}, {"shape": (10**9, 10**9)}):
-        mask = provenance.mask.model_copy(update=change)
-        text = provenance.model_copy(update={"mask": mask}).model_dump_json()
+        mask = original.model_copy(update=change)
+        text = provenance.model_copy(update={"masks": (mask,)}).model_dump_json()
         write("bad.shadowinv", saved.assign_attrs(provenance=text), overwrite=True)
-        refused("rerun", "bad.shadowinv", names="the mask kept with the result is damaged")
+        refused("rerun", "bad.shadowinv", names="the mask stored in the result is damaged")
 
 
 def test_rerun_is_identical_bit_for_bit(
@@ -990,7 +989,7 @@ def test_rerun_reads_no_foreign_file(
     shadowinv("invert", "private/shot.npy", "--out", "first.shadowinv")
     first = dataset("first.shadowinv")
     provenance = json.loads(first.attrs["provenance"])
-    provenance["image"]["file"] = file = place.format(folder=folder)
+    provenance["images"][0]["file"] = file = place.format(folder=folder)
     write("mine/bad.shadowinv", first.assign_attrs(provenance=json.dumps(provenance)))
     os.chdir(folder / "mine")
 

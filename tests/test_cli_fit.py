@@ -27,7 +27,8 @@ from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.plotting import fit_figure
-from napari_shadowinv.preprocessing import Bin, FitProvenance, Origin, Recipe, polynomial_source
+from napari_shadowinv.preprocessing import Bin, Recipe, polynomial_source
+from napari_shadowinv.provenance import Origin, Provenance
 
 SHAPE = (48, 56)
 TRUTH = gaussian_blob(SHAPE, 25.0, 7.0, (22, 30)).displacement
@@ -96,7 +97,7 @@ def fit_in(path: str) -> tuple[Fit, xr.Dataset]:
     return Fit.from_dataset(dataset), dataset
 
 
-def provenance_in(path: str) -> FitProvenance:
+def provenance_in(path: str) -> Provenance:
     provenance = fit_in(path)[0].provenance
     assert provenance is not None
     return provenance
@@ -215,8 +216,8 @@ def test_a_table_describes_each_image(folder: Path, fit_arguments: dict[str, Any
     np.testing.assert_array_equal(fit_arguments["source"], np.full((2, *SHAPE), 900))
     np.testing.assert_array_equal(fit_arguments["mask"], [mask > 0, np.ones(SHAPE, bool)])
     provenance = provenance_in("a_fit.shadowinv")
-    assert [image.image.file for image in provenance.images] == ["a.tif", "b.tif"]
-    assert provenance.images[1].image.sha256 == sha256(night / "b.tif")
+    assert [image.file for image in provenance.images] == ["a.tif", "b.tif"]
+    assert provenance.images[1].sha256 == sha256(night / "b.tif")
     assert [image.mask for image in provenance.images] == [0, None]
     (origin,) = provenance.masks
     assert (origin.file, origin.sha256) == ("mask.tif", sha256(night / "mask.tif"))

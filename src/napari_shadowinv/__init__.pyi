@@ -11,7 +11,7 @@ from .physics.forward import synthetic_image
 from .physics.poisson import poisson_invert
 from .physics.projection import project, project_potential
 from .physics.setup import OpticalSetup, ProtonSetup
-from .pipeline import run
+from .pipeline import Rerun, rerun, run
 from .preprocessing import Recipe
 from .stack import invert_stack, run_stack, stack_statistics, watch_stack
 
@@ -32,6 +32,7 @@ __all__ = [
     "Radiograph",
     "Recipe",
     "Report",
+    "Rerun",
     "Uncertainty",
     "__version__",
     "add_inversion",
@@ -43,6 +44,7 @@ __all__ = [
     "project",
     "project_potential",
     "read",
+    "rerun",
     "run",
     "run_stack",
     "stack_statistics",

@@ -17,7 +17,8 @@ from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.pipeline import run
-from napari_shadowinv.preprocessing import Crop, LowPassFilter, MeasuredSource, Provenance, Recipe
+from napari_shadowinv.preprocessing import Crop, LowPassFilter, MeasuredSource, Recipe
+from napari_shadowinv.provenance import Provenance
 
 
 def assert_same(first: Inversion, second: Inversion) -> None:
@@ -134,12 +135,12 @@ def test_attributes_contain_recipe_and_origins(tmp_path: Path, proton_setup: Pro
     assert provenance == inversion.provenance == Inversion.from_dataset(dataset).provenance
     assert provenance is not None
     assert provenance.recipe == recipe.model_copy(update={"source": MeasuredSource()})
-    for origin, name in ((provenance.image, "shot.npy"), (provenance.source, "beam.npy")):
+    for origin, name in ((provenance.image, "shot.npy"), (provenance.image.source, "beam.npy")):
         assert origin is not None
         digest = hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
         assert (origin.file, origin.sha256) == (name, digest)
-    assert provenance.mask is not None
-    np.testing.assert_array_equal(provenance.mask.mask(), dead)
+    (mask,) = provenance.masks
+    np.testing.assert_array_equal(mask.mask(), dead)
     assert provenance.setup == proton_setup
     assert "path_integrated_b" in dataset
     assert json.loads(dataset.attrs["options"])["n_sites"] == 300

@@ -11,7 +11,7 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read, read_radiograph, write
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-from napari_shadowinv.preprocessing import Origin, Provenance, Recipe
+from napari_shadowinv.provenance import ImageOrigin, Provenance
 
 IMAGE = np.arange(20.0).reshape(4, 5)
 ATTRIBUTES = {
@@ -111,7 +111,7 @@ def test_published_examples(
 
 
 def written(path: Path, inversion: Inversion, setup: ProtonSetup) -> Path:
-    provenance = Provenance(version="1", recipe=Recipe(), image=Origin(file="shot.tif"))
+    provenance = Provenance(kind="inversion", images=(ImageOrigin(file="shot.tif"),))
     return write(path, dataclasses.replace(inversion, provenance=provenance), setup=setup)
 
 

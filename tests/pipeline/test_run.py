@@ -40,7 +40,6 @@ from napari_shadowinv.preprocessing import (
     IsotropicEstimate,
     LowPassFilter,
     MeasuredSource,
-    Origin,
     PolynomialEstimate,
     Radiograph,
     Recipe,
@@ -50,6 +49,7 @@ from napari_shadowinv.preprocessing import (
     polynomial_source,
     remove_background,
 )
+from napari_shadowinv.provenance import MaskOrigin
 
 SHAPE = (40, 52)
 OPTIONS = InversionOptions(n_sites=400)
@@ -132,7 +132,7 @@ def test_the_matrix_says_where_pixels_came_from(steps: tuple[Step, ...]) -> None
     recipe = Recipe(steps=steps, setup=paper_setup())
     matrix = recipe.matrix(SHAPE)
     for axis, plane in enumerate(np.indices(SHAPE, dtype=float)):
-        moved = recipe.moved(Radiograph(plane, setup=paper_setup()))
+        moved = recipe.move(Radiograph(plane, setup=paper_setup()))
         assert moved.shape == recipe.shape_after(SHAPE)
         share = abs(np.linalg.det(matrix))  # pixels of the image in one of the result
         y, x = np.indices(moved.shape)
@@ -154,7 +154,7 @@ def test_a_point_source_is_where_it_was_in_the_recorded_image(steps: tuple[Step,
         recipe = Recipe(steps=steps, source=estimate, setup=setup, options=OPTIONS)
         inversion = run(recipe, image)
         uncropped = run(Recipe(source=estimate, setup=setup, options=OPTIONS), image).source
-        moved = recipe.moved(Radiograph(uncropped))
+        moved = recipe.move(Radiograph(uncropped))
         used = inversion.mask if moved.mask is None else inversion.mask & moved.mask
         ratio = inversion.source[used] / moved.image[used]
         # The source sees the same solid angle, up to the curvature within rotated pixels.
@@ -163,13 +163,13 @@ def test_a_point_source_is_where_it_was_in_the_recorded_image(steps: tuple[Step,
 
 @given(arrays(bool, st.tuples(st.integers(4, 30), st.integers(4, 30))))
 def test_a_mask_is_kept_whole(mask: Any) -> None:
-    stored = Origin.model_validate_json(Origin.of_mask(mask).model_dump_json())
+    stored = MaskOrigin.model_validate_json(MaskOrigin.of(mask).model_dump_json())
     np.testing.assert_array_equal(stored.mask(), mask)
 
 
 def test_a_mask_too_complex_for_an_attribute_is_not_kept_in_part() -> None:
     noise = np.random.default_rng(0).random((900, 900)) > 0.5
-    assert Origin.of_mask(noise).mask() is None
+    assert MaskOrigin.of(noise).mask() is None
 
 
 def changed(choice: type[Choice]) -> Choice:
@@ -277,7 +277,7 @@ def test_cache_spares_work_without_changing_results(image: FloatArray) -> None:
     preview = run(sharper, image, cache=cache, preview=True)
     np.testing.assert_allclose(preview.displacement, second.displacement, atol=1e-3)
     assert preview.provenance is not None
-    assert preview.provenance.notes == ("previewed",)
+    assert preview.provenance.image.notes == ("previewed",)
     assert_same(run(recipe, image, cache=cache), first)
 
 
@@ -334,5 +334,5 @@ def test_provenance_says_all_that_is_needed(image: FloatArray) -> None:
     assert content["recipe"]["source"] == {"method": "uniform"}
     assert provenance.setup is not None
     assert provenance.setup.object_pixel_size == 2 * paper_setup().object_pixel_size
-    assert provenance.notes == ("binned 2 × 2",)
+    assert provenance.image.notes == ("binned 2 × 2",)
     assert_same(run(provenance.recipe, image), run(recipe, image))

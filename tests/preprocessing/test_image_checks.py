@@ -187,7 +187,7 @@ def test_dark_gives_the_field_without_an_offset(shot):
     plain = run(Recipe(), image, source=source)
     taken = run(Recipe(steps=(Dark(level=200.0),)), image + 200, source=source + 200)
     np.testing.assert_array_equal(taken.displacement, plain.displacement)
-    assert taken.provenance.notes == ("dark level 200 subtracted",)
+    assert taken.provenance.image.notes == ("dark level 200 subtracted",)
 
 
 def test_dark_frame_moves_with_the_image(shot, tmp_path):
@@ -200,7 +200,7 @@ def test_dark_frame_moves_with_the_image(shot, tmp_path):
     for steps in ((dark, crop, merge), (crop, dark, merge), (crop, merge, dark)):
         taken = run(Recipe(steps=steps), image + frame, source=source + frame)
         np.testing.assert_allclose(taken.displacement, plain.displacement, atol=1e-6)
-    assert taken.provenance.dark.file == "dark.npy"
+    assert taken.provenance.image.dark.file == "dark.npy"
 
 
 def test_dark_is_a_number_or_a_file_in_every_notation():

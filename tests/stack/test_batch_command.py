@@ -27,7 +27,7 @@ from command_line import flat, shadowinv
 from napari_shadowinv import InversionOptions, invert, read
 from napari_shadowinv.cli._batch import progress_columns
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
-from napari_shadowinv.preprocessing import Provenance
+from napari_shadowinv.provenance import Provenance
 
 HERE = Path(__file__).parent
 SOURCES = Path(sys.modules["napari_shadowinv"].__file__ or "").parents[1]
@@ -92,8 +92,8 @@ def test_batch_writes_and_reports_shots(night, folder):
     np.testing.assert_allclose(dataset.potential[2], alone.potential, rtol=1e-6, atol=1e-6)
     provenance = Provenance.of(dataset.attrs)
     assert provenance is not None
-    assert provenance.source is not None
-    assert provenance.source.file == "reference.npy"
+    assert provenance.image.source is not None
+    assert provenance.image.source.file == "reference.npy"
     assert "line_integrated_density" in dataset
     reports = StackStore(Path("n.shadowinv.zarr")).reports()
     noise = np.median([report["errors"]["noise"][0] for report in reports])

@@ -29,13 +29,13 @@ from napari_shadowinv.preprocessing import (
     LowPassEstimate,
     LowPassFilter,
     PolynomialEstimate,
-    Provenance,
     UniformEstimate,
     high_pass,
     isotropic_source,
     low_pass,
     polynomial_source,
 )
+from napari_shadowinv.provenance import Provenance
 
 FILTERS = (HotPixelFilter(), LowPassFilter(width=0.8))
 

@@ -31,7 +31,8 @@ from napari_shadowinv.io.store import DONE, FAILED, StackStore
 from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.physics.setup import BeamSetup, OpticalSetup, ProtonSetup
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, shot_rows
-from napari_shadowinv.preprocessing import Bin, PolynomialEstimate, Provenance
+from napari_shadowinv.preprocessing import Bin, PolynomialEstimate
+from napari_shadowinv.provenance import Provenance
 from napari_shadowinv.stack import read_shot
 from napari_shadowinv.stack._plan import describe_stack
 
@@ -129,12 +130,12 @@ def test_a_row_is_inverted_as_alone(pack: Path, out: Path) -> None:
         assert provenance.setup == expected.setup
         assert provenance.recipe.setup == at((5.0, 14.7)[k])
         assert provenance.image.file == f"film{k}.npy"
-    assert provenance.source is not None
-    assert provenance.source.file == "other.npy"
+    assert provenance.image.source is not None
+    assert provenance.image.source.file == "other.npy"
     assert "source other.npy" in flat(shadowinv("status", out).stdout)
     first = StackStore(out).report(0)["provenance"]
-    assert first["brightness"] == 1.25
-    assert first["mask"]["file"] == "mask.npy"
+    assert first["images"][0]["brightness"] == 1.25
+    assert first["masks"][0]["file"] == "mask.npy"
 
 
 def test_images_of_uniform_beams_are_relative_to_their_mean(pack: Path, out: Path) -> None:

@@ -20,11 +20,12 @@ from napari_shadowinv._napari.kinds import Kind
 from napari_shadowinv._napari.layer_metadata import CAME_WITH, Result, metadata_for
 from napari_shadowinv._napari.layers import FullLayerData, Limits
 from napari_shadowinv._napari.shots import shot_layer
-from napari_shadowinv._system.validation import validated
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.film import Pack
 from napari_shadowinv.physics.setup import setup_from_dict
+from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
     import xarray
@@ -166,7 +167,10 @@ def pack_frame(dataset: xarray.Dataset) -> Frame:
 
 def pack_of(dataset: xarray.Dataset) -> Pack:
     """Return the pack that a dataset was computed from, or raise an `InputError`."""
-    return validated(Pack, json.loads(dataset.attrs["pack"]), "the result's pack")
+    provenance = Provenance.of(dataset.attrs)
+    if provenance is None or provenance.pack is None:
+        raise InputError("the result has no readable film pack: convert its scans again")
+    return provenance.pack
 
 
 def warnings_of_pack(dataset: xarray.Dataset) -> tuple[Caution, ...]:

@@ -225,14 +225,15 @@ def _summary(store: StackStore, status: _RunStatus) -> Table:
 
 def _recipe_rows(store: StackStore) -> Rows:
     """Return the origin of the source and the steps before the inversion."""
-    from napari_shadowinv.preprocessing import Provenance
+    from napari_shadowinv.provenance import Provenance
 
     provenance = Provenance.of(store.attributes)
-    common = None if provenance is None else provenance.source
+    common = None if provenance is None else provenance.image.source
     source = common.file if common is not None else ""
     # Each row of a table may name another source.
-    origins = [report.get("provenance", {}).get("source", {}) for report in store.reports()]
-    files = list(dict.fromkeys(origin["file"] for origin in origins if origin.get("file")))
+    origins = map(Provenance.of, store.reports())
+    sources = [origin.image.source for origin in origins if origin is not None]
+    files = list(dict.fromkeys(source.file for source in sources if source and source.file))
     rows = [("source", _list_text(files) or source or str(store.attributes["source_image"]))]
     steps = () if provenance is None else provenance.recipe.steps
     return rows + [("step", step.described) for step in steps]

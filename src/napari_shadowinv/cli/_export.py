@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import importlib.util
-import json
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,7 @@ from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
 from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.io.store import DAMAGED, DONE, STATUS_NAMES, StackStore, read_stack
-from napari_shadowinv.preprocessing import Provenance
+from napari_shadowinv.pipeline.rerun import provenance_of
 
 if TYPE_CHECKING:
     import xarray
@@ -153,16 +152,8 @@ def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[_Job]:
 
 def _with_origin(shot: xarray.Dataset) -> xarray.Dataset:
     """Return a shot with its own provenance, or else the provenance of its store."""
-    report = json.loads(str(shot["report"].values))
-    if "provenance" in report:
-        return shot.assign_attrs(provenance=json.dumps(report["provenance"]))
-    provenance = Provenance.of(shot.attrs)
-    if provenance is None:
-        return shot
-    origin = {"file": str(shot["name"].values), "sha256": report.get("sha256", "")}
-    image = provenance.image.model_copy(update=origin)
-    completed = provenance.model_copy(update={"image": image})
-    return shot.assign_attrs(provenance=completed.model_dump_json(exclude_none=True))
+    provenance = provenance_of(shot)
+    return shot if provenance is None else shot.assign_attrs(provenance=provenance.to_json())
 
 
 def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> Path:

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     import xarray
     from rich.table import Table
 
-    from napari_shadowinv.cli._rerun import FileLocator
     from napari_shadowinv.film import Pack
 
 LayersFormat = Literal["tiff", "pradformat"]
@@ -151,31 +150,6 @@ def write_pack(
 
     figures = {figure: pack_figure(dataset, title=name)}
     _outputs.write_with_figures(dataset, figures, result, overwrite)
-
-
-def rerun_pack(
-    dataset: xarray.Dataset, files: FileLocator, outputs: list[Path], quiet: bool
-) -> tuple[xarray.Dataset, Rows]:
-    """Repeat a film pack from the scans that its dataset names, and list the changes."""
-    import numpy as np
-
-    from napari_shadowinv.cli._rerun import UNCHANGED, version_changes
-    from napari_shadowinv.film import Pack
-
-    pack = Pack.model_validate_json(dataset.attrs["pack"])
-    for file in pack.files:
-        files.check(file, "the file")
-    _outputs.protect(outputs, [files.result, *pack.files])
-    again = _run_pack(pack, quiet)
-    changes = version_changes(str(dataset.attrs["package_version"]))
-    rows = [("changed", change) for change in changes]
-    for old, new in zip(dataset["sha256"].values, again["sha256"].values, strict=True):
-        if old != new:
-            rows.append(("changed", f"a scan with the checksum {old[:12]}… is now {new[:12]}…"))
-    is_equal = again["fluence"].shape == dataset["fluence"].shape and all(
-        np.array_equal(again[name], dataset[name], equal_nan=True) for name in ("dose", "fluence")
-    )
-    return again, [*rows, ("difference", UNCHANGED if is_equal else "doses or fluences differ")]
 
 
 def layer_table(dataset: xarray.Dataset) -> Table:

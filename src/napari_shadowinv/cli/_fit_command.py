@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from napari_shadowinv.cli import _flags, _inputs, _outputs
-from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups
+from napari_shadowinv.cli._terminal import (
+    is_interrupted,
+    notify_errors,
+    progress_bars,
+    say,
+    warn_of_setups,
+)
 from napari_shadowinv.io.formats import IMAGE_TITLES
 
 # Help of arguments, where it is longer than a line.
@@ -111,6 +118,7 @@ def fit(
     from napari_shadowinv.pipeline import write_recipe
     from napari_shadowinv.pipeline.fit_shots import read_rows
     from napari_shadowinv.pipeline.shot_table import shot_rows
+    from napari_shadowinv.pipeline.static_checks import run_checks
 
     lists = {"energy": energies, "strength": strengths}
     if brightness not in (None, "known", "free"):
@@ -143,15 +151,19 @@ def fit(
         )
     else:
         result_fit = _fit_result.fit_images(chosen, shots, fiducials, quiet)
-    static = _static_result.run_checks(chosen, shots, result_fit, short, quiet, **checks)
+    with nullcontext() if quiet else progress_bars() as show:
+        callbacks: dict[str, Any] = {"on_progress": show, "should_stop": is_interrupted}
+        static = run_checks(chosen, shots, result_fit, names=short, **checks, **callbacks)
     _fit_result.write_fit(result_fit, names, result, figure, overwrite, static)
     if save_recipe is not None:
         setups = {shot.setup for shot in shots}
         (common,) = setups if len(setups) == 1 else (None,)
         write_recipe(save_recipe, chosen.model_copy(update={"setup": common}), overwrite=overwrite)
     if not quiet:
-        for table in static.tables(result_fit, short, [row.energy for row in rows]):
+        for table in _static_result.check_tables(
+            static, result_fit, short, [row.energy for row in rows]
+        ):
             say(table)
         say(_fit_result.fit_table(result_fit, names, list(outputs)))
-    static.exit_unless_static(result)
+    _static_result.exit_unless_static(static, result)
     _fit_result.exit_unless_determined(result_fit, result)

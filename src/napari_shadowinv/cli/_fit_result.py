@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from napari_shadowinv._typing import FloatArray
-    from napari_shadowinv.cli._static_result import StaticChecks
     from napari_shadowinv.fitting import Fit
-    from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.pipeline import FitShot
-    from napari_shadowinv.preprocessing import FitProvenance, Recipe
+    from napari_shadowinv.pipeline.static_checks import StaticChecks
+    from napari_shadowinv.preprocessing import Recipe
+    from napari_shadowinv.provenance import Provenance
 
 
 def fit_images(
@@ -47,21 +47,6 @@ def fit_images(
     with nullcontext() if quiet else progress_bars() as show:
         return run_fit(
             recipe, shots, fiducials=fiducials, on_progress=show, should_stop=is_interrupted
-        )
-
-
-def refine_inversion(inversion: Inversion, provenance: FitProvenance, quiet: bool) -> Fit:
-    """Refine an inversion as a provenance says, with a bar for each stage."""
-    from napari_shadowinv.pipeline import run_refinement
-
-    assert provenance.recipe.fit is not None
-    with nullcontext() if quiet else progress_bars() as show:
-        return run_refinement(
-            inversion,
-            provenance.images[0].setup,
-            provenance.recipe.fit,
-            on_progress=show,
-            should_stop=is_interrupted,
         )
 
 
@@ -123,6 +108,7 @@ def write_fit(
 ) -> None:
     """Write a fit and its figures, all or none; `names` are the files of the images."""
     from napari_shadowinv.cli._outputs import write_with_figures
+    from napari_shadowinv.cli._static_result import check_figures
     from napari_shadowinv.io.files import text_of
     from napari_shadowinv.plotting import fit_figure
 
@@ -130,7 +116,7 @@ def write_fit(
     dataset, figures = fit.to_dataset(), {report: fit_figure(fit, title=title)}
     if static is not None:
         dataset = static.add_to(dataset)
-        figures |= static.figures(fit, report, title)
+        figures |= check_figures(static, fit, report, title)
     write_with_figures(dataset, figures, out, overwrite)
 
 
@@ -156,7 +142,7 @@ def fit_file_rows(dataset: xarray.Dataset) -> Rows:
 
     fit = Fit.from_dataset(dataset)
     provenance = fit.provenance
-    names = [] if provenance is None else [origin.image.file for origin in provenance.images]
+    names = [] if provenance is None else [origin.file for origin in provenance.images]
     return [
         ("kind", f"fit of shadowinv {dataset.attrs['package_version']}"),
         ("created", str(dataset.attrs["created"])),
@@ -167,16 +153,15 @@ def fit_file_rows(dataset: xarray.Dataset) -> Rows:
     ]
 
 
-def _provenance_rows(provenance: FitProvenance) -> Rows:
+def _provenance_rows(provenance: Provenance) -> Rows:
     """Return the steps before a fit, its choices, and the checksums of its files."""
     steps = [("step", step.described) for step in provenance.recipe.steps]
     fit = provenance.recipe.fit
     choices = {} if fit is None else fit.model_dump(exclude_none=True, exclude={"options"})
     rows = [*steps, ("fit", options_text(choices))]
     for number, image in enumerate(provenance.images, 1):
-        indices = (image.mask, image.source_mask)
-        masks = [provenance.masks[index] for index in indices if index is not None]
-        origins = [("image", image.image), ("source", image.source)]
+        masks = map(provenance.mask_of, (image.mask, image.source_mask))
+        origins = [("image", image), ("source", image.source)]
         for name, origin in [*origins, *(("mask", mask) for mask in masks)]:
             if origin is not None and origin.sha256:
                 rows.append((f"{name} {number} sha256", f"{origin.sha256} ({origin.file})"))

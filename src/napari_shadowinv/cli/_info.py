@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from napari_shadowinv._typing import AnyArray
     from napari_shadowinv.io import Radiograph
     from napari_shadowinv.io.formats import Format
-    from napari_shadowinv.preprocessing import Provenance
+    from napari_shadowinv.provenance import Provenance
 
 PACKAGES = (
     "numpy scipy numba llvmlite dask distributed xarray zarr h5py h5netcdf scikit-image matplotlib "
@@ -171,7 +171,7 @@ def _origin_rows(provenance: Provenance | None) -> _summary.Rows:
     """Return the files that a result was made from, and the steps before the inversion."""
     if provenance is None:
         return []
-    origins = {"image": provenance.image, "source": provenance.source}
+    origins = {"image": provenance.image, "source": provenance.image.source}
     rows: _summary.Rows = []
     for name, origin in origins.items():
         if origin is not None and origin.file:

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from napari_shadowinv.cli import _flags, _inputs, _outputs
-from napari_shadowinv.cli._terminal import exit_unless_converged, invert_shot, notify_errors, say
+from napari_shadowinv.cli._terminal import (
+    exit_unless_converged,
+    invert_shot,
+    is_interrupted,
+    notify_errors,
+    progress_bars,
+    say,
+    warn_of_setups,
+)
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
 
@@ -161,40 +170,22 @@ def rerun(
 
     With the same files and version, the result is identical bit for bit.
     """
-    from napari_shadowinv.cli import _fit_result
-    from napari_shadowinv.cli._film_command import rerun_pack, write_pack
-    from napari_shadowinv.cli._rerun import FileLocator, rerun_inversion
-    from napari_shadowinv.cli._rerun_fit import refit_table, rerun_fit
-    from napari_shadowinv.cli._summary import rerun_table, two_columns
-    from napari_shadowinv.inversion.variables import is_fit, is_pack
-    from napari_shadowinv.io import read_dataset
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, FIT_WRITERS, RESULT_WRITERS
+    from napari_shadowinv.cli import _rerun
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT_WRITERS
+    from napari_shadowinv.pipeline.rerun import collect_rerun
 
     target = out or Path(f"{result.stem}_again{result.suffix}")
     again_out, figure = _outputs.result_and_figure(result, target, figure)
-    written = [again_out, figure]
     _outputs.check_outputs({again_out: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}, overwrite)
-    dataset = read_dataset(result)
-    files = FileLocator(result, image or (), source, other_folders)
-    if is_pack(dataset.attrs):
-        remade, changes = rerun_pack(dataset, files, written, quiet)
-        write_pack(remade, result.name, again_out, figure, overwrite)
-        if not quiet:
-            say(two_columns("Rerun", changes))
-        return
-    if is_fit(dataset.attrs):
-        _outputs.check_outputs({again_out: tuple(FIT_WRITERS)}, overwrite)
-        refit = rerun_fit(dataset, files, written, quiet=quiet)
-        _fit_result.write_fit(refit.fit, refit.names, again_out, figure, overwrite)
-        if not quiet:
-            say(refit_table(refit, written))
-        _fit_result.exit_unless_determined(refit.fit, again_out)
-        return
-    again = rerun_inversion(dataset, files, written, quiet=quiet)
-    _outputs.write_inversion(again.inversion, again.shot, again_out, figure, overwrite)
+    inputs = collect_rerun(result, image, source=source, other_folders=other_folders)
+    _rerun.check_rerun(inputs, result, again_out, figure, overwrite)
+    warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in inputs.shots)
+    with nullcontext() if quiet else progress_bars() as show:
+        again = inputs.run(show, is_interrupted)
+    _rerun.write_rerun(again, inputs, result, again_out, figure, overwrite)
     if not quiet:
-        say(rerun_table(again, written))
-    exit_unless_converged(again.inversion.report, again_out)
+        say(_rerun.rerun_table(again, inputs, [again_out, figure]))
+    _rerun.exit_unless_sound(again, again_out)
 
 
 FORWARD_EPILOG = """

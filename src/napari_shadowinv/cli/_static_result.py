@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from napari_shadowinv.cli._summary import Rows
 from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
-    is_interrupted,
     plain,
-    progress_bars,
     say_on_stderr,
 )
 from napari_shadowinv.errors import InputError
@@ -27,52 +23,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from napari_shadowinv.fitting import Fit, FitWindows, LeaveOneOut
-    from napari_shadowinv.pipeline import FitShot
-    from napari_shadowinv.preprocessing import Recipe
-
-
-@dataclass(frozen=True)
-class StaticChecks:
-    """Checks that one static field explains the images, as far as requested."""
-
-    left_out: LeaveOneOut | None = None
-    windows: FitWindows | None = None
-
-    def add_to(self, dataset: xarray.Dataset) -> xarray.Dataset:
-        """Add the checks to the dataset of a fit."""
-        if self.left_out is not None:
-            addition = self.left_out.to_dataset()
-            dataset = dataset.assign(addition.data_vars).assign_attrs(addition.attrs)
-        return dataset if self.windows is None else self.windows.added_to(dataset)
-
-    def figures(self, fit: Fit, report: Path, title: str) -> dict[Path, Figure]:
-        """Return the figures of the checks by file."""
-        from napari_shadowinv.plotting import left_out_figure, windows_figure
-
-        left_out, windows = static_figures(report, left_out=True, window=1)
-        figures = {}
-        if self.left_out is not None:
-            figures[left_out] = left_out_figure(self.left_out, fit.setups, title=title)
-        if self.windows is not None:
-            figures[windows] = windows_figure(self.windows, title=title)
-        return figures
-
-    def tables(
-        self, fit: Fit, names: Sequence[str], energies: Sequence[float | None]
-    ) -> list[Table]:
-        """Return a table for each check; `energies` (MeV) are given in the rows."""
-        tables = []
-        if self.left_out is not None:
-            tables.append(left_out_table(self.left_out, fit, names, energies))
-        if self.windows is not None:
-            tables.append(windows_table(self.windows))
-        return tables
-
-    def exit_unless_static(self, out: Path) -> None:
-        """Exit with an error code if a static field does not explain an image."""
-        if self.left_out is not None and not self.left_out.explained.all():
-            say_on_stderr(f"NOT STATIC: {out} was written, but {self.left_out.explanation}")
-            raise typer.Exit(EXIT_NOT_CONVERGED)
+    from napari_shadowinv.pipeline.static_checks import StaticChecks
 
 
 def check_requests(
@@ -108,30 +59,36 @@ def static_figures(report: Path, *, left_out: bool, window: int | None) -> list[
     ]
 
 
-def run_checks(
-    recipe: Recipe,
-    shots: Sequence[FitShot],
-    fit: Fit,
-    names: Sequence[str],
-    quiet: bool,
-    *,
-    left_out: bool,
-    window: int | None,
-) -> StaticChecks:
-    """Leave out each image, and fit windows of them, with the fields of a fit."""
-    from napari_shadowinv.options import FitChoices
-    from napari_shadowinv.pipeline import run_leave_one_out, run_windows
+def check_figures(checks: StaticChecks, fit: Fit, report: Path, title: str) -> dict[Path, Figure]:
+    """Return the figures of the checks by file."""
+    from napari_shadowinv.plotting import left_out_figure, windows_figure
 
-    choices = (recipe.fit or FitChoices()).model_copy(
-        update={"fields": tuple(field.name for field in fit.fields)}
-    )
-    chosen = recipe.model_copy(update={"fit": choices})
-    with nullcontext() if quiet else progress_bars() as show:
-        callbacks: dict[str, Any] = {"on_progress": show, "should_stop": is_interrupted}
-        return StaticChecks(
-            run_leave_one_out(chosen, shots, names=names, **callbacks) if left_out else None,
-            None if window is None else run_windows(chosen, shots, window, **callbacks),
-        )
+    left_out, windows = static_figures(report, left_out=True, window=1)
+    figures = {}
+    if checks.left_out is not None:
+        figures[left_out] = left_out_figure(checks.left_out, fit.setups, title=title)
+    if checks.windows is not None:
+        figures[windows] = windows_figure(checks.windows, title=title)
+    return figures
+
+
+def check_tables(
+    checks: StaticChecks, fit: Fit, names: Sequence[str], energies: Sequence[float | None]
+) -> list[Table]:
+    """Return a table for each check; `energies` (MeV) are given in the rows."""
+    tables = []
+    if checks.left_out is not None:
+        tables.append(left_out_table(checks.left_out, fit, names, energies))
+    if checks.windows is not None:
+        tables.append(windows_table(checks.windows))
+    return tables
+
+
+def exit_unless_static(checks: StaticChecks, out: Path) -> None:
+    """Exit with an error code if a static field does not explain an image."""
+    if checks.left_out is not None and not checks.left_out.explained.all():
+        say_on_stderr(f"NOT STATIC: {out} was written, but {checks.left_out.explanation}")
+        raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
 def left_out_table(

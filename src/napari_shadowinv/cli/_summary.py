@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from napari_shadowinv._typing import AnyArray
-    from napari_shadowinv.cli._rerun import InversionRerun
     from napari_shadowinv.facts import Fact
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Provenance, Radiograph
+    from napari_shadowinv.preprocessing import Radiograph
+    from napari_shadowinv.provenance import Provenance
 
 Rows = list[tuple[str, str]]
 
@@ -58,34 +58,22 @@ def summary(inversion: Inversion, shot: Radiograph, written: list[Path]) -> Tabl
     return two_columns("Inversion", rows)
 
 
-def rerun_table(again: InversionRerun, written: list[Path]) -> Table:
-    """Build the table of a repeated inversion: its headline and the changes."""
-    rows = [
-        headline_row(again.inversion, again.inversion.setup),
-        ("image", f"{again.shot.path}, {size_text(again.inversion.image)}"),
-        *[("changed", text) for text in again.changes or ("nothing",)],
-        ("difference", again.difference),
-        *fact_rows(again.inversion.facts),
-        *written_rows(written),
-    ]
-    return two_columns("Rerun", rows)
-
-
 def provenance_rows(provenance: Provenance | None) -> Rows:
     """Return the steps before the inversion, and the origin of the source."""
     if provenance is None:
         return []
-    source, estimate = provenance.source, provenance.recipe.estimate
+    image, estimate = provenance.image, provenance.recipe.estimate
+    source = image.source
     if source is not None:
         origin = source.file or "an array"
     else:
         origin = "uniform" if estimate is None else estimate.described
-    rows = [*[("prepared", note) for note in provenance.notes], ("source", origin)]
-    for name, mask in (("mask", provenance.mask), ("source mask", provenance.source_mask)):
-        if mask is not None:
+    rows = [*[("prepared", note) for note in image.notes], ("source", origin)]
+    for name, index in (("mask", image.mask), ("source mask", image.source_mask)):
+        if (mask := provenance.mask_of(index)) is not None:
             rows.append((name, mask.file or "drawn"))
-    if provenance.brightness is not None:
-        rows.append(("brightness", f"{provenance.brightness:g} (the image was divided by it)"))
+    if image.brightness is not None:
+        rows.append(("brightness", f"{image.brightness:g} (the image was divided by it)"))
     return rows
 
 

@@ -31,7 +31,7 @@ from napari_shadowinv.inversion.variables import (
 from napari_shadowinv.options import FIELDS, FitOptions
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
 from napari_shadowinv.physics.units import PeakError, ShownField, peak_facts, shown_fields
-from napari_shadowinv.preprocessing import FitProvenance
+from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
     import xarray
@@ -221,7 +221,7 @@ class Fit:
         The options used.
     setups : tuple of Setup
         The experiment of each image, if they are known.
-    provenance : FitProvenance or None
+    provenance : Provenance or None
         How it was made, if that is known: from which files, and by which recipe.
     """
 
@@ -242,7 +242,7 @@ class Fit:
     report: FitReport
     options: FitOptions
     setups: tuple[Setup, ...] = ()
-    provenance: FitProvenance | None = None
+    provenance: Provenance | None = None
 
     @property
     def used(self) -> BoolArray:
@@ -269,7 +269,7 @@ class Fit:
         """Reasons to doubt the images, each with the name of its image."""
         images = () if self.provenance is None else self.provenance.images
         return tuple(
-            caution.about(each.image.file or f"image {number}")
+            caution.about(each.file or f"image {number}")
             for number, each in enumerate(images, 1)
             for caution in each.warnings
         )
@@ -390,7 +390,7 @@ class Fit:
             "setups": json.dumps([each.model_dump(mode="json") for each in used_setups]),
         }
         if self.provenance is not None:
-            history["provenance"] = self.provenance.model_dump_json(exclude_none=True)
+            history["provenance"] = self.provenance.to_json()
         merged = xr.Dataset()
         for field in self.fields:
             part = dataset_from_field(field.displacement, field.potential, setup)
@@ -480,7 +480,7 @@ class Fit:
                 setup_from_dict(values, "the dataset's setups")
                 for values in json.loads(attributes["setups"])
             ),
-            provenance=FitProvenance.of(attributes),
+            provenance=Provenance.of(attributes),
         )
 
     def _arrays(self) -> dict[str, AnyArray]:

@@ -27,7 +27,7 @@ from napari_shadowinv.inversion.variables import (
 )
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.units import peak_facts, shown_fields
-from napari_shadowinv.preprocessing import Provenance
+from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
     import xarray
@@ -319,7 +319,7 @@ class Inversion:
             "image_residual": self.report.image_residual,
         }
         if self.provenance is not None:
-            history["provenance"] = self.provenance.model_dump_json(exclude_none=True)
+            history["provenance"] = self.provenance.to_json()
             setup = self.setup if setup is None else setup
         if self.errors is not None and setup is not None:
             field = setup.main_field

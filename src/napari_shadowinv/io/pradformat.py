@@ -31,7 +31,7 @@ from napari_shadowinv.inversion.variables import (
 )
 from napari_shadowinv.io.dataset import require
 from napari_shadowinv.io.hdf5 import hdf5_in_memory, held_arrays, load_dataset, member
-from napari_shadowinv.preprocessing import Provenance
+from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
     import xarray
@@ -213,8 +213,8 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
         attributes["description"] = f"Fit of the forward model by napari-shadowinv: {verdict}"
     provenance = Provenance.of(dataset.attrs)
     if provenance is not None:
-        attributes["provenance"] = provenance.model_dump_json(exclude_none=True)
-        if provenance.image.file:
+        attributes["provenance"] = provenance.to_json()
+        if provenance.images and provenance.image.file:
             attributes["radiograph_filename"] = provenance.image.file
     _write_object(path, datasets, attributes)
 

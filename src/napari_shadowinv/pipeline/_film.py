@@ -35,7 +35,9 @@ from napari_shadowinv.film.scans import common_shape, upright
 from napari_shadowinv.fitting.measurements import estimated_noise
 from napari_shadowinv.inversion.variables import PACK_FORMAT, PIXEL, place_coordinates
 from napari_shadowinv.io.images import Scan
+from napari_shadowinv.io.files import text_of
 from napari_shadowinv.pipeline._film_inputs import Film, in_parallel, read_films, to_scan_frame
+from napari_shadowinv.provenance import ImageOrigin, Provenance
 
 if TYPE_CHECKING:
     import xarray
@@ -49,7 +51,7 @@ _MAX_DARK_SHARE = 0.01  # of a film's pixels
 _CUT_APART_PX = 3.0  # films whose sides differ by more were not cut together
 _PER_AREA = "1/(m² MeV)"
 _UNITS = {"dose": "Gy", "dose_error": "Gy", "fluence": _PER_AREA, "fluence_error": _PER_AREA}
-_UNITS |= {"usable": "1", "by_images": "1", "sha256": "1", "turn": "rad"}
+_UNITS |= {"usable": "1", "by_images": "1", "turn": "rad"}
 
 _SEEN_FROM = {
     None: "the source (assumed)",
@@ -153,7 +155,20 @@ def run_film(
     by_film = _layer_variables(pack, films, cut, poses)
     warnings = _warnings(aligned, doses, poses, pack)
     setups = pack.setups(spectra.energies, pixel)
-    return _dataset(pack, response, spectra.energies, setups, pixel, planes, by_film, warnings)
+    provenance = Provenance(kind="film pack", pack=pack, images=_scans(pack, films))
+    return _dataset(
+        pack, response, spectra.energies, setups, pixel, planes, by_film, warnings, provenance
+    )
+
+
+def _scans(pack: Pack, films: list[Film]) -> tuple[ImageOrigin, ...]:
+    """Return the origin of each film's scan."""
+    origins = []
+    for film in films:
+        file = pack.layers[film.number - 1].file or pack.scan
+        name = "" if file is None else text_of(file.name)
+        origins.append(ImageOrigin(file=name, sha256=film.scan.checksum))
+    return tuple(origins)
 
 
 def _scale_about_axis(films: list[Film], pack: Pack, scales: FloatArray) -> list[Film]:
@@ -286,7 +301,6 @@ def _layer_variables(
         "shift_error": (("layer",), np.full(count, np.nan)),
         "by_images": (("layer",), np.zeros(count, dtype=bool)),
         "corners": (("layer", "corner", "component"), np.full((count, 4, 2), np.nan)),
-        "sha256": (("layer",), np.full(count, "", dtype="U64")),
     }
     for k, film in enumerate(films):
         at = film.number - 1
@@ -294,7 +308,6 @@ def _layer_variables(
         values["turn"][1][at] = poses.turns[k]
         values["shift_error"][1][at] = poses.errors[k]
         values["by_images"][1][at] = poses.by_images[k]
-        values["sha256"][1][at] = film.scan.checksum
         layer = pack.layers[at]
         _, on_scan = to_scan_frame(
             film.scan, corners[film.number], layer.turned, pack.is_mirrored(layer)
@@ -357,6 +370,7 @@ def _dataset(
     planes: dict[str, Any],
     by_film: ByLayer,
     warnings: list[Caution],
+    provenance: Provenance,
 ) -> xarray.Dataset:
     import xarray as xr
 
@@ -381,7 +395,7 @@ def _dataset(
         "format": PACK_FORMAT,
         "package_version": __version__,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "pack": pack.model_dump_json(exclude_defaults=True),
+        "provenance": provenance.to_json(),
         "warnings": json.dumps([asdict(caution) for caution in warnings]),
         "seen_from": _SEEN_FROM[pack.seen_from],
     }

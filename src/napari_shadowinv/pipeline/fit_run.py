@@ -15,7 +15,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv import __version__
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.cautions import Caution
@@ -31,16 +30,13 @@ from napari_shadowinv.pipeline.shot_table import fiducials_from
 from napari_shadowinv.preprocessing import (
     FIT_STEPS,
     Estimate,
-    FitOrigin,
-    FitProvenance,
-    Origin,
     Radiograph,
     Recipe,
     UniformEstimate,
     estimated_source,
 )
-from napari_shadowinv.preprocessing.fit_provenance import short_fiducials, short_masks
 from napari_shadowinv.preprocessing.image_checks import image_warnings
+from napari_shadowinv.provenance import Origin, Provenance, index_masks
 
 __all__ = [
     "COMPARED",
@@ -109,7 +105,7 @@ class FitInputs:
         The images after the recipe's steps, with setup, source and mask, on one grid of pixels.
     names : tuple of str
         Names of the images in messages.
-    provenance : FitProvenance
+    provenance : Provenance
         Origin of all inputs, and the recipe.
     fiducials : ndarray or None
         Known displacements in the first image.
@@ -118,7 +114,7 @@ class FitInputs:
     recorded: tuple[FitShot, ...]
     shots: tuple[Radiograph, ...]
     names: tuple[str, ...]
-    provenance: FitProvenance
+    provenance: Provenance
     fiducials: FloatArray | None
 
     @property
@@ -340,11 +336,14 @@ def collect_fit_inputs(
     source = recipe.estimate
     cleared = {"source": source, "mask": None, "source_mask": None, "setup": None, "fit": resolved}
     table, origin = _read_fiducials(fiducials)
-    provenance = _provenance(recipe.model_copy(update=cleared), recorded, collected, ready)
-    rows = None if table is None else short_fiducials(table)
-    fiducial_entries = {"fiducials": origin, "fiducial_rows": rows}
-    complete = FitProvenance.model_validate({**dict(provenance), **fiducial_entries})
-    return FitInputs(recorded, tuple(ready), tuple(names), complete, table)
+    provenance = Provenance(
+        kind="fit",
+        recipe=_without_folder(recipe).model_copy(update=cleared),
+        **_image_origins(recorded, collected, ready),
+        fiducials=origin,
+        fiducial_rows=None if table is None else table.tolist(),
+    )
+    return FitInputs(recorded, tuple(ready), tuple(names), provenance.shorten(), table)
 
 
 def check_fit(recipe: Recipe) -> None:
@@ -399,7 +398,7 @@ def _collect_image(recipe: Recipe, shot: FitShot, name: str, *, unknown: bool) -
 def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) -> Radiograph:
     """Apply the steps to an image, and estimate its source if the recipe does so."""
     try:
-        shot = inputs.prepared(should_stop)
+        shot = inputs.prepare(should_stop)
         doubts = image_warnings(shot.image, shot.source, shot.mask)
         if shot.setup is not None:
             doubts += setup_warnings(shot.setup, shot.shape)
@@ -443,40 +442,27 @@ def _read_fiducials(fiducials: ArrayLike | Path | None) -> tuple[FloatArray | No
     return np.array(fiducials, dtype=np.float64), Origin()
 
 
-def _provenance(
-    recipe: Recipe,
-    recorded: Sequence[FitShot],
-    collected: Sequence[Inputs],
-    ready: Sequence[Radiograph],
-) -> FitProvenance:
-    masks: list[Origin] = []
+def _without_folder(recipe: Recipe) -> Recipe:
+    """Return the recipe with the name of its dark frame only; the images have its checksum."""
+    dark = recipe.dark_file
+    return recipe if dark is None else recipe.with_dark_file(Path(text_of(dark.name)))
 
-    def place(mask: Origin | None) -> int | None:
-        if mask is None:
-            return None
-        if mask not in masks:
-            masks.append(mask)
-        return masks.index(mask)
 
-    images = tuple(
-        FitOrigin(
-            image=inputs.provenance.image,
-            source=inputs.provenance.source,
-            mask=place(inputs.provenance.mask),
-            source_mask=place(inputs.provenance.source_mask),
-            setup=inputs.shot.setup,
-            strength=row.strength,
-            brightness=row.brightness,
-            psf=row.psf,
-            noise=row.noise,
-            notes=shot.notes,
-            warnings=shot.warnings,
-        )
-        for row, inputs, shot in zip(recorded, collected, ready, strict=True)
-    )
-    return FitProvenance(
-        version=__version__, recipe=recipe, images=images, masks=short_masks(masks)
-    )
+def _image_origins(
+    recorded: Sequence[FitShot], collected: Sequence[Inputs], ready: Sequence[Radiograph]
+) -> dict[str, Any]:
+    """Return the images and masks of a fit's provenance."""
+    origins, masks = [], []
+    for row, inputs, shot in zip(recorded, collected, ready, strict=True):
+        before = inputs.provenance
+        names = ("strength", "brightness", "psf", "noise")
+        entries: dict[str, Any] = {name: getattr(row, name) for name in names}
+        entries["setup"] = inputs.shot.setup
+        entries |= {"notes": shot.notes, "warnings": shot.warnings}
+        origins.append(before.image.model_copy(update=entries))
+        indices = before.image.mask, before.image.source_mask
+        masks.append([before.mask_of(index) for index in indices])
+    return index_masks(origins, masks)
 
 
 def _common_values(

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv import __version__
 from napari_shadowinv._system.arrays import (
     check_spacing,
     join_masks,
@@ -37,8 +36,6 @@ from napari_shadowinv.physics.setup import deflection_warnings, setup_warnings
 from napari_shadowinv.pipeline.cache import Cache
 from napari_shadowinv.preprocessing import (
     MeasuredSource,
-    Origin,
-    Provenance,
     Radiograph,
     Recipe,
     UniformEstimate,
@@ -46,6 +43,7 @@ from napari_shadowinv.preprocessing import (
     uniform_warnings,
 )
 from napari_shadowinv.preprocessing.estimates import centre_within
+from napari_shadowinv.provenance import ImageOrigin, MaskOrigin, Origin, Provenance, index_masks
 
 __all__ = ["PREVIEW_PIXELS", "PREVIEW_SITES", "Inputs", "collect_inputs", "run", "run_prepared"]
 
@@ -74,9 +72,9 @@ class Inputs:
     shot: Radiograph
     provenance: Provenance
 
-    def prepared(self, should_stop: ShouldStop | None = None) -> Radiograph:
-        """Return the shot after the recipe's steps; see `Recipe.prepared`."""
-        return self.recipe.prepared(self.shot, should_stop)
+    def prepare(self, should_stop: ShouldStop | None = None) -> Radiograph:
+        """Return the shot after the recipe's steps; see `Recipe.prepare`."""
+        return self.recipe.prepare(self.shot, should_stop)
 
 
 def run(
@@ -140,7 +138,7 @@ def run(
     report("prepare", 0, None, "image and source")
     inputs = collect_inputs(recipe, shot, source=source, mask=mask, source_mask=source_mask)
     inputs.recipe.check(inputs.shot)
-    ready = inputs.prepared(should_stop)
+    ready = inputs.prepare(should_stop)
     inversion = run_prepared(
         inputs,
         ready,
@@ -214,8 +212,8 @@ def run_prepared(
     seconds |= {stage: spent[stage] + seconds.get(stage, 0.0) for stage in spent}
     notes = (*shot.notes, "previewed") if preview else shot.notes
     recipe = inputs.provenance.recipe.model_copy(update={"options": options})
-    provenance = inputs.provenance.model_copy(
-        update={"setup": shot.setup, "notes": notes, "recipe": recipe}
+    provenance = inputs.provenance.with_image(notes=notes).model_copy(
+        update={"setup": shot.setup, "recipe": recipe}
     )
     inversion = replace(
         inversion, report=replace(inversion.report, seconds=seconds), provenance=provenance
@@ -298,15 +296,13 @@ def collect_inputs(
     dark = _dark_frame(recipe, radiograph)
     if dark is not None:
         resolved = resolved.with_dark_file(Path(_origin(dark).file))
-    provenance = Provenance(
-        version=__version__,
-        recipe=resolved,
-        image=_origin(radiograph),
+    origin = ImageOrigin(
+        **dict(_origin(radiograph)),
         source=None if beam is None else _origin(beam),
         dark=None if dark is None else _origin(dark),
-        mask=usable.origin,
-        source_mask=bare.origin,
     )
+    masks = index_masks([origin], [(usable.origin, bare.origin)])
+    provenance = Provenance(kind="inversion", recipe=resolved, **masks).shorten()
     complete = replace(
         radiograph,
         source=None if beam is None else beam.image,
@@ -346,10 +342,10 @@ class _Mask:
     file: Path | None
 
     @property
-    def origin(self) -> Origin | None:
+    def origin(self) -> MaskOrigin | None:
         if self.pixels is None:
             return None
-        packed = Origin.of_mask(self.pixels)
+        packed = MaskOrigin.of(self.pixels)
         if self.file is None:
             return packed
         file_origin = {"file": text_of(self.file.name), "sha256": sha256(self.file)}

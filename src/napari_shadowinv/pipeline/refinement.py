@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from napari_shadowinv import __version__
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.fitting import Fit, fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import FIELDS, FitChoices, FitOptions
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.preprocessing import FitOrigin, FitProvenance, Provenance
+from napari_shadowinv.provenance import Provenance
 
 __all__ = ["refinement_choices", "run_refinement"]
 
@@ -83,7 +82,7 @@ def refinement_choices(inversion: Inversion, setup: Setup | None, psf: float = 0
     return FitChoices(fields=(field,), psf=psf, options=options)
 
 
-def _provenance(start: Provenance, setup: Setup | None, choices: FitChoices) -> FitProvenance:
+def _provenance(start: Provenance, setup: Setup | None, choices: FitChoices) -> Provenance:
     recipe = start.recipe.model_copy(update={"setup": None, "fit": choices})
-    image = FitOrigin(image=start.image, source=start.source, setup=setup, notes=start.notes)
-    return FitProvenance(version=__version__, recipe=recipe, images=(image,), start=start)
+    image = start.image.model_copy(update={"mask": None, "source_mask": None, "setup": setup})
+    return Provenance(kind="fit", recipe=recipe, images=(image,), start=start)

@@ -1,26 +1,77 @@
 """Tests of one static field against several images: `run_leave_one_out`, `run_windows`.
 
+Both, as far as requested, next to the fit of all images: `run_checks`.
 Images are processed in order of energy, so results do not depend on their order in the call.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import FitWindows, LeaveOneOut, fit, leave_one_out
+from napari_shadowinv.fitting import Fit, FitWindows, LeaveOneOut, fit, leave_one_out
 from napari_shadowinv.fitting.agreement import check_count
 from napari_shadowinv.fitting.measurements import strengths_of
+from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline.fit_run import FitInputs, FitShot, collect_fit_inputs
 from napari_shadowinv.pipeline.inversion_run import Shot
 from napari_shadowinv.preprocessing import Recipe
 
-__all__ = ["check_count", "check_window", "run_leave_one_out", "run_windows"]
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = [
+    "StaticChecks",
+    "check_count",
+    "check_window",
+    "run_checks",
+    "run_leave_one_out",
+    "run_windows",
+]
+
+
+@dataclass(frozen=True)
+class StaticChecks:
+    """Checks that one static field explains the images, as far as requested."""
+
+    left_out: LeaveOneOut | None = None
+    windows: FitWindows | None = None
+
+    def add_to(self, dataset: xarray.Dataset) -> xarray.Dataset:
+        """Add the checks to the dataset of a fit."""
+        if self.left_out is not None:
+            addition = self.left_out.to_dataset()
+            dataset = dataset.assign(addition.data_vars).assign_attrs(addition.attrs)
+        return dataset if self.windows is None else self.windows.added_to(dataset)
+
+
+def run_checks(
+    recipe: Recipe,
+    shots: Sequence[FitShot | Shot],
+    fit: Fit,
+    *,
+    left_out: bool,
+    window: int | None,
+    names: Sequence[str] | None = None,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> StaticChecks:
+    """Leave out each image, and fit windows of `window` images, with the fields of a fit."""
+    choices = (recipe.fit or FitChoices()).model_copy(
+        update={"fields": tuple(field.name for field in fit.fields)}
+    )
+    chosen = recipe.model_copy(update={"fit": choices})
+    callbacks: dict[str, Any] = {"on_progress": on_progress, "should_stop": should_stop}
+    return StaticChecks(
+        run_leave_one_out(chosen, shots, names=names, **callbacks) if left_out else None,
+        None if window is None else run_windows(chosen, shots, window, **callbacks),
+    )
 
 
 def run_leave_one_out(

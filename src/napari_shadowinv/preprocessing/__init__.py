@@ -1,6 +1,6 @@
 """Preparation of a shot for its inversion, and the recipe of it.
 
-- the shot: `Radiograph`; the recipe: `Recipe`; the files it was applied to: `Provenance`
+- the shot: `Radiograph`; the recipe: `Recipe`
 - whether image and source look right: `image_warnings`, `ReferencePair`
 - steps: `Dark`, `Rotate`, `Crop`, `Bin`, and filters by name in `FILTERS`; as functions `low_pass`,
   `high_pass`, `butterworth`, `remove_background`, `remove_hot_pixels`

@@ -26,7 +26,6 @@ from .filters import (
     low_pass,
     remove_background,
 )
-from .fit_provenance import FitOrigin, FitProvenance
 from .hot_pixels import HotPixelFilter, remove_hot_pixels
 from .image_checks import ReferencePair, image_warnings
 from .pixels import fit_polynomial, interpolated_source
@@ -37,8 +36,6 @@ from .recipe import (
     FIT_STEPS,
     STEPS,
     MeasuredSource,
-    Origin,
-    Provenance,
     Recipe,
     check_masks,
     estimated_source,
@@ -58,8 +55,6 @@ __all__ = [
     "Dark",
     "Estimate",
     "Filter",
-    "FitOrigin",
-    "FitProvenance",
     "GaussianEstimate",
     "HighPassFilter",
     "HotPixelFilter",
@@ -68,9 +63,7 @@ __all__ = [
     "LowPassEstimate",
     "LowPassFilter",
     "MeasuredSource",
-    "Origin",
     "PolynomialEstimate",
-    "Provenance",
     "Radiograph",
     "Recipe",
     "ReferencePair",

@@ -2,21 +2,18 @@
 
 - all steps, by name: `STEPS`; only filters: `FILTERS`; steps allowed before a fit: `FIT_STEPS`;
   estimates of the source: `ESTIMATES`
-- a recipe with the files it was applied to, stored with a result: `Provenance`, `Origin`
 """
 
 from __future__ import annotations
 
-import base64
-import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import reduce
 from operator import or_
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field
 
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -39,7 +36,6 @@ _CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 _LEAST_VISIBLE = 0.1  # of an object under the source mask, for the inversion to see it
 _LEAST_OBJECT = 10  # pixels
 _MOST_FALL = 10.0  # times below the dimmest pixel seen
-_LONGEST_MASK = 48_000  # characters: HDF5 keeps no longer attributes
 
 
 class MeasuredSource(Choice):
@@ -159,7 +155,7 @@ class Recipe(CheckedModel):
             shape = step.shape_after(shape)
         return matrix
 
-    def moved(self, shot: Radiograph) -> Radiograph:
+    def move(self, shot: Radiograph) -> Radiograph:
         """Return a shot after only the steps that move pixels, such as for its masks."""
         for step in self.steps:
             if step.moves_pixels:
@@ -207,7 +203,7 @@ class Recipe(CheckedModel):
                 "choose an estimate"
             )
 
-    def prepared(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+    def prepare(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
         """Return a shot, with its source and masks, after all steps; see `Step.applied`."""
         for step in self.steps:
             shot = step.applied(shot, should_stop)
@@ -282,75 +278,3 @@ def _check_fall(
             "with another estimate"
         )
         (on_caution or warn_of)(Caution("source", text))
-
-
-class Origin(CheckedModel):
-    """Origin of an image.
-
-    Attributes
-    ----------
-    file, sha256 : str
-        Name of the file, without its folder, and its checksum; "" if it was an array.
-    variable, channel : str or int or None
-        Array and colour channel taken from the file.
-    pixels, shape : str and tuple of int, or None
-        A drawn mask, packed, and its shape.
-    """
-
-    model_config = _CONFIG
-    file: str = ""
-    sha256: str = ""
-    variable: str | None = None
-    channel: str | int | None = None
-    pixels: str | None = None
-    shape: tuple[int, int] | None = None
-
-    @classmethod
-    def of_mask(cls, mask: BoolArray) -> Origin:
-        """Pack a mask, unless it is too complicated for the file."""
-        packed = base64.b85encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode()
-        height, width = mask.shape
-        return cls(pixels=packed if len(packed) <= _LONGEST_MASK else None, shape=(height, width))
-
-    def mask(self) -> BoolArray | None:
-        """Unpack a mask."""
-        if self.pixels is None or self.shape is None:
-            return None
-        size = self.shape[0] * self.shape[1]
-        try:
-            bits = zlib.decompressobj().decompress(base64.b85decode(self.pixels), size // 8 + 8)
-        except (ValueError, zlib.error):
-            bits = b""
-        if min(self.shape) < 1 or len(bits) != -(-size // 8):
-            raise InputError("the mask kept with the result is damaged: give the mask again")
-        packed = np.frombuffer(bits, np.uint8)
-        return np.unpackbits(packed, count=size).reshape(self.shape).astype(bool)
-
-
-class Provenance(CheckedModel):
-    """Provenance of a result, by which it can be repeated.
-
-    The `recipe` includes the setup and the kind of source from the image's file; `setup` describes
-    the result's pixels; the image was divided by its `brightness`, if it has one; `notes` are
-    notes of the steps, for people.
-    """
-
-    model_config = _CONFIG
-    version: str
-    recipe: Recipe
-    image: Origin = Origin()
-    source: Origin | None = None
-    dark: Origin | None = None
-    mask: Origin | None = None
-    source_mask: Origin | None = None
-    setup: Setup | None = None
-    brightness: float | None = None
-    notes: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, attributes: Mapping[str, Any]) -> Provenance | None:
-        """Read the provenance from a dataset's attributes; None if it is missing or unreadable."""
-        try:
-            return cls.model_validate_json(attributes.get("provenance", ""))
-        except ValidationError:
-            return None

@@ -116,7 +116,7 @@ class FitWork:
         if np.isfinite(fit.report.uncertainty):
             entries["uncertainty"] = fit.report.uncertainty
         provenance = fit.provenance
-        if provenance is not None and any(image.image.file for image in provenance.images):
+        if provenance is not None and any(image.file for image in provenance.images):
             entries["images"] = [
                 image.model_dump(mode="json", exclude_none=True, exclude={"mask", "source_mask"})
                 for image in provenance.images

@@ -33,12 +33,12 @@ from napari_shadowinv.pipeline.shot_table import ShotRow, is_table
 from napari_shadowinv.preprocessing import (
     Estimate,
     MeasuredSource,
-    Origin,
     Radiograph,
     Recipe,
     Step,
     UniformEstimate,
 )
+from napari_shadowinv.provenance import Origin
 from napari_shadowinv.stack._discovery import Shots, find_shots, find_source, usual_shape
 from napari_shadowinv.stack._shots import FitStack, Stack, TableStack
 from napari_shadowinv.stack._sources import (
@@ -196,7 +196,7 @@ def _describe_inputs(
         )  # refuses a wrong setup
     if isinstance(source, (str, Path)):
         origin = Origin(file=text_of(Path(source).name))
-        provenance = inputs.provenance.model_copy(update={"source": origin})
+        provenance = inputs.provenance.with_image(source=origin)
         inputs = replace(inputs, provenance=provenance)
     return stack_shots, replace(inputs, shot=replace(inputs.shot, source=None)), sources
 
@@ -293,13 +293,13 @@ def _recipe(
 
 def _shared_beam(inputs: Inputs, sources: Any) -> Beam | None:
     """Return the common source after all steps, and mask; None if each shot has its own source."""
-    moved = inputs.recipe.moved(inputs.shot)
+    moved = inputs.recipe.move(inputs.shot)
     if isinstance(inputs.recipe.source, UniformEstimate):
         return Beam.of(moved.shape, None, moved.mask)
     if sources is None or isinstance(sources, Shots):
         return None
     beam = np.asarray(sources, np.float64)
-    ready = inputs.recipe.prepared(replace(inputs.shot, image=beam, source=beam))
+    ready = inputs.recipe.prepare(replace(inputs.shot, image=beam, source=beam))
     assert ready.source is not None
     checked_source(ready.source, ready.mask)
     return Beam.of(ready.shape, ready.source, ready.mask)
@@ -341,12 +341,13 @@ def coordinates_of(stack: Stack) -> dict[str, Any]:
 
 def attributes_of(stack: Stack) -> dict[str, str]:
     attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.setup).attrs
-    provenance = stack.inputs.provenance.model_copy(update={"setup": stack.setup})
+    kind = "fit" if isinstance(stack, FitStack) else "inversion"
+    provenance = stack.inputs.provenance.model_copy(update={"setup": stack.setup, "kind": kind})
     return {
         "format": FORMAT,
         **attributes,
         "options": stack.recipe.options.model_dump_json(),
-        "provenance": provenance.model_dump_json(exclude_none=True),
+        "provenance": provenance.to_json(),
         **({"fields": json.dumps([stack.fitted_field])} if isinstance(stack, FitStack) else {}),
     }
 

@@ -71,7 +71,7 @@ class Stack:
     @cached_property
     def moved(self) -> Radiograph:
         """Masks and setup after the steps that move pixels; its image means nothing."""
-        return self.recipe.moved(self.inputs.shot)
+        return self.recipe.move(self.inputs.shot)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -195,7 +195,7 @@ class TableStack(Stack):
             return None
         recorded = (self._shot(index).setup for index in range(len(self.shots)))
         bare = replace(self.inputs.shot, mask=None, source_mask=None)
-        moved = (self.recipe.moved(replace(bare, setup=setup)).setup for setup in recorded)
+        moved = (self.recipe.move(replace(bare, setup=setup)).setup for setup in recorded)
         return ["" if setup is None else setup.model_dump_json() for setup in moved]
 
     def work(self, variables: tuple[str, ...]) -> RowWork:

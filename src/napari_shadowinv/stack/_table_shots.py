@@ -215,15 +215,15 @@ class RowWork(Work):
             inputs.recipe.check(inputs.shot)
         entries: dict[str, Any] = {"brightness": row.brightness}
         if row.source is None:
-            entries["source"] = common.provenance.source
-        provenance = inputs.provenance.model_copy(update=entries)
+            entries["source"] = common.provenance.image.source
+        provenance = inputs.provenance.with_image(**entries)
         return dataclasses.replace(inputs, provenance=provenance)
 
     def report(self, inversion: Inversion) -> dict[str, Any]:
         """Return the report of a shot, with its own provenance and energy."""
         provenance = inversion.provenance
         assert provenance is not None
-        entries = {"provenance": json.loads(provenance.model_dump_json(exclude_none=True))}
+        entries = {"provenance": json.loads(provenance.to_json())}
         energy = getattr(provenance.setup, "energy", None)
         return {**super().report(inversion), **entries, **({"energy": energy} if energy else {})}
 

@@ -144,7 +144,7 @@ class Work:
             raise InputError(f"source has shape {np.shape(source)}, expected {self.shape}")
         inputs = self.collect_inputs(content, beam, source)
         recipe = inputs.recipe
-        ready = recipe.prepared(inputs.shot, should_stop)
+        ready = recipe.prepare(inputs.shot, should_stop)
         if beam is None and isinstance(recipe.source, UniformEstimate):
             beam = Beam.of(ready.shape, None, ready.mask)
         if beam is not None:

@@ -794,9 +794,9 @@ def test_window_and_command_make_the_same_fit_and_make_it_again(
     tool.masks.layer = window.add_labels(painted, name="dust")
     result = run(tool)
     provenance = result.provenance
-    assert [image.image.file for image in provenance.images] == ["fast.txt", "slow.txt"]
+    assert [image.file for image in provenance.images] == ["fast.txt", "slow.txt"]
     assert [image.source.file for image in provenance.images] == ["beam.txt"] * 2
-    assert all(image.image.sha256 and image.source.sha256 for image in provenance.images)
+    assert all(image.sha256 and image.source.sha256 for image in provenance.images)
     save(window, result, tmp_path / "window.shadowinv")
     output = command("rerun", "window.shadowinv", "--out", "again.shadowinv")
     assert "changed nothing" in output
@@ -849,7 +849,7 @@ def test_what_was_no_file_is_asked_for(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     result = run(tool)
-    assert [image.image.file for image in result.provenance.images] == ["", ""]
+    assert [image.file for image in result.provenance.images] == ["", ""]
     assert [image.setup for image in result.provenance.images] == list(SETUPS)
     save(window, result, tmp_path / "window.shadowinv")
     refused = CliRunner().invoke(app, ["rerun", "window.shadowinv"])

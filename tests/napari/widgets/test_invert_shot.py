@@ -25,14 +25,8 @@ from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
-from napari_shadowinv.preprocessing import (
-    STEPS,
-    Crop,
-    LowPassFilter,
-    PolynomialEstimate,
-    Provenance,
-    Recipe,
-)
+from napari_shadowinv.preprocessing import STEPS, Crop, LowPassFilter, PolynomialEstimate, Recipe
+from napari_shadowinv.provenance import Provenance
 
 Array = np.ndarray[Any, Any]
 FEW = {"n_sites": 500}

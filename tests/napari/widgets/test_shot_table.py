@@ -102,8 +102,9 @@ def test_a_table_is_shown_changed_and_inverted(
     assert (store.statuses() == DONE).all()
     stack = read(tool.store.store)
     assert [setup_from_dataset(stack.isel(shot=k)) for k in range(2)] == [at(6.0), SETUP]
-    assert "mask" not in store.report(0)["provenance"]
-    assert store.report(0)["provenance"]["brightness"] == 1.5
+    (origin,) = store.report(0)["provenance"]["images"]
+    assert "mask" not in origin
+    assert origin["brightness"] == 1.5
     # The layer is in the units of each shot's own energy: the same field twice.
     (field,) = [layer for layer in window.layers if role_of(layer) == "field"]
     first, second = (np.asarray(field.data[k]) for k in range(2))

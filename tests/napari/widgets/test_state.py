@@ -312,7 +312,7 @@ def test_a_source_mask_hides_the_object_from_the_estimate_alone(
     assert inversion.mask.all()
     assert np.ptp(inversion.potential) == pytest.approx(np.ptp(potential), rel=0.1)
     cropped = Recipe(steps=(Crop(y=(2, 62), x=(4, 70)),))
-    moved = cropped.moved(Radiograph(shot, source_mask=~is_object)).source_mask
+    moved = cropped.move(Radiograph(shot, source_mask=~is_object)).source_mask
     np.testing.assert_array_equal(moved, ~is_object[2:62, 4:70])
     with pytest.raises(InputError, match="source mask has shape"):
         run_recipe(recipe, shot, source_mask=is_object[1:])
@@ -443,7 +443,7 @@ def test_a_result_says_where_everything_came_from(
     assert dict(result_of(field).attributes) == origins  # type: ignore[union-attr]
     provenance = result_of(field).content.provenance  # type: ignore[union-attr]
     assert provenance.recipe.source == PolynomialEstimate()
-    assert provenance.source_mask.mask() is not None
+    assert provenance.masks[provenance.image.source_mask].mask() is not None
 
 
 def test_the_report_of_one_run_does_not_stand_beside_another(

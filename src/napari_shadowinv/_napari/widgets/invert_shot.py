@@ -159,7 +159,7 @@ class _Request:
         for _, keywords, _ in layer_data:
             if role_of(keywords) == SOURCE and mask is not None:
                 masked = Radiograph(mask.astype(float), source_mask=mask)
-                keywords["metadata"][KEY]["source_mask"] = self.recipe.moved(masked).source_mask
+                keywords["metadata"][KEY]["source_mask"] = self.recipe.move(masked).source_mask
         if self.preview:
             layer_data = [layer for layer in layer_data if role_of(layer[1]) in _PREVIEW_ROLES]
         return _FinishedInversion(inversion, layer_data)

@@ -1,0 +1,532 @@
+"""Repeat a result from its provenance: `rerun`.
+
+- read the inputs first, to check them before the work: `collect_rerun`
+- the provenance of a result, also of a shot of a stack: `provenance_of`
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from napari_shadowinv import __version__
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
+from napari_shadowinv._system.safety import as_file_errors
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.fitting import Fit
+from napari_shadowinv.fitting.windows import PREFIX
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.inversion.variables import setup_from_dataset
+from napari_shadowinv.io import read_dataset
+from napari_shadowinv.io.files import sha256
+from napari_shadowinv.pipeline._film import run_film
+from napari_shadowinv.pipeline.files import read_part
+from napari_shadowinv.pipeline.fit_run import FitShot, run_fit
+from napari_shadowinv.pipeline.inversion_run import Shot, picture_mask, radiograph_of, run
+from napari_shadowinv.pipeline.refinement import run_refinement
+from napari_shadowinv.pipeline.static_checks import StaticChecks, run_checks
+from napari_shadowinv.preprocessing import MeasuredSource, Radiograph, Recipe
+from napari_shadowinv.provenance import Origin, Provenance
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["IDENTICAL", "Rerun", "RerunInputs", "collect_rerun", "provenance_of", "rerun"]
+
+IDENTICAL = "none: the same result, bit for bit"
+_PAINTED = {"caustic"}  # may have been corrected by hand
+
+
+@dataclass(frozen=True, eq=False)
+class Rerun:
+    """A repeated result, and the changes since the first one.
+
+    Attributes
+    ----------
+    content : Inversion, Fit or Dataset
+        The result; of a film pack its dataset.
+    dataset : Dataset
+        All of it, with the images left out of a fit and its windows.
+    checks : StaticChecks
+        The images left out of a fit and its windows, if the first result has them.
+    changes : tuple of str
+        Changes of the version and the files.
+    difference : str
+        Difference of the results, `IDENTICAL` if there is none.
+    """
+
+    content: Any
+    dataset: xarray.Dataset
+    checks: StaticChecks
+    changes: tuple[str, ...]
+    difference: str
+
+    @property
+    def is_identical(self) -> bool:
+        """Whether it is the same result, bit for bit."""
+        return self.difference == IDENTICAL
+
+
+@dataclass(frozen=True, eq=False)
+class RerunInputs:
+    """Inputs of a rerun.
+
+    Attributes
+    ----------
+    dataset : Dataset
+        The first result.
+    provenance : Provenance
+        Its provenance.
+    recipe : Recipe
+        The recipe, with the dark frame where it is now.
+    shots : tuple of FitShot
+        The images with source, masks and setup; empty for a film pack.
+    fiducials : ndarray, Path or None
+        Known displacements in the first image.
+    files : tuple of Path
+        All files that were read, the images first.
+    changes : tuple of str
+        Changes of the version and of masks and tables.
+    """
+
+    dataset: xarray.Dataset
+    provenance: Provenance
+    recipe: Recipe
+    shots: tuple[FitShot, ...] = ()
+    fiducials: FloatArray | Path | None = None
+    files: tuple[Path, ...] = ()
+    changes: tuple[str, ...] = ()
+
+    @property
+    def has_left_out(self) -> bool:
+        """Whether the first result has the images of a fit left out one by one."""
+        return "left_out_chi2" in self.dataset
+
+    @property
+    def window(self) -> int | None:
+        """Number of images in a window of a fit; None if it has no windows."""
+        numbers = self.dataset.get(f"{PREFIX}image_number")
+        return None if numbers is None else int(numbers.sizes["member"])
+
+    def run(
+        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
+    ) -> Rerun:
+        """Repeat the result, and compare it with the first."""
+        callbacks: dict[str, Any] = {"on_progress": on_progress, "should_stop": should_stop}
+        kind, before, checks = self.provenance.kind, self.provenance, StaticChecks()
+        content: Any
+        if kind == "film pack":
+            assert before.pack is not None
+            content = run_film(before.pack, **callbacks)
+            dataset = content
+        elif kind == "inversion":
+            content = self._invert(self.recipe, **callbacks)
+            dataset = content.to_dataset()
+        else:
+            content, checks = self._fit(**callbacks)
+            dataset = checks.add_to(content.to_dataset())
+        after = Provenance.of(dataset.attrs)
+        changes = [*self.changes, *([] if after is None else _image_changes(before, after))]
+        difference = _difference(self.dataset, dataset)
+        return Rerun(content, dataset, checks, tuple(dict.fromkeys(changes)), difference)
+
+    def _invert(self, recipe: Recipe, **callbacks: Any) -> Inversion:
+        (shot,) = self.shots
+        assert isinstance(shot.image, Radiograph)
+        image, brightness = shot.image, shot.brightness
+        if brightness is not None:
+            image = replace(image, image=image.image / brightness)
+        masks: dict[str, Any] = {"mask": shot.mask, "source_mask": shot.source_mask}
+        source: Any = shot.source
+        try:
+            inversion = run(recipe, image, source=source, **masks, **callbacks)
+        except InputError as error:
+            raise InputError(f"{image.path}: {error}" if image.path else str(error)) from error
+        assert inversion.provenance is not None
+        return replace(inversion, provenance=inversion.provenance.with_image(brightness=brightness))
+
+    def _fit(self, **callbacks: Any) -> tuple[Fit, StaticChecks]:
+        start, choices = self.provenance.start, self.recipe.fit
+        if start is not None and choices is not None:
+            inversion = self._invert(_with_dark(start.recipe, self.recipe.dark_file), **callbacks)
+            setup = self.provenance.image.setup
+            return run_refinement(inversion, setup, choices, **callbacks), StaticChecks()
+        fit = run_fit(self.recipe, self.shots, fiducials=self.fiducials, **callbacks)
+        checks = run_checks(
+            self.recipe,
+            self.shots,
+            fit,
+            left_out=self.has_left_out,
+            window=self.window,
+            **callbacks,
+        )
+        return fit, checks
+
+
+def rerun(
+    result: Path | str | Inversion | Fit | xarray.Dataset,
+    images: Sequence[Shot] | Shot | None = None,
+    *,
+    source: Path | str | None = None,
+    other_folders: bool = False,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> Rerun:
+    """Repeat a result from its provenance, and report the changes.
+
+    With the same files and version the result is identical bit for bit.
+
+    Parameters
+    ----------
+    result : path, Dataset, Inversion or Fit
+        An inversion, a fit with its images left out and windows, a film pack, or the dataset of
+        one shot of a stack, which is inverted without another shot to start from.
+    images : sequence of path, array_like or Radiograph, optional
+        The images in their order. Default: the files that the provenance names, in the result's
+        folder or the current one.
+    source : path, optional
+        The measured source, if it has moved.
+    other_folders : bool, default False
+        Read also files in other folders that the provenance names. A result may come from anybody.
+    on_progress, should_stop : callable, optional
+        As for `run`.
+
+    Returns
+    -------
+    Rerun
+        The new result, the changes of files and version, and the difference.
+
+    Raises
+    ------
+    InputError
+        If the result has no readable provenance, names files in other folders, or was made from
+        another number of images.
+    FileFormatError
+        If a file does not exist or cannot be read.
+    InversionCancelled
+        If `should_stop` returned true.
+    """
+    inputs = collect_rerun(result, images, source=source, other_folders=other_folders)
+    return inputs.run(on_progress, should_stop)
+
+
+def collect_rerun(
+    result: Path | str | Inversion | Fit | xarray.Dataset,
+    images: Sequence[Shot] | Shot | None = None,
+    *,
+    source: Path | str | None = None,
+    other_folders: bool = False,
+    folder: Path | None = None,
+) -> RerunInputs:
+    """Read a result and the files of its provenance, otherwise as `rerun`.
+
+    `folder` is where the files of a result in memory are. Default: the current one.
+    """
+    dataset: Any = result
+    name = "the result"
+    if isinstance(result, (str, Path)):
+        dataset, name = read_dataset(result), str(result)
+        folder = Path(result).parent
+    elif isinstance(result, (Inversion, Fit)):
+        dataset = result.to_dataset()
+    provenance = _checked_provenance(dataset, name)
+    listed: Any = () if images is None else images
+    shots = (listed,) if isinstance(listed, (str, Path, Radiograph)) else tuple(listed)
+    reader = _Reader(name, folder or Path(), shots, source, other_folders)
+    if provenance.pack is not None:
+        files = provenance.pack.files
+        for file in files:
+            reader.check(file, "the file")
+        changes = _version_changes(provenance.version)
+        return RerunInputs(
+            dataset, provenance, Recipe(), files=tuple(files), changes=tuple(changes)
+        )
+    return reader.inputs(dataset, provenance)
+
+
+def provenance_of(dataset: xarray.Dataset) -> Provenance | None:
+    """Return the provenance of a result or of one shot of a stack, None if it has none."""
+    provenance = Provenance.of(dataset.attrs)
+    if "report" not in dataset.variables or dataset["report"].ndim:
+        return provenance
+    report = json.loads(str(dataset["report"].values))
+    if "provenance" in report:
+        return Provenance.of(report)
+    if provenance is None or provenance.kind != "inversion":
+        return None
+    origin = {"file": str(dataset["name"].values), "sha256": report.get("sha256", "")}
+    return provenance.with_image(**origin)
+
+
+def _checked_provenance(dataset: xarray.Dataset, name: str) -> Provenance:
+    """Return the provenance of a dataset, or raise an `InputError` that says what is wrong."""
+    if "shot" in dataset.dims:
+        raise InputError(
+            f"{name} is a stack: expected one result; export a shot with shadowinv export, or "
+            "choose one in Python, as in read_stack(path).isel(shot=3)"
+        )
+    provenance = provenance_of(dataset)
+    if provenance is None:
+        raise InputError(f"{name} {_defect(dataset)}")
+    if "report" not in dataset.variables:  # no shot of a stack
+        if provenance.kind == "inversion":
+            Inversion.from_dataset(dataset)
+        elif provenance.kind == "fit":
+            as_file_errors(lambda _: Fit.from_dataset(dataset))(name)
+    return provenance
+
+
+def _defect(dataset: xarray.Dataset) -> str:
+    """Describe a missing, damaged or newer provenance."""
+    text = dataset.attrs.get("provenance", "")
+    if not text:
+        return (
+            "has no provenance, like all results of invert() and fit() in scripts: repeat it with "
+            "a recipe (docs/recipes.md)"
+        )
+    try:
+        version = json.loads(text)["version"]
+    except (TypeError, ValueError, KeyError, RecursionError):
+        version = __version__
+    if version == __version__:
+        return (
+            "has a damaged provenance, or one of an earlier state of this version: repeat it with "
+            "a recipe (docs/recipes.md)"
+        )
+    return (
+        f"was made by version {str(version)[:20]}, and version {__version__} cannot read its "
+        "provenance: use that version, or repeat it with a recipe (docs/recipes.md)"
+    )
+
+
+@dataclass
+class _Reader:
+    """Reads the files of a result: the caller's, or those in its folder or the current one.
+
+    A result may come from anybody: files in other folders are read only if the caller allows it.
+    """
+
+    result: str
+    folder: Path
+    images: tuple[Shot, ...]
+    source: Path | str | None
+    other_folders: bool
+    files: list[Path] = field(default_factory=list)
+    changes: list[str] = field(default_factory=list)
+
+    def check(self, file: Path, name: str) -> None:
+        """Refuse a file outside of the result's folder and the current one."""
+        path = Path(os.path.abspath(file))  # a link in the result's folder belongs to the user
+        folders = (self.folder, Path())
+        is_inside = any(path.is_relative_to(os.path.abspath(folder)) for folder in folders)
+        if not (self.other_folders or is_inside):
+            raise InputError(
+                f"{self.result} names {name} {file}, which is in another folder: name the file to "
+                "use, or allow other folders if you trust the result (--other-folders, "
+                "other_folders=True)"
+            )
+
+    def inputs(self, dataset: xarray.Dataset, provenance: Provenance) -> RerunInputs:
+        """Read the inputs of an inversion or a fit."""
+        count = len(provenance.images)
+        if len(self.images) not in (0, count):
+            raise InputError(
+                f"received {len(self.images)} images, and {self.result} was made from {count}: "
+                "name all of them in their order, or none if they are in the result's folder"
+            )
+        # The image of a refinement was prepared by the recipe of its start.
+        origins = provenance.start or provenance
+        self._check_recipe(provenance.recipe)
+        self._check_recipe(origins.recipe)
+        self.changes += _version_changes(provenance.version)
+        numbered = provenance.kind == "fit"
+        images = [self._image(origins, k, numbered=numbered) for k in range(count)]
+        shots = [self._shot(origins, k, images[k], numbered=numbered) for k in range(count)]
+        dark = origins.image.dark
+        path = None if dark is None else self._find(dark, "the dark frame")
+        return RerunInputs(
+            dataset,
+            provenance,
+            _with_dark(provenance.recipe, path),
+            tuple(shots),
+            self._fiducials(provenance),
+            tuple(self.files if path is None else [*self.files, path]),
+            tuple(self.changes),
+        )
+
+    def _check_recipe(self, recipe: Recipe) -> None:
+        """Refuse files that a recipe names in other folders."""
+        files = {
+            "a mask": recipe.mask,
+            "a source mask": recipe.source_mask,
+            "a dark frame": recipe.dark_file,
+            "a source": recipe.source.file if isinstance(recipe.source, MeasuredSource) else None,
+        }
+        for name, file in files.items():
+            if file is not None:
+                self.check(file, name)
+
+    def _find(self, origin: Origin, name: str) -> Path:
+        """Return the file of an image, source, mask or table."""
+        candidates = [folder / origin.file for folder in (self.folder, Path()) if origin.file]
+        if candidates:
+            self.check(candidates[0], name)
+        path = next((file for file in candidates if file.is_file()), None)
+        if path is None:
+            reason = f"{origin.file} does not exist" if origin.file else "was not made from a file"
+            raise FileFormatError(f"{name} {reason}: name the file to use")
+        return path
+
+    def _read(self, origin: Origin, name: str, argument: Shot | None = None) -> Radiograph:
+        """Read an image or source; an argument has precedence."""
+        if argument is None:
+            argument = self._find(origin, name)
+        if not isinstance(argument, (str, Path)):
+            return radiograph_of(argument, name)
+        self.files.append(Path(argument))
+        channel = None if origin.channel is None else str(origin.channel)
+        return read_part(Path(argument), channel, origin.variable)
+
+    def _image(self, provenance: Provenance, k: int, *, numbered: bool) -> Radiograph:
+        name = f"image {k + 1}" if numbered else "the image"
+        return self._read(provenance.images[k], name, self.images[k] if self.images else None)
+
+    def _shot(
+        self, provenance: Provenance, k: int, image: Radiograph, *, numbered: bool
+    ) -> FitShot:
+        """Return an image with its setup, source, masks and numbers."""
+        origin, source = provenance.images[k], None
+        if origin.source is not None and (
+            (origin.source.file, origin.source.variable) != (origin.file, origin.variable)
+        ):
+            name = f"the source of image {k + 1}" if numbered else "the source"
+            source = self._read(origin.source, name, self.source)
+        return FitShot(
+            # The provenance says which other contents of the file were used.
+            image=replace(image, setup=None, mask=None, source_mask=None),
+            setup=origin.setup or provenance.recipe.setup,
+            source=source,
+            mask=self._mask(provenance, origin.mask, image.mask),
+            source_mask=self._mask(provenance, origin.source_mask, image.source_mask),
+            strength=origin.strength,
+            brightness=origin.brightness,
+            psf=origin.psf,
+            noise=origin.noise,
+        )
+
+    def _mask(
+        self, provenance: Provenance, index: int | None, image_mask: BoolArray | None
+    ) -> BoolArray | None:
+        """Return a mask from the result, its file or the image's file."""
+        origin = provenance.mask_of(index)
+        if origin is None:
+            return None
+        mask = origin.mask()
+        if mask is not None:
+            return mask
+        if origin.file:
+            return picture_mask(self._find_changed(origin, "mask"))
+        if image_mask is None:
+            raise InputError(
+                "a mask is too complex to be stored in the result, and was not a file: repeat the "
+                "work with a recipe and the mask"
+            )
+        return image_mask
+
+    def _fiducials(self, provenance: Provenance) -> FloatArray | Path | None:
+        """Return the fiducial displacements, from the result or from their table."""
+        if provenance.fiducial_rows is not None:
+            return np.array(provenance.fiducial_rows)
+        if provenance.fiducials is None:
+            return None
+        return self._find_changed(provenance.fiducials, "table of fiducials")
+
+    def _find_changed(self, origin: Origin, name: str) -> Path:
+        """Return a file, and record whether it has changed."""
+        path = self._find(origin, f"the {name}")
+        self.files.append(path)
+        after = Origin(file=path.name, sha256=sha256(path))
+        self.changes += _file_changes(name, origin, after)
+        return path
+
+
+def _with_dark(recipe: Recipe, path: Path | None) -> Recipe:
+    return recipe if path is None else recipe.with_dark_file(path)
+
+
+def _version_changes(version: str) -> list[str]:
+    return [] if version == __version__ else [f"made by version {version}, now {__version__}"]
+
+
+def _image_changes(before: Provenance, after: Provenance) -> list[str]:
+    """Report the changes of images, sources and dark frames."""
+    changes: list[str] = []
+    pairs = zip(before.images, after.images, strict=False)
+    for number, (old, new) in enumerate(pairs, 1):
+        name = "image" if before.kind == "inversion" else f"image {number}"
+        of_image = "" if before.kind == "inversion" else f" of image {number}"
+        changes += _file_changes(f"film {number}" if before.pack else name, old, new)
+        changes += _file_changes(f"source{of_image}", old.source, new.source)
+        changes += _file_changes("dark frame", old.dark, new.dark)
+    return changes
+
+
+def _file_changes(name: str, before: Origin | None, after: Origin | None) -> list[str]:
+    if before is None or after is None:
+        return []
+    if not before.sha256:
+        return [f"the {name} was not a file before: {after.file} may differ from it"]
+    if before.sha256 != after.sha256:
+        return [f"the {name} {after.file} differs from the {before.file} used before"]
+    return []
+
+
+def _difference(before: xarray.Dataset, after: xarray.Dataset) -> str:
+    """Describe how a result differs from the first one."""
+    shapes = [(dataset.sizes["y"], dataset.sizes["x"]) for dataset in (after, before)]
+    if shapes[0] != shapes[1]:
+        return f"different size: {shapes[0]}, before {shapes[1]}"
+    setup = setup_from_dataset(before)
+    in_si = () if setup is None else tuple(si_field.name for si_field in setup.si_fields)
+    names = [
+        str(name)
+        for name in before.data_vars
+        # Fields in SI units follow from those in pixels, and the setup may be of a later choice.
+        if name in after.data_vars
+        and name not in _PAINTED
+        and not str(name).removeprefix(PREFIX).startswith(in_si)
+    ]
+    pairs: dict[str, tuple[Any, Any]] = {}
+    for name in names:
+        old, new = before[name].values, after[name].values
+        new = new.astype(old.dtype) if old.dtype.kind == "f" else new
+        is_number = old.dtype.kind in "fc" and new.dtype.kind in "fc"
+        if not np.array_equal(old, new, equal_nan=is_number):
+            pairs[name] = old, new
+    if not pairs:
+        return IDENTICAL
+    return _describe_pairs(pairs) + _verdict_change(before.attrs, after.attrs)
+
+
+def _describe_pairs(pairs: Mapping[str, tuple[Any, Any]]) -> str:
+    displacements = [
+        np.abs(old - new).max()
+        for name, (old, new) in pairs.items()
+        if name.startswith("displacement") and old.shape == new.shape
+    ]
+    if displacements:
+        return f"displacement differs by up to {max(displacements):.2g} px"
+    return f"{', '.join(pairs)} differ{'s' * (len(pairs) == 1)}"
+
+
+def _verdict_change(before: Mapping[Any, Any], after: Mapping[Any, Any]) -> str:
+    if before.get("verdict") == after.get("verdict"):
+        return ""
+    return f"; the verdict was '{before['verdict']}'"
