@@ -477,8 +477,8 @@ def test_rerun_reports_an_older_version(empty_figure: None) -> None:
 def test_rerun_uses_the_fiducials_and_masks(empty_figure: None) -> None:
     rng = np.random.default_rng(3)
     for name in ("one", "two"):  # too complex to be kept with the result
-        tifffile.imwrite(f"{name}.tif", (rng.random((400, 600)) > 0.15).astype(np.uint8))
-        tifffile.imwrite(f"image_{name}.tif", rng.normal(100, 1, (400, 600)).astype(np.float32))
+        tifffile.imwrite(f"{name}.tif", (rng.random((480, 640)) > 0.15).astype(np.uint8))
+        tifffile.imwrite(f"image_{name}.tif", rng.normal(100, 1, (480, 640)).astype(np.float32))
     lines = ["file,strength,mask", "image_one.tif,1,one.tif", "image_two.tif,2,two.tif"]
     Path("shots.csv").write_text("\n".join(lines))
     rows = ["y,x,dy,dx,sigma", *(f"{k % 30}.25,{k % 40}.5,0,0,10" for k in range(1000))]

@@ -177,7 +177,7 @@ def test_images_of_one_object_are_fitted_together(folder: Path, out: Path) -> No
         np.testing.assert_array_equal(field, alone.fields[0].displacement)
         assert np.abs(field - truth(index)).max() < 0.3
         report = StackStore(out).report(index)
-        assert [image["image"]["file"] for image in report["images"]] == [
+        assert [image["file"] for image in report["images"]] == [
             f"low{index}.tif",
             f"high{index}.tif",
         ]

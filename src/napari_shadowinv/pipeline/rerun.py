@@ -33,7 +33,7 @@ from napari_shadowinv.pipeline.inversion_run import Shot, picture_mask, radiogra
 from napari_shadowinv.pipeline.refinement import run_refinement
 from napari_shadowinv.pipeline.static_checks import StaticChecks, run_checks
 from napari_shadowinv.preprocessing import MeasuredSource, Radiograph, Recipe
-from napari_shadowinv.provenance import Origin, Provenance
+from napari_shadowinv.provenance import MaskOrigin, Origin, Provenance
 
 if TYPE_CHECKING:
     import xarray
@@ -92,6 +92,8 @@ class RerunInputs:
         Known displacements in the first image.
     files : tuple of Path
         All files that were read, the images first.
+    masks : tuple of MaskOrigin
+        The origins of all masks; those of files as they are now.
     changes : tuple of str
         Changes of the version and of masks and tables.
     """
@@ -102,6 +104,7 @@ class RerunInputs:
     shots: tuple[FitShot, ...] = ()
     fiducials: FloatArray | Path | None = None
     files: tuple[Path, ...] = ()
+    masks: tuple[MaskOrigin, ...] = ()
     changes: tuple[str, ...] = ()
 
     @property
@@ -150,7 +153,12 @@ class RerunInputs:
         except InputError as error:
             raise InputError(f"{image.path}: {error}" if image.path else str(error)) from error
         assert inversion.provenance is not None
-        return replace(inversion, provenance=inversion.provenance.with_image(brightness=brightness))
+        provenance = inversion.provenance.with_image(brightness=brightness)
+        return replace(inversion, provenance=self._with_masks(provenance))
+
+    def _with_masks(self, provenance: Provenance) -> Provenance:
+        """Return a new provenance with the origins of the masks, which were passed as arrays."""
+        return provenance.model_copy(update={"masks": self.masks})
 
     def _fit(self, **callbacks: Any) -> tuple[Fit, StaticChecks]:
         start, choices = self.provenance.start, self.recipe.fit
@@ -167,7 +175,12 @@ class RerunInputs:
             window=self.window,
             **callbacks,
         )
-        return fit, checks
+        assert fit.provenance is not None
+        provenance = self._with_masks(fit.provenance)
+        if self.provenance.fiducial_rows is not None:
+            fiducials = {"fiducials": self.provenance.fiducials}
+            provenance = provenance.model_copy(update=fiducials)
+        return replace(fit, provenance=provenance), checks
 
 
 def rerun(
@@ -272,20 +285,20 @@ def _checked_provenance(dataset: xarray.Dataset, name: str) -> Provenance:
             f"{name} is a stack: expected one result; export a shot with shadowinv export, or "
             "choose one in Python, as in read_stack(path).isel(shot=3)"
         )
+    if "report" in dataset.attrs:  # not of a shot of a stack, a film pack or a field alone
+        kind = Fit if "verdict" in dataset.attrs else Inversion
+        as_file_errors(lambda _: kind.from_dataset(dataset))(name)
     provenance = provenance_of(dataset)
     if provenance is None:
         raise InputError(f"{name} {_defect(dataset)}")
-    if "report" not in dataset.variables:  # no shot of a stack
-        if provenance.kind == "inversion":
-            Inversion.from_dataset(dataset)
-        elif provenance.kind == "fit":
-            as_file_errors(lambda _: Fit.from_dataset(dataset))(name)
     return provenance
 
 
 def _defect(dataset: xarray.Dataset) -> str:
     """Describe a missing, damaged or newer provenance."""
     text = dataset.attrs.get("provenance", "")
+    if "report" in dataset.variables:
+        return "is a shot of a stack without a provenance: repeat it with shadowinv fit or batch"
     if not text:
         return (
             "has no provenance, like all results of invert() and fit() in scripts: repeat it with "
@@ -319,6 +332,7 @@ class _Reader:
     source: Path | str | None
     other_folders: bool
     files: list[Path] = field(default_factory=list)
+    masks: dict[int, MaskOrigin] = field(default_factory=dict)
     changes: list[str] = field(default_factory=list)
 
     def check(self, file: Path, name: str) -> None:
@@ -358,6 +372,7 @@ class _Reader:
             tuple(shots),
             self._fiducials(provenance),
             tuple(self.files if path is None else [*self.files, path]),
+            tuple(self.masks.get(k, mask) for k, mask in enumerate(origins.masks)),
             tuple(self.changes),
         )
 
@@ -426,13 +441,15 @@ class _Reader:
     ) -> BoolArray | None:
         """Return a mask from the result, its file or the image's file."""
         origin = provenance.mask_of(index)
-        if origin is None:
+        if index is None or origin is None:
             return None
         mask = origin.mask()
         if mask is not None:
             return mask
         if origin.file:
-            return picture_mask(self._find_changed(origin, "mask"))
+            path = self._find_changed(origin, "mask")
+            self.masks[index] = origin.model_copy(update={"sha256": sha256(path)})
+            return picture_mask(path)
         if image_mask is None:
             raise InputError(
                 "a mask is too complex to be stored in the result, and was not a file: repeat the "

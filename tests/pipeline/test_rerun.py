@@ -1,0 +1,208 @@
+"""Results of every kind are repeated from their files, bit for bit."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from simulated_pack import simulate
+
+from napari_shadowinv import FitOptions, InputError, InversionOptions, ProtonSetup, rerun, run_stack
+from napari_shadowinv.errors import FileFormatError, InversionCancelled
+from napari_shadowinv.io import read_dataset, write
+from napari_shadowinv.io.store import read_stack
+from napari_shadowinv.options import FitChoices
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.pipeline import (
+    FitShot,
+    read_pack,
+    run,
+    run_film,
+    run_fit,
+    run_refinement,
+    write_layers,
+)
+from napari_shadowinv.pipeline.fit_shots import read_rows
+from napari_shadowinv.pipeline.refinement import refinement_choices
+from napari_shadowinv.pipeline.rerun import provenance_of
+from napari_shadowinv.pipeline.shot_table import shot_rows
+from napari_shadowinv.pipeline.static_checks import run_checks
+from napari_shadowinv.preprocessing import Crop, Dark, LowPassFilter, Recipe
+from napari_shadowinv.provenance import Provenance
+
+SHAPE = (40, 48)
+LENGTHS = {"source_object_distance": 0.01, "object_image_distance": 0.3, "pixel_size": 1e-5}
+SETUPS = [ProtonSetup(energy=energy, **LENGTHS) for energy in (8, 12, 20)]
+HASTY = FitOptions(samples=2, max_iterations=3, spacing=0.5)
+STEPS = (Dark(level=Path("dark.npy")), Crop(y=(1, 39)))
+FIT = Recipe(steps=STEPS, fit=FitChoices(noise=2.0, options=HASTY))
+
+
+@dataclass(frozen=True)
+class Example:
+    """A result of some kind, and one of the images that it was made from."""
+
+    result: Any
+    image: Path
+
+    @property
+    def dataset(self) -> Any:
+        return read_dataset(self.result) if isinstance(self.result, Path) else self.result
+
+
+def record(folder: Path) -> list[Path]:
+    """Write images of one object at three energies, with source, mask and dark frame."""
+    rng = np.random.default_rng(1)
+    field = gaussian_blob(SHAPE, 12.0, 5.0, (19, 25)).displacement
+    beam = 1000 + np.arange(SHAPE[1]) + np.zeros(SHAPE)
+    paths = [folder / f"{setup.energy:g}.npy" for setup in SETUPS]
+    for path, setup in zip(paths, SETUPS, strict=True):
+        image = synthetic_image(SETUPS[0].momentum / setup.momentum * field, beam)
+        np.save(path, 7 + image + rng.normal(0, 2, SHAPE))
+    np.save(folder / "beam.npy", 7 + beam)
+    np.save(folder / "dark.npy", np.full(SHAPE, 7.0))
+    tifffile.imwrite(folder / "mask.tif", (rng.random(SHAPE) > 0.02).astype(np.uint8))
+    return paths
+
+
+def fit_shots(paths: list[Path]) -> list[FitShot]:
+    source, mask = Path("beam.npy"), Path("mask.tif")
+    return [
+        FitShot(path, setup, source=source, mask=mask)
+        for path, setup in zip(paths, SETUPS, strict=False)
+    ]
+
+
+def inversion(folder: Path) -> Example:
+    paths = record(folder)
+    options = InversionOptions(n_sites=150, boundary="free", seed=3)
+    steps = (*STEPS, LowPassFilter(width=0.6))
+    recipe = Recipe(steps=steps, mask=Path("mask.tif"), setup=SETUPS[0], options=options)
+    return Example(write(Path("a.shadowinv"), run(recipe, paths[0], source="beam.npy")), paths[0])
+
+
+def fit(folder: Path) -> Example:
+    paths = record(folder)[:2]
+    fiducials = [[5.0, 6.0, 0.1, 0.2, 0.5]]
+    return Example(
+        write(Path("a.shadowinv"), run_fit(FIT, fit_shots(paths), fiducials=fiducials)), paths[1]
+    )
+
+
+def refinement(folder: Path) -> Example:
+    paths = record(folder)
+    recipe = Recipe(steps=STEPS, setup=SETUPS[0], options=InversionOptions(n_sites=150))
+    start = run(recipe, paths[0])
+    choices = refinement_choices(start, start.setup, psf=0.5).model_copy(update={"options": HASTY})
+    return Example(
+        write(Path("a.shadowinv"), run_refinement(start, start.setup, choices)), paths[0]
+    )
+
+
+def leave_one_out(folder: Path) -> Example:
+    paths = record(folder)
+    shots = fit_shots(paths)
+    result = run_fit(FIT, shots)
+    checks = run_checks(FIT, shots, result, left_out=True, window=None)
+    return Example(write(Path("a.shadowinv"), checks.add_to(result.to_dataset())), paths[2])
+
+
+def film_pack(folder: Path) -> Example:
+    truth = simulate(folder, layers=3, shape=(60, 80), seed=2, b_peak=2.0, e_peak=0.0, strata=4)
+    dataset = run_film(read_pack(truth.pack))
+    return Example(write(Path("pack.shadowinv"), dataset), folder / "film_02.tif")
+
+
+def energy_windows(folder: Path) -> Example:
+    pack = film_pack(folder)
+    table = write_layers(pack.dataset, folder)[-1]
+    recipe = Recipe(fit=FitChoices(brightness="free", options=HASTY))
+    shots = read_rows(shot_rows([table], {}, {}), recipe)
+    result = run_fit(recipe, shots)
+    checks = run_checks(recipe, shots, result, left_out=False, window=2)
+    written = write(Path("a.shadowinv"), checks.add_to(result.to_dataset()))
+    return Example(written, folder / "layer_02.tif")
+
+
+def shot_of_stack(folder: Path) -> Example:
+    paths = record(folder)
+    options = InversionOptions(n_sites=150)
+    recipe = Recipe(steps=STEPS, mask=Path("mask.tif"), setup=SETUPS[0], options=options)
+    arguments = {"recipe": recipe, "scheduler": "synchronous", "warm_start": 1}
+    run_stack(paths, "a.shadowinv.zarr", source="beam.npy", **arguments)
+    return Example(read_stack(Path("a.shadowinv.zarr")).isel(shot=1).load(), paths[1])
+
+
+KINDS = (inversion, fit, refinement, leave_one_out, film_pack, energy_windows, shot_of_stack)
+
+
+@pytest.fixture
+def example(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: Any) -> Example:
+    monkeypatch.chdir(tmp_path)
+    make: Callable[[Path], Example] = request.param
+    return make(tmp_path)
+
+
+every_kind = pytest.mark.parametrize("example", KINDS, indirect=True, ids=lambda f: f.__name__)
+
+
+@every_kind
+def test_a_result_is_repeated_bit_for_bit(example: Example, tmp_path: Path) -> None:
+    before, provenance = example.dataset, provenance_of(example.dataset)
+    stages: list[Any] = []
+    again = rerun(example.result, on_progress=stages.append)
+    assert again.changes == ()
+    assert again.is_identical
+    assert stages
+    assert set(before.data_vars) - {"report", "status", "name", "image"} <= set(again.dataset)
+    for name in set(before.data_vars) & set(again.dataset.data_vars):
+        values = again.dataset[name].values
+        if before[name].dtype.kind == "f":
+            values = values.astype(before[name].dtype)
+        np.testing.assert_array_equal(before[name], values, str(name))
+    assert provenance_of(again.dataset) == provenance
+    # And once more from the file of the repeated result.
+    written = write(tmp_path / "again.shadowinv", again.dataset)
+    assert Provenance.of(read_dataset(written).attrs) == provenance
+
+    # The image differs now.
+    if example.image.suffix == ".npy":
+        np.save(example.image, np.load(example.image) * np.linspace(1, 1.1, SHAPE[1]))
+    else:
+        pixels = tifffile.imread(example.image)
+        tifffile.imwrite(example.image, pixels[::-1].copy(), resolution=(300, 300))
+    changed = rerun(example.result)
+    name = example.image.name
+    assert any(f"{name} differs from the {name} used before" in text for text in changed.changes)
+    assert "differ" in changed.difference
+    with pytest.raises(InversionCancelled):
+        rerun(example.result, should_stop=lambda: True)
+
+    # It is no longer there.
+    example.image.unlink()
+    with pytest.raises(FileFormatError, match=f"{name} does not exist"):
+        rerun(example.result)
+
+
+@every_kind
+def test_a_file_elsewhere_is_asked_for(example: Example, tmp_path: Path) -> None:
+    dataset, foreign = example.dataset, "../private/shot.npy"
+    provenance = json.loads(provenance_of(dataset).to_json())
+    for part in (provenance, provenance.get("start", {})):
+        for image in part.get("images", []):
+            image["file"] = foreign
+    if "pack" in provenance:
+        provenance["pack"]["layers"][0]["file"] = foreign
+    dataset = dataset.drop_vars("report", errors="ignore")
+    harmful = dataset.assign_attrs(provenance=json.dumps(provenance))
+    with pytest.raises(InputError, match=f"names .* {foreign}, which is in another folder"):
+        rerun(harmful)
+    with pytest.raises(FileFormatError, match=r"shot.npy"):
+        rerun(harmful, other_folders=True)
