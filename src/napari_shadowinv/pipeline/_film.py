@@ -34,8 +34,8 @@ from napari_shadowinv.film.registration import EDGES
 from napari_shadowinv.film.scans import common_shape, upright
 from napari_shadowinv.fitting.measurements import estimated_noise
 from napari_shadowinv.inversion.variables import PACK_FORMAT, PIXEL, place_coordinates
-from napari_shadowinv.io.images import Scan
 from napari_shadowinv.io.files import text_of
+from napari_shadowinv.io.images import Scan
 from napari_shadowinv.pipeline._film_inputs import Film, in_parallel, read_films, to_scan_frame
 from napari_shadowinv.provenance import ImageOrigin, Provenance
 
