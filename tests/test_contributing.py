@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,13 @@ def test_the_option_is_one_field(names):
     (field,) = names["InversionOptions"].model_fields
     assert field not in InversionOptions.model_fields
     assert names["InversionOptions"](ceiling=10.0).ceiling == 10.0
+
+
+def test_the_column_reads_a_result_and_words_it(names):
+    column = names["MEAN_DISPLACEMENT"]
+    inversion = SimpleNamespace(displacement=np.full((2, 4, 4), 3.0))
+    assert column.text({column.key: column.value(inversion)}) == "4.24"
+    assert column.heading == "mean_displacement (px)"
 
 
 @pytest.mark.parametrize("kind", ["u1", ">u2"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -98,6 +99,20 @@ def shot_of_store(path: Path, index: int) -> xarray.Dataset:
     planes = [str(name) for name in shot.data_vars if "y" in shot[name].dims]
     result: xarray.Dataset = shot[planes].drop_vars("shot", errors="ignore").compute()
     return result.assign_attrs(shot=labels.get("name", str(index)))
+
+
+@as_file_errors
+def shot_rows(path: Path, index: int) -> list[tuple[str, str]]:
+    """Return the quantities of a shot that tables list, as rows of a report."""
+    from napari_shadowinv.io.store import kind_of_shots
+    from napari_shadowinv.io.store_columns import columns_of
+
+    dataset = _open(path)
+    report = json.loads(str(dataset["report"][index].values) or "{}")
+    columns = columns_of(kind_of_shots(dataset.attrs))
+    texts = {column.title: column.text(report) for column in columns if column.format}
+    rows = [(title.capitalize(), text) for title, text in texts.items() if text]
+    return [("Shot", f"{index} ({_shot_names(dataset)[index]})"), *rows]
 
 
 def _first_done(dataset: xarray.Dataset, path: Path) -> int:

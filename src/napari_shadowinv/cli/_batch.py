@@ -340,19 +340,6 @@ def _verdict_rows(store: StackStore) -> Rows:
     ]
 
 
-_SHOT_COLUMNS: dict[str, tuple[str, Callable[[Any], str]]] = {
-    "iterations": ("iterations", str),
-    "image residual": ("image_residual", "{:.2%}".format),
-}
-_ROW_COLUMNS = {"MeV": ("energy", "{:g}".format), **_SHOT_COLUMNS}
-_FIT_COLUMNS: dict[str, tuple[str, Callable[[Any], str]]] = {
-    "verdict": ("verdict", str),
-    "χ²": ("chi2", "{:.3g}".format),
-    "crossed": ("folded", "{:.1%}".format),
-    "error bars": ("uncertainty", "{:.2%}".format),
-}
-
-
 @as_file_errors
 def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[Table], bool]:
     """Describe a store and each shot, and return whether anything is damaged.
@@ -367,22 +354,18 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
     is_damaged = bool(store.damage.shots or store.damage.files)
     if not every:
         return tables, is_damaged
-    columns = _ROW_COLUMNS if store.own_setups else _SHOT_COLUMNS
-    if store.field is not None:
-        columns = _FIT_COLUMNS
-    headings = "shot", "name", "status", "seconds", *columns
+    columns = [column for column in store.columns if column.format]
     shots = Table(box=box.SIMPLE)
-    for heading in headings:
-        # A verdict is not broken into letters.
-        width = len(_DETERMINED) if heading == "verdict" else None
-        shots.add_column(heading, overflow="fold", min_width=width)
+    for heading in ("shot", "name", "status"):
+        shots.add_column(heading, overflow="fold")
+    for column in columns:
+        shots.add_column(column.title, overflow="fold", min_width=column.width or None)
     for index, (status, report) in enumerate(zip(store.statuses(), store.reports(), strict=True)):
         shots.add_row(
             str(index),
             plain(store.names[index]),
             STATUS_NAMES[status],
-            f"{report['seconds']:.1f}" if "seconds" in report else "",
-            *(text(report[key]) if key in report else "" for key, text in columns.values()),
+            *(column.text(report) for column in columns),
             style="red" if status in (FAILED, DAMAGED) else "",
         )
     # A column of the table above would leave them a few letters a line.

@@ -26,21 +26,6 @@ if TYPE_CHECKING:
 
 _FORMULA_SIGNS = ("=", "+", "-", "@")
 FORMATS = ("tiff", "pradformat", "csv")
-# Headings of the table, and the keys of a shot's report.
-_INVERSION_COLUMNS = {
-    "converged": "converged",
-    "flux_residual": "residual",
-    "image_residual": "image_residual",
-    "noise_error (px)": "noise_error",
-    "discretisation_error (px)": "discretisation_error",
-    "iterations": "iterations",
-    "reason": "reason",
-}
-_TABLE_ROW_COLUMNS = {"energy (MeV)": "energy", **_INVERSION_COLUMNS}
-_FIT_COLUMNS = {
-    name: name
-    for name in ("verdict", "chi2", "folded", "uncertainty", "converged", "iterations", "reason")
-}
 
 
 def _open_shots(path: Path, shots: str | None) -> xarray.Dataset:
@@ -173,12 +158,11 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
         temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as f,
     ):
         rows = csv.writer(f)
-        keys = _TABLE_ROW_COLUMNS if content.own_setups else _INVERSION_COLUMNS
-        if content.field is not None:
-            keys = _FIT_COLUMNS
-        rows.writerow(["shot", "name", "status", *keys, *headings])
+        listed = [column.heading for column in content.columns]
+        rows.writerow(["shot", "name", "status", *listed, "reason", *headings])
+        keys = [*(column.key for column in content.columns), "reason"]
         for index in indices:
-            report = (reports[index].get(name, "") for name in keys.values())
+            report = (reports[index].get(key, "") for key in keys)
             peak = (f"{columns[name][index]:.9g}" for name in names)
             status = STATUS_NAMES[statuses[index]]
             rows.writerow([index, _escape_cell(content.names[index]), status, *report, *peak])

@@ -23,7 +23,6 @@ from napari_shadowinv._system.safety import as_file_errors, small_text
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.inversion.variables import (
-    PIXEL,
     fit_labels,
     setup_from_dataset,
     update_labels,
@@ -43,6 +42,7 @@ from napari_shadowinv.io.store_checksums import (
     note_shot,
     read_labels,
 )
+from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, columns_of
 from napari_shadowinv.io.store_setups import OWN_SETUPS, field_in_si, with_own_setups
 
 if TYPE_CHECKING:
@@ -50,44 +50,8 @@ if TYPE_CHECKING:
 
 FORMAT = "shadowinv stack"
 STORE_SUFFIX = STORE.suffix
-# One number for each shot, gathered when a run ends.
-SUMMARY: dict[str, tuple[type, dict[str, str]]] = {
-    "converged": (bool, {"units": "1", "long_name": "Flux residual is below the tolerance"}),
-    "flux_residual": (float, {"units": "1", "long_name": "Largest relative flux error of a cell"}),
-    "image_residual": (
-        float,
-        {"units": "1", "long_name": "Image minus re-projection, r.m.s. relative to the mean"},
-    ),
-    "noise_error": (
-        float,
-        {"units": PIXEL, "long_name": "Standard error of the displacement by noise, r.m.s."},
-    ),
-    "discretisation_error": (
-        float,
-        {"units": PIXEL, "long_name": "Error of the displacement by too few sites, r.m.s."},
-    ),
-    "iterations": (int, {"units": "1", "long_name": "Solver iterations, summed over all levels"}),
-    "seconds": (float, {"units": "s", "long_name": "Time its worker spent on the shot"}),
-}
-FIT_SUMMARY: dict[str, tuple[type, dict[str, str]]] = {
-    "verdict": (str, {"units": "1", "long_name": "Whether the field may be believed"}),
-    "chi2": (float, {"units": "1", "long_name": "Largest χ² of the shot's images"}),
-    "folded": (float, {"units": "1", "long_name": "Share of the pixels whose rays have crossed"}),
-    "uncertainty": (
-        float,
-        {"units": "1", "long_name": "Displacement's error bar, r.m.s., as a share of it"},
-    ),
-    "converged": (bool, {"units": "1", "long_name": "Ended before the most steps allowed"}),
-    "iterations": (int, {"units": "1", "long_name": "Steps at full size"}),
-    "seconds": SUMMARY["seconds"],
-}
-TABLE_SUMMARY: dict[str, tuple[type, dict[str, str]]] = {
-    **SUMMARY,
-    "energy": (float, {"units": "MeV", "long_name": "Energy of the particles"}),
-}
 PENDING, DONE, FAILED, DAMAGED = map(int, Status)
 STATUS_NAMES = tuple(status.name.lower() for status in Status)
-_OWN_ORDER = ("status", *dict.fromkeys((*FIT_SUMMARY, *TABLE_SUMMARY)), "setup", "report")
 
 
 class StoreError(OSError):
@@ -120,21 +84,11 @@ def fitted_field(attributes: Mapping[Any, Any]) -> str | None:
     return str(names[0]) if names else None
 
 
-def summary_of(attributes: Mapping[Any, Any]) -> dict[str, tuple[type, dict[str, str]]]:
-    """Return the numbers that are gathered of each shot of a store: their types and labels."""
+def kind_of_shots(attributes: Mapping[Any, Any]) -> str:
+    """Return whether the shots of a store are inversions, rows of a table, or fits."""
     if fitted_field(attributes) is not None:
-        return FIT_SUMMARY
-    return TABLE_SUMMARY if OWN_SETUPS in attributes else SUMMARY
-
-
-def nothing_yet(kind: type) -> Any:
-    """Return the placeholder of a number that a shot does not have yet."""
-    return "" if kind is str else np.nan if kind is float else 0
-
-
-def number_of(report: Mapping[str, Any], name: str, kind: type) -> Any:
-    """Return one of the gathered numbers from a shot's report."""
-    return report.get("residual" if name == "flux_residual" else name, nothing_yet(kind))
+        return FITS
+    return ROWS if OWN_SETUPS in attributes else INVERSIONS
 
 
 def _read_document(path: Path) -> dict[str, Any]:
@@ -215,7 +169,7 @@ class ShotWriter:
 
     def labels(self, index: int, attributes: Mapping[str, Any]) -> dict[str, Any]:
         """Return the name and other labels of a shot."""
-        numbers = tuple(summary_of(attributes))
+        numbers = tuple(column.key for column in columns_of(kind_of_shots(attributes)))
         labels = _labels_of_all(self.path, self.store_id, self.shots, numbers)
         return labels[index] if labels else {}
 
@@ -282,8 +236,8 @@ class StackStore:
     ----------
     field : str or None
         The fitted field; None where shots were inverted.
-    own_setups : bool
-        Whether its shots are rows of a table.
+    columns : tuple of Column
+        The quantities that it lists of each shot.
     """
 
     def __init__(self, path: Path, *, every_byte: bool = False) -> None:
@@ -300,7 +254,7 @@ class StackStore:
         if self.attributes.get("format") != FORMAT:
             raise FileFormatError(f"{path} is not a stack of shots: expected name{STORE_SUFFIX}")
         self.field = fitted_field(self.attributes)
-        self.own_setups = OWN_SETUPS in self.attributes
+        self.columns = columns_of(kind_of_shots(self.attributes))
         self._layout = Layout.of(path, document)
         self._arrays = _open_readable(path)
         self.names = tuple(map(str, self._values("name").tolist()))
@@ -349,7 +303,7 @@ class StackStore:
     def _exchanged(self, damage: Damage) -> Iterator[str]:
         """Name files with values of many shots that disagree with the shots' reports."""
         assert self._layout is not None
-        numbers = summary_of(self.attributes)
+        columns = {column.key: column for column in self.columns}
         for name in self._layout.of_many_shots:
             length = self._arrays[name].chunks[0]
             for first in range(0, len(self.names), length):
@@ -359,9 +313,8 @@ class StackStore:
                 report = _parse_reports(self.path, [str(self._values("report", index))])[0]
                 value = self._values(name, index).item()
                 expected: list[Any] = [report.get(LABELS, {}).get(name, value)]
-                if name in numbers:
-                    kind = numbers[name][0]
-                    expected = [kind(number_of(report, name, kind)), kind(nothing_yet(kind))]
+                if column := columns.get(name):
+                    expected = [column.kind(column.of(report)), column.kind(column.fill)]
                 if json.dumps(value) not in map(json.dumps, expected):
                     yield (
                         f"{name}/c/{first // length} does not belong to shots {first} to "
@@ -383,11 +336,11 @@ class StackStore:
         reports = self.reports()
         group = self.writer.arrays()
         try:
-            for name, (kind, _) in summary_of(self.attributes).items():
-                if name not in group:  # a store of an older version
+            for column in self.columns:
+                if column.key not in group:  # a store of an older version
                     continue
-                values = [number_of(report, name, kind) for report in reports]
-                group[name][...] = np.array(values, dtype=object if kind is str else kind)
+                values = [column.of(report) for report in reports]
+                group[column.key][...] = np.array(values, dtype=column.dtype)
         except OSError as error:
             raise store_error(self.path, error) from error
 
@@ -474,7 +427,8 @@ def read_stack(path: Path) -> xarray.Dataset:
     setup = setup_from_dataset(dataset)
     complete = _with_fields(with_own_setups(dataset), setup)
     # The folder's own order is arbitrary.
-    order = [*_labels(dataset, setup), *_OWN_ORDER]
+    columns = (column.key for column in store.columns)
+    order = [*_labels(dataset, setup), "status", *columns, "setup", "report"]
     ordered = complete[[name for name in order if name in complete]]
     return ordered.assign(status=ordered["status"].copy(data=store.statuses()))
 

@@ -19,12 +19,12 @@ from napari_shadowinv.io.store import (
     STATUS_NAMES,
     ShotWriter,
     StackStore,
-    number_of,
+    kind_of_shots,
     open_to_write,
     store_error,
-    summary_of,
 )
 from napari_shadowinv.io.store_checksums import read_labels
+from napari_shadowinv.io.store_columns import columns_of
 from napari_shadowinv.io.store_layout import lengthen
 
 
@@ -38,7 +38,8 @@ class _OpenWriter(ShotWriter):
         return self.opened
 
     def labels(self, index: int, attributes: Mapping[str, Any]) -> dict[str, Any]:
-        labels = read_labels(self.opened, summary_of(attributes), slice(index, index + 1))
+        numbers = [column.key for column in columns_of(kind_of_shots(attributes))]
+        labels = read_labels(self.opened, numbers, slice(index, index + 1))
         return labels[0] if labels else {}
 
 
@@ -52,9 +53,7 @@ class GrowingStore:
         arrays = open_to_write(store.path)
         count = len(store.names)
         self._writer = _OpenWriter(store.path, store.attributes["store_id"], count, arrays)
-        self._summary = {
-            name: kind for name, (kind, _) in summary_of(store.attributes).items() if name in arrays
-        }
+        self._columns = [column for column in store.columns if column.key in arrays]
         self._numbers = {name: index for index, name in enumerate(store.names)}
         self._statuses = bytearray(store.statuses().astype(np.uint8).tobytes())
         self._counts = [self._statuses.count(status) for status in range(len(STATUS_NAMES))]
@@ -113,11 +112,9 @@ class GrowingStore:
 
     def _gather(self, index: int, report: Mapping[str, Any]) -> None:
         try:
-            for name, kind in self._summary.items():
-                value: Any = np.array(
-                    [number_of(report, name, kind)], object if kind is str else kind
-                )
-                self._writer.opened[name][index : index + 1] = value
+            for column in self._columns:
+                value: Any = np.array([column.of(report)], column.dtype)
+                self._writer.opened[column.key][index : index + 1] = value
         except OSError as error:
             raise store_error(self.path, error) from error
 

@@ -28,12 +28,12 @@ from napari_shadowinv.io.store import (
     STATUS_NAMES,
     StackStore,
     is_along_shots,
-    nothing_yet,
+    kind_of_shots,
     open_to_write,
     store_error,
-    summary_of,
 )
 from napari_shadowinv.io.store_checksums import FIXED, fixed_keys, reseal, seal, stored_checksum
+from napari_shadowinv.io.store_columns import columns_of
 
 _TOGETHER = 1024  # values of a coordinate along shots that are one file
 _SMALL = 64  # values that are not worth compressing
@@ -192,11 +192,10 @@ def _shot_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Vari
         "status": Variable(("shot",), np.dtype("int8"), status),
         "report": Variable(("shot",), str, report),
     }
-    for name, (kind, labels) in summary_of(attributes).items():
-        dtype = str if kind is str else np.dtype(kind)
-        numpy_dtype = object if kind is str else kind
-        nothing: AnyArray = np.full(shots, nothing_yet(kind), dtype=numpy_dtype)
-        variables[name] = Variable(("shot",), dtype, labels, nothing)
+    for column in columns_of(kind_of_shots(attributes)):
+        dtype = str if column.kind is str else np.dtype(column.kind)
+        fill: AnyArray = np.full(shots, column.fill, dtype=column.dtype)
+        variables[column.key] = Variable(("shot",), dtype, column.labels, fill)
     return variables
 
 

@@ -14,6 +14,7 @@ from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion.variables import dataset_from_field
+from napari_shadowinv.io.store_columns import FITS, column_values
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import FitShot, run_fit
@@ -100,21 +101,15 @@ class FitWork:
         """Return the report of a shot."""
         report, doubt = dataclasses.asdict(fit.report), fit.verdict_caution
         entries = {
-            "verdict": str(fit.verdict),
+            **column_values(FITS, fit),
             "explanation": fit.explanation,
-            "chi2": float(fit.chi2.max()),
             "chi2_images": fit.chi2.tolist(),
-            "folded": fit.folded,
             "brightness": fit.brightness.tolist(),
             "strengths": fit.strengths.tolist(),
-            "converged": fit.report.converged,
-            "iterations": fit.report.iterations,
             "objective": fit.report.objective,
             "stages": report["seconds"],
             "warnings": [] if doubt is None else [dataclasses.asdict(doubt)],
         }
-        if np.isfinite(fit.report.uncertainty):
-            entries["uncertainty"] = fit.report.uncertainty
         provenance = fit.provenance
         if provenance is not None and any(image.file for image in provenance.images):
             entries["images"] = [

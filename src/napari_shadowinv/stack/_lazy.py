@@ -13,7 +13,7 @@ from napari_shadowinv._system.validation import check_instance
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.variables import SETUPS_LABEL, variable_labels
-from napari_shadowinv.io.store import SUMMARY
+from napari_shadowinv.io.store_columns import INVERSIONS, column_values, columns_of
 from napari_shadowinv.io.store_setups import with_places
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing import Recipe
@@ -21,16 +21,13 @@ from napari_shadowinv.stack import _plan
 from napari_shadowinv.stack._shots import Stack
 from napari_shadowinv.stack._site_count import choose_sites
 from napari_shadowinv.stack._sources import Reader, Shot, read_shot
-from napari_shadowinv.stack._worker import Beam, Work, numbers_of
+from napari_shadowinv.stack._worker import Beam, Work
 
 if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Step
-
-# Scalar results of each shot.
-_SUMMARY_TYPES = {name: kind for name, (kind, _) in SUMMARY.items() if name != "seconds"}
 
 
 def invert_stack(
@@ -155,7 +152,7 @@ def _invert(
         raise InputError(f"{label}: {error}") from error
     return {
         **work.arrays(inversion),
-        **{name: _SUMMARY_TYPES[name](value) for name, value in numbers_of(inversion).items()},
+        **column_values(INVERSIONS, inversion),
         **({"inversion": inversion} if keep else {}),
     }
 
@@ -227,9 +224,10 @@ class _Graph:
         if setups is not None:
             da: Any = import_module("dask.array")
             variables["setup"] = (("shot",), da.from_array(np.array(setups, "O"), 1), SETUPS_LABEL)
-        for name in _SUMMARY_TYPES:
-            dtype, labels = SUMMARY[name]
-            variables[name] = (("shot",), self._per_shot_array(name, (), dtype), labels)
+        for column in columns_of(INVERSIONS):
+            if column.value is not None:
+                values = self._per_shot_array(column.key, (), column.kind)
+                variables[column.key] = (("shot",), values, column.labels)
         dataset = xr.Dataset(
             variables, coords=_plan.coordinates_of(stack), attrs=_plan.attributes_of(stack)
         )

@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.formats import PRADFORMAT, TEXT, kind_of
+from napari_shadowinv.io.store_columns import ROWS
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
 from napari_shadowinv.pipeline import FitShot, Inputs, collect_inputs
 from napari_shadowinv.pipeline.files import read_part
@@ -182,6 +183,7 @@ class RowWork(Work):
     """Task of every row of a table to invert."""
 
     estimate: Estimate | None = None  # of the source of rows without one
+    shots: ClassVar[str] = ROWS
 
     def collect_inputs(self, content: Any, beam: Beam | None, source: AnyArray | None) -> Inputs:
         """Return the image of a row over its brightness, with its own source, mask and setup."""
@@ -220,12 +222,11 @@ class RowWork(Work):
         return dataclasses.replace(inputs, provenance=provenance)
 
     def report(self, inversion: Inversion) -> dict[str, Any]:
-        """Return the report of a shot, with its own provenance and energy."""
+        """Return the report of a shot, with its own provenance."""
         provenance = inversion.provenance
         assert provenance is not None
         entries = {"provenance": json.loads(provenance.to_json())}
-        energy = getattr(provenance.setup, "energy", None)
-        return {**super().report(inversion), **entries, **({"energy": energy} if energy else {})}
+        return {**super().report(inversion), **entries}
 
     def _check_setup(self, setup: Setup | None) -> None:
         first = self.inputs.recipe.setup

@@ -9,14 +9,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import math
 import multiprocessing
 import sys
 import threading
 import time
 from collections import OrderedDict
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -28,6 +27,7 @@ from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.store import DONE, FAILED, ShotWriter
+from napari_shadowinv.io.store_columns import INVERSIONS, column_values
 from napari_shadowinv.io.store_growing import GrowingStore
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.pipeline import Cache, Inputs, run_prepared
@@ -123,6 +123,7 @@ class Work:
     inputs: Inputs  # without an image; shots inverted at once share the cores
     variables: tuple[str, ...]
     sites_chosen: bool = False  # as the first shots needed them
+    shots: ClassVar[str] = INVERSIONS
 
     def invert(
         self,
@@ -183,7 +184,7 @@ class Work:
             "stages": inversion.report.seconds,
             "level": headline.level.value,
             "headline": headline.text,
-            **numbers_of(inversion),
+            **column_values(self.shots, inversion),
         }
 
 
@@ -199,19 +200,6 @@ def _with_sites_reason(inversion: Inversion) -> Inversion:
         warnings=(*inversion.report.warnings, *filter(None, [caution])),
     )
     return replace(inversion, report=report)
-
-
-def numbers_of(inversion: Inversion) -> dict[str, Any]:
-    """Return the scalar results of a shot by the store's names."""
-    report, errors = inversion.report, inversion.errors
-    return {
-        "converged": report.converged,
-        "flux_residual": report.residual,
-        "image_residual": report.image_residual,
-        "noise_error": math.nan if errors is None else errors.noise.rms,
-        "discretisation_error": math.nan if errors is None else errors.discretisation.rms,
-        "iterations": report.iterations,
-    }
 
 
 def _divide_by_mean(image: AnyArray, mask: BoolArray | None) -> AnyArray:

@@ -126,7 +126,7 @@ class StackRequest:
 
     def update_limits(self, layers: Sequence[Any]) -> None:
         """Extend limits that the user has not changed to the strongest shot so far."""
-        for layer in filter(_is_image, layers):
+        for layer in filter(is_image, layers):
             role = str(role_of(layer))
             if role not in self._limits:
                 continue
@@ -141,7 +141,7 @@ class StackRequest:
         """Take over the contrast of an earlier run into the same store."""
         self._applied.update(earlier._applied)
         current = {
-            role_of(layer): tuple(layer.contrast_limits) for layer in filter(_is_image, layers)
+            role_of(layer): tuple(layer.contrast_limits) for layer in filter(is_image, layers)
         }
         for _, keywords, kind in self.layer_data:
             role = str(role_of(keywords))
@@ -192,7 +192,8 @@ class StackRequest:
         )
 
 
-def _is_image(layer: Any) -> bool:
+def is_image(layer: Any) -> bool:
+    """Return whether a layer is an image."""
     return kind_of(layer) == "image"
 
 

@@ -16,7 +16,7 @@ from napari_shadowinv._napari.layer_metadata import KEY, role_of
 from napari_shadowinv._napari.widgets._forms import PathEdit, labelled
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import column
-from napari_shadowinv._napari.widgets._stacking import RunStatus, StackJob, StackRequest
+from napari_shadowinv._napari.widgets._stacking import RunStatus, StackJob, StackRequest, is_image
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import NEW_SHOTS
@@ -203,11 +203,16 @@ class WatchRequest(StackRequest):
         return layer_data
 
 
+def shot_in_view(viewer: Any, layers: Sequence[Any]) -> int | None:
+    """Return the shot of the layers that the viewer shows; None without a shot in view."""
+    shot = int(viewer.dims.current_step[viewer.dims.ndim - 3]) if viewer.dims.ndim > 2 else -1
+    return shot if 0 <= shot <= newest_shot(layers) and any(map(is_image, layers)) else None
+
+
 def is_newest_in_view(viewer: Any, layers: Sequence[Any]) -> bool:
     """Whether the viewer shows the newest shot of the layers."""
-    lengths = [len(layer.data) for layer in layers if kind_of(layer) == "image"]
     axis = viewer.dims.ndim - 3
-    return bool(lengths) and viewer.dims.current_step[axis] >= max(lengths) - 1
+    return any(map(is_image, layers)) and viewer.dims.current_step[axis] >= newest_shot(layers)
 
 
 def show_shot(viewer: Any, shot: int) -> None:
@@ -217,4 +222,4 @@ def show_shot(viewer: Any, shot: int) -> None:
 
 def newest_shot(layers: Sequence[Any]) -> int:
     """Return the index of the last shot of the layers."""
-    return max((len(layer.data) - 1 for layer in layers if kind_of(layer) == "image"), default=0)
+    return max((len(layer.data) - 1 for layer in filter(is_image, layers)), default=0)

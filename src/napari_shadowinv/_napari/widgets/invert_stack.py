@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +15,12 @@ from qtpy.QtWidgets import QCheckBox, QFileDialog, QHeaderView, QLabel, QLineEdi
 
 from napari_shadowinv._napari.kinds import main_layers
 from napari_shadowinv._napari.layer_metadata import may_be_shot, role_of
-from napari_shadowinv._napari.stores import follow_shots
+from napari_shadowinv._napari.stores import follow_shots, shot_rows
 from napari_shadowinv._napari.widgets._forms import PathEdit, RowPicker, labelled
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, ToolPanel
-from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, timer
+from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, timer, while_alive
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
 from napari_shadowinv._napari.widgets._runner import Outcome
 from napari_shadowinv._napari.widgets._saving import (
@@ -37,10 +38,11 @@ from napari_shadowinv._napari.widgets._watching import (
     WatchRequest,
     is_newest_in_view,
     newest_shot,
+    shot_in_view,
     show_shot,
 )
 from napari_shadowinv._system.progress import Progress
-from napari_shadowinv.errors import InputError
+from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.store import STORE_SUFFIX
 
 if TYPE_CHECKING:
@@ -245,6 +247,7 @@ class InvertStack(InversionInputs, ToolPanel):
         self._arrows: Any = None
         self._read_arrows: Callable[[], None] | None = None
         self._refresh_timer = timer(self, _REFRESH_INTERVAL_MS, self._refresh, once=True)
+        self._report_timer = timer(self, _REFRESH_INTERVAL_MS, self._show_report, once=True)
         self._build()
         self._connect()
         self.restore_last()
@@ -289,6 +292,7 @@ class InvertStack(InversionInputs, ToolPanel):
         for part in (*self.inputs, self.engine):
             part.changed.connect(self.keep)
         self.panel.runner.progressed.connect(self._on_progress)
+        while_alive(self, self.viewer.dims.events.current_step, self._on_step)
 
     def parts(self) -> dict[str, Any]:
         return {**super().parts(), "engine": self.engine}
@@ -424,6 +428,20 @@ class InvertStack(InversionInputs, ToolPanel):
         self._show_failures([])
         self.panel.say("")
 
+    def _on_step(self, _: Any) -> None:
+        self._report_timer.start()
+
+    def _show_report(self) -> None:
+        """Show the origins of the results, and the quantities of the shot in view."""
+        request = self._shown
+        if request is None or self.panel.runner.running:
+            return
+        rows = request.origins.rows()
+        shot = shot_in_view(self.viewer, self.results.layers)
+        with suppress(FileFormatError):  # a damaged shot
+            rows = rows if shot is None else [*rows, *shot_rows(request.job.out, shot)]
+        self.report.show_rows(rows)
+
     def _show_failures(self, failures: list[tuple[str, str]]) -> None:
         self.failures.show_failures(failures)
         self.failures_title.setVisible(bool(failures))
@@ -439,7 +457,7 @@ class InvertStack(InversionInputs, ToolPanel):
                 self.panel.say("Stopped: no shot has arrived.")
             return
         self._show(request)
-        self.report.show_rows(request.origins.rows())
+        self._show_report()
         if outcome.cancelled:
             self.panel.say(f"Cancelled: {status.text}. Press Run to resume.")
         else:

@@ -1,0 +1,225 @@
+"""Numbers and words of each shot, as stores, tables and windows list them: `COLUMNS`.
+
+A column is described once. Every store has an array of each of its columns, ``shadowinv export
+--format csv`` writes them all, ``shadowinv status --all`` and the window of a stack list those with
+a format.
+
+- add a column: one entry of `COLUMNS`
+- the columns of a kind of stores: `columns_of`; their values from a result: `column_values`
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any
+
+from napari_shadowinv.inversion.variables import PIXEL, display_unit
+
+# Kinds of stores
+INVERSIONS = "inversions"
+ROWS = "rows of a table"
+FITS = "fits"
+
+
+@dataclass(frozen=True)
+class Column:
+    """Quantity of each shot of a store.
+
+    Attributes
+    ----------
+    key : str
+        Name of its array and of its entry in a shot's report.
+    title : str
+        Heading of tables for people.
+    long_name : str
+        Label of the array.
+    stores : tuple of str
+        Kinds of stores that have the column.
+    unit : str
+        Unit of the array.
+    kind : type
+        `bool`, `int`, `float` or `str`.
+    value : callable, optional
+        Returns the value of an `Inversion` or a `Fit`, None if this result has none. Without it,
+        the value comes from the run.
+    format : str
+        Format specification in tables for people, which omit columns without one.
+    width : int
+        Least number of characters of a table's column.
+    """
+
+    key: str
+    title: str
+    long_name: str
+    stores: tuple[str, ...]
+    unit: str = "1"
+    kind: type = float
+    value: Callable[[Any], Any] | None = None
+    format: str = ""
+    width: int = 0
+
+    @property
+    def fill(self) -> Any:
+        """Value of a shot that has none yet."""
+        return {str: "", float: math.nan}.get(self.kind, 0)
+
+    @property
+    def dtype(self) -> type:
+        """Type of a numpy array of values."""
+        return object if self.kind is str else self.kind
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """Attributes of the array."""
+        return {"units": self.unit, "long_name": self.long_name}
+
+    @property
+    def heading(self) -> str:
+        """Heading of tables for programs."""
+        return self.key if self.unit == "1" else f"{self.key} ({display_unit(self.unit)})"
+
+    def of(self, report: Mapping[str, Any]) -> Any:
+        """Return the value from a shot's report, or the fill value."""
+        return report.get(self.key, self.fill)
+
+    def text(self, report: Mapping[str, Any]) -> str:
+        """Return the value from a shot's report as text, empty without a value."""
+        return format(report[self.key], self.format) if self.key in report else ""
+
+
+def _error(part: str) -> Callable[[Any], float]:
+    """Return the reader of an error of an inversion, which may have no error budget."""
+    rms = attrgetter(f"errors.{part}.rms")
+    return lambda result: math.nan if result.errors is None else float(rms(result))
+
+
+def _uncertainty(fit: Any) -> float | None:
+    error = float(fit.report.uncertainty)
+    return error if math.isfinite(error) else None
+
+
+# In the order of all tables.
+COLUMNS: tuple[Column, ...] = (
+    Column(
+        "seconds",
+        "seconds",
+        "Time its worker spent on the shot",
+        unit="s",
+        stores=(INVERSIONS, ROWS, FITS),
+        format=".1f",
+    ),
+    Column(
+        "energy",
+        "MeV",
+        "Energy of the particles",
+        unit="MeV",
+        stores=(ROWS,),
+        value=lambda inversion: getattr(inversion.setup, "energy", None),
+        format="g",
+    ),
+    Column(
+        "verdict",
+        "verdict",
+        "Whether the field may be believed",
+        kind=str,
+        stores=(FITS,),
+        value=lambda fit: str(fit.verdict),
+        format="s",
+        width=len("determined"),  # not broken into letters
+    ),
+    Column(
+        "chi2",
+        "χ²",
+        "Largest χ² of the shot's images",
+        stores=(FITS,),
+        value=lambda fit: float(fit.chi2.max()),
+        format=".3g",
+    ),
+    Column(
+        "folded",
+        "crossed",
+        "Share of the pixels whose rays have crossed",
+        stores=(FITS,),
+        value=attrgetter("folded"),
+        format=".1%",
+    ),
+    Column(
+        "uncertainty",
+        "error bars",
+        "Displacement's error bar, r.m.s., as a share of it",
+        stores=(FITS,),
+        value=_uncertainty,
+        format=".2%",
+    ),
+    Column(
+        "converged",
+        "converged",
+        "Whether the solver converged",
+        kind=bool,
+        stores=(INVERSIONS, ROWS, FITS),
+        value=attrgetter("report.converged"),
+    ),
+    Column(
+        "flux_residual",
+        "flux residual",
+        "Largest relative flux error of a cell",
+        stores=(INVERSIONS, ROWS),
+        value=attrgetter("report.residual"),
+    ),
+    Column(
+        "iterations",
+        "iterations",
+        "Solver iterations, summed over all levels",
+        kind=int,
+        stores=(INVERSIONS, ROWS),
+        value=attrgetter("report.iterations"),
+        format="d",
+    ),
+    Column(
+        "iterations",
+        "iterations",
+        "Iterations at full size",
+        kind=int,
+        stores=(FITS,),
+        value=attrgetter("report.iterations"),
+    ),
+    Column(
+        "image_residual",
+        "image residual",
+        "Image minus re-projection, r.m.s. relative to the mean",
+        stores=(INVERSIONS, ROWS),
+        value=attrgetter("report.image_residual"),
+        format=".2%",
+    ),
+    Column(
+        "noise_error",
+        "noise error",
+        "Standard error of the displacement by noise, r.m.s.",
+        unit=PIXEL,
+        stores=(INVERSIONS, ROWS),
+        value=_error("noise"),
+    ),
+    Column(
+        "discretisation_error",
+        "discretisation error",
+        "Error of the displacement by too few sites, r.m.s.",
+        unit=PIXEL,
+        stores=(INVERSIONS, ROWS),
+        value=_error("discretisation"),
+    ),
+)
+
+
+def columns_of(store: str) -> tuple[Column, ...]:
+    """Return the columns of a kind of stores."""
+    return tuple(column for column in COLUMNS if store in column.stores)
+
+
+def column_values(store: str, result: Any) -> dict[str, Any]:
+    """Return the values of a result by the columns' keys, for the shot's report."""
+    columns = (column for column in columns_of(store) if column.value is not None)
+    values = {column.key: column.value(result) for column in columns if column.value}
+    return {key: value for key, value in values.items() if value is not None}

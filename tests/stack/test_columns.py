@@ -1,0 +1,65 @@
+"""A column is one entry of a table: store, status, export and window list it."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+
+from command_line import flat, shadowinv
+from napari_shadowinv._napari.stores import shot_rows
+from napari_shadowinv.io import store_columns
+from napari_shadowinv.io.store import StackStore
+from napari_shadowinv.io.store_columns import COLUMNS, FITS, INVERSIONS, ROWS, Column, columns_of
+
+
+@pytest.fixture
+def site_column(monkeypatch) -> Column:
+    column = Column(
+        "site_count",
+        "places",
+        "Number of sites",
+        kind=int,
+        stores=(INVERSIONS,),
+        value=lambda inversion: len(inversion.sites),
+        format="04d",
+    )
+    monkeypatch.setattr(store_columns, "COLUMNS", (*COLUMNS, column))
+    return column
+
+
+def test_added_column_is_stored_and_listed_everywhere(site_column, make_night, out, tmp_path):
+    night = make_night(2)
+    np.save(night.path(1), 0 * night.images[1])
+    written = night.run(out, scheduler="synchronous")
+    assert written.site_count.values.tolist() == [100, 0]
+    assert written.site_count.attrs["long_name"] == "Number of sites"
+    assert StackStore(out).columns[-1] is site_column
+
+    listed = flat(shadowinv("status", out, "--all").output)
+    assert "places" in listed
+    assert "0100" in listed
+
+    table = tmp_path / "t.csv"
+    shadowinv("export", out, "--format", "csv", "--out", table)
+    with table.open(newline="", encoding="utf-8") as f:
+        assert [row["site_count"] for row in csv.DictReader(f)] == ["100", ""]
+
+    assert ("Places", "0100") in shot_rows(out, 0)
+    assert shot_rows(out, 1)[0] == ("Shot", "1 (shot_1.npy)")
+    assert "Places" not in dict(shot_rows(out, 1))
+
+
+@pytest.mark.parametrize("store", [INVERSIONS, ROWS, FITS])
+def test_keys_and_titles_of_a_store_are_unique(store):
+    columns = columns_of(store)
+    assert len({column.key for column in columns}) == len(columns)
+    assert len({column.title for column in columns}) == len(columns)
+
+
+def test_value_without_entry_is_the_fill_value():
+    values = {column.kind: column.of({}) for column in COLUMNS}
+    assert (values[str], values[bool], values[int]) == ("", 0, 0)
+    assert np.isnan(values[float])
+    assert COLUMNS[0].text({}) == ""
