@@ -25,7 +25,7 @@ import tifffile
 
 from napari_shadowinv import InversionOptions, Recipe, run_stack, watch_stack
 from napari_shadowinv.preprocessing import Bin
-from napari_shadowinv.stack import WatchProgress, read_shot
+from napari_shadowinv.stack import RunStatus, read_shot
 
 BURNER = Path(__file__).resolve().parents[2] / "shared" / "data" / "burner" / "data"
 
@@ -60,9 +60,9 @@ def kept_up(folder: Path, recipe: Recipe, count: int, rate: float) -> str:
     most = 0
     started = threading.Event()
 
-    def note(news: WatchProgress) -> None:
+    def note(news: RunStatus) -> None:
         nonlocal most
-        if not news.preparing:
+        if not news.stage:
             started.set()
         if news.outcome is not None:
             stored[news.name] = time.perf_counter()
@@ -101,7 +101,7 @@ def against_a_run(folder: Path, recipe: Recipe, count: int) -> None:
     source = iio.imread(BURNER / "Image_00000.bmp").astype(float)
     ends: list[float] = []
 
-    def note(news: WatchProgress) -> None:
+    def note(news: RunStatus) -> None:
         if news.result is not None:
             ends.append(time.perf_counter())
 

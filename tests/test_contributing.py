@@ -43,10 +43,10 @@ def test_the_option_is_one_field(names):
 
 
 def test_the_column_reads_a_result_and_words_it(names):
-    column = names["MEAN_DISPLACEMENT"]
+    column = names["RMS_DISPLACEMENT"]
     inversion = SimpleNamespace(displacement=np.full((2, 4, 4), 3.0))
     assert column.text({column.key: column.value(inversion)}) == "4.24"
-    assert column.heading == "mean_displacement (px)"
+    assert column.heading == "rms_displacement (px)"
 
 
 @pytest.mark.parametrize("kind", ["u1", ">u2"])

@@ -294,9 +294,9 @@ def test_the_first_run_ever_compiles_before_its_shots(night, out, monkeypatch):
     progress = []
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
     night.run(out, scheduler="synchronous", on_progress=progress.append)
-    assert "minute" in progress[0].preparing
+    assert "minute" in progress[0].stage
     assert progress[0].engine == ""
-    assert not any(news.preparing for news in progress[1:])
+    assert not any(news.stage for news in progress[1:])
     assert progress[-1].done == 6
     with pytest.raises(InversionCancelled):
         night.run(out, overwrite=True, should_stop=lambda: True)

@@ -30,7 +30,7 @@ from napari_shadowinv import (
 from napari_shadowinv._system.locking import locked
 from napari_shadowinv.cli import _watch
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
-from napari_shadowinv.stack import WatchProgress, _folder_events, _watch_loop
+from napari_shadowinv.stack import RunStatus, _folder_events, _watch_loop
 
 IMAGES, SOURCE = make_shots(6)
 SETTLE = 0.1
@@ -41,7 +41,7 @@ class Watched:
 
     def __init__(self, folder: Path, out: Path, **choices: Any) -> None:
         self.folder, self.out = folder, out
-        self.events: list[WatchProgress] = []
+        self.events: list[RunStatus] = []
         self.error: Exception | None = None
         self._stop = threading.Event()
         defaults = {"source": SOURCE, "options": OPTIONS, "pattern": "*.npy", "settle": SETTLE}
@@ -62,7 +62,7 @@ class Watched:
 
     def __enter__(self) -> Watched:
         self._thread.start()
-        self.until(lambda: any(not event.preparing for event in self.events) or self.error)
+        self.until(lambda: any(not event.stage for event in self.events) or self.error)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -76,7 +76,7 @@ class Watched:
             assert time.monotonic() < end, self.events
             time.sleep(0.005)
 
-    def ended(self, count: int) -> list[WatchProgress]:
+    def ended(self, count: int) -> list[RunStatus]:
         """Wait until a number of shots have ended."""
         self.until(lambda: self.error or len(self.shots) >= count)
         if self.error is not None:
@@ -84,7 +84,7 @@ class Watched:
         return self.shots
 
     @property
-    def shots(self) -> list[WatchProgress]:
+    def shots(self) -> list[RunStatus]:
         return [event for event in self.events if event.outcome is not None]
 
 
@@ -498,7 +498,7 @@ def test_ctrl_c_is_the_normal_end_unless_files_wait(
     put(folder, *range(files))
     update = _watch._WatchPrinter.update
 
-    def update_and_interrupt(printer: Any, progress: WatchProgress) -> None:
+    def update_and_interrupt(printer: Any, progress: RunStatus) -> None:
         update(printer, progress)
         if progress.outcome is not None:
             signal.raise_signal(signal.SIGINT)

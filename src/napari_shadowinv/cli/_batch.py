@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import functools
 import json
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,7 +38,7 @@ from napari_shadowinv.io.store import (
 )
 
 if TYPE_CHECKING:
-    from napari_shadowinv.stack import RunProgress
+    from napari_shadowinv.stack import RunStatus
 
 EXIT_FAILED_SHOTS = 1
 _BAR_COLUMNS = 16
@@ -49,36 +46,18 @@ _MAX_LISTED = 10  # shots that a row lists
 _DETERMINED = "determined"  # the only verdict of a reliable fit
 
 
-@dataclass
-class _RunStatus:
-    """Progress of a run, with its rate and the time that remains."""
+def _rate_text(status: RunStatus) -> str:
+    if not status.ended:
+        return "no shot finished"
+    rate = status.rate
+    return f"{rate:.1f} shots/s" if rate >= 1 else f"{60 * rate:.1f} shots/min"
 
-    start: float = field(default_factory=time.monotonic)
-    progress: RunProgress | None = None
-    ended: int = 0
 
-    def update(self, progress: RunProgress) -> None:
-        if self.progress is None:
-            self.start = time.monotonic()  # the workers are ready
-        self.progress = progress
-        if progress.outcome is not None:
-            self.ended += 1
-
-    @property
-    def rate_text(self) -> str:
-        seconds = time.monotonic() - self.start
-        if not self.ended:
-            return "no shot finished"
-        rate = self.ended / seconds
-        return f"{rate:.1f} shots/s" if rate >= 1 else f"{60 * rate:.1f} shots/min"
-
-    @property
-    def remaining_text(self) -> str:
-        if self.progress is None or not self.ended:
-            return ""
-        pending = self.progress.total - self.progress.done - self.progress.failed
-        seconds = round(pending * (time.monotonic() - self.start) / self.ended)
-        return f"{timedelta(seconds=seconds)} left" if pending else "finishing"
+def _remaining_text(status: RunStatus) -> str:
+    if status.remaining is None:
+        return ""
+    seconds = round(status.remaining)
+    return f"{timedelta(seconds=seconds)} left" if status.waiting else "finishing"
 
 
 def run_batch(
@@ -96,18 +75,17 @@ def run_batch(
     from napari_shadowinv.stack import read_shot, run_stack
 
     _check_store(out, resume or choices["redo_failed"], choices["overwrite"])
-    status = _RunStatus()
     selection: dict[str, Any] = {"channel": channel}
     if variable is not None:
         selection["variable"] = variable
     try:
-        with _progress_bar(status, quiet) as show:
+        with _ProgressBar(quiet) as bar:
             run_stack(
                 shots[0] if len(shots) == 1 else shots,
                 out,
                 variables=None if variables is None else split_names(variables),
                 reader=functools.partial(read_shot, **selection),
-                on_progress=show,
+                on_progress=bar.update,
                 should_stop=is_interrupted,
                 **choices,
             )
@@ -117,7 +95,7 @@ def run_batch(
         raise typer.Exit(cancel_exit_code()) from None
     store = StackStore(out)
     if not quiet:
-        say(_summary(store, status))
+        say(_summary(store, bar.status))
     exit_unless_reliable(store)
 
 
@@ -169,38 +147,46 @@ def progress_columns() -> tuple[progress.ProgressColumn, ...]:
     )
 
 
-@contextmanager
-def _progress_bar(status: _RunStatus, quiet: bool) -> Iterator[Callable[[RunProgress], None]]:
-    """Show a bar with the rate and the time that remains, and print each failure above it."""
-    console = Console(stderr=True)
-    hidden = quiet or not console.is_terminal
-    with progress.Progress(
-        *progress_columns(), console=console, disable=hidden, expand=True
-    ) as bars:
-        task = bars.add_task("starting", total=None, rate="", remaining="", failed="", last="")
+class _ProgressBar:
+    """Bar with the rate and the time that remains; failures are printed above it."""
 
-        def show(progress: RunProgress) -> None:
-            if progress.preparing:
-                bars.update(task, description=progress.preparing)
-                return
-            status.update(progress)
-            outcome = progress.outcome
-            last = "" if outcome is None else f"{progress.name}, {outcome.seconds:.1f} s"
-            bars.update(
-                task,
-                description=progress.engine,
-                total=progress.total,
-                completed=progress.done + progress.failed,
-                rate=status.rate_text,
-                remaining=status.remaining_text,
-                failed=f"{progress.failed} failed" if progress.failed else "",
-                last=plain(last).plain,
-            )
-            if outcome is not None and outcome.reason and not quiet:
-                line = plain(f"failed: {progress.name}: {outcome.reason}", "red")
-                console.print(line, soft_wrap=True)
+    def __init__(self, quiet: bool) -> None:
+        self._console = Console(stderr=True)
+        self._quiet = quiet
+        hidden = quiet or not self._console.is_terminal
+        self._bars = progress.Progress(
+            *progress_columns(), console=self._console, disable=hidden, expand=True
+        )
+        fields: dict[str, Any] = {"rate": "", "remaining": "", "failed": "", "last": ""}
+        self._task = self._bars.add_task("starting", total=None, **fields)
+        self.status: RunStatus | None = None
 
-        yield show
+    def __enter__(self) -> _ProgressBar:
+        self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bars.stop()
+
+    def update(self, status: RunStatus) -> None:
+        if status.stage:
+            self._bars.update(self._task, description=status.stage)
+            return
+        self.status, outcome = status, status.outcome
+        last = "" if outcome is None else f"{status.name}, {outcome.seconds:.1f} s"
+        self._bars.update(
+            self._task,
+            description=status.engine,
+            total=status.total,
+            completed=status.done + status.failed,
+            rate=_rate_text(status),
+            remaining=_remaining_text(status),
+            failed=f"{status.failed} failed" if status.failed else "",
+            last=plain(last).plain,
+        )
+        if outcome is not None and outcome.reason and not self._quiet:
+            line = plain(f"failed: {status.name}: {outcome.reason}", "red")
+            self._console.print(line, soft_wrap=True)
 
 
 def _counts_text(store: StackStore) -> str:
@@ -210,12 +196,13 @@ def _counts_text(store: StackStore) -> str:
     return ", ".join(f"{counts[name]} {name}" for name in names)
 
 
-def _summary(store: StackStore, status: _RunStatus) -> Table:
-    seconds = time.monotonic() - status.start
-    this_run = f"{status.ended} shots in {seconds:.1f} s, {status.rate_text}"
+def _summary(store: StackStore, status: RunStatus | None) -> Table:
+    this_run = "nothing to do"
+    if status is not None and status.ended:
+        this_run = f"{status.ended} shots in {status.seconds:.1f} s, {_rate_text(status)}"
     rows = [
         ("shots", _counts_text(store)),
-        ("this run", this_run if status.ended else "nothing to do"),
+        ("this run", this_run),
         *_site_rows(store),
         *_trouble_rows(store),
         ("written", str(store.path)),

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.stack import WatchProgress
+    from napari_shadowinv.stack import RunStatus
 
 _LINE_COLUMNS = 100
 _MIN_NAME_COLUMNS = 12
@@ -34,53 +34,51 @@ _MIN_NAME_COLUMNS = 12
 
 @dataclass
 class _WatchPrinter:
-    """Printer of the shots, with the latest progress of the run."""
+    """Printer of the shots, with the latest status of the run."""
 
     folder: Path
     pattern: str
     quiet: bool
     out: Console
     err: Console
-    progress: WatchProgress | None = None
+    status: RunStatus | None = None
     warned: set[str] = field(default_factory=set)
     is_watching: bool = False
 
-    def update(self, progress: WatchProgress) -> None:
-        self.progress = progress
+    def update(self, status: RunStatus) -> None:
+        self.status = status
         if self.quiet:
             return
-        if progress.note or progress.preparing:
-            text = progress.note or f"{progress.preparing[:1].upper()}{progress.preparing[1:]}"
+        if status.note or status.stage:
+            text = status.note or f"{status.stage[:1].upper()}{status.stage[1:]}"
             self._print(self.err, text, "dim")
-        elif progress.outcome is not None:
-            self._print_shot(progress)
+        elif status.outcome is not None:
+            self._print_shot(status)
         elif not self.is_watching:
             self.is_watching = True
-            counts = f"{progress.done} done, {progress.failed} failed; " if progress.total else ""
+            counts = f"{status.done} done, {status.failed} failed; " if status.total else ""
             self._print(
                 self.out,
                 f"Watching {self.folder} for {self.pattern}; {counts}press Ctrl-C to stop.",
             )
 
-    def _print_shot(self, progress: WatchProgress) -> None:
-        outcome = progress.outcome
+    def _print_shot(self, status: RunStatus) -> None:
+        outcome = status.outcome
         assert outcome is not None
-        name = (
-            f"{progress.name} (again, as the file has changed)" if progress.again else progress.name
-        )
-        waiting = f"  {progress.waiting} waiting" if progress.waiting else ""
+        name = f"{status.name} (again, as the file has changed)" if status.again else status.name
+        waiting = f"  {status.waiting} waiting" if status.waiting else ""
         if outcome.reason:
             self._print(self.err, f"failed: {name}: {outcome.reason}", "red")
             return
-        assert progress.result is not None
-        summary, doubts = _shot_summary(progress.result)
+        assert status.result is not None
+        summary, doubts = _shot_summary(status.result)
         summary = f"  {summary}  {outcome.seconds:.2f} s{waiting}{doubts}"
         name = _shorten_name(name, _LINE_COLUMNS - len(summary))
         self._print(self.out, f"{name}{summary}", _style(doubts))
-        for warning in _warnings_of(progress.result):
+        for warning in _warnings_of(status.result):
             if warning.code not in self.warned:
                 self.warned.add(warning.code)
-                self._print(self.err, f"warning: {progress.name}: {warning.text}", "yellow")
+                self._print(self.err, f"warning: {status.name}: {warning.text}", "yellow")
 
     def _print(self, console: Console, text: str, style: str = "") -> None:
         console.print(plain(text, style), soft_wrap=True, highlight=False)
@@ -157,15 +155,15 @@ def run_watch(
             should_stop=is_interrupted,
             **choices,
         )
-    _print_summary(printer.progress, out, quiet)
+    _print_summary(printer.status, out, quiet)
 
 
-def _print_summary(progress: WatchProgress | None, out: Path, quiet: bool) -> None:
+def _print_summary(status: RunStatus | None, out: Path, quiet: bool) -> None:
     from napari_shadowinv.io.store import StackStore
 
     done, failed, waiting = 0, 0, 0
-    if progress is not None:
-        done, failed, waiting = progress.done, progress.failed, progress.waiting
+    if status is not None:
+        done, failed, waiting = status.done, status.failed, status.waiting
     remaining = f", {waiting} not yet inverted" if waiting else ""
     if not done:
         text = f"Stopped: {failed} failed, nothing written" if failed else "Stopped: no shots"

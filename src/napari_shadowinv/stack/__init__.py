@@ -4,23 +4,23 @@
 - invert or fit shots one by one into ``name.shadowinv.zarr``, and resume after a crash: `run_stack`
 - read a shot's file, or one of its colour channels: `read_shot`
 - watch a folder and invert each shot as soon as it arrives: `watch_stack`
+- what a run reports: `RunStatus`
 - mean, spread and peaks across shots: `stack_statistics`
 """
 
 from napari_shadowinv.stack._lazy import invert_stack
 from napari_shadowinv.stack._plan import STORED
-from napari_shadowinv.stack._run import RunProgress, run_stack
+from napari_shadowinv.stack._run import run_stack
 from napari_shadowinv.stack._sources import read_shot
 from napari_shadowinv.stack._statistics import stack_statistics
-from napari_shadowinv.stack._watch_loop import WatchProgress
+from napari_shadowinv.stack._status import RunStatus
 from napari_shadowinv.stack._worker import ShotOutcome
 from napari_shadowinv.stack.watch import watch_stack
 
 __all__ = [
     "STORED",
-    "RunProgress",
+    "RunStatus",
     "ShotOutcome",
-    "WatchProgress",
     "invert_stack",
     "read_shot",
     "run_stack",

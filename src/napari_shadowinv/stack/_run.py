@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +29,7 @@ from napari_shadowinv.stack._resume import append_shots, contents_of, reopen_dam
 from napari_shadowinv.stack._shots import Stack
 from napari_shadowinv.stack._site_count import choose_sites
 from napari_shadowinv.stack._sources import Reader, read_shot
+from napari_shadowinv.stack._status import OnStatus, RunStatus
 from napari_shadowinv.stack._worker import ShotOutcome, TaskContext, run_shots
 
 if TYPE_CHECKING:
@@ -39,34 +39,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.preprocessing import Step
 
 _POLL_S = 0.25  # between two looks at the engine and at `should_stop`
-
-
-@dataclass(frozen=True)
-class RunProgress:
-    """Progress of a run.
-
-    Attributes
-    ----------
-    total, done, failed : int
-        Numbers of shots, including earlier runs.
-    engine : str
-        Name of the engine that inverts the shots.
-    name, outcome : str, ShotOutcome or None
-        The shot that has just ended, if any, and its outcome.
-    preparing : str
-        Current stage of the preparation, before all shots.
-    """
-
-    total: int
-    done: int
-    failed: int
-    engine: str
-    name: str = ""
-    outcome: ShotOutcome | None = None
-    preparing: str = ""
-
-
-OnRunProgress = Callable[[RunProgress], None]
 
 
 def run_stack(
@@ -88,7 +60,7 @@ def run_stack(
     workers: int | None = None,
     overwrite: bool = False,
     redo_failed: bool = False,
-    on_progress: OnRunProgress | None = None,
+    on_progress: OnStatus | None = None,
     should_stop: ShouldStop | None = None,
 ) -> xarray.Dataset:
     """Invert, or fit, every shot into one store; another call resumes it.
@@ -119,7 +91,7 @@ def run_stack(
     overwrite, redo_failed : bool, optional
         Discard the content of the store; repeat shots that failed before.
     on_progress : callable, optional
-        Receives a `RunProgress` at the start and after each shot.
+        Receives a `RunStatus` at the start and after each shot.
     should_stop : callable, optional
         Called regularly; the run ends when it returns true.
 
@@ -158,7 +130,7 @@ def run_stack(
 
     def prepare(stage: str) -> None:
         if on_progress is not None:
-            on_progress(RunProgress(len(stack.shots), 0, 0, "", preparing=stage))
+            on_progress(RunStatus(total=len(stack.shots), stage=stage))
 
     if is_local(scheduler):
         # Once, instead of in all workers during their first shot.
@@ -215,28 +187,56 @@ class _Run:
         stack: Stack,
         store: StackStore,
         again: tuple[int, ...],
-        on_progress: OnRunProgress | None,
+        on_progress: OnStatus | None,
         should_stop: ShouldStop | None,
     ) -> None:
         self._stack = stack
         self._store = store
         self._on_progress = on_progress
         self._should_stop = should_stop
-        statuses = store.statuses()
+        statuses, reports = store.statuses(), store.reports()
         self._todo = {int(index) for index in np.flatnonzero(np.isin(statuses, again))}
         self._counts = {
             status: 0 if status in again else int((statuses == status).sum())
             for status in (DONE, FAILED)
         }
+        self._doubtful = sum(
+            status == DONE and bool(report.get("warnings"))
+            for status, report in zip(statuses, reports, strict=True)
+        )
+        self._failures = [
+            (store.names[index], str(reports[int(index)].get("reason", "unknown")))
+            for index in np.flatnonzero(statuses == FAILED)
+            if index not in self._todo
+        ]
+        self._ended = 0
+        self._began = time.monotonic()
 
     def report(self, engine: str, outcome: ShotOutcome | None = None) -> None:
+        shots = self._stack.shots
+        name = "" if outcome is None else shots.names[outcome.index]
         if outcome is not None:
+            self._ended += 1
             self._counts[outcome.status] += 1
-        if self._on_progress is not None:
-            shots = self._stack.shots
-            name = "" if outcome is None else shots.names[outcome.index]
-            done, failed = self._counts[DONE], self._counts[FAILED]
-            self._on_progress(RunProgress(len(shots), done, failed, engine, name, outcome))
+            self._doubtful += outcome.warnings > 0
+            self._failures += [(name, outcome.reason)] if outcome.reason else []
+        if self._on_progress is None:
+            return
+        done, failed = self._counts[DONE], self._counts[FAILED]
+        status = RunStatus(
+            total=len(shots),
+            done=done,
+            failed=failed,
+            doubtful=self._doubtful,
+            waiting=len(shots) - done - failed,
+            ended=self._ended,
+            seconds=time.monotonic() - self._began,
+            engine=engine,
+            name=name,
+            outcome=outcome,
+            failures=tuple(self._failures),
+        )
+        self._on_progress(status)
 
     def run_on(self, engine: Engine) -> None:
         """Invert all pending shots, and summarise their reports."""

@@ -1,6 +1,5 @@
 """The loop over files that arrive in a watched folder: `Watch`.
 
-- progress and its callback: `WatchProgress`, `RunStatus`
 - the description of the stack from its first files: `StackMaker`
 """
 
@@ -8,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -29,10 +28,10 @@ from napari_shadowinv.io.store_layout import create_store
 from napari_shadowinv.stack._discovery import Shots
 from napari_shadowinv.stack._folder_events import Arrivals
 from napari_shadowinv.stack._resume import NUMBERED_AS_ARRIVED, contents_of, match_store
-from napari_shadowinv.stack._run import RunProgress
 from napari_shadowinv.stack._shots import FitStack, Stack
 from napari_shadowinv.stack._site_count import MAX_TRIED_SHOTS, needed_shares, with_enough_sites
 from napari_shadowinv.stack._sources import FileShot, Reader, Shot, stamp
+from napari_shadowinv.stack._status import WATCHING, OnStatus, RunStatus
 from napari_shadowinv.stack._worker import Attempt, ShotOutcome, failure_text, try_shot, write_shot
 
 if TYPE_CHECKING:
@@ -44,61 +43,6 @@ if TYPE_CHECKING:
 _LANES = 2
 _CLOCK_RESOLUTION_S = 2.0  # of file times, on any file system
 _POLL_S = 0.25  # between two looks at `should_stop` while nothing arrives
-
-
-@dataclass(frozen=True)
-class WatchProgress(RunProgress):
-    """Progress of a watched folder; see also `RunProgress`.
-
-    Attributes
-    ----------
-    waiting : int
-        Files that have arrived and were not inverted yet.
-    again : bool
-        Whether the shot was inverted before and its file has changed since.
-    result : Inversion, Fit or None
-        Result of the shot that has just ended; do not keep a reference.
-    note : str
-        A sentence for the user.
-    """
-
-    waiting: int = 0
-    again: bool = False
-    result: Inversion | Fit | None = None
-    note: str = ""
-
-
-OnWatchProgress = Callable[[WatchProgress], None]
-
-
-class RunStatus:
-    """Status of the shots, and the callback that reports it."""
-
-    def __init__(self, arrivals: Arrivals, on_progress: OnWatchProgress | None) -> None:
-        self._arrivals = arrivals
-        self._on_progress = on_progress
-        self.store: GrowingStore | None = None
-        # Failures before the first good shot, which creates the store or proves that it fits.
-        self.early: dict[str, dict[str, Any]] = {}
-        self.in_work = 0  # shots that are being inverted
-
-    def report_stage(self, stage: str) -> None:
-        self.report(preparing=stage)
-
-    def report_note(self, sentence: str) -> None:
-        self.report(note=sentence)
-
-    def report(self, **news: Any) -> None:
-        """Report the numbers of shots, and some news."""
-        if self._on_progress is None:
-            return
-        early, store = len(self.early), self.store
-        total = early + (0 if store is None else len(store))
-        done = 0 if store is None else store.count(DONE)
-        failed = early + (0 if store is None else store.count(FAILED))
-        waiting = self._arrivals.waiting + self.in_work
-        progress: dict[str, Any] = {"engine": "watching", "waiting": waiting, **news}
-        self._on_progress(WatchProgress(total, done, failed, **progress))
 
 
 def _is_unchanged(shot: FileShot, report: dict[str, Any], stamp_now: dict[str, int]) -> bool:
@@ -173,11 +117,16 @@ class Watch:
         dtype: np.dtype[Any],
         stacks: StackMaker,
         arrivals: Arrivals,
-        status: RunStatus,
+        on_progress: OnStatus | None,
         should_stop: ShouldStop | None,
     ) -> None:
         self._path, self._dtype, self._stacks = path, dtype, stacks
-        self._arrivals, self._status, self._should_stop = arrivals, status, should_stop
+        self._arrivals, self._on_progress, self._should_stop = arrivals, on_progress, should_stop
+        self.store: GrowingStore | None = None
+        # Failures before the first good shot, which creates the store or proves that it fits.
+        self._early: dict[str, dict[str, Any]] = {}
+        self._doubtful: set[str] = set()
+        self._failures: dict[str, str] = {}
         self._overwrite = False
         self._stack: Stack | None = None
         self._work: Any = None  # once the number of sites is known
@@ -187,7 +136,26 @@ class Watch:
         self._lanes: list[Inversion | Fit | None] = [None] * _LANES
         self._redo: set[str] = set()
         self._begun = self._ended = 0
-        self._last = time.monotonic()
+        self._last = self._busy_since = time.monotonic()
+        self._busy_s = 0.0
+
+    def report(self, **news: Any) -> None:
+        """Report the numbers of shots, and some news."""
+        if self._on_progress is None:
+            return
+        early, store = len(self._early), self.store
+        status = RunStatus(
+            total=early + (0 if store is None else len(store)),
+            done=0 if store is None else store.count(DONE),
+            failed=early + (0 if store is None else store.count(FAILED)),
+            doubtful=len(self._doubtful),
+            waiting=self._arrivals.waiting + len(self._running),
+            ended=self._ended,
+            seconds=self._busy_s + (time.monotonic() - self._busy_since if self._running else 0.0),
+            engine=WATCHING,
+            failures=tuple(self._failures.items()),
+        )
+        self._on_progress(replace(status, **news))
 
     def open(self, *, overwrite: bool, redo_failed: bool) -> None:
         """Open or check the store before any shot arrives, as far as possible."""
@@ -198,7 +166,9 @@ class Watch:
         store = StackStore(self._path)
         again = (PENDING, FAILED) if redo_failed else (PENDING,)
         self._redo = {store.names[i] for i in np.flatnonzero(np.isin(store.statuses(), again))}
-        self._status.store = GrowingStore(store, NUMBERED_AS_ARRIVED)
+        for name, report in zip(store.names, store.reports(), strict=True):
+            self._note_report(name, report)
+        self.store = GrowingStore(store, NUMBERED_AS_ARRIVED)
         if self._stack is not None:
             self._use_stack(match_store(store, self._stack, self._dtype))
 
@@ -206,7 +176,7 @@ class Watch:
         """Invert existing and arriving files until the watch ends."""
         for name in sorted(self._redo):
             self._arrivals.put_back(name)
-        self._status.report()
+        self.report()
         try:
             while not self._is_over(idle, most):
                 self._advance(most)
@@ -215,7 +185,7 @@ class Watch:
         finally:
             self._abandoned.set()
             self._pool.shutdown(cancel_futures=True)
-            self._status.report()
+            self.report()
 
     def _is_over(self, idle: float | None, most: int | None) -> bool:
         if most is not None and self._ended >= most:
@@ -250,25 +220,26 @@ class Watch:
             report = self._previous_report(text_of(name))
             if report is not None and _is_unchanged(shot, report, stamp_now):
                 if not self._arrivals.waiting:
-                    self._status.report()
+                    self.report()
                 return
         except OSError:
             self._arrivals.check()
             return  # removed before its turn
         lane = self._begun % _LANES
         self._begun += 1
-        self._status.in_work += 1
         attempt = self._submit(name, shot, lane)
         attempt.add_done_callback(lambda _: self._arrivals.wake())
+        self._busy_since = self._busy_since if self._running else time.monotonic()
         self._running.append(_RunningShot(name, shot, stamp_now, lane, attempt))
-        self._status.report()
+        self.report()
 
     def _finish(self) -> None:
         """Wait for the oldest attempt, and write its outcome."""
         running = self._running[0]
         attempt, stamp_before = running.attempt.result(), running.stamp_before
         self._running.popleft()
-        self._status.in_work -= 1
+        if not self._running:
+            self._busy_s += time.monotonic() - self._busy_since
         stamp_after = {**stamp_before, **attempt.origin}
         with suppress(OSError):
             stamp_after = stamp(running.shot.path) if attempt.failure else stamp_after
@@ -285,14 +256,24 @@ class Watch:
         self._lanes[running.lane] = self._start_for_next(attempt)
         self._ended += 1
         self._last = time.monotonic()
-        self._status.report(name=name, outcome=outcome, result=attempt.result, again=again)
+        self._note_report(name, {"reason": outcome.reason, "warnings": outcome.warnings})
+        self.report(name=name, outcome=outcome, result=attempt.result, again=again)
+
+    def _note_report(self, name: str, report: Mapping[str, Any]) -> None:
+        """Note whether a shot has failed or is doubtful, instead of its earlier report."""
+        self._failures.pop(name, None)
+        self._doubtful.discard(name)
+        if reason := report.get("reason"):
+            self._failures[name] = reason
+        elif report.get("warnings"):
+            self._doubtful.add(name)
 
     def _previous_report(self, name: str) -> dict[str, Any] | None:
         """Return the report of a shot that has ended before; None if it has not."""
-        store = self._status.store
+        store = self.store
         index = None if store is None else store.number(name)
-        if store is None or index is None or name in self._status.early:
-            return self._status.early.get(name)
+        if store is None or index is None or name in self._early:
+            return self._early.get(name)
         pending = name in self._redo or store.status(index) == PENDING
         return None if pending else store.report(index)
 
@@ -321,7 +302,7 @@ class Watch:
                 shot.shape()
             except Exception as error:
                 return Attempt(began, time.perf_counter() - began, {}, failure=failure_text(error))
-            store = self._status.store
+            store = self.store
             if store is not None:
                 # Earlier shots are a better reference for the size of the images.
                 existing = (
@@ -333,7 +314,7 @@ class Watch:
                 self._use_stack(match_store(StackStore(self._path), stack, self._dtype))
                 return None
         if stack.chooses_sites:
-            self._status.report_stage("how many sites the first shots need")
+            self.report(stage="how many sites the first shots need")
             shots = self._stacks.of(names).shots
             shares = needed_shares(replace(stack, shots=shots), self._should_stop)
             if not shares:
@@ -349,11 +330,11 @@ class Watch:
         self._work = stack.work(per_shot)
 
     def _write(self, name: str, attempt: Attempt) -> ShotOutcome:
-        early = self._status.early
-        if attempt.result is None and (self._work is None or self._status.store is None):
+        early = self._early
+        if attempt.result is None and (self._work is None or self.store is None):
             early[name] = {**attempt.origin, "reason": attempt.failure, "seconds": attempt.seconds}
             return ShotOutcome(len(early) - 1, FAILED, attempt.seconds, attempt.failure)
-        store = self._status.store or self._create_store([*early, name])
+        store = self.store or self._create_store([*early, name])
         for early_name in list(early):
             index = store.number(early_name)
             report = early.pop(early_name)
@@ -375,8 +356,8 @@ class Watch:
             self._path, contents_of(stack, self._dtype), overwrite=self._overwrite
         )
         self._overwrite = False
-        self._status.store = GrowingStore(created, NUMBERED_AS_ARRIVED)
-        return self._status.store
+        self.store = GrowingStore(created, NUMBERED_AS_ARRIVED)
+        return self.store
 
     def _start_for_next(self, attempt: Attempt) -> Inversion | Fit | None:
         chained = self._stack is not None and self._stack.chained

@@ -268,6 +268,8 @@ class ShotOutcome:
         Time that its worker spent on it, reading and writing included.
     reason, converged : str and bool
         Why it failed, and whether the solver reached its tolerance, or the fit its end.
+    warnings : int
+        Number of warnings about its result.
     """
 
     index: int
@@ -275,6 +277,7 @@ class ShotOutcome:
     seconds: float
     reason: str = ""
     converged: bool = True
+    warnings: int = 0
 
 
 @dataclass(frozen=True)
@@ -360,7 +363,8 @@ def write_shot(
     report = {**entries, "seconds": attempt.seconds, **attempt.origin, **warnings}
     writer.write(index, work.arrays(result), report)
     spent = time.perf_counter() - attempt.began
-    return ShotOutcome(index, DONE, spent, converged=result.report.converged)
+    count = len(report["warnings"])
+    return ShotOutcome(index, DONE, spent, converged=result.report.converged, warnings=count)
 
 
 def failure_text(error: Exception) -> str:

@@ -23,7 +23,8 @@ from napari_shadowinv.stack._folder_events import Arrivals, checked_folder, obse
 from napari_shadowinv.stack._plan import describe_stack
 from napari_shadowinv.stack._run import stored_type, stored_variables
 from napari_shadowinv.stack._sources import Reader, read_shot
-from napari_shadowinv.stack._watch_loop import OnWatchProgress, RunStatus, StackMaker, Watch
+from napari_shadowinv.stack._status import OnStatus
+from napari_shadowinv.stack._watch_loop import StackMaker, Watch
 
 if TYPE_CHECKING:
     import xarray
@@ -55,7 +56,7 @@ def watch_stack(
     polling: bool = False,
     idle: float | None = None,
     shots: int | None = None,
-    on_progress: OnWatchProgress | None = None,
+    on_progress: OnStatus | None = None,
     should_stop: ShouldStop | None = None,
 ) -> xarray.Dataset | None:
     """Invert, or fit, each file that arrives in a folder as soon as it is completely written.
@@ -94,7 +95,7 @@ def watch_stack(
     shots : int, optional
         Return after this many shots.
     on_progress : callable, optional
-        Receives a `WatchProgress` at the start, after each shot, and at the end.
+        Receives a `RunStatus` at the start, after each shot, and at the end.
     should_stop : callable, optional
         Called regularly, also in other threads; the watch ends when it returns true. Unfinished
         shots are inverted when it is resumed.
@@ -131,19 +132,18 @@ def watch_stack(
     )
     stored = stored_type(dtype)
     arrivals = Arrivals(place, pattern, settle=settle, existing=not skip_existing)
-    status = RunStatus(arrivals, on_progress)
+    stacks = StackMaker(describe, place, reader, chained=warm_start)
+    watch = Watch(path, stored, stacks, arrivals, on_progress, should_stop)
     try:
-        ensure_compiled(lambda news: status.report_stage(f"compiling, {news.message}"), should_stop)
+        ensure_compiled(lambda news: watch.report(stage=f"compiling, {news.message}"), should_stop)
     except InversionCancelled:
         return None
     with clear_up_when_terminated(), locked(path):
         remove_unfinished(path)
-        stacks = StackMaker(describe, place, reader, chained=warm_start)
-        watch = Watch(path, stored, stacks, arrivals, status, should_stop)
         watch.open(overwrite=overwrite, redo_failed=redo_failed)
-        with observing(arrivals, polling=polling, on_note=status.report_note):
+        with observing(arrivals, polling=polling, on_note=lambda note: watch.report(note=note)):
             watch.run(idle, shots)
-    return read_stack(path) if status.store is not None else None
+    return read_stack(path) if watch.store is not None else None
 
 
 def _check_numbers(**numbers: float | None) -> None:

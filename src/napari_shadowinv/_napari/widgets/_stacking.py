@@ -20,34 +20,16 @@ from napari_shadowinv.preprocessing import Recipe
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
-    from napari_shadowinv.stack import RunProgress
+    from napari_shadowinv.stack import RunStatus
 
 
-@dataclass
-class RunStatus:
-    """Progress of a run: its thread writes it, the window reads it."""
+def _empty_status() -> RunStatus:
+    from napari_shadowinv.stack import RunStatus
 
-    # Shots of the stack, including shots of earlier runs
-    total: int = 0
-    done: int = 0
-    failed: int = 0
-    ended: int = 0  # in this run
-    failures: list[tuple[str, str]] = field(default_factory=list)  # name and reason
-
-    @property
-    def text(self) -> str:
-        failed = f", {self.failed} failed" if self.failed else ""
-        return f"{self.done} of {self.total} done{failed}"
-
-    def update(self, progress: RunProgress) -> None:
-        if progress.outcome is not None:
-            self.ended += 1
-            if progress.outcome.reason:
-                self.failures.append((progress.name, progress.outcome.reason))
-        self.total, self.done, self.failed = progress.total, progress.done, progress.failed
+    return RunStatus()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class StackJob:
     """Shots to invert into a store: the arguments of `stack.run_stack`, and the run's status."""
 
@@ -61,7 +43,7 @@ class StackJob:
     workers: int | None = None
     overwrite: bool = False
     redo_failed: bool = False
-    status: RunStatus = field(default_factory=RunStatus)
+    status: RunStatus = field(default_factory=_empty_status)  # the window reads it at any time
 
     def run(
         self,
@@ -72,36 +54,23 @@ class StackJob:
         """Invert the pending shots; `on_done` gets each finished shot before the window does."""
         from napari_shadowinv.stack import run_stack
 
-        def update(progress: RunProgress) -> None:
-            if progress.preparing:
-                on_progress(Progress("prepare", 0, None, progress.preparing))
+        def update(status: RunStatus) -> None:
+            if status.stage:
+                on_progress(Progress("prepare", 0, None, status.stage))
                 return
-            if progress.outcome is None:
-                self._collect_earlier_failures()
-            # The window reads the status at any time: the layers must be ready before it changes.
-            if progress.done:
-                outcome = progress.outcome
+            # The layers must be ready before the window reads the status.
+            if status.done:
+                outcome = status.outcome
                 on_done(None if outcome is None or outcome.reason else outcome.index)
-            self.status.update(progress)
-            step = progress.done + progress.failed
-            on_progress(Progress("shots", step, progress.total, self.status.text))
+            self.status = status
+            step = status.done + status.failed
+            on_progress(Progress("shots", step, status.total, status.text))
 
         on_progress(Progress("prepare", 0, None, "shots and source"))
         names = [attribute.name for attribute in fields(self) if attribute.name != "status"]
         arguments = {name: getattr(self, name) for name in names}
         run_stack(**arguments, on_progress=update, should_stop=should_stop)
         return self.status
-
-    def _collect_earlier_failures(self) -> None:
-        """List the failures of earlier runs that are not retried."""
-        from napari_shadowinv.io.store import FAILED, StackStore
-
-        if self.redo_failed:
-            return
-        store = StackStore(self.out)
-        for index in np.flatnonzero(store.statuses() == FAILED):
-            reason = str(store.report(int(index)).get("reason", "unknown"))
-            self.status.failures.append((store.names[index], reason))
 
 
 @dataclass(frozen=True, eq=False)

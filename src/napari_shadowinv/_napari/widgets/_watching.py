@@ -16,14 +16,14 @@ from napari_shadowinv._napari.layer_metadata import KEY, role_of
 from napari_shadowinv._napari.widgets._forms import PathEdit, labelled
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import column
-from napari_shadowinv._napari.widgets._stacking import RunStatus, StackJob, StackRequest, is_image
+from napari_shadowinv._napari.widgets._stacking import StackJob, StackRequest, is_image
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import NEW_SHOTS
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
-    from napari_shadowinv.stack import RunProgress, WatchProgress
+    from napari_shadowinv.stack import RunStatus
 
 _UPDATE_INTERVAL_S = 0.5  # while the inversion falls behind the folder
 
@@ -59,35 +59,13 @@ class FolderEdit(QtWidgets.QWidget):
         return Path(self.folder.path).expanduser()
 
 
-@dataclass
-class WatchStatus(RunStatus):
-    """Progress of a watched folder."""
-
-    waiting: int = 0
-    note: str = ""
-
-    @property
-    def text(self) -> str:
-        failed = f", {self.failed} failed" if self.failed else ""
-        waiting = f", {self.waiting} waiting" if self.waiting else ""
-        note = f" ({self.note})" if self.note else ""
-        return f"{self.done} done{failed}{waiting}{note}"
-
-    def update(self, progress: RunProgress) -> None:
-        watch: WatchProgress = progress  # type: ignore[assignment]
-        # A shot that failed before may have been rewritten.
-        if any(name == progress.name for name, _ in self.failures):
-            self.failures = [failure for failure in self.failures if failure[0] != progress.name]
-        super().update(progress)
-        self.waiting, self.note = watch.waiting, watch.note or self.note
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class WatchJob(StackJob):
     """A folder to watch, as `shots`: the arguments of `stack.watch_stack`, and the status."""
 
     pattern: str = NEW_SHOTS
-    status: RunStatus = field(default_factory=WatchStatus)
+    waiting: int = 0  # files that have arrived
+    note: str = ""
 
     def run(
         self,
@@ -98,20 +76,18 @@ class WatchJob(StackJob):
         """Watch until stopped; `on_done` gets each finished shot, as in a run."""
         from napari_shadowinv.stack import watch_stack
 
-        status = self.status
-        assert isinstance(status, WatchStatus)
-
-        def update(progress: WatchProgress) -> None:
-            if progress.preparing:
-                on_progress(Progress("prepare", 0, None, progress.preparing))
+        def update(status: RunStatus) -> None:
+            if status.stage:
+                on_progress(Progress("prepare", 0, None, status.stage))
                 return
-            status.waiting = progress.waiting
-            outcome = progress.outcome
-            if progress.done and (outcome is not None or not status.total):
+            self.waiting, self.note = status.waiting, status.note or self.note
+            outcome = status.outcome
+            if status.done and (outcome is not None or not self.status.total):
                 on_done(None if outcome is None or outcome.reason else outcome.index)
-            status.update(progress)
+            self.status = status
             stage = "shots" if status.ended and status.waiting else "wait"
-            on_progress(Progress(stage, status.ended, None, status.text))
+            note = f" ({self.note})" if self.note else ""
+            on_progress(Progress(stage, status.ended, None, f"{status.text}{note}"))
 
         watch_stack(
             self.shots,
@@ -126,7 +102,7 @@ class WatchJob(StackJob):
             on_progress=update,
             should_stop=should_stop,
         )
-        return status
+        return self.status
 
 
 @dataclass
@@ -187,8 +163,7 @@ class WatchRequest(StackRequest):
             self._describe(self.growth.reference_shot)
 
     def _is_due(self) -> bool:
-        status = self.job.status
-        is_behind = isinstance(status, WatchStatus) and status.waiting > 1
+        is_behind = isinstance(self.job, WatchJob) and self.job.waiting > 1
         return not is_behind or time.monotonic() > self.growth.updated_at + _UPDATE_INTERVAL_S
 
     def _describe_longer(self) -> list[FullLayerData] | None:

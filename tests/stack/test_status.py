@@ -1,0 +1,48 @@
+"""The status of a run: numbers of shots, rate and forecast, as all faces show them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from napari_shadowinv import InversionOptions
+from napari_shadowinv.io.store import StackStore
+from napari_shadowinv.stack import RunStatus
+
+
+def test_rate_and_forecast_follow_from_the_numbers():
+    status = RunStatus(total=12, done=8, failed=1, waiting=3, ended=6, seconds=12.0)
+    assert status.rate == 0.5
+    assert status.remaining == 6.0
+    assert RunStatus(total=3, waiting=3).remaining is None
+
+
+@pytest.mark.parametrize(
+    ("status", "text"),
+    [
+        (RunStatus(total=4, done=4), "4 of 4 done"),
+        (RunStatus(total=4, done=2, failed=1, waiting=1), "2 of 4 done, 1 failed"),
+        (RunStatus(total=4, done=4, doubtful=3), "4 of 4 done, 3 with warnings"),
+        (RunStatus(done=2, waiting=5, engine="watching"), "2 done, 5 waiting"),
+    ],
+)
+def test_text_names_the_numbers_above_zero(status, text):
+    assert status.text == text
+
+
+def test_status_counts_shots_of_earlier_runs(make_night, out):
+    night = make_night(4)
+    np.save(night.path(1), 0 * night.images[1])
+    few = InversionOptions(n_sites=30)  # too few sites for the image: a warning
+    events: list[RunStatus] = []
+    night.run(out, options=few, on_progress=events.append)
+    last = [event for event in events if not event.stage][-1]
+    warned = sum(bool(report.get("warnings")) for report in StackStore(out).reports())
+    assert (last.total, last.done, last.failed, last.waiting, last.ended) == (4, 3, 1, 0, 4)
+    assert last.doubtful == warned > 0
+    assert [name for name, _ in last.failures] == ["shot_1.npy"]
+    events.clear()
+    night.run(out, options=few, on_progress=events.append)
+    again = events[-1]
+    assert (again.done, again.failed, again.doubtful, again.ended) == (3, 1, warned, 0)
+    assert again.failures == last.failures
