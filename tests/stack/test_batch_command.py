@@ -550,7 +550,7 @@ def test_ctrl_c_while_the_store_is_made_leaves_nothing(night, folder):
         import time
         from concurrent.futures import ThreadPoolExecutor
         from pathlib import Path
-        from napari_shadowinv.io import store_layout as store
+        from napari_shadowinv.io import store_writing as store
 
         create = store._create_array
         pool = ThreadPoolExecutor(1)

@@ -16,6 +16,7 @@ from napari_shadowinv import FileFormatError, InputError, InversionOptions, read
 from napari_shadowinv._system.locking import locked
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.io.store_checksums import SEAL
+from napari_shadowinv.io.store_writing import ShotWriter
 
 
 @pytest.fixture
@@ -265,7 +266,7 @@ def test_workers_of_the_shorter_store_write_new_shots(night, out, whole, hidden)
 
 def test_a_store_that_looks_shorter_here_is_not_written(night, out):
     night.run(out)
-    old = StackStore(out).writer
+    old = ShotWriter.of(StackStore(out))
     writer = type(old)(old.path, old.store_id, old.shots + 1)
     with pytest.raises(OSError, match="has 6 shots here and 7 where the run was started"):
         writer.write(6, {}, {})

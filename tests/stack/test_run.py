@@ -24,6 +24,7 @@ from napari_shadowinv import (
 from napari_shadowinv.inversion import compilation
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
+from napari_shadowinv.io.store_writing import ShotWriter
 from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import read_shot
 from napari_shadowinv.stack._sources import reader_text
@@ -315,7 +316,7 @@ def test_overwriting_begins_anew(night, out):
 
 def test_a_writer_of_a_store_that_was_replaced_writes_nothing(night, out):
     night.run(out, shots=night.images)
-    old = StackStore(out).writer
+    old = ShotWriter.of(StackStore(out))
     night.run(out, shots=night.images, overwrite=True)
     before = content(out)
     with pytest.raises(OSError, match="is not the store the run started with"):

@@ -17,6 +17,7 @@ from store_content import content
 from command_line import flat, shadowinv
 from napari_shadowinv import FileFormatError, read
 from napari_shadowinv.io.store import DAMAGED, DONE, FAILED, PENDING, StackStore
+from napari_shadowinv.io.store_writing import ShotWriter
 
 
 @pytest.fixture(scope="module")
@@ -157,8 +158,7 @@ def test_done_shot_whose_file_turns_bad_loses_every_field(make_night, out):
     night.run(out, variables=names)
     field(out, 1, "potential").unlink()
     np.save(night.path(1), 0 * night.images[1])
-    store = StackStore(out)
-    store.writer.reopen(1)
+    ShotWriter.of(StackStore(out)).reopen(1)
     written = night.run(out, variables=names)
     assert written.status.values.tolist() == [DONE, FAILED]
     for name in ("potential", "displacement", "weights"):
@@ -172,7 +172,7 @@ def test_done_shot_whose_file_turns_bad_loses_every_field(make_night, out):
 def test_shot_that_was_done_keeps_no_field(make_night, out, way):
     names = ("potential", "displacement", "caustic", "weights")
     make_night(2).run(out, variables=names)
-    writer = StackStore(out).writer
+    writer = ShotWriter.of(StackStore(out))
     if way == "reopened":
         writer.reopen(1)
     else:
@@ -202,9 +202,9 @@ def test_checksums_of_a_folder_are_not_passed_on(finished):
 
 
 def test_many_shots_span_chunks_without_false_alarm(any_night, tmp_path, monkeypatch):
-    from napari_shadowinv.io import store_layout
+    from napari_shadowinv.io import store_writing
 
-    monkeypatch.setattr(store_layout, "_TOGETHER", 2)
+    monkeypatch.setattr(store_writing, "_TOGETHER", 2)
     path = tmp_path / "n.shadowinv.zarr"
     any_night.run(path, shots=[any_night.path(i) for i in range(3)])
     any_night.run(path)

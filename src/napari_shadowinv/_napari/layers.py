@@ -21,7 +21,7 @@ from napari_shadowinv._napari.sites import Cells, power_cells, site_features
 from napari_shadowinv._napari.viewer_sync import connect_viewer, show_scale_bar
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.inversion.variables import VARIABLES
-from napari_shadowinv.io.store_setups import of_each_setup
+from napari_shadowinv.io.store import of_each_setup
 from napari_shadowinv.physics.units import (
     ShownField,
     intensity_limits,

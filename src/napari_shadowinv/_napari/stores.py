@@ -23,7 +23,7 @@ from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.formats import RESULT
-from napari_shadowinv.io.store_setups import with_own_setups
+from napari_shadowinv.io.store import columns_of_store, open_dataset, with_own_setups
 
 if TYPE_CHECKING:
     import xarray
@@ -53,21 +53,9 @@ def first_shot(path: Path) -> int:
 @as_file_errors
 def _open(path: Path) -> xarray.Dataset:
     """Open a store lazily with the axis of shots first, or raise a `FileFormatError`."""
-    import xarray as xr
-
-    from napari_shadowinv.io.store_files import CheckedStore, describes_arrays
-
     if not path.is_dir():
         raise FileFormatError(f"{path} does not exist: expected a folder made by an inversion")
-    # No variable is a time, whatever its unit. While a store grows, only the folder's consolidated
-    # metadata give all arrays the same length.
-    dataset: xr.Dataset = xr.open_zarr(
-        CheckedStore(path),
-        chunks={},
-        decode_times=False,
-        mask_and_scale=False,
-        consolidated=describes_arrays(path),
-    )
+    dataset = open_dataset(path)
     if "displacement" not in dataset or "shot" not in dataset["displacement"].dims:
         raise FileFormatError(
             f"{path} is a Zarr folder but not a store of inverted shots (it has no "
@@ -104,12 +92,9 @@ def shot_of_store(path: Path, index: int) -> xarray.Dataset:
 @as_file_errors
 def shot_rows(path: Path, index: int) -> list[tuple[str, str]]:
     """Return the quantities of a shot that tables list, as rows of a report."""
-    from napari_shadowinv.io.store import kind_of_shots
-    from napari_shadowinv.io.store_columns import columns_of
-
     dataset = _open(path)
     report = json.loads(str(dataset["report"][index].values) or "{}")
-    columns = columns_of(kind_of_shots(dataset.attrs))
+    columns = columns_of_store(dataset.attrs)
     texts = {column.title: column.text(report) for column in columns if column.format}
     rows = [(title.capitalize(), text) for title, text in texts.items() if text]
     return [("Shot", f"{index} ({_shot_names(dataset)[index]})"), *rows]

@@ -1,7 +1,7 @@
 """Results of many shots in one Zarr store, written shot by shot.
 
-- write one shot, or why it failed: `ShotWriter`
-- read the results: `read_stack` (lazy, for everyone), `StackStore` (for a run)
+- open the results: `read_stack` (lazy, for everyone), `StackStore` (for a run)
+- the setup of each shot, where shots have different ones: `with_own_setups`, `of_each_setup`
 
 Each variable has one chunk for each shot, each chunk is a file that appears whole or not at
 all, and the last one of a shot is its `status`: a shot that is not marked there is pending and will
@@ -11,19 +11,20 @@ be written again. So workers can write at the same time, and any of them may die
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from napari_shadowinv._system.safety import as_file_errors, small_text
-from napari_shadowinv._typing import AnyArray
+from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.inversion.variables import (
+    SETUPS_LABEL,
     fit_labels,
+    place_label,
     setup_from_dataset,
     update_labels,
     variable_labels,
@@ -39,11 +40,9 @@ from napari_shadowinv.io.store_checksums import (
     Status,
     check_seal,
     find_damage,
-    note_shot,
-    read_labels,
+    is_along_shots,
 )
-from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, columns_of
-from napari_shadowinv.io.store_setups import OWN_SETUPS, field_in_si, with_own_setups
+from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, Column, columns_of
 
 if TYPE_CHECKING:
     import xarray
@@ -52,10 +51,9 @@ FORMAT = "shadowinv stack"
 STORE_SUFFIX = STORE.suffix
 PENDING, DONE, FAILED, DAMAGED = map(int, Status)
 STATUS_NAMES = tuple(status.name.lower() for status in Status)
-
-
-class StoreError(OSError):
-    """A store that cannot be written: the run must end, no shot is to blame."""
+# Attribute of a store whose shots are rows of a table, each with its own setup in its report.
+OWN_SETUPS = "table_of_shots"
+_NO_TEXT = np.array([], object)
 
 
 def check_store_path(path: str | Path) -> Path:
@@ -75,7 +73,7 @@ def check_store_path(path: str | Path) -> Path:
 
 def is_stack(path: str | Path) -> bool:
     """Return whether a folder is a store of many shots."""
-    return _read_attributes(Path(path)).get("format") == FORMAT
+    return read_attributes(Path(path)).get("format") == FORMAT
 
 
 def fitted_field(attributes: Mapping[Any, Any]) -> str | None:
@@ -84,11 +82,11 @@ def fitted_field(attributes: Mapping[Any, Any]) -> str | None:
     return str(names[0]) if names else None
 
 
-def kind_of_shots(attributes: Mapping[Any, Any]) -> str:
-    """Return whether the shots of a store are inversions, rows of a table, or fits."""
+def columns_of_store(attributes: Mapping[Any, Any]) -> tuple[Column, ...]:
+    """Return the columns of a store, by its attributes."""
     if fitted_field(attributes) is not None:
-        return FITS
-    return ROWS if OWN_SETUPS in attributes else INVERSIONS
+        return columns_of(FITS)
+    return columns_of(ROWS if OWN_SETUPS in attributes else INVERSIONS)
 
 
 def _read_document(path: Path) -> dict[str, Any]:
@@ -101,125 +99,9 @@ def _read_document(path: Path) -> dict[str, Any]:
         return {}
 
 
-def _read_attributes(path: Path) -> dict[str, Any]:
+def read_attributes(path: Path) -> dict[str, Any]:
+    """Return the attributes of a store, empty for a folder of another kind."""
     return dict(_read_document(path).get("attributes", {}))
-
-
-def store_error(path: Path, error: OSError) -> StoreError:
-    """Return the error of a store that cannot be written, with its reason and advice."""
-    if not (path / "zarr.json").exists():
-        return StoreError(
-            f"{path} was removed or moved while it was being written: put it back and run again to "
-            "resume, or start again with another name"
-        )
-    return StoreError(
-        f"{path} cannot be written ({error.strerror or error}): free some disk space or check "
-        "the folder's permissions, then run again to resume"
-    )
-
-
-@dataclass(frozen=True)
-class ShotWriter:
-    """Writer of shots into an existing store; it can be sent to a worker."""
-
-    path: Path
-    store_id: str  # another store may have taken its place
-    shots: int  # it may have had fewer when this process opened it before
-
-    def write(self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
-        """Write a shot and its report; it is done when this returns, pending if this fails."""
-        self._commit(index, arrays, report, DONE)
-
-    def fail(self, index: int, report: Mapping[str, Any]) -> None:
-        """Write why a shot failed."""
-        self._commit(index, {}, report, FAILED)
-
-    def _commit(
-        self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any], status: int
-    ) -> None:
-        attributes = _read_attributes(self.path)
-        if attributes.get("store_id") != self.store_id:
-            raise StoreError(
-                f"{self.path} is missing or is not the store the run started with: all workers "
-                "must share one file system, and the store must not be replaced during the run"
-            )
-        group = self.arrays()
-        try:
-            for name in fields_of(group):
-                if name in arrays:
-                    group[name][index : index + 1] = np.asarray(arrays[name])[np.newaxis]
-                else:
-                    erase(self.path, group[name], index)
-            checksums = note_shot(self.path, group, index, self.labels(index, attributes))
-            text = json.dumps({**report, **checksums})
-            group["report"][index : index + 1] = np.array([text], dtype=object)
-            group["status"][index : index + 1] = np.int8(status)
-        except OSError as error:
-            raise store_error(self.path, error) from error
-
-    def reopen(self, index: int) -> None:
-        """Mark a shot as pending that is to be done again, and forget its report and fields."""
-        group = self.arrays()
-        try:
-            group["status"][index : index + 1] = np.int8(PENDING)
-            for name in ("report", *fields_of(group)):
-                erase(self.path, group[name], index)
-        except OSError as error:
-            raise store_error(self.path, error) from error
-
-    def labels(self, index: int, attributes: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the name and other labels of a shot."""
-        numbers = tuple(column.key for column in columns_of(kind_of_shots(attributes)))
-        labels = _labels_of_all(self.path, self.store_id, self.shots, numbers)
-        return labels[index] if labels else {}
-
-    def arrays(self) -> dict[str, Any]:
-        return _open_arrays(self.path, self.store_id, self.shots)
-
-
-def fields_of(arrays: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names of the arrays that hold a chunk of values for each shot."""
-    return tuple(
-        name
-        for name, array in arrays.items()
-        if is_along_shots(array) and array.chunks[0] == 1 and name not in ("status", "report")
-    )
-
-
-def erase(path: Path, array: Any, index: int) -> None:
-    """Remove the chunk of a shot, which is read as the fill value then."""
-    key = array.metadata.encode_chunk_key((index, *[0] * (array.ndim - 1)))
-    (path / array.basename / key).unlink(missing_ok=True)
-
-
-def open_to_write(path: Path) -> dict[str, Any]:
-    """Open the arrays of a store to write to them."""
-    import zarr
-
-    # Also chunks that are empty: one that is not there has been lost.
-    return {
-        name: array.with_config({"write_empty_chunks": True})
-        for name, array in zarr.open_group(path, mode="r+").arrays()
-    }
-
-
-@lru_cache(maxsize=4)
-def _labels_of_all(
-    path: Path, store_id: str, shots: int, numbers: tuple[str, ...]
-) -> list[dict[str, Any]]:
-    return read_labels(_open_arrays(path, store_id, shots), numbers, slice(shots))
-
-
-@lru_cache(maxsize=4)
-def _open_arrays(path: Path, store_id: str, shots: int) -> dict[str, Any]:
-    arrays = open_to_write(path)
-    shot_count = arrays["status"].shape[0]
-    if shot_count != shots:
-        raise StoreError(
-            f"{path} has {shot_count} shots here and {shots} where the run was started: wait until "
-            "the file system is in sync on all machines, then run again to resume"
-        )
-    return arrays
 
 
 class StackStore:
@@ -254,16 +136,12 @@ class StackStore:
         if self.attributes.get("format") != FORMAT:
             raise FileFormatError(f"{path} is not a stack of shots: expected name{STORE_SUFFIX}")
         self.field = fitted_field(self.attributes)
-        self.columns = columns_of(kind_of_shots(self.attributes))
+        self.columns = columns_of_store(self.attributes)
         self._layout = Layout.of(path, document)
         self._arrays = _open_readable(path)
         self.names = tuple(map(str, self._values("name").tolist()))
         if self._layout is None:
             self.statuses()
-
-    @property
-    def writer(self) -> ShotWriter:
-        return ShotWriter(self.path, self.attributes["store_id"], len(self.names))
 
     def statuses(self) -> AnyArray:
         """Return PENDING, DONE, FAILED or DAMAGED for each shot."""
@@ -331,19 +209,6 @@ class StackStore:
     def _values(self, name: str, which: Any = ...) -> AnyArray:
         return _values(self.path, self._arrays[name], which)
 
-    def summarise(self) -> None:
-        """Gather numbers of each shot from their reports, for those who open the store."""
-        reports = self.reports()
-        group = self.writer.arrays()
-        try:
-            for column in self.columns:
-                if column.key not in group:  # a store of an older version
-                    continue
-                values = [column.of(report) for report in reports]
-                group[column.key][...] = np.array(values, dtype=column.dtype)
-        except OSError as error:
-            raise store_error(self.path, error) from error
-
 
 def check_files(store: StackStore) -> None:
     """Refuse a store with damage to files that belong to no single shot."""
@@ -383,9 +248,22 @@ def _parse_reports(path: Path, texts: Sequence[str]) -> list[dict[str, Any]]:
     return [dict(json.loads(text)) if text else {} for text in texts]
 
 
-def is_along_shots(array: Any) -> bool:
-    """Return whether an array of a store has a value for each shot."""
-    return tuple(array.metadata.dimension_names or ())[:1] == ("shot",)
+def open_dataset(path: Path) -> xarray.Dataset:
+    """Open the arrays of a Zarr folder lazily; each file is checked before it is read."""
+    import xarray as xr
+
+    from napari_shadowinv.io.store_files import CheckedStore, describes_arrays
+
+    # No variable is a time, whatever its unit. While a store grows, only the folder's consolidated
+    # metadata give all arrays the same length.
+    dataset: xr.Dataset = xr.open_zarr(
+        CheckedStore(path),
+        chunks={},
+        decode_times=False,
+        mask_and_scale=False,
+        consolidated=describes_arrays(path),
+    )
+    return dataset
 
 
 @as_file_errors
@@ -410,15 +288,8 @@ def read_stack(path: Path) -> xarray.Dataset:
     FileFormatError
         If it is no store, or is damaged.
     """
-    import xarray as xr
-
-    from napari_shadowinv.io.store_files import CheckedStore
-
     store = StackStore(path)
-    dataset: xr.Dataset = xr.open_zarr(
-        CheckedStore(path), decode_times=False, mask_and_scale=False, chunks={}
-    )
-    dataset = update_labels(dataset)
+    dataset = update_labels(open_dataset(path))
     if dataset.sizes["shot"] > len(store.names):  # grown since
         dataset = dataset.isel(shot=slice(len(store.names)))
     check_files(store)
@@ -451,3 +322,67 @@ def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:
             continue
         fields[name] = (("shot", *dims), field_in_si(dataset, origin, name, setup), labels)
     return dataset.assign(fields)
+
+
+def with_own_setups(dataset: xarray.Dataset) -> xarray.Dataset:
+    """Add the setup of each shot, read lazily, if shots have different ones."""
+    if OWN_SETUPS not in dataset.attrs or "setup" not in dataset.attrs:
+        return dataset
+    texts = dataset["report"].data.map_blocks(_setups_of_block, dtype=object, meta=_NO_TEXT)
+    return with_places(dataset.assign(setup=(("shot",), texts, SETUPS_LABEL)))
+
+
+def with_places(dataset: xarray.Dataset) -> xarray.Dataset:
+    """Add the coordinates of each shot's pixels in metres, by the shot's own setup."""
+    sizes = of_each_setup(dataset, _pixel_size)[:, np.newaxis]
+    places = {
+        f"{name}_si": (("shot", name), sizes * dataset[name].values, place_label(name))
+        for name in ("y", "x")
+    }
+    return dataset.assign_coords(places)
+
+
+def _pixel_size(setup: Any) -> float:
+    return float(setup.object_pixel_size)
+
+
+def _setups_of_block(reports: AnyArray) -> AnyArray:
+    provenances = (json.loads(str(text) or "{}").get("provenance", {}) for text in reports)
+    setups = (provenance.get("setup") for provenance in provenances)
+    return np.array(["" if setup is None else json.dumps(setup) for setup in setups], object)
+
+
+def of_each_setup(dataset: xarray.Dataset, measure: Callable[[Any], float]) -> Any:
+    """Return a number of each shot's setup, NaN until it is done; None if all share one setup."""
+    if "setup" not in dataset:
+        return None
+    return dataset["setup"].data.map_blocks(_measure_setups, measure, dtype=np.float64)
+
+
+def _measure_setups(texts: AnyArray, measure: Callable[[Any], float]) -> FloatArray:
+    from napari_shadowinv.physics.setup import setup_from_dict
+
+    measures = (measure(setup_from_dict(json.loads(text))) if text else np.nan for text in texts)
+    return np.array(list(measures))
+
+
+def field_in_si(dataset: xarray.Dataset, origin: str, name: str, setup: Any) -> Any:
+    """Return a field of all shots in SI units, lazily, by one setup for each or for all."""
+    data = dataset[origin].data
+    if "setup" not in dataset:
+        return data.map_blocks(_field_of_block, None, name, setup, dtype=np.float64)
+    texts = dataset["setup"].data[(..., *[np.newaxis] * (data.ndim - 1))]
+    return data.map_blocks(
+        _field_of_block, texts, name, setup, dtype=np.float64, chunks=data.chunks
+    )
+
+
+def _field_of_block(block: AnyArray, texts: AnyArray | None, name: str, setup: Any) -> FloatArray:
+    from napari_shadowinv.physics.setup import setup_from_dict
+
+    setups = [setup] * len(block)
+    if texts is not None:
+        # A shot that is not done yet is NaN with any setup.
+        setups = [setup_from_dict(json.loads(text)) if text else setup for text in texts.flat]
+    pairs = zip(setups, block, strict=True)
+    return np.stack([shot_setup.field_in_si(name, values) for shot_setup, values in pairs])

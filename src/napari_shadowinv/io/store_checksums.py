@@ -106,24 +106,20 @@ class Layout:
         return tuple(
             name
             for name in self.arrays
-            if self._is_along_shots(name) and self._together(name) == 1 and name not in _RECORD
+            if _has_shots(self.arrays[name]) and self._together(name) == 1 and name not in _RECORD
         )
 
     @cached_property
     def of_many_shots(self) -> tuple[str, ...]:
         """Arrays with the values of many shots in one chunk."""
         return tuple(
-            name for name in self.arrays if self._is_along_shots(name) and self._together(name) > 1
+            name
+            for name in self.arrays
+            if _has_shots(self.arrays[name]) and self._together(name) > 1
         )
 
-    def _is_along_shots(self, name: str) -> bool:
-        return bool((self.arrays[name].get("dimension_names") or [None])[0] == "shot")
-
     def _together(self, name: str) -> int:
-        return int(self._chunk_shape(name)[0])
-
-    def _chunk_shape(self, name: str) -> list[int]:
-        return list(self.arrays[name]["chunk_grid"]["configuration"]["chunk_shape"])
+        return int(self.arrays[name]["chunk_grid"]["configuration"]["chunk_shape"][0])
 
     def key(self, name: str, index: int) -> str:
         """Return the key of a chunk by its first number; along other axes there is one."""
@@ -136,11 +132,27 @@ class Layout:
                 yield self.key(name, index)
 
 
+def _has_shots(description: Mapping[str, Any]) -> bool:
+    """Return whether a described array has a value for each shot."""
+    return bool((description.get("dimension_names") or [None])[0] == "shot")
+
+
 def fixed_keys(document: Mapping[str, Any]) -> Iterator[str]:
     """Yield the keys of chunks that belong to no shot; such an array has one."""
     for name, array in document["consolidated_metadata"]["metadata"].items():
-        if (array.get("dimension_names") or [None])[0] != "shot" and array["node_type"] == "array":
+        if not _has_shots(array) and array["node_type"] == "array":
             yield "/".join([name, "c", *["0"] * len(array["shape"])])
+
+
+def is_along_shots(array: Any) -> bool:
+    """Return whether an open Zarr array has a value for each shot."""
+    return tuple(array.metadata.dimension_names or ())[:1] == ("shot",)
+
+
+def chunk_file(root: Path, array: Any, index: int) -> Path:
+    """Return the file of a shot's chunk of an open Zarr array."""
+    key = array.metadata.encode_chunk_key((index, *[0] * (array.ndim - 1)))
+    return Path(root, array.basename, key)
 
 
 def has_checksums(array: Any) -> bool:
@@ -155,28 +167,22 @@ def note_shot(
     """Return the checksums of a shot's written chunks and its labels, for its report."""
     chunks: dict[str, str | None] = {}
     for name, array in arrays.items():
-        if (array.metadata.dimension_names or (None,))[0] != "shot" or name in _RECORD:
+        if not is_along_shots(array) or name in _RECORD:
             continue
         if not has_checksums(array):
             return {}
         if array.chunks[0] == 1:
-            key = array.metadata.encode_chunk_key((index, *[0] * (array.ndim - 1)))
-            chunks[name] = stored_checksum(root / name / key)
+            chunks[name] = stored_checksum(chunk_file(root, array, index))
     return {CHUNKS: chunks, LABELS: dict(labels)}
 
 
-def read_labels(
-    arrays: Mapping[str, Any], numbers: Collection[str], which: slice
-) -> list[dict[str, Any]]:
-    """Return the labels of some shots; the `numbers` are arrays that are copied from reports."""
-    columns = {
-        name: np.asarray(array[which]).tolist()
+def read_labels(arrays: Mapping[str, Any], numbers: Collection[str], index: int) -> dict[str, Any]:
+    """Return the labels of a shot; the `numbers` are arrays that are copied from reports."""
+    return {
+        name: np.asarray(array[index]).tolist()
         for name, array in arrays.items()
-        if (array.metadata.dimension_names or (None,))[0] == "shot"
-        and array.chunks[0] > 1
-        and name not in numbers
+        if is_along_shots(array) and array.chunks[0] > 1 and name not in numbers
     }
-    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def stored_checksum(file: Path) -> str | None:

@@ -13,8 +13,8 @@ from napari_shadowinv._system.validation import check_instance
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.variables import SETUPS_LABEL, variable_labels
+from napari_shadowinv.io.store import with_places
 from napari_shadowinv.io.store_columns import INVERSIONS, column_values, columns_of
-from napari_shadowinv.io.store_setups import with_places
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack import _plan

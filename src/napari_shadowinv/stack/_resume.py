@@ -13,7 +13,7 @@ from napari_shadowinv import __version__
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.store import DONE, StackStore, check_files
-from napari_shadowinv.io.store_layout import Contents, Variable, grow_store
+from napari_shadowinv.io.store_writing import Contents, ShotWriter, Variable, grow_store, summarise
 from napari_shadowinv.stack import _plan
 from napari_shadowinv.stack._plan import dtype_of
 from napari_shadowinv.stack._shots import CHAINED, Stack
@@ -127,12 +127,12 @@ def reopen_damaged(store: StackStore) -> StackStore:
     """
     damage = StackStore(store.path, every_byte=True).damage
     for index in damage.shots:
-        store.writer.reopen(index)
+        ShotWriter.of(store).reopen(index)
     if not (damage.shots or damage.files):
         return store
     store = StackStore(store.path)
     if damage.files:
-        store.summarise()
+        summarise(store)
         check_files(store := StackStore(store.path, every_byte=True))
     return store
 
@@ -195,11 +195,12 @@ def _difference(before: str, now: str) -> str:
 def append_shots(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> StackStore:
     """Append shots that arrived since the last run, as pending, to the store."""
     coordinates = {
-        name: np.asarray(coordinate.values)
+        name: np.asarray(coordinate.values)[len(store.names) :]
         for name, coordinate in _coordinates(stack).items()
         if coordinate.along_shots
     }
     begins = [*store.attributes.get(_APPENDED, []), len(store.names)]
     source = _identity(stack, dtype)["source_image"]
     attributes = {"source_image": source, _APPENDED: begins}
-    return grow_store(store.path, len(stack.shots), coordinates, attributes)
+    grow_store(store.path, coordinates, attributes)
+    return StackStore(store.path)

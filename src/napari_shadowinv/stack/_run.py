@@ -20,7 +20,12 @@ from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_store_path
-from napari_shadowinv.io.store_layout import create_store, remove_unfinished
+from napari_shadowinv.io.store_writing import (
+    ShotWriter,
+    create_store,
+    remove_unfinished,
+    summarise,
+)
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._engines import Engine, WorkerDiedError, engine_for, is_local
@@ -191,7 +196,7 @@ class _Run:
         should_stop: ShouldStop | None,
     ) -> None:
         self._stack = stack
-        self._store = store
+        self._store, self._writer = store, ShotWriter.of(store)
         self._on_progress = on_progress
         self._should_stop = should_stop
         statuses, reports = store.statuses(), store.reports()
@@ -244,9 +249,9 @@ class _Run:
             self._work_on(engine)
         except BaseException:
             with suppress(OSError):
-                self._store.summarise()
+                summarise(self._store)
             raise
-        self._store.summarise()
+        summarise(self._store)
 
     def _work_on(self, engine: Engine) -> None:
         self.report(engine.name)
@@ -280,7 +285,7 @@ class _Run:
     def _shared(self, engine: Engine) -> tuple[Any, Any]:
         stack = self._stack
         per_shot = tuple(name for name in stack.variables if not stack.is_shared(name))
-        context = TaskContext(self._store.writer, stack.work(per_shot), engine.workers)
+        context = TaskContext(self._writer, stack.work(per_shot), engine.workers)
         # A name that no earlier run has used: dask would reuse the earlier value.
         name = f"settings-{self._store.attributes['store_id']}-{time.time_ns()}"
         beam = stack.beam and engine.share(stack.beam, f"beam-{stack.beam.key}")
@@ -320,7 +325,7 @@ class _Run:
             lost = [index for index in batch if index in self._todo]
             outcomes = [ShotOutcome(index, FAILED, 0.0, str(error)) for index in lost]
             for index in lost:
-                self._store.writer.fail(index, {"reason": str(error)})
+                self._writer.fail(index, {"reason": str(error)})
         if outcomes is None:
             return False
         for outcome in outcomes:

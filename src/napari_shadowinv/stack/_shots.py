@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.inversion import count_sites
 from napari_shadowinv.inversion.variables import fit_labels, variable_labels
-from napari_shadowinv.io.store_setups import OWN_SETUPS
+from napari_shadowinv.io.store import OWN_SETUPS
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline import Inputs
 from napari_shadowinv.pipeline.fit_run import usual_fields

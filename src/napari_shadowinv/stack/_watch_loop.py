@@ -23,8 +23,7 @@ from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
-from napari_shadowinv.io.store_growing import GrowingStore
-from napari_shadowinv.io.store_layout import create_store
+from napari_shadowinv.io.store_writing import GrowingStore, create_store
 from napari_shadowinv.stack._discovery import Shots
 from napari_shadowinv.stack._folder_events import Arrivals
 from napari_shadowinv.stack._resume import NUMBERED_AS_ARRIVED, contents_of, match_store

@@ -26,9 +26,9 @@ from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
-from napari_shadowinv.io.store import DONE, FAILED, ShotWriter
+from napari_shadowinv.io.store import DONE, FAILED
 from napari_shadowinv.io.store_columns import INVERSIONS, column_values
-from napari_shadowinv.io.store_growing import GrowingStore
+from napari_shadowinv.io.store_writing import GrowingStore, ShotWriter
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.pipeline import Cache, Inputs, run_prepared
 from napari_shadowinv.preprocessing import UniformEstimate

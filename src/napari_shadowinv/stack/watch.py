@@ -17,7 +17,7 @@ from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.formats import NEW_SHOTS
 from napari_shadowinv.io.store import check_store_path
-from napari_shadowinv.io.store_layout import remove_unfinished
+from napari_shadowinv.io.store_writing import remove_unfinished
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.stack._folder_events import Arrivals, checked_folder, observing
 from napari_shadowinv.stack._plan import describe_stack

@@ -1,0 +1,442 @@
+"""Writing a store of many shots: create it, add shots to it, write each.
+
+- create a store with all shots pending: `create_store`, from its `Contents`
+- make room for more shots: `grow_store`
+- write a shot, or why it failed, also in a worker: `ShotWriter`; gather numbers: `summarise`
+- a store that grows by one shot at a time while its run goes on: `GrowingStore`
+
+The folder's own ``zarr.json`` holds a copy of every array's shape, and who opens the store goes
+by that copy. So a store changes its length in one moment: when that one file is replaced.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shutil
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from napari_shadowinv._system.hidden_files import hidden_name, sweep
+from napari_shadowinv._system.machine import defer_interrupts
+from napari_shadowinv._typing import AnyArray
+from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.io.files import replacing
+from napari_shadowinv.io.store import (
+    DONE,
+    FAILED,
+    FORMAT,
+    PENDING,
+    STATUS_NAMES,
+    StackStore,
+    columns_of_store,
+    read_attributes,
+)
+from napari_shadowinv.io.store_checksums import (
+    FIXED,
+    chunk_file,
+    fixed_keys,
+    is_along_shots,
+    note_shot,
+    read_labels,
+    reseal,
+    seal,
+    stored_checksum,
+)
+from napari_shadowinv.io.store_columns import Column
+
+_TOGETHER = 1024  # values of a coordinate along shots that are one file
+_SMALL = 64  # values that are not worth compressing
+
+
+class StoreError(OSError):
+    """A store that cannot be written: the run must end, no shot is to blame."""
+
+
+@contextmanager
+def _as_store_errors(path: Path) -> Iterator[None]:
+    """Turn an error of the file system into a `StoreError` with its reason and advice."""
+    try:
+        yield
+    except StoreError:
+        raise
+    except OSError as error:
+        if not (path / "zarr.json").exists():
+            raise StoreError(
+                f"{path} was removed or moved while it was being written: put it back and run "
+                "again to resume, or start again with another name"
+            ) from error
+        raise StoreError(
+            f"{path} cannot be written ({error.strerror or error}): free some disk space or check "
+            "the folder's permissions, then run again to resume"
+        ) from error
+
+
+@dataclass(frozen=True)
+class ShotWriter:
+    """Writer of shots into an existing store; it can be sent to a worker."""
+
+    path: Path
+    store_id: str  # another store may have taken its place
+    shots: int  # it may have had fewer when this process opened it before
+    opened: dict[str, Any] | None = field(default=None, compare=False, repr=False)
+
+    @classmethod
+    def of(cls, store: StackStore) -> ShotWriter:
+        return cls(store.path, store.attributes["store_id"], len(store.names))
+
+    def write(self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
+        """Write a shot and its report; it is done when this returns, pending if this fails."""
+        self._commit(index, arrays, report, DONE)
+
+    def fail(self, index: int, report: Mapping[str, Any]) -> None:
+        """Write why a shot failed."""
+        self._commit(index, {}, report, FAILED)
+
+    def _commit(
+        self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any], status: int
+    ) -> None:
+        attributes = read_attributes(self.path)
+        if attributes.get("store_id") != self.store_id:
+            raise StoreError(
+                f"{self.path} is missing or is not the store the run started with: all workers "
+                "must share one file system, and the store must not be replaced during the run"
+            )
+        group = self.arrays()
+        with _as_store_errors(self.path):
+            for name in _fields_of(group):
+                if name in arrays:
+                    group[name][index : index + 1] = np.asarray(arrays[name])[np.newaxis]
+                else:
+                    self._erase(group[name], index)
+            labels = read_labels(group, [c.key for c in columns_of_store(attributes)], index)
+            text = json.dumps({**report, **note_shot(self.path, group, index, labels)})
+            group["report"][index : index + 1] = np.array([text], dtype=object)
+            group["status"][index : index + 1] = np.int8(status)
+
+    def reopen(self, index: int) -> None:
+        """Mark a shot as pending that is to be done again, and forget its report and fields."""
+        group = self.arrays()
+        with _as_store_errors(self.path):
+            group["status"][index : index + 1] = np.int8(PENDING)
+            for name in ("report", *_fields_of(group)):
+                self._erase(group[name], index)
+
+    def _erase(self, array: Any, index: int) -> None:
+        """Remove the chunk of a shot, which is read as the fill value then."""
+        chunk_file(self.path, array, index).unlink(missing_ok=True)
+
+    def arrays(self) -> dict[str, Any]:
+        return self.opened or _open_arrays(self.path, self.store_id, self.shots)
+
+
+def _fields_of(arrays: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of the arrays that hold a chunk of values for each shot."""
+    return tuple(
+        name
+        for name, array in arrays.items()
+        if is_along_shots(array) and array.chunks[0] == 1 and name not in ("status", "report")
+    )
+
+
+def _open_to_write(path: Path) -> dict[str, Any]:
+    import zarr
+
+    # Also chunks that are empty: one that is not there has been lost.
+    return {
+        name: array.with_config({"write_empty_chunks": True})
+        for name, array in zarr.open_group(path, mode="r+").arrays()
+    }
+
+
+@lru_cache(maxsize=4)
+def _open_arrays(path: Path, store_id: str, shots: int) -> dict[str, Any]:
+    arrays = _open_to_write(path)
+    shot_count = arrays["status"].shape[0]
+    if shot_count != shots:
+        raise StoreError(
+            f"{path} has {shot_count} shots here and {shots} where the run was started: wait until "
+            "the file system is in sync on all machines, then run again to resume"
+        )
+    return arrays
+
+
+def summarise(store: StackStore) -> None:
+    """Gather the columns of all shots from their reports, for those who open the store."""
+    arrays = ShotWriter.of(store).arrays()
+    _write_columns(store.path, arrays, store.columns, store.reports(), slice(None))
+
+
+def _write_columns(
+    path: Path,
+    arrays: Mapping[str, Any],
+    columns: Sequence[Column],
+    reports: Sequence[Mapping[str, Any]],
+    shots: slice,
+) -> None:
+    with _as_store_errors(path):
+        for column in columns:
+            if column.key in arrays:  # not in a store of an older version
+                values: Any = np.array([column.of(report) for report in reports], column.dtype)
+                arrays[column.key][shots] = values
+
+
+@dataclass(frozen=True)
+class Variable:
+    """Array of a store to create."""
+
+    dims: tuple[str, ...]
+    dtype: Any
+    attributes: Mapping[str, Any]  # its units and long name
+    values: AnyArray | None = None  # written at once; without, it is written shot by shot
+
+    @property
+    def along_shots(self) -> bool:
+        return self.dims[:1] == ("shot",)
+
+
+@dataclass(frozen=True)
+class Contents:
+    """Content of a store to create: arrays, lengths of dimensions, attributes of all shots."""
+
+    sizes: Mapping[str, int]
+    variables: Mapping[str, Variable]
+    coordinates: Mapping[str, Variable]
+    attributes: Mapping[str, Any]
+
+
+def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> StackStore:
+    """Create a store with all its shots pending; it appears completely or not at all."""
+    if path.exists() and not overwrite:
+        raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")
+    sweep(path.parent)
+    new = hidden_name(path)
+    try:
+        with _as_store_errors(path):
+            # Zarr writes in a thread of its own, which would go on behind our back.
+            with defer_interrupts():
+                _write_template(new, contents)
+            if path.exists():
+                old = hidden_name(path)
+                os.replace(path, old)
+                os.replace(new, path)
+                shutil.rmtree(old, ignore_errors=True)
+            else:
+                os.replace(new, path)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+    return StackStore(path)
+
+
+def remove_unfinished(path: Path) -> None:
+    """Remove the halves of chunks that killed processes left in a store.
+
+    The run must hold the store's lock. A worker of an earlier run that still writes loses its
+    chunk, and its shot stays pending.
+    """
+    for folder, _, names in os.walk(path):
+        for name in names:
+            if name.endswith(".partial"):
+                Path(folder, name).unlink(missing_ok=True)
+
+
+def grow_store(
+    path: Path,
+    values: Mapping[str, AnyArray],
+    attributes: Mapping[str, Any],
+    arrays: Mapping[str, Any] | None = None,
+) -> None:
+    """Make room for more shots, pending; a process killed meanwhile leaves the store unchanged.
+
+    The coordinates, `values`, are of the new shots. `arrays` are open already, or opened.
+    """
+    file = path / "zarr.json"
+    with _as_store_errors(path):
+        arrays = _open_to_write(path) if arrays is None else arrays
+        longer = [name for name, array in arrays.items() if is_along_shots(array)]
+        before = arrays["status"].shape[0]
+        length = before + len(values["shot"])
+        metadata = json.loads(file.read_text(encoding="utf-8"))
+        for name in longer:
+            array = arrays[name]
+            together = array.chunks[0]
+            # Beyond the end stated in the folder's own copy: nobody sees it yet.
+            array.resize((length, *array.shape[1:]))
+            if name in values:
+                array[before:] = values[name]
+            elif together > 1 and (before - 1) // together < (length - 1) // together:
+                array[before:] = array.fill_value  # a file that is not there has been lost
+        metadata["attributes"].update(attributes)
+        for name in longer:
+            metadata["consolidated_metadata"]["metadata"][name]["shape"][0] = length
+        # From here on the store is longer.
+        with replacing(file, overwrite=True) as draft:
+            draft.write_text(json.dumps(reseal(metadata), indent=2), encoding="utf-8")
+
+
+def _write_template(path: Path, contents: Contents) -> None:
+    import zarr
+
+    extra = [name for name in contents.coordinates if name not in contents.sizes]
+    group = zarr.create_group(
+        path,
+        zarr_format=3,
+        attributes={
+            **contents.attributes,
+            "format": FORMAT,
+            "store_id": secrets.token_hex(8),
+            "coordinates": " ".join(extra),
+        },
+    )
+    shot_variables = _shot_variables(contents.sizes["shot"], contents.attributes)
+    arrays = {**contents.coordinates, **contents.variables, **shot_variables}
+    for name, variable in arrays.items():
+        _create_array(group, name, variable, contents.sizes)
+    with warnings.catch_warnings():
+        # The warning is that other programs may not know this: they read the arrays' own metadata.
+        warnings.simplefilter("ignore")
+        zarr.consolidate_metadata(path)
+    file = path / "zarr.json"
+    document = json.loads(file.read_text(encoding="utf-8"))
+    fixed = {key: stored_checksum(path / key) for key in fixed_keys(document)}
+    document["attributes"][FIXED] = json.dumps(fixed)
+    file.write_text(json.dumps(seal(document), indent=2), encoding="utf-8")
+
+
+def _shot_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Variable]:
+    """Return the variables that every store has for its shots."""
+    status = {
+        "units": "1",
+        "long_name": "Status of the shot",
+        "flag_values": list(range(len(STATUS_NAMES))),
+        "flag_meanings": " ".join(STATUS_NAMES),
+    }
+    report = {"units": "1", "long_name": "Report, or reason for failure (JSON)"}
+    variables = {
+        "status": Variable(("shot",), np.dtype("int8"), status),
+        "report": Variable(("shot",), str, report),
+    }
+    for column in columns_of_store(attributes):
+        dtype = str if column.kind is str else np.dtype(column.kind)
+        fill: AnyArray = np.full(shots, column.fill, dtype=column.dtype)
+        variables[column.key] = Variable(("shot",), dtype, column.labels, fill)
+    return variables
+
+
+def _create_array(group: Any, name: str, variable: Variable, sizes: Mapping[str, int]) -> None:
+    from zarr.codecs import BloscCodec, Crc32cCodec
+
+    shape = tuple(sizes[dim] for dim in variable.dims)
+    chunks = _chunks(variable, shape)
+    is_text = variable.dtype is str
+    is_float = not is_text and np.dtype(variable.dtype).kind == "f"
+    # Fields compress well once their slowly changing bytes are next to each other.
+    fields = BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")
+    is_plain = is_text or np.prod(chunks) <= _SMALL
+    array = group.create_array(
+        name,
+        shape=shape,
+        chunks=chunks,
+        dtype=variable.dtype,
+        fill_value="" if is_text else np.nan if is_float else 0,
+        compressors=[Crc32cCodec()] if is_plain else [fields, Crc32cCodec()],
+        dimension_names=variable.dims,
+        attributes=dict(variable.attributes),
+        config={"write_empty_chunks": True},
+    )
+    if variable.values is not None:
+        array[...] = variable.values
+
+
+def _chunks(variable: Variable, shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the shape of a chunk, which is one file."""
+    if not variable.along_shots:
+        return tuple(max(1, length) for length in shape)
+    # Values of the start are in few files, with room for new shots; others in a file for each shot.
+    return (1 if variable.values is None else _TOGETHER, *shape[1:])
+
+
+class GrowingStore:
+    """Store that this process alone writes; it remembers the name and status of each shot.
+
+    It is opened once: the cost of a shot does not depend on how many there are already.
+    """
+
+    def __init__(self, store: StackStore, attributes: Mapping[str, Any]) -> None:
+        self.path = store.path
+        self._attributes = attributes  # of a store that has grown so
+        # Not the cached arrays, as these grow: other code in this process needs a fixed length.
+        self._writer = replace(ShotWriter.of(store), opened=_open_to_write(store.path))
+        self._columns = store.columns
+        self._numbers = {name: index for index, name in enumerate(store.names)}
+        self._statuses = bytearray(store.statuses().astype(np.uint8).tobytes())
+        self._counts = [self._statuses.count(status) for status in range(len(STATUS_NAMES))]
+
+    def __len__(self) -> int:
+        return len(self._statuses)
+
+    def count(self, status: int) -> int:
+        """Return how many shots are pending, done or failed."""
+        return self._counts[status]
+
+    def number(self, name: str) -> int | None:
+        """Return the number of a shot, None if it is not there yet."""
+        return self._numbers.get(name)
+
+    def done(self) -> Iterator[str]:
+        """Yield the names of the shots that are done."""
+        for name, index in self._numbers.items():
+            if self._statuses[index] == DONE:
+                yield name
+
+    def status(self, index: int) -> int:
+        return self._statuses[index]
+
+    def report(self, index: int) -> dict[str, Any]:
+        """Return the report of a shot that has ended."""
+        text = str(self._writer.arrays()["report"][index])
+        return dict(json.loads(text or "{}"))
+
+    def append(self, name: str) -> int:
+        """Make room for one more shot, pending, and return its number."""
+        index = len(self)
+        values = {"shot": np.array([index]), "name": np.array([name], dtype=object)}
+        grow_store(self.path, values, self._attributes, self._writer.arrays())
+        self._numbers[name] = index
+        self._statuses.append(PENDING)
+        self._counts[PENDING] += 1
+        return index
+
+    def reopen(self, index: int) -> None:
+        """Mark a shot as pending that is to be done again, and forget its fields."""
+        self._writer.reopen(index)
+        self._set_status(index, PENDING)
+
+    def write(self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
+        """As `ShotWriter.write`; the shot's numbers are there as soon as it is done."""
+        self._gather(index, report)
+        self._writer.write(index, arrays, report)
+        self._set_status(index, DONE)
+
+    def fail(self, index: int, report: Mapping[str, Any]) -> None:
+        """As `ShotWriter.fail`."""
+        self._gather(index, report)
+        self._writer.fail(index, report)
+        self._set_status(index, FAILED)
+
+    def _gather(self, index: int, report: Mapping[str, Any]) -> None:
+        shot = slice(index, index + 1)
+        _write_columns(self.path, self._writer.arrays(), self._columns, [report], shot)
+
+    def _set_status(self, index: int, status: int) -> None:
+        self._counts[self._statuses[index]] -= 1
+        self._counts[status] += 1
+        self._statuses[index] = status
