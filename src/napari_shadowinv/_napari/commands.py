@@ -59,7 +59,7 @@ def refine(
     """Fit the forward model to the image of the selected inversion, in a window by Invert shot."""
     if layer is None:
         raise InputError("no layer is selected: select a layer of an inversion's result")
-    from napari_shadowinv._napari.fit_jobs import name_of_result, refinement
+    from napari_shadowinv._napari.jobs import name_of_result, refinement
 
     name = name_of_result(layer)
     job = refinement(layer, layer, name, psf=0.0)

@@ -17,12 +17,11 @@ from qtpy.QtWidgets import QFileDialog
 from simulated_pack import Truth
 
 from napari_shadowinv import read, write
+from napari_shadowinv._napari import packs
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of, usable_of
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.packs import BY_HAND, film_layers, pack_frame, pack_of
-from napari_shadowinv._napari.widgets import _pack_work
-from napari_shadowinv._napari.widgets._new_pack import NewPackDialog
-from napari_shadowinv._napari.widgets.film_pack import FilmPack
+from napari_shadowinv._napari.widgets.film_pack import FilmPack, NewPackDialog
 from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.errors import InversionCancelled
@@ -234,7 +233,7 @@ def test_cancelling_leaves_nothing(
             time.sleep(0.01)
 
     tool = evaluated
-    monkeypatch.setattr(_pack_work, "run_film", work_slowly)
+    monkeypatch.setattr(packs, "run_film", work_slowly)
     of_role(viewer, "unusable").data[0, 30:40, 30:40] = BY_HAND
     before = list(viewer.layers)
     tool.run_again.click()

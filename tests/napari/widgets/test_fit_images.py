@@ -18,8 +18,8 @@ from scipy.ndimage import zoom
 from typer.testing import CliRunner
 
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read, write
-from napari_shadowinv._napari.fit_jobs import FinishedFit
 from napari_shadowinv._napari.fit_layers import fit_layers
+from napari_shadowinv._napari.jobs import FinishedFit
 from napari_shadowinv._napari.layer_metadata import (
     Result,
     displacement_of,

@@ -20,7 +20,7 @@ from napari_shadowinv import InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari.frame import frame_of
 from napari_shadowinv._napari.layer_metadata import metadata_for, result_of, role_of, unit_of
 from napari_shadowinv._napari.notifications import window_text
-from napari_shadowinv._napari.widgets import _runner, invert_shot
+from napari_shadowinv._napari.widgets import _panels, invert_shot
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.physics.forward import synthetic_image
@@ -58,7 +58,7 @@ def run(qtbot: Any) -> Callable[[Any], None]:
 def slow(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Make every run wait, as a large image would, until it is stopped or let go."""
     let_go = threading.Event()
-    run = _runner._run
+    run = _panels._run
 
     def waiting(work: Any, box: Any) -> None:
         def work_slowly(on_progress: Any, should_stop: Any) -> Any:
@@ -68,7 +68,7 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 
         run(work_slowly, box)
 
-    monkeypatch.setattr(_runner, "_run", waiting)
+    monkeypatch.setattr(_panels, "_run", waiting)
     return let_go
 
 
@@ -260,7 +260,7 @@ def test_cancel_ends_the_work_itself(
 
     cancelled = threading.Event()
     stages_after_cancel: list[str] = []
-    run = _runner._run
+    run = _panels._run
 
     def run_held(work: Any, box: Any) -> None:
         """Hold the work at its first site until it is cancelled, and record its later stages."""
@@ -277,7 +277,7 @@ def test_cancel_ends_the_work_itself(
 
         run(held, box)
 
-    monkeypatch.setattr(_runner, "_run", run_held)
+    monkeypatch.setattr(_panels, "_run", run_held)
     slow.set()
     shot = synthetic_image(toroid((200, 200), paper_setup(), 97, 30e-6).displacement)
     window.layers["shot"].data = shot

@@ -16,7 +16,7 @@ from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
 from napari_shadowinv._napari.frame import Frame, frame_of
 from napari_shadowinv._napari.layer_metadata import metadata_for, role_of, setup_origin_of
 from napari_shadowinv._napari.layers import add_inversion
-from napari_shadowinv._napari.widgets._steps import StepsSection
+from napari_shadowinv._napari.widgets._forms import StepsSection
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.cli import app

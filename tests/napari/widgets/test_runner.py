@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from qtpy.QtWidgets import QWidget
 
-from napari_shadowinv._napari.widgets._runner import Outcome, Runner
+from napari_shadowinv._napari.widgets._panels import Outcome, Runner
 
 
 class Heard(Runner):

@@ -11,12 +11,12 @@ from napari.utils.notifications import show_warning
 from qtpy.QtCore import QSignalBlocker, Qt
 from qtpy.QtWidgets import QDoubleSpinBox, QPushButton, QWidget
 
-from napari_shadowinv._napari.fit_jobs import FinishedFit, FitJob
 from napari_shadowinv._napari.fit_layers import (
     alternative_layers,
     start_name,
     verdict_sentence,
 )
+from napari_shadowinv._napari.jobs import FinishedFit, FitJob
 from napari_shadowinv._napari.kinds import main_layers
 from napari_shadowinv._napari.layer_metadata import Result, result_of
 from napari_shadowinv._napari.notifications import window_text

@@ -1,8 +1,8 @@
-"""Inputs of an inversion other than the shots: source, masks, setup, steps and options."""
+"""Inputs of an inversion or fit other than its images: source, masks, setup and options."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -17,21 +17,31 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.shots import radiograph_of, source_of_shot
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
+from napari_shadowinv._napari.widgets._editors import SteadyComboBox
+from napari_shadowinv._napari.widgets._forms import StepsSection
 from napari_shadowinv._napari.widgets._qt import column
 from napari_shadowinv._napari.widgets._recipes import RecipeButton
 from napari_shadowinv._napari.widgets._results import Origins
-from napari_shadowinv._napari.widgets._steps import StepsSection
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.options import FIELDS, InversionOptions
 from napari_shadowinv.physics.setup import SETUPS, Setup, geometry_text, setup_warnings
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
 
 _NONE = "none"
 _CHANGED = ", changed by hand"
 _EARLIER = ", in an earlier session"
-_SUPPLIED, _LAYER, _FILE = "own", "layer", "file"
+UNIFORM, LAYER, FILE, SUPPLIED, UNKNOWN = "uniform", "layer", "file", "own", "unknown"
+"""Kinds of sources; all other kinds are estimates."""
+SHOT_SOURCES = tuple(dict.fromkeys((UNIFORM, LAYER, FILE, SUPPLIED, *preprocessing.ESTIMATES)))
+FIT_SOURCES = (UNIFORM, LAYER, UNKNOWN)
+_SOURCE_TITLES = {
+    LAYER: "a layer",
+    FILE: "a file",
+    SUPPLIED: "supplied with the shot",
+    UNKNOWN: "unknown (fit it)",
+}
 
 
 @dataclass(frozen=True)
@@ -213,53 +223,58 @@ class SetupPicker(QWidget):
 
 
 class SourcePicker(forms.RowPicker):
-    """The source: uniform, a layer, a file, supplied with the shot, or estimated from it."""
+    """The undisturbed beam, of the kinds that a window offers."""
 
-    def __init__(self, viewer: Any) -> None:
+    def __init__(self, viewer: Any, kinds: Sequence[str], tip: str) -> None:
         self._image: Any = None
-        self._kind_before_supplied = "uniform"
+        self._kind_before_supplied = UNIFORM
         self._recipe_source = preprocessing.MeasuredSource()
-        tip = "Image layer of the undisturbed beam."
-        self.layers = layers.LayerPicker(viewer, ("image",), tip, "choose a layer", self._offers)
+        self._offered = kinds
+        layer_tip = "Image layer of the undisturbed beam."
+        if UNKNOWN in kinds:
+            layer_tip = "Image layer of the undisturbed beam, or a stack with one for each image."
+        self.layers = layers.LayerPicker(
+            viewer, ("image",), layer_tip, "choose a layer", self._offers
+        )
         self.file = forms.PathEdit("Image of the undisturbed beam")
-        kinds = forms.kinds_of(preprocessing.ESTIMATES, "estimate: ")
-        _, uniform = kinds.pop("uniform")
+        rows = {LAYER: forms.labelled("", self.layers), FILE: forms.labelled("", self.file)}
         super().__init__(
             "Source",
-            {
-                "uniform": ("uniform", uniform),
-                _LAYER: ("a layer", None),
-                _FILE: ("a file", None),
-                _SUPPLIED: ("supplied with the shot", None),
-                **kinds,
-            },
-            "The beam without the object: ideally a measured reference image, otherwise uniform "
-            "or estimated from the shot.",
-            {_LAYER: forms.labelled("", self.layers), _FILE: forms.labelled("", self.file)},
+            {kind: _source_kind(kind) for kind in kinds},
+            tip,
+            {kind: row for kind, row in rows.items() if kind in kinds},
         )
         self.layers.picked.connect(self.changed)
         self.file.changed.connect(self.changed)
 
     @property
+    def kind(self) -> str:
+        return self.picker.kind
+
+    @property
+    def layer(self) -> Any | None:
+        """The selected layer; None for another kind of source."""
+        return self.layers.layer if self.kind == LAYER else None
+
+    @property
     def is_estimated(self) -> bool:
         """Whether it is estimated from the shot, where a mask can exclude the object."""
-        estimate = preprocessing.ESTIMATES.get(self.picker.kind)
+        estimate = preprocessing.ESTIMATES.get(self.kind)
         return estimate is not None and estimate.uses_mask
 
     @property
     def is_supplied(self) -> bool:
         """Whether it came with the shot."""
-        return self.picker.kind == _SUPPLIED
+        return self.kind == SUPPLIED
 
     @property
     def summary(self) -> str:
-        kind = self.picker.kind
-        if kind == _LAYER and self.layers.layer is not None:
-            return f"layer '{self.layers.layer.name}'"
-        if kind == _FILE:
+        if self.layer is not None:
+            return f"layer '{self.layer.name}'"
+        if self.kind == FILE:
             return f"file {Path(self.file.path).name}"
-        if kind == _SUPPLIED:
-            return "came with the shot"
+        if self.kind in (SUPPLIED, UNKNOWN):
+            return "came with the shot" if self.is_supplied else "fitted"
         model = self.picker.model()
         assert isinstance(model, preprocessing.Estimate)
         return f"estimate: {model.described}" if self.is_estimated else model.described
@@ -267,94 +282,120 @@ class SourcePicker(forms.RowPicker):
     @property
     def short_name(self) -> str:
         """The source in the name of a result; empty if uniform or supplied with the shot."""
-        kind = self.picker.kind
-        if kind in (_SUPPLIED, "uniform"):
+        if self.kind in (SUPPLIED, UNIFORM):
             return ""
-        if kind == _LAYER:
-            return "" if self.layers.layer is None else str(self.layers.layer.name)
-        return Path(self.file.path).name if kind == _FILE else f"{kind} source"
+        if self.kind == LAYER:
+            return "" if self.layer is None else str(self.layer.name)
+        return Path(self.file.path).name if self.kind == FILE else f"{self.kind} source"
 
-    def chosen(self) -> preprocessing.Estimate | preprocessing.MeasuredSource:
-        """Return the source as a recipe describes it, or raise an `InputError`."""
+    def chosen(self) -> preprocessing.Estimate | preprocessing.MeasuredSource | None:
+        """Return the source as a recipe describes it, None if it is fitted; or an `InputError`."""
         model = self.picker.model()
         if isinstance(model, preprocessing.Estimate):
             return model
-        if self.picker.kind != _FILE:
-            return preprocessing.MeasuredSource()
+        if self.kind != FILE:
+            return None if self.kind == UNKNOWN else preprocessing.MeasuredSource()
         if not self.file.path:
             raise InputError("no source file is selected: choose one, or choose another source")
         if self._recipe_source.file is not None and str(self._recipe_source.file) == self.file.path:
-            return (
-                self._recipe_source
-            )  # with the variable in the file, which the form does not show
+            # With the variable in the file, which the form does not show.
+            return self._recipe_source
         return preprocessing.MeasuredSource(file=Path(self.file.path))
 
-    def show(self, source: Any) -> None:
-        """Show the source of a recipe; None for uniform."""
-        if isinstance(source, preprocessing.Estimate):
+    def show(self, source: Any, beam: str = "known") -> None:
+        """Show the source of a recipe; None for uniform, unless the beam is unknown."""
+        if beam == "unknown":
+            self.picker.set_kind(UNKNOWN)
+        elif isinstance(source, preprocessing.Estimate):
             name = source.name()
             self.restore({"kind": name, "values": {name: source.values()}})
         elif source is None:
-            self.picker.set_kind("uniform")
+            self.picker.set_kind(UNIFORM)
+        elif FILE not in self._offered:
+            self.picker.set_kind(LAYER)
         elif source.file is None:
-            self.picker.set_kind(_SUPPLIED)
+            self.picker.set_kind(SUPPLIED)
         else:
             self._recipe_source = source
             self.file.edit.setText(str(source.file))
-            self.picker.set_kind(_FILE)
+            self.picker.set_kind(FILE)
             self.changed.emit()
 
     def measured(self, image_layer: Any) -> preprocessing.Radiograph | None:
         """Return the measured source of an image layer; None for estimates and files."""
-        kind = self.picker.kind
-        if kind == _LAYER:
-            if self.layers.layer is None:
-                raise InputError(
-                    "no source layer is selected: choose a layer below 'a layer', or another kind "
-                    "of source"
-                )
-            layer = self.layers.layer
+        if self.kind == LAYER:
+            layer = self._selected_layer()
             data = layers.image_of(layer, "source image")
             shot = preprocessing.Radiograph(data)
             if image_layer is not None:
                 shot = radiograph_of(image_layer, image_layer.data)
             beam = source_of_shot(layer, data, shot)
             return replace(beam, warnings=layers.warnings_of(layer))
-        if kind == _SUPPLIED:
-            supplied = about.source_of(image_layer)
-            if supplied is None:
-                raise InputError(
-                    f"no source was supplied with '{image_layer.name}': choose another kind of "
-                    "source"
-                )
-            return radiograph_of(image_layer, supplied)
-        return None
+        if not self.is_supplied:
+            return None
+        supplied = about.source_of(image_layer)
+        if supplied is None:
+            raise InputError(
+                f"no source was supplied with '{image_layer.name}': choose another kind of source"
+            )
+        return radiograph_of(image_layer, supplied)
+
+    def measured_for_each(
+        self, shots: Sequence[preprocessing.Radiograph]
+    ) -> list[preprocessing.Radiograph | None]:
+        """Return the measured sources of the images of a fit; None for another kind of source."""
+        if self.kind != LAYER:
+            return [None] * len(shots)
+        layer = self._selected_layer()
+        if layer.ndim != 3:
+            image = layers.image_of(layer, "source")
+            return [source_of_shot(layer, image, shot) for shot in shots]
+        planes = layers.stack_of(layer)
+        if len(planes) != len(shots):
+            raise InputError(
+                f"'{layer.name}' has {len(planes)} sources for {len(shots)} images: expected one "
+                "source for each image, or one for all"
+            )
+        return [
+            source_of_shot(layer, plane, shot, k)
+            for k, (plane, shot) in enumerate(zip(planes, shots, strict=True))
+        ]
+
+    def _selected_layer(self) -> Any:
+        if self.layer is None:
+            raise InputError(
+                "no source layer is selected: choose a layer below 'a layer', or another kind of "
+                "source"
+            )
+        return self.layer
 
     def check(self, mask: BoolArray | None) -> None:
         """Refuse a mask over the object that the source layer's estimate excluded."""
-        layer = self.layers.layer if self.picker.kind == _LAYER else None
-        beyond_object = None if layer is None else about.metadata_of(layer).get("source_mask")
+        beyond_object = None
+        if self.layer is not None:
+            beyond_object = about.metadata_of(self.layer).get("source_mask")
         if beyond_object is not None and mask is not None and beyond_object.shape == mask.shape:
             preprocessing.check_masks(mask, beyond_object)
 
     def state(self) -> dict[str, Any]:
         """Return the choice without layers and files, which belong to a session."""
         state = self.picker.state()
-        kind = self._kind_before_supplied if state["kind"] == _SUPPLIED else state["kind"]
-        return {**state, "kind": "uniform" if kind in (_LAYER, _FILE) else kind}
+        kind = self._kind_before_supplied if state["kind"] == SUPPLIED else state["kind"]
+        return {**state, "kind": UNIFORM if kind in (LAYER, FILE) else kind}
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self.picker.restore(state)
+    def restore(self, state: Any) -> None:
+        if isinstance(state, Mapping):
+            self.picker.restore(state)
 
     def follow(self, image_layer: Any) -> None:
         """Select the source supplied with an image; without one, deselect the last image's."""
         self._image = image_layer
         self.layers.fill()
         if image_layer is not None and about.source_of(image_layer) is not None:
-            if self.picker.kind != _SUPPLIED:
-                self._kind_before_supplied = self.picker.kind
-            self.picker.set_kind(_SUPPLIED)
-        elif self.picker.kind == _SUPPLIED:
+            if not self.is_supplied:
+                self._kind_before_supplied = self.kind
+            self.picker.set_kind(SUPPLIED)
+        elif self.is_supplied:
             self.picker.set_kind(self._kind_before_supplied)
 
     def _offers(self, layer: Any) -> bool:
@@ -362,7 +403,7 @@ class SourcePicker(forms.RowPicker):
         return layer != self._image and about.may_be_source(layer)
 
     def _on_kind(self) -> None:
-        if self.picker.kind == _LAYER and self.layers.layer is None:
+        if self.kind == LAYER and self.layers.layer is None:
             self.layers.layer = self._only_source()
         super()._on_kind()
 
@@ -376,6 +417,14 @@ class SourcePicker(forms.RowPicker):
         ]
         fitting = [layer for layer in sources if tuple(layer.data.shape[-2:]) == shape]
         return fitting[0] if len(fitting) == 1 else None
+
+
+def _source_kind(kind: str) -> tuple[str, type[BaseModel] | None]:
+    """Return title and form of a kind of source."""
+    if kind in _SOURCE_TITLES:
+        return _SOURCE_TITLES[kind], None
+    title = preprocessing.ESTIMATES[kind].title
+    return title if kind == UNIFORM else f"estimate: {title}", preprocessing.ESTIMATES[kind]
 
 
 class OptionsForm(forms.ModelForm):
@@ -409,7 +458,12 @@ class InversionInputs:
         self, image: Callable[[], Any], kinds: tuple[str, ...], mask_tip: str, source_mask_tip: str
     ) -> None:
         """Make the controls, in rows `beam` and `settings`; masks are layers of these kinds."""
-        self.source = SourcePicker(self.viewer)
+        self.source = SourcePicker(
+            self.viewer,
+            SHOT_SOURCES,
+            "The beam without the object: ideally a measured reference image, otherwise uniform "
+            "or estimated from the shot.",
+        )
         self.masks = layers.MaskPicker(self.viewer, image, kinds, mask_tip)
         self.source_masks = layers.MaskPicker(
             self.viewer, image, kinds, source_mask_tip, "Source mask"
@@ -476,3 +530,62 @@ class InversionInputs:
             self.setup.summary,
             self.setup.origin,
         )
+
+
+_FIELD_TITLES = {
+    "B": "magnetic field (B)",
+    "E": "electric field (E)",
+    "plasma": "plasma (phase ∝ λ²)",
+    "phase": "refractive index (phase)",
+}
+BOTH = " and "
+NOISES = {
+    "": "estimated from each image",
+    "poisson": "Poisson counts",
+    "proportional": "proportional to each pixel (film)",
+}
+
+
+class ChoiceBox(SteadyComboBox):
+    """A choice that is saved between sessions."""
+
+    def __init__(self, choices: dict[str, str], tip: str) -> None:
+        super().__init__()
+        self._selected: Any = None
+        self.setToolTip(f"<qt>{tip}</qt>")
+        self.offer(choices)
+        self.activated.connect(self._on_choice)
+
+    def offer(self, choices: dict[str, str]) -> None:
+        """Replace the choices, titles by key; the selected key stays if it is offered."""
+        with QSignalBlocker(self):
+            self.clear()
+            for key, title in choices.items():
+                self.addItem(title, key)
+            self.setCurrentIndex(max(self.findData(self._selected), 0))
+
+    def state(self) -> str:
+        return str(self.currentData())
+
+    def restore(self, state: Any) -> None:
+        """Select a key, now or once it is offered."""
+        self._selected = state
+        index = self.findData(state)
+        if index >= 0:
+            self.setCurrentIndex(index)
+
+    def _on_choice(self) -> None:
+        self._selected = self.currentData()
+
+
+def fields_of(kind: str) -> dict[str, str]:
+    """Return the fields that can deflect in a kind of setup, titles by key."""
+    if kind not in SETUPS:
+        return {"B": "one field, in pixels"}
+    keys = [key for key, deflector in FIELDS.items() if deflector in SETUPS[kind].deflectors]
+    choices = {key: _FIELD_TITLES[key] for key in keys}
+    return choices | ({BOTH.join(keys): BOTH.join(keys)} if len(keys) > 1 else {})
+
+
+def field_key(fields: Sequence[str]) -> str:
+    return BOTH.join(key for key in FIELDS if key in fields)

@@ -171,7 +171,7 @@ class FitRecipeButton(RecipeButton):
                 f"'{source.layer.name}' has a source for each image, but a recipe has one source "
                 "for all: choose one plane (right click on the layer → Split Stack)"
             )
-        beams: list[Radiograph | None] = source.measured([Radiograph(image.data)])
+        beams: list[Radiograph | None] = source.measured_for_each([Radiograph(image.data)])
         return beams[0]
 
 

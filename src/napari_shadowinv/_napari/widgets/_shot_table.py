@@ -10,8 +10,8 @@ from qtpy.QtWidgets import QFileDialog, QSizePolicy, QWidget
 
 from napari_shadowinv._napari.widgets._editors import parse_number
 from napari_shadowinv._napari.widgets._forms import PathEdit, labelled, small_button
-from napari_shadowinv._napari.widgets._number_table import NumberTable
 from napari_shadowinv._napari.widgets._qt import column, notify_errors, side_by_side
+from napari_shadowinv._napari.widgets._tables import NumberTable
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import SITES

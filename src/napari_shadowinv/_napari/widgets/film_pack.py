@@ -8,40 +8,297 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from napari.utils.notifications import show_info
 from qtpy import QtWidgets
-from qtpy.QtCore import Qt
+from qtpy.QtCore import QObject, Qt
 
 from napari_shadowinv._napari import packs
 from napari_shadowinv._napari.frame import frame_of
 from napari_shadowinv._napari.layer_metadata import (
     Result,
     may_be_mask,
+    metadata_for,
     metadata_of,
     result_of,
     role_of,
 )
 from napari_shadowinv._napari.layer_state import dataset_of_layers
+from napari_shadowinv._napari.packs import FinishedPack, PackJob
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._corners import CornerEditor
-from napari_shadowinv._napari.widgets._forms import PathEdit, labelled, with_button
+from napari_shadowinv._napari.widgets._forms import (
+    ModelForm,
+    PathEdit,
+    labelled,
+    with_button,
+    wrapping_label,
+)
 from napari_shadowinv._napari.widgets._layers import LayerPicker, LayerWatch, mask_of, new_shapes
-from napari_shadowinv._napari.widgets._new_pack import NewPackDialog
-from napari_shadowinv._napari.widgets._pack_work import FinishedPack, PackJob, copy_edits
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._plots import COLOURS, Plot
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.hidden_files import temporary_folder
+from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.film.pack import FILM_TYPES
+from napari_shadowinv.film.scans import checked_corners
 from napari_shadowinv.io import write
 from napari_shadowinv.io.formats import RESULT
+from napari_shadowinv.io.images import Scan, read_scan
 from napari_shadowinv.pipeline import read_pack, write_layers
+from napari_shadowinv.pipeline.new_pack import (
+    PACK_FILE,
+    NewPack,
+    draft_pack,
+    missing_entries,
+    write_new_pack,
+)
 
 if TYPE_CHECKING:
     import xarray
 
     import napari
+    from napari_shadowinv.film import Pack
+
+_COLUMNS = ("Scan", "Film", "Filters in front of the film")
+_MIN_SIZE_PX = (620, 560)
+
+
+class NewPackDialog(QtWidgets.QDialog):
+    """The scans of a folder in pack order, and entries that the scans do not contain.
+
+    Attributes
+    ----------
+    written : Path or None
+        Path of the pack file after saving.
+    """
+
+    def __init__(self, folder: Path, parent: QtWidgets.QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.setWindowTitle("New film pack")
+        self.setMinimumSize(*_MIN_SIZE_PX)
+        self._folder = folder
+        self.written: Path | None = None
+        self.form = ModelForm(NewPack)
+        self.table = QtWidgets.QTableWidget(0, len(_COLUMNS))
+        self.table.setHorizontalHeaderLabels(_COLUMNS)
+        self.table.horizontalHeader().setStretchLastSection(True)
+        self.table.setToolTip(
+            "<qt>Films in the order in which the beam passes them. Filters as thickness, unit and "
+            "material, such as 13 um Al; 25 um Fe.</qt>"
+        )
+        self._problem = wrapping_label()
+        choices = QtWidgets.QDialogButtonBox.StandardButton
+        self.buttons = QtWidgets.QDialogButtonBox(choices.Save | choices.Cancel)
+        self.buttons.accepted.connect(self.accept)
+        self.buttons.rejected.connect(self.reject)
+        column = QtWidgets.QVBoxLayout(self)
+        for widget in (self.form, self.table, self._problem, self.buttons):
+            column.addWidget(widget)
+        self._show_layers(draft_pack(folder)["layers"])
+        self.form.editors["film"].changed.connect(self._on_film)
+
+    def entries(self) -> dict[str, Any]:
+        """Return the entries of the pack file."""
+        facts = self.form.model()
+        assert isinstance(facts, NewPack)
+        layers = [
+            {
+                "film": self.table.cellWidget(row, 1).currentText(),
+                "filters": [
+                    part.strip()
+                    for part in self.table.item(row, 2).text().split(";")
+                    if part.strip()
+                ],
+                "file": self.table.item(row, 0).text(),
+            }
+            for row in range(self.table.rowCount())
+        ]
+        return draft_pack(self._folder, facts, layers)
+
+    def missing_text(self) -> str:
+        """Return a sentence on entries still missing in the pack file, or the next action."""
+        missing = missing_entries(self.entries())
+        return f"Add to this file: {'; '.join(missing)}." if missing else "Press Run."
+
+    def accept(self) -> None:
+        """Write the pack file, or show the problem."""
+        try:
+            path = self._folder / PACK_FILE
+            self.written = write_new_pack(
+                self._folder, self.entries(), overwrite=path.exists() and self._may_replace(path)
+            )
+        except (InputError, OSError, ValueError) as error:
+            self._problem.setText(str(error))
+            return
+        super().accept()
+
+    def _may_replace(self, path: Path) -> bool:
+        button = QtWidgets.QMessageBox.question(
+            self, "New film pack", f"{path} already exists. Replace it?"
+        )
+        return bool(button == QtWidgets.QMessageBox.StandardButton.Yes)
+
+    def _show_layers(self, layers: list[dict[str, Any]]) -> None:
+        self.table.setRowCount(len(layers))
+        for row, layer in enumerate(layers):
+            scan = QtWidgets.QTableWidgetItem(layer["file"])
+            scan.setFlags(scan.flags() & ~Qt.ItemFlag.ItemIsEditable)
+            film = QtWidgets.QComboBox()
+            film.addItems(list(FILM_TYPES))
+            film.setCurrentText(layer["film"])
+            self.table.setItem(row, 0, scan)
+            self.table.setCellWidget(row, 1, film)
+            self.table.setItem(row, 2, QtWidgets.QTableWidgetItem(""))
+
+    def _on_film(self) -> None:
+        """Show the selected type for all films whose file names contain no type."""
+        facts = NewPack(film=self.form.editors["film"].value())
+        for row, layer in enumerate(draft_pack(self._folder, facts)["layers"]):
+            self.table.cellWidget(row, 1).setCurrentText(layer["film"])
+
+
+_COLOUR = "#00c8ff"
+_SETTLE_MS = 60
+_MIN_MOVE_PX = 0.01  # napari rounds coordinates
+
+
+class CornerEditor(QObject):
+    """Layers with the scan of the displayed film and a polygon of its corners."""
+
+    def __init__(self, viewer: Any, parent: QObject) -> None:
+        super().__init__(parent)
+        self._viewer = viewer
+        self._films: Any = None  # the fluence layer
+        self._dataset: Any = None
+        self._pack: Any = None
+        self._plane = 0
+        self._moved: dict[int, FloatArray] = {}  # by plane
+        self._read: tuple[Path | None, Scan | None] = None, None
+        self.scan: Any = None
+        self.polygon: Any = None
+        self._settle_timer = qt.timer(self, _SETTLE_MS, self._follow, once=True)
+        qt.while_alive(self, viewer.dims.events.current_step, self._on_step)
+
+    @property
+    def shown(self) -> bool:
+        return self.polygon is not None and self.polygon in self._viewer.layers
+
+    def show(self, films: Any, dataset: xarray.Dataset, pack: Pack) -> None:
+        """Show the displayed film of a pack's layer; changes to another pack are discarded."""
+        if dataset is not self._dataset:
+            self.close()
+        self._films, self._dataset, self._pack = films, dataset, pack
+        self._show(plane_in_view(self._viewer, films))
+
+    def close(self) -> None:
+        """Remove the layers and discard the changes."""
+        for layer in (self.polygon, self.scan):
+            if layer is not None and layer in self._viewer.layers:
+                self._viewer.layers.remove(layer)
+        self.scan = self.polygon = self._dataset = None
+        self._moved = {}
+
+    def corners(self, dataset: xarray.Dataset) -> dict[str, FloatArray] | None:
+        """Return the corners of all films by number; None if the user moved none."""
+        if dataset is not self._dataset:
+            return None
+        self._store_changes()
+        if not self._moved:
+            return None
+        numbers = dataset["layer"].values
+        corners = {
+            k: film for k, film in enumerate(dataset["corners"].values) if np.isfinite(film).all()
+        }
+        try:
+            return {
+                str(numbers[k]): checked_corners(film)
+                for k, film in (corners | self._moved).items()
+            }
+        except InputError as error:
+            raise InputError(f"{error}; press Show corners to reset them") from None
+
+    def _store_changes(self) -> None:
+        """Store the polygon of the shown film if the user moved it."""
+        if not self.shown:
+            return
+        shapes = [np.asarray(vertices, np.float64)[:, -2:] for vertices in self.polygon.data]
+        if len(shapes) != 1 or len(shapes[0]) != 4:
+            raise InputError(
+                f"'{self.polygon.name}' has {len(shapes)} shapes with "
+                f"{', '.join(str(len(vertices)) for vertices in shapes)} corners: expected one "
+                "polygon with the four corners of the film"
+            )
+        old_corners = self._moved.get(self._plane, self._dataset["corners"].values[self._plane])
+        if np.abs(shapes[0] - old_corners).max() > _MIN_MOVE_PX:
+            self._moved[self._plane] = shapes[0]
+
+    def _show(self, plane: int) -> None:
+        corners = self._moved.get(plane, self._dataset["corners"].values[plane])
+        text = packs.film_labels(self._dataset)[plane]
+        if not np.isfinite(corners).all():
+            raise InputError(
+                f"{text}: the layer is excluded and shows no film; choose another film"
+            )
+        pixels = self._scan_of(plane)
+        self._plane = plane
+        title = text.partition(":")[0]
+        # The scan has the pixel size of the films, and its film lies over them.
+        frame = frame_of(self._films)
+        size = np.array(self._films.data.shape[-2:])
+        centre = np.asarray(frame.translate) + (size - 1) / 2 * frame.scale
+        placement = frame.keywords()
+        placement["translate"] = tuple(centre - corners.mean(axis=0) * frame.scale)
+        if self.shown and self.scan in self._viewer.layers:
+            self.scan.data, self.scan.name = pixels, f"scan of {title}"
+            self.polygon.data, self.polygon.name = [corners], f"corners of {title}"
+            for layer in (self.scan, self.polygon):
+                layer.translate = placement["translate"]
+            self.polygon.mode = "direct"
+            return
+        from napari.layers import Image, Shapes
+
+        self.scan = Image(pixels, rgb=True, name=f"scan of {title}", **placement)
+        self.polygon = Shapes(
+            [corners],
+            shape_type="polygon",
+            name=f"corners of {title}",
+            face_color="transparent",
+            edge_color=_COLOUR,
+            edge_width=max(1.0, max(size) / 200),
+            **placement,
+        )
+        for layer, role in ((self.scan, "scan"), (self.polygon, "corners")):
+            layer.metadata = metadata_for(role, "")
+            self._viewer.layers.append(layer)
+        self._viewer.layers.selection.active = self.polygon
+        self.polygon.mode = "direct"
+        self._viewer.reset_view()
+
+    def _scan_of(self, plane: int) -> AnyArray:
+        """Return the pixels of a film's scan with eight bits."""
+        path = self._pack.layers[plane].file or self._pack.scan
+        if path != self._read[0] or self._read[1] is None:
+            self._read = path, read_scan(path)
+        scan = self._read[1]
+        assert scan is not None
+        pixels = scan.pixels
+        return pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
+
+    def _on_step(self, _: Any = None) -> None:
+        if self.shown and self._films in self._viewer.layers:
+            self._settle_timer.start()
+
+    @qt.notify_errors
+    def _follow(self) -> None:
+        if not self.shown or self._films not in self._viewer.layers:
+            return
+        plane = plane_in_view(self._viewer, self._films)
+        if plane != self._plane:
+            self._store_changes()
+            self._show(plane)
+
 
 _REDRAW_MS = 60  # while a region is drawn
 _PLOT_HEIGHT_PX = 260
@@ -370,7 +627,7 @@ class FilmPack(ToolPanel):
         result = result_of(layer)
         assert result is not None
         saved = Result(
-            copy_edits(dataset, packs.pack_of(dataset), scratch, path),
+            packs.copy_edits(dataset, packs.pack_of(dataset), scratch, path),
             result.setup,
             result.attributes,
         )

@@ -8,23 +8,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.fit_jobs import FinishedFit, FitJob
-from napari_shadowinv._napari.fit_progress import PACE, estimate_fit_time
+from napari_shadowinv._napari.jobs import PACE, FinishedFit, FitJob, estimate_fit_time
 from napari_shadowinv._napari.shots import radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
-from napari_shadowinv._napari.widgets._fit_inputs import (
+from napari_shadowinv._napari.widgets._fitting import FitView
+from napari_shadowinv._napari.widgets._forms import StepsSection
+from napari_shadowinv._napari.widgets._inputs import (
     BOTH,
+    FIT_SOURCES,
     NOISES,
     UNKNOWN,
-    BeamPicker,
     ChoiceBox,
+    OptionsForm,
+    SetupPicker,
+    SourcePicker,
     field_key,
     fields_of,
 )
-from napari_shadowinv._napari.widgets._fitting import FitView
-from napari_shadowinv._napari.widgets._image_table import ImageRow, ImageTable, beam_column
-from napari_shadowinv._napari.widgets._inputs import OptionsForm, SetupPicker
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._qt import side_by_side, while_alive
 from napari_shadowinv._napari.widgets._recipes import FitRecipeButton
@@ -36,7 +37,7 @@ from napari_shadowinv._napari.widgets._saving import (
     result_to_save,
     shown_result,
 )
-from napari_shadowinv._napari.widgets._steps import StepsSection
+from napari_shadowinv._napari.widgets._tables import ImageRow, ImageTable, beam_column
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import point_spread
@@ -83,7 +84,12 @@ class FitImages(ToolPanel):
         self._ready = True
 
     def _build(self) -> None:
-        self.source = BeamPicker(self.viewer)
+        self.source = SourcePicker(
+            self.viewer,
+            FIT_SOURCES,
+            "The beam without the object. An unknown beam is fitted as a smooth beam, the same in "
+            "all images except for its brightness.",
+        )
         self.images = ImageTable(self.viewer, self._may_be_image)
         self.fields = ChoiceBox(
             {}, "Field that deflects the beam. Two fields require images at two energies."
@@ -176,7 +182,7 @@ class FitImages(ToolPanel):
     def recipe(self) -> Recipe:
         """Return the recipe of the controls, without table and layers; or raise an `InputError`."""
         fields = tuple(self.fields.state().split(BOTH))
-        beam = "unknown" if self.source.picker.kind == UNKNOWN else "known"
+        beam = "unknown" if self.source.kind == UNKNOWN else "known"
         choices = FitChoices(
             fields=fields,
             beam=beam,
@@ -282,7 +288,7 @@ class FitImages(ToolPanel):
     def _shots(self, rows: list[ImageRow], setup: Setup | None) -> tuple[FitShot, ...]:
         """Return the images, lazy if their layers are, with all their settings."""
         images = [radiograph_of(row.layer, row.data, row.plane) for row in rows]
-        sources = self.source.measured(images)
+        sources = self.source.measured_for_each(images)
         factors = self._known_brightness(rows)
         return tuple(
             FitShot(
@@ -314,7 +320,7 @@ class FitImages(ToolPanel):
         except InputError:
             self.cost.setVisible(False)  # Run reports the problem
             return
-        source = UNKNOWN if self.source.picker.kind == UNKNOWN else None
+        source = UNKNOWN if self.source.kind == UNKNOWN else None
         fields = len(self.fields.state().split(BOTH))
         estimate = estimate_fit_time(shape, len(rows), fields, source, options)  # type: ignore[arg-type]
         self.cost.setText(estimate.text(PACE))

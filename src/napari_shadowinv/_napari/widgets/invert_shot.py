@@ -7,9 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 from napari.utils.notifications import show_warning
 
-from napari_shadowinv._napari.fit_jobs import FinishedFit, FitJob, name_of_result, refinement
-from napari_shadowinv._napari.fit_progress import duration_in_words
 from napari_shadowinv._napari.frame import Frame
+from napari_shadowinv._napari.jobs import (
+    FinishedFit,
+    FitJob,
+    duration_in_words,
+    name_of_result,
+    refinement,
+)
 from napari_shadowinv._napari.layer_metadata import (
     KEY,
     SOURCE,

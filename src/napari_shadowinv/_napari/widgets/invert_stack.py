@@ -19,10 +19,9 @@ from napari_shadowinv._napari.stores import follow_shots, shot_rows
 from napari_shadowinv._napari.widgets._forms import PathEdit, RowPicker, labelled
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
-from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, ToolPanel
+from napari_shadowinv._napari.widgets._panels import Outcome, ReportTable, RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, timer, while_alive
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
-from napari_shadowinv._napari.widgets._runner import Outcome
 from napari_shadowinv._napari.widgets._saving import (
     MoreLayersButton,
     SaveButton,
@@ -345,12 +344,8 @@ class InvertStack(InversionInputs, ToolPanel):
 
     def _source(self, layer: Any) -> ArrayLike | None:
         # A stack of sources has one for each shot.
-        layer_of_source = self.source.layers.layer
-        if (
-            self.source.picker.kind == "layer"
-            and layer_of_source is not None
-            and layer_of_source.ndim == 3
-        ):
+        layer_of_source = self.source.layer
+        if layer_of_source is not None and layer_of_source.ndim == 3:
             return stack_of(layer_of_source)
         beam = self.source.measured(layer)
         return None if beam is None else beam.image

@@ -1,24 +1,25 @@
-"""Fits of layers.
+"""Work on layers in a thread, with its estimated time and progress.
 
 - a fit to run: `FitJob`; its result with layers: `FinishedFit`
 - the job that refines an inversion: `refinement`
+- its estimated time and progress: `TimeEstimate`, `FitProgress`, `PACE`
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari.fit_layers import fit_layers, setup_of_fit
-from napari_shadowinv._napari.fit_progress import PACE, FitProgress, TimeEstimate, estimate_fit_time
 from napari_shadowinv._napari.frame import Frame, frame_of
 from napari_shadowinv._napari.layer_metadata import Result, metadata_of, result_of
 from napari_shadowinv._napari.shots import load_radiograph
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit
+from napari_shadowinv.fitting import Fit, FitOptions
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline import FitShot, run_fit, run_refinement
@@ -28,6 +29,143 @@ from napari_shadowinv.preprocessing import Radiograph, Recipe
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.physics.setup import Setup
+
+# Measured on two cores with two to four images of 64² to 400² px without crossing rays. Crossing
+# rays, or a search for the cause of a misfit, multiply the time by 1.9 to 4.
+_TIME_S, _TIME_PER_PIXEL_S = 1.5, 5e-5
+_CROSSING_RAYS_FACTOR = 4.0
+_TWO_FIELDS_FACTOR, _UNKNOWN_BEAM_FACTOR = 1.5, 1.6
+# Time of an error bar's sample relative to the fit, and its steps. Modes that beam and field share
+# converge slowly.
+_TIME_PER_SAMPLE, _STEPS_PER_SAMPLE = 0.008, 12.0
+_TIME_PER_BEAM_SAMPLE, _STEPS_PER_BEAM_SAMPLE = 0.02, 50.0
+_EVIDENCE_IN_SAMPLES = 20
+_MINUTE_S, _HOUR_S = 60, 3600
+
+# Shares of the time, and approximate steps; all stages without a name belong to the starts.
+_WEIGHTS = {"starts": 0.4, "smoothness": 0.4, "full size": 0.2}
+_STEPS = {"starts": 140.0, "smoothness": 180.0, "full size": 20.0}
+_ERROR_BARS = "error bars"
+_STAGE_NAMES = {"smoothness": "smoothness", "other starts": "smoothness", "full size": "full size"}
+_STAGE_NAMES |= {
+    "point spread": "full size",
+    "rivals": "full size",
+    "samples": _ERROR_BARS,
+    "evidence": _ERROR_BARS,
+}
+_BAR_LENGTH = 1000
+
+
+def duration_in_words(seconds: float) -> str:
+    """Format an approximate time with a suitable unit."""
+    if seconds < 2 * _MINUTE_S:
+        return f"{float(f'{seconds:.1g}'):g} s" if seconds < 10 else f"{round(seconds, -1):g} s"
+    if seconds < 2 * _HOUR_S:
+        return f"{seconds / _MINUTE_S:.0f} min"
+    return f"{seconds / _HOUR_S:.1f} h"
+
+
+class Pace:
+    """Time of fits on this machine relative to the reference, from the last fit."""
+
+    def __init__(self) -> None:
+        self.factor: float | None = None
+
+    def learn(self, estimate: TimeEstimate, seconds: float) -> None:
+        """Update the factor from the measured time of a fit."""
+        self.factor = seconds / estimate.seconds
+
+
+@dataclass(frozen=True)
+class TimeEstimate:
+    """Properties of a fit that determine its time."""
+
+    shape: tuple[int, ...]
+    images: int
+    fields: int
+    beam_is_unknown: bool
+    samples: int
+
+    @property
+    def seconds(self) -> float:
+        """Estimated time in s without crossing rays."""
+        seconds = _TIME_S + _TIME_PER_PIXEL_S * self.images * self.shape[0] * self.shape[1]
+        seconds *= _TWO_FIELDS_FACTOR if self.fields > 1 else 1
+        seconds *= _UNKNOWN_BEAM_FACTOR if self.beam_is_unknown else 1
+        return seconds * (1 + self.samples_weight)
+
+    @property
+    def samples_weight(self) -> float:
+        """Time of the error bars relative to the rest of the fit."""
+        return self.samples * (_TIME_PER_BEAM_SAMPLE if self.beam_is_unknown else _TIME_PER_SAMPLE)
+
+    @property
+    def samples_steps(self) -> float:
+        """Approximate number of steps of the error bars."""
+        steps_per_sample = _STEPS_PER_BEAM_SAMPLE if self.beam_is_unknown else _STEPS_PER_SAMPLE
+        return self.samples * steps_per_sample
+
+    def text(self, pace: Pace) -> str:
+        """Return the estimate as a sentence."""
+        count = "one image" if self.images == 1 else f"{self.images} images"
+        subject = f"{count} of {self.shape[0]} × {self.shape[1]} px"
+        if self.fields > 1:
+            subject += f", {self.fields} fields"
+        if self.beam_is_unknown:
+            subject += ", unknown beam"
+        time = duration_in_words((pace.factor or 1) * self.seconds)
+        if pace.factor is None:
+            longest = duration_in_words(_CROSSING_RAYS_FACTOR * self.seconds)
+            return f"{subject}: about {time}, up to {longest} if rays cross."
+        return f"{subject}: about {time}, based on the last fit."
+
+
+PACE = Pace()
+
+
+class FitProgress:
+    """Converts messages of a fit to monotonic progress, and records its objectives."""
+
+    def __init__(self, estimate: TimeEstimate) -> None:
+        self.history: list[tuple[str, float]] = []
+        self._weights, self._expected = dict(_WEIGHTS), dict(_STEPS)
+        if estimate.samples:
+            self._weights[_ERROR_BARS] = estimate.samples_weight
+            self._expected[_ERROR_BARS] = estimate.samples_steps
+        self._stage, self._steps, self._done = "", 0, 0.0
+
+    def update(self, progress: Progress) -> Progress:
+        """Return the progress of the fit, with a share of the total time and the stage in words."""
+        if progress.stage != "fit" or progress.objective is None:
+            return progress
+        name, value = progress.message, progress.objective
+        self.history.append((name, value))
+        stage = _STAGE_NAMES.get(name, "starts")
+        if stage not in self._weights:
+            return progress
+        if stage != self._stage:
+            self._stage, self._steps = stage, 0
+        self._steps += 1
+        self._done = max(self._done, self._share())
+        message = f"stage {list(self._weights).index(stage) + 1} of {len(self._weights)}, {stage}"
+        if stage == "starts":
+            message += f" ({name})"
+        return Progress(progress.stage, int(_BAR_LENGTH * self._done), _BAR_LENGTH, message, value)
+
+    def _share(self) -> float:
+        stages = list(self._weights)
+        before = sum(self._weights[stage] for stage in stages[: stages.index(self._stage)])
+        within = 1 - math.exp(-2 * self._steps / self._expected[self._stage])
+        return (before + within * self._weights[self._stage]) / sum(self._weights.values())
+
+
+def estimate_fit_time(
+    shape: tuple[int, ...], images: int, fields: int, source: object, options: FitOptions
+) -> TimeEstimate:
+    """TimeEstimate a fit with the source and options that `fit` takes."""
+    samples = options.samples if options.samples > 1 else 0
+    samples += _EVIDENCE_IN_SAMPLES if options.evidence else 0
+    return TimeEstimate(shape, images, fields, isinstance(source, str), samples)
 
 
 @dataclass(frozen=True, eq=False)

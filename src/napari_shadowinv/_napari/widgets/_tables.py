@@ -1,23 +1,94 @@
-"""The images of a fit in a table, with beam, brightness and blur of each: `ImageTable`."""
+"""Tables with a row for each image: `NumberTable`, `ImageTable`."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
-from qtpy.QtWidgets import QSizePolicy, QWidget
+from qtpy.QtGui import QColor
+from qtpy.QtWidgets import QHeaderView, QSizePolicy, QTableWidget, QTableWidgetItem, QWidget
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.widgets._editors import parse_number, unit_of_title
-from napari_shadowinv._napari.widgets._forms import labelled
+from napari_shadowinv._napari.widgets._editors import format_number, parse_number, unit_of_title
+from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, labelled
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, kind_of, stack_of
-from napari_shadowinv._napari.widgets._number_table import NumberTable
 from napari_shadowinv._napari.widgets._qt import column, while_alive
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup import SETUPS, Setup
+
+_MAX_SHOWN_ROWS = 8
+_PROBLEM_COLOUR = QColor(PROBLEM_STYLE.removeprefix("color: ").removesuffix(";"))
+
+
+class NumberTable(QTableWidget):
+    """A row for each image; its first cell holds the name and whether it is used."""
+
+    def __init__(self, columns: int, widths: Mapping[int, int]) -> None:
+        super().__init__(0, columns)
+        self.verticalHeader().setVisible(False)
+        self.setSelectionMode(QTableWidget.SelectionMode.NoSelection)
+        self.setTextElideMode(Qt.TextElideMode.ElideMiddle)
+        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        header = self.horizontalHeader()
+        header.setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
+        for number, width in widths.items():
+            header.setSectionResizeMode(number, QHeaderView.ResizeMode.Fixed)
+            header.resizeSection(number, width)
+
+    def fill_row(self, row: int, name: str, tip: str, *, checked: bool) -> None:
+        """Create the cells of a row, empty except the first."""
+        item = QTableWidgetItem(name)
+        item.setFlags(Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsUserCheckable)
+        item.setCheckState(Qt.CheckState.Checked if checked else Qt.CheckState.Unchecked)
+        item.setToolTip(f"<qt>{tip}</qt>")
+        self.setItem(row, 0, item)
+        for number in range(1, self.columnCount()):
+            self.setItem(row, number, QTableWidgetItem())
+
+    def fit_height(self) -> None:
+        """Fit the height to the rows, up to a maximum."""
+        rows = sum(self.rowHeight(row) for row in range(min(self.rowCount(), _MAX_SHOWN_ROWS)))
+        header = self.horizontalHeader()
+        header.setFixedHeight(header.sizeHint().height())
+        self.setFixedHeight(header.height() + rows + 2 * self.frameWidth())
+
+    def is_checked(self, row: int) -> bool:
+        return bool(self.item(row, 0).checkState() == Qt.CheckState.Checked)
+
+    def number(self, row: int, column: int, unit: str) -> float | None:
+        """Return the number in a cell, None if it is empty; or raise an `InputError`."""
+        item = self.item(row, column)
+        exact, text = item.data(Qt.ItemDataRole.UserRole), item.text().strip()
+        if exact is not None:
+            return float(exact)
+        return parse_number(text, unit) if text else None
+
+    def write(self, row: int, column: int, value: Any, unit: str, tip: str) -> None:
+        """Show a number, or text that the user has to correct."""
+        item = self.item(row, column)
+        is_number = not isinstance(value, str) and value is not None
+        # The shown text is rounded.
+        item.setData(Qt.ItemDataRole.UserRole, value if is_number else None)
+        if not is_number:
+            item.setText(value or "")
+        else:
+            item.setText(format_number(value, unit) if unit not in ("", "MeV") else f"{value:.6g}")
+        self._check(item, unit, tip)
+
+    def _check(self, item: QTableWidgetItem, unit: str, tip: str) -> None:
+        """Mark an invalid number by its colour and tooltip."""
+        try:
+            parse_number(item.text() or "0", unit)
+        except InputError as error:
+            item.setForeground(_PROBLEM_COLOUR)
+            item.setToolTip(f"<qt>{error}</qt>")
+        else:
+            item.setData(Qt.ItemDataRole.ForegroundRole, None)
+            item.setToolTip(f"<qt>{tip}</qt>")
+
 
 _METADATA_KEY = "fit"  # entries of the rows in a layer's metadata
 _NAME, _BEAM, _BRIGHTNESS, _PSF = range(4)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from napari_shadowinv import ProtonSetup, fit
-from napari_shadowinv._napari.fit_progress import FitProgress, Pace, estimate_fit_time
+from napari_shadowinv._napari.jobs import FitProgress, Pace, estimate_fit_time
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.fitting import FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
