@@ -41,6 +41,7 @@ SHAPE = (40, 48)
 LENGTHS = {"source_object_distance": 0.01, "object_image_distance": 0.3, "pixel_size": 1e-5}
 SETUPS = [ProtonSetup(energy=energy, **LENGTHS) for energy in (8, 12, 20)]
 HASTY = FitOptions(samples=2, max_iterations=3, spacing=0.5)
+PLAIN = FitOptions(samples=0, max_iterations=1, spacing=0.5, smoothness=10.0)
 STEPS = (Dark(level=Path("dark.npy")), Crop(y=(1, 39)))
 FIT = Recipe(steps=STEPS, fit=FitChoices(noise=2.0, options=HASTY))
 
@@ -108,9 +109,9 @@ def refinement(folder: Path) -> Example:
 
 def leave_one_out(folder: Path) -> Example:
     paths = record(folder)
-    shots = fit_shots(paths)
-    result = run_fit(FIT, shots)
-    checks = run_checks(FIT, shots, result, left_out=True, window=None)
+    shots, recipe = fit_shots(paths), FIT.model_copy(update={"fit": FitChoices(options=PLAIN)})
+    result = run_fit(recipe, shots)
+    checks = run_checks(recipe, shots, result, left_out=True, window=None)
     return Example(write(Path("a.shadowinv"), checks.add_to(result.to_dataset())), paths[2])
 
 
@@ -123,7 +124,8 @@ def film_pack(folder: Path) -> Example:
 def energy_windows(folder: Path) -> Example:
     pack = film_pack(folder)
     table = write_layers(pack.dataset, folder)[-1]
-    recipe = Recipe(fit=FitChoices(brightness="free", options=HASTY))
+    steps = (Crop(y=(14, 46), x=(20, 60)),)
+    recipe = Recipe(steps=steps, fit=FitChoices(options=PLAIN))
     shots = read_rows(shot_rows([table], {}, {}), recipe)
     result = run_fit(recipe, shots)
     checks = run_checks(recipe, shots, result, left_out=False, window=2)
@@ -135,7 +137,7 @@ def shot_of_stack(folder: Path) -> Example:
     paths = record(folder)
     options = InversionOptions(n_sites=150)
     recipe = Recipe(steps=STEPS, mask=Path("mask.tif"), setup=SETUPS[0], options=options)
-    arguments = {"recipe": recipe, "scheduler": "synchronous", "warm_start": 1}
+    arguments = {"recipe": recipe, "scheduler": "synchronous", "dtype": "float64"}
     run_stack(paths, "a.shadowinv.zarr", source="beam.npy", **arguments)
     return Example(read_stack(Path("a.shadowinv.zarr")).isel(shot=1).load(), paths[1])
 
@@ -161,8 +163,10 @@ def test_a_result_is_repeated_bit_for_bit(example: Example, tmp_path: Path) -> N
     assert again.changes == ()
     assert again.is_identical
     assert stages
-    assert set(before.data_vars) - {"report", "status", "name", "image"} <= set(again.dataset)
-    for name in set(before.data_vars) & set(again.dataset.data_vars):
+    # A store has a report of each shot, too, in several columns.
+    names = [name for name in before.data_vars if before[name].ndim]
+    assert len(names) > 2
+    for name in names:
         values = again.dataset[name].values
         if before[name].dtype.kind == "f":
             values = values.astype(before[name].dtype)

@@ -24,7 +24,7 @@ from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, checked_mask, checked_source
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
-from napari_shadowinv.io.files import text_of
+from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.pipeline import Inputs, collect_inputs
@@ -195,7 +195,9 @@ def _describe_inputs(
             inputs.recipe.setup, stack_shots.shape
         )  # refuses a wrong setup
     if isinstance(source, (str, Path)):
-        origin = Origin(file=text_of(Path(source).name))
+        path = Path(source)
+        checksum = sha256(path) if path.is_file() else ""  # or a pattern of several files
+        origin = Origin(file=text_of(path.name), sha256=checksum, variable=measured.variable)
         provenance = inputs.provenance.with_image(source=origin)
         inputs = replace(inputs, provenance=provenance)
     return stack_shots, replace(inputs, shot=replace(inputs.shot, source=None)), sources

@@ -79,13 +79,14 @@ def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> d
     """Return the attributes that must agree for a store with `shots` shots to be continued."""
     height, width = stack.shape
     recipe, shot = stack.recipe, stack.inputs.shot
+    steps = [step.model_dump(mode="json") for step in recipe.steps]
     return {
         "fit": stack.fit_text,
         "options": stack.options_text,
         **stack.setup_texts,
         "source_image": stack.source_text(shots),
         "mask_image": _mask_text(shot.mask) or "none",
-        "steps": json.dumps([step.model_dump() for step in recipe.steps]) if recipe.steps else "",
+        "steps": json.dumps(steps) if steps else "",
         "source_mask_image": _mask_text(shot.source_mask),
         "image_size": f"{width} × {height} px",
         "stored": f"{', '.join(stack.variables)} as {dtype}",
