@@ -418,43 +418,21 @@ def test_info_shows_a_doubtful_verdict(make_fit: Callable[..., Fit]) -> None:
 # Rerun
 
 
-def test_rerun_of_a_fit_is_identical_bit_for_bit(
+def test_rerun_takes_moved_images_in_their_order(
     folder: Path, refused: Callable[..., None], empty_figure: None
 ) -> None:
-    mask = np.full(SHAPE, 255, np.uint8)
-    mask[:9, :7] = 0
-    tifffile.imwrite("mask.tif", mask)
     tifffile.imwrite("beam.tif", np.full(SHAPE, 1000, np.float32))
-    steps = ("--crop-y", "2:46", "--crop-x", "0:54", "--hot-pixels", 8)
-    inputs = ("--mask", "mask.tif", "--source", "beam.tif", "--psf", 0.3, "--noise", 20)
-    quick = ("--samples", 2, "--max-iterations", 5, "--spacing", 0.25)
-    result = shadowinv(*PAIR, *steps, *inputs, *quick, "--brightness", "1,1.01")
-    assert result.exit_code in (0, 3), result.output
-    # A mask whose pixels are kept need not be there any more.
-    Path("mask.tif").unlink()
-    Path("setup.toml").unlink()
-    again = shadowinv("rerun", "a_fit.shadowinv")
-    output = flat(again.stdout)
-    assert "changed nothing difference none: the same result, bit for bit" in output
-    first, second = fit_in("a_fit.shadowinv")[0], fit_in("a_fit_again.shadowinv")[0]
-    assert first.provenance is not None
-    assert second.provenance is not None
-    assert first.provenance.recipe == second.provenance.recipe
-    assert first.provenance.images == second.provenance.images
-    assert first.options == second.options
-    for before, after in zip(first.fields, second.fields, strict=True):
-        np.testing.assert_array_equal(before.uncertainty, after.uncertainty)
-
-    # Elsewhere, with an image that is not the same.
+    quick = ("--samples", 0, "--max-iterations", 1, "--spacing", 0.5, "--smoothness", 10)
+    assert shadowinv(*PAIR, "--source", "beam.tif", *quick).exit_code in (0, 3)
     elsewhere = folder / "elsewhere"
     elsewhere.mkdir()
     for name in ("a.tif", "beam.tif"):
         Path(name).rename(elsewhere / name)
     tifffile.imwrite(elsewhere / "c.tif", tifffile.imread("b.tif") + np.float32(5))
-    where = ("--source", "elsewhere/beam.tif", "--overwrite")
     refused("rerun", "a_fit.shadowinv", "--overwrite", names=("image 1 a.tif does not exist",))
     alone = ("rerun", "a_fit.shadowinv", "b.tif", "--overwrite")
     refused(*alone, names=("received 1 images", "made from 2"))
+    where = ("--source", "elsewhere/beam.tif", "--overwrite")
     moved = shadowinv("rerun", "a_fit.shadowinv", "elsewhere/a.tif", "elsewhere/c.tif", *where)
     output = flat(moved.stdout)
     assert "changed the image 2 c.tif differs from the b.tif used before" in output

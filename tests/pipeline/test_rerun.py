@@ -171,10 +171,12 @@ def test_a_result_is_repeated_bit_for_bit(example: Example, tmp_path: Path) -> N
         if before[name].dtype.kind == "f":
             values = values.astype(before[name].dtype)
         np.testing.assert_array_equal(before[name], values, str(name))
-    assert provenance_of(again.dataset) == provenance
+    after = provenance_of(again.dataset)
+    # A store has no notes of each shot.
+    assert after == provenance or after.with_image(notes=()) == provenance
     # And once more from the file of the repeated result.
     written = write(tmp_path / "again.shadowinv", again.dataset)
-    assert Provenance.of(read_dataset(written).attrs) == provenance
+    assert Provenance.of(read_dataset(written).attrs) == after
 
     # The image differs now.
     if example.image.suffix == ".npy":

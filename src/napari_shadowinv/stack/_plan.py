@@ -196,8 +196,12 @@ def _describe_inputs(
         )  # refuses a wrong setup
     if isinstance(source, (str, Path)):
         path = Path(source)
-        checksum = sha256(path) if path.is_file() else ""  # or a pattern of several files
-        origin = Origin(file=text_of(path.name), sha256=checksum, variable=measured.variable)
+        origin = Origin(
+            file=text_of(path.name),
+            sha256=sha256(path) if path.is_file() else "",  # else a pattern of several files
+            variable=measured.variable,
+            shape=stack_shots.shape,
+        )
         provenance = inputs.provenance.with_image(source=origin)
         inputs = replace(inputs, provenance=provenance)
     return stack_shots, replace(inputs, shot=replace(inputs.shot, source=None)), sources
