@@ -37,6 +37,7 @@ TASKS: dict[str, tuple[str, ...]] = {
         "plan_sites",
     ),
     "Apply a recipe to a file": ("read", "Radiograph", "Recipe", "run", "write"),
+    "Repeat a result from its provenance": ("rerun", "Rerun"),
     "Describe the experiment, for SI units": ("ProtonSetup", "OpticalSetup"),
     "Estimate the error of a field": ("uncertainty", "Uncertainty"),
     "Fit one or several images, also where rays cross": ("fit", "FitOptions", "Fit"),

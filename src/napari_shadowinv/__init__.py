@@ -10,6 +10,7 @@
   folder: `watch_stack`
 - everything that is done to a shot, as one model: `Recipe`; apply it: `run`; its parts, and
   further filters of images and estimates of beams: `napari_shadowinv.preprocessing`
+- repeat a result from its provenance: `rerun`; the answer is a `Rerun`
 - predict an image, or invert it linearly: `synthetic_image`, `poisson_invert`
 - predict the image of the same object in another experiment: `project`, `project_potential`
 - read and write files: `read`, `write`

@@ -11,7 +11,8 @@ from .physics.forward import synthetic_image
 from .physics.poisson import poisson_invert
 from .physics.projection import project, project_potential
 from .physics.setup import OpticalSetup, ProtonSetup
-from .pipeline import Rerun, rerun, run
+from .pipeline import run
+from .pipeline.rerun import Rerun, rerun
 from .preprocessing import Recipe
 from .stack import invert_stack, run_stack, stack_statistics, watch_stack
 

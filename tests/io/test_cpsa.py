@@ -13,7 +13,7 @@ from command_line import flat, shadowinv
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io import read, read_cpsa, read_radiograph, read_tracks
 from napari_shadowinv.io.cpsa import as_text
-from napari_shadowinv.pipeline import rerun
+from napari_shadowinv.pipeline.rerun import rerun
 
 PIXEL = 0.5  # µm; a frame of 800 × 400 px is 400 × 200 µm
 WIDTH, HEIGHT = 800, 400

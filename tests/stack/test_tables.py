@@ -30,7 +30,7 @@ from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
 from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.physics.setup import BeamSetup, OpticalSetup, ProtonSetup
-from napari_shadowinv.pipeline import rerun
+from napari_shadowinv.pipeline.rerun import rerun
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, shot_rows
 from napari_shadowinv.preprocessing import Bin, PolynomialEstimate
 from napari_shadowinv.provenance import Provenance

@@ -7,6 +7,7 @@
 - test whether one static field explains them: `run_leave_one_out`; a movie of fields:
   `run_windows`
 - refine an inversion by a fit that starts from it: `run_refinement`
+- repeat a result from its provenance: module `rerun`
 - recipes as files: `read_recipe`, `write_recipe`
 """
 

@@ -5,18 +5,15 @@ from .film_files import read_pack, write_layers
 from .fit_run import FitShot, run_comparison, run_fit
 from .inversion_run import Inputs, collect_inputs, run, run_prepared
 from .refinement import run_refinement
-from .rerun import Rerun, rerun
 from .static_checks import run_leave_one_out, run_windows
 
 __all__ = [
     "Cache",
     "FitShot",
     "Inputs",
-    "Rerun",
     "collect_inputs",
     "read_pack",
     "read_recipe",
-    "rerun",
     "run",
     "run_comparison",
     "run_film",
