@@ -536,7 +536,7 @@ def test_forward_to_other_pixels_keeps_the_picture(folder: Path) -> None:
     (folder / "first.toml").write_text(PROTON_TOML)
     (folder / "second.toml").write_text(PROTON_TOML.replace("1e-5", "5e-6"))
     np.save("d.npy", BLOB.displacement)
-    arguments = ["--made-with", "first.toml", "--setup", "second.toml", "--out", "fine.tif"]
+    arguments = ["--recorded-with", "first.toml", "--setup", "second.toml", "--out", "fine.tif"]
     result = shadowinv("forward", "d.npy", *arguments)
     assert result.exit_code == 0, result.output
     fine = tifffile.imread("fine.tif")
@@ -557,12 +557,12 @@ def test_forward_refuses_mismatched_setups(folder: Path, refused: Callable[..., 
     light = 'kind = "optical"\nwavelength = 5e-7\nobject_image_distance = 0.1\npixel_size = 1e-5\n'
     (folder / "green.toml").write_text(light)
     (folder / "red.toml").write_text(light.replace("5e-7", "7e-7"))
-    both = ["forward", "d.npy", "--made-with", "high.toml", "--setup"]
+    both = ["forward", "d.npy", "--recorded-with", "high.toml", "--setup"]
     refused(*both, "green.toml", names=("kind 'proton'", "kind 'optical'"))
     refused(*both, "low.toml", "--deflector", "gravity", names=("'gravity'", "magnetic field"))
-    refused("forward", "d.npy", "--deflector", "plasma", names="--made-with")
+    refused("forward", "d.npy", "--deflector", "plasma", names="--recorded-with")
     refused("forward", "d.npy", "--source-variable", "beam", names="it needs --source")
-    colours = ["forward", "d.npy", "--made-with", "green.toml", "--setup", "red.toml"]
+    colours = ["forward", "d.npy", "--recorded-with", "green.toml", "--setup", "red.toml"]
     refused(*colours, names=("wavelengths differ", "'plasma'"))
     assert shadowinv(*colours, "--deflector", "plasma", "--out", "red.npy").exit_code == 0
     expected = synthetic_image((7 / 5) ** 2 * BLOB.displacement)

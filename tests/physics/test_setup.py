@@ -374,11 +374,11 @@ class NeutralSetup(BeamSetup):
     def example(cls) -> Self:
         return cls(energy=2e-3, source_object_distance=1, object_image_distance=1, pixel_size=1e-6)
 
-    def default_deflector(self, made_with: Any) -> str:
+    def default_deflector(self, recorded_with: Any) -> str:
         return "force"
 
-    def angle_ratio(self, made_with: Any, deflector: str) -> float:
-        return made_with.energy / self.energy
+    def angle_ratio(self, recorded_with: Any, deflector: str) -> float:
+        return recorded_with.energy / self.energy
 
     def path_integrated_force(self, displacement: Any) -> Any:
         return 2 * self.energy * self.deflection_angle(displacement)

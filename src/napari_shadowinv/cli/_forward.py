@@ -90,22 +90,22 @@ def _no_field(path: Path, kind: str) -> FileFormatError:
 def choose_setups(
     field: Field,
     target: Setup | None,
-    made_with: Setup | None,
+    recorded_with: Setup | None,
     deflector: str | None,
     dispersion: float,
 ) -> tuple[Setup | None, Setup | None]:
     """Return the setup that a field was measured with, and the one to predict it for."""
-    if made_with is not None and field.setup is not None and made_with != field.setup:
+    if recorded_with is not None and field.setup is not None and recorded_with != field.setup:
         raise InputError(
-            "received --made-with, but the field's file contains its own setup, "
+            "received --recorded-with, but the field's file contains its own setup, "
             f"{setup_text(field.setup)}: leave it out"
         )
-    original = made_with or field.setup or target
+    original = recorded_with or field.setup or target
     target = target or original
     if (deflector is not None or dispersion != 1) and original == target:
         raise InputError(
             "received --deflector or --dispersion, but only one setup: expected a different one "
-            "with --setup, and for a field in px also --made-with"
+            "with --setup, and for a field in px also --recorded-with"
         )
     return original, target
 
@@ -113,7 +113,7 @@ def choose_setups(
 def predict_image(
     displacement: FloatArray,
     source: FloatArray | None,
-    made_with: Setup | None,
+    recorded_with: Setup | None,
     target: Setup | None,
     deflector: str | None,
     dispersion: float,
@@ -122,15 +122,15 @@ def predict_image(
     from napari_shadowinv.physics.forward import synthetic_image
     from napari_shadowinv.physics.projection import default_deflector, project
 
-    if made_with is None or target is None or made_with == target:
+    if recorded_with is None or target is None or recorded_with == target:
         return synthetic_image(displacement, source), ""
     # Names of two words have a hyphen on the command line.
     name = cast("Deflector | None", deflector and deflector.replace("-", " "))
-    name = name or default_deflector(made_with, target)
+    name = name or default_deflector(recorded_with, target)
     image = project(
-        displacement, made_with, target, deflector=name, dispersion=dispersion, source=source
+        displacement, recorded_with, target, deflector=name, dispersion=dispersion, source=source
     )
     return image, (
-        f"From {setup_text(made_with)} to {setup_text(target)}, assuming that only a {name} "
+        f"From {setup_text(recorded_with)} to {setup_text(target)}, assuming that only a {name} "
         "deflects the beam"
     )

@@ -30,7 +30,7 @@ HELP = {
     "containing a displacement (2, H, W) in px or a potential (H, W) in px².",
     "setup": "TOML file with the setup of the prediction, for example with another energy. "
     "Default: the field's own setup.",
-    "made_with": "TOML file with the setup of the measurement, if the field's file does not "
+    "recorded_with": "TOML file with the setup of the measurement, if the field's file does not "
     "contain it.",
     "deflector": "Cause of the deflection, if --setup differs from the field's setup: "
     "magnetic-field, electric-field, plasma or refractive-index.",
@@ -193,7 +193,7 @@ FORWARD_EPILOG = """
 shadowinv forward shot.shadowinv
 shadowinv forward shot.shadowinv --setup lower_energy.toml
 shadowinv forward shot.shadowinv --setup lower_energy.toml --deflector electric-field
-shadowinv forward d.npy --made-with first.toml --setup second.toml
+shadowinv forward d.npy --recorded-with first.toml --setup second.toml
 
 [bold]Another experiment[/bold]
 A deflection depends on the beam; the object's line integral does not. To convert between
@@ -210,7 +210,7 @@ def forward(
     field: Annotated[Path, typer.Argument(help=HELP["field"], show_default=False)],
     source: _flags.SourceFile = None,
     setup: Annotated[Path | None, typer.Option("--setup", help=HELP["setup"])] = None,
-    made_with: Annotated[Path | None, typer.Option(help=HELP["made_with"])] = None,
+    recorded_with: Annotated[Path | None, typer.Option(help=HELP["recorded_with"])] = None,
     deflector: Annotated[str | None, typer.Option(metavar="WHAT", help=HELP["deflector"])] = None,
     dispersion: Annotated[float, typer.Option(help=HELP["dispersion"])] = 1.0,
     channel: _flags.Channel = None,
@@ -235,11 +235,11 @@ def forward(
 
     path = Path(f"{field.stem}_image{TIFF.suffix}") if out is None else out
     _outputs.check_outputs({path: tuple(IMAGE_WRITERS)}, overwrite)
-    _outputs.protect([path], [field, source, setup, made_with])
+    _outputs.protect([path], [field, source, setup, recorded_with])
     if source_variable is not None and source is None:
         raise InputError("received --source-variable: it needs --source, the file that contains it")
     target = None if setup is None else setup_from(setup)
-    original = None if made_with is None else setup_from(made_with)
+    original = None if recorded_with is None else setup_from(recorded_with)
     content = field_from(field, variable)
     original, target = choose_setups(content, target, original, deflector, dispersion)
     # The beam of another experiment is not known.

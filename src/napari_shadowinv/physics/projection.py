@@ -54,7 +54,7 @@ _SIZE_TOLERANCE = 1e-9
 
 def project(
     displacement: ArrayLike,
-    made_with: Setup,
+    recorded_with: Setup,
     setup: Setup,
     *,
     deflector: Deflector | None = None,
@@ -69,8 +69,8 @@ def project(
     Parameters
     ----------
     displacement : array_like, shape (2, H, W)
-        Displacement in px of `made_with`, axis order (y, x), such as `Inversion.displacement`.
-    made_with, setup : Setup
+        Displacement in px of `recorded_with`, axis order (y, x), such as `Inversion.displacement`.
+    recorded_with, setup : Setup
         The experiment that the displacement belongs to, and the one to predict.
     deflector, dispersion, shape
         As for `transferred_displacement`.
@@ -96,7 +96,7 @@ def project(
         height, width = np.shape(source)[:2] if np.ndim(source) == 2 else (0, 0)
         shape = (height, width)
     moved = transferred_displacement(
-        displacement, made_with, setup, deflector=deflector, dispersion=dispersion, shape=shape
+        displacement, recorded_with, setup, deflector=deflector, dispersion=dispersion, shape=shape
     )
     return synthetic_image(moved, source, rays_per_pixel=rays_per_pixel, threads=threads)
 
@@ -111,26 +111,26 @@ class _Keywords(TypedDict, total=False):
 
 
 def project_potential(
-    potential: ArrayLike, made_with: Setup, setup: Setup, **keywords: Unpack[_Keywords]
+    potential: ArrayLike, recorded_with: Setup, setup: Setup, **keywords: Unpack[_Keywords]
 ) -> FloatArray:
     """Image that a potential in SI units makes, in its own or in another experiment.
 
     Parameters
     ----------
     potential : array_like, shape (H, W)
-        Potential Φ in m at the centres of the pixels of `made_with`, as its `potential` gives
+        Potential Φ in m at the centres of the pixels of `recorded_with`, as its `potential` gives
         it; `displacement_from_potential` takes the gradient.
-    made_with, setup, **keywords
+    recorded_with, setup, **keywords
         As for `project`, whose result and errors this has; also refused is a potential that is
         no plane.
     """
-    displacement = made_with.displacement_from_potential(potential)
-    return project(displacement, made_with, setup, **keywords)
+    displacement = recorded_with.displacement_from_potential(potential)
+    return project(displacement, recorded_with, setup, **keywords)
 
 
 def transferred_displacement(
     displacement: ArrayLike,
-    made_with: Setup,
+    recorded_with: Setup,
     setup: Setup,
     *,
     deflector: Deflector | None = None,
@@ -142,14 +142,14 @@ def transferred_displacement(
     Parameters
     ----------
     displacement : array_like, shape (2, H, W)
-        Displacement in px of `made_with`, axis order (y, x).
-    made_with, setup : Setup
+        Displacement in px of `recorded_with`, axis order (y, x).
+    recorded_with, setup : Setup
         The experiment that the displacement belongs to, and the other one.
     deflector : {"magnetic field", "electric field", "plasma", "refractive index"}, optional
         Cause of the deflection. Default: see `default_deflector`.
     dispersion : float, default 1
         For a refractive index: ln η at the wavelength of `setup`, divided by ln η at the
-        wavelength of `made_with`.
+        wavelength of `recorded_with`.
     shape : tuple of int, optional
         Height and width of the other image in its own pixels. Default: the area of the known
         field.
@@ -178,30 +178,30 @@ def transferred_displacement(
     2.22
     """
     field = _checked_field(displacement)
-    factor = _angle_ratio(made_with, setup, deflector, dispersion)
-    ratio = setup.object_pixel_size / made_with.object_pixel_size
+    factor = _angle_ratio(recorded_with, setup, deflector, dispersion)
+    ratio = setup.object_pixel_size / recorded_with.object_pixel_size
     old = (field.shape[1], field.shape[2])
     size = _covered_shape(old, ratio) if shape is None else _checked_shape(shape, old, ratio, setup)
     # One factor, so that nothing changes, not even by rounding, where nothing differs.
-    factor *= float(made_with.deflection_angle(1.0) / setup.deflection_angle(1.0))
+    factor *= float(recorded_with.deflection_angle(1.0) / setup.deflection_angle(1.0))
     if size == old and math.isclose(ratio, 1, rel_tol=_SIZE_TOLERANCE):
         return factor * field
     return factor * _resampled(field, size, ratio)
 
 
-def default_deflector(made_with: Setup, setup: Setup) -> Deflector:
+def default_deflector(recorded_with: Setup, setup: Setup) -> Deflector:
     """Return the default cause of the deflection.
 
     It is a magnetic field for particles, and a refractive index for light of the same wavelength,
     for which a plasma gives the same result. An `InputError` is raised if the wavelengths differ,
     or if one experiment uses particles and the other light.
     """
-    _require_same_kind(made_with, setup)
-    return setup.default_deflector(made_with)
+    _require_same_kind(recorded_with, setup)
+    return setup.default_deflector(recorded_with)
 
 
 def _angle_ratio(
-    made_with: Setup, setup: Setup, deflector: Deflector | None, dispersion: float
+    recorded_with: Setup, setup: Setup, deflector: Deflector | None, dispersion: float
 ) -> float:
     """Deflection angle in the new experiment over that in the old one."""
     if not (math.isfinite(dispersion) and dispersion != 0):
@@ -210,24 +210,24 @@ def _angle_ratio(
         raise InputError(
             f"deflector is {deflector!r}: it must be one of {', '.join(get_args(Deflector))}"
         )
-    usual = deflector or default_deflector(made_with, setup)
+    usual = deflector or default_deflector(recorded_with, setup)
     if dispersion != 1 and usual != "refractive index":
         raise InputError(
             f"dispersion is {dispersion:g}, but it does not apply to a {usual}: leave it out"
         )
-    _require_same_kind(made_with, setup)
+    _require_same_kind(recorded_with, setup)
     if usual not in setup.deflectors:
         raise InputError(
             f"deflector is {usual!r}, but the beam is {setup.beam}: expected "
             f"{' or '.join(map(repr, setup.deflectors))}"
         )
-    return setup.angle_ratio(made_with, usual) * dispersion
+    return setup.angle_ratio(recorded_with, usual) * dispersion
 
 
-def _require_same_kind(made_with: Setup, setup: Setup) -> None:
-    if made_with.kind != setup.kind:
+def _require_same_kind(recorded_with: Setup, setup: Setup) -> None:
+    if recorded_with.kind != setup.kind:
         raise InputError(
-            f"the field was measured with a setup of kind {made_with.kind!r}, but the image is "
+            f"the field was measured with a setup of kind {recorded_with.kind!r}, but the image is "
             f"requested for kind {setup.kind!r}: expected the same kind; the deflection of light "
             "does not determine that of particles"
         )

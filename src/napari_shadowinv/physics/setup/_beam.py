@@ -253,11 +253,11 @@ class BeamSetup(CheckedModel):
         """Return an experiment to start from."""
 
     @abstractmethod
-    def default_deflector(self, made_with: Any) -> str:
+    def default_deflector(self, recorded_with: Any) -> str:
         """Return the default cause of the deflection; an `InputError` if there is none."""
 
     @abstractmethod
-    def angle_ratio(self, made_with: Any, deflector: str) -> float:
+    def angle_ratio(self, recorded_with: Any, deflector: str) -> float:
         """Deflection angle by one object here over that with a setup of the same kind."""
 
 

@@ -84,19 +84,19 @@ class OpticalSetup(BeamSetup):
         """Return the probe of the paper's plasma wave; see `phantoms.wakefield_setup`."""
         return cls(wavelength=810e-9, object_image_distance=20e-6, pixel_size=0.25e-6)
 
-    def default_deflector(self, made_with: Any) -> LightDeflector:
-        if made_with.wavelength != self.wavelength:
+    def default_deflector(self, recorded_with: Any) -> LightDeflector:
+        if recorded_with.wavelength != self.wavelength:
             raise InputError(
-                f"the wavelengths differ ({made_with.wavelength:g} and {self.wavelength:g} m) but "
+                f"the wavelengths differ ({recorded_with.wavelength:g} and {self.wavelength:g} m) but "
                 "no deflector was given: choose 'plasma' (angles scale with the wavelength "
                 "squared) or 'refractive index' (angles are unchanged, apart from dispersion)"
             )
         return "refractive index"
 
-    def angle_ratio(self, made_with: Any, deflector: str) -> float:
+    def angle_ratio(self, recorded_with: Any, deflector: str) -> float:
         if deflector == "refractive index":
             return 1.0
-        ratio: float = made_with.critical_density / self.critical_density
+        ratio: float = recorded_with.critical_density / self.critical_density
         return ratio
 
     @property

@@ -156,14 +156,14 @@ class ProtonSetup(BeamSetup):
         lengths = {"source_object_distance": 1.3e-3, "object_image_distance": 2e-2}
         return cls(energy=14.7, pixel_size=1.5e-6, **lengths)
 
-    def default_deflector(self, made_with: Any) -> ParticleDeflector:
+    def default_deflector(self, recorded_with: Any) -> ParticleDeflector:
         return "magnetic field"
 
-    def angle_ratio(self, made_with: Any, deflector: str) -> float:
-        ratio: float = self.particle.charge / made_with.particle.charge
-        ratio *= made_with.momentum / self.momentum
+    def angle_ratio(self, recorded_with: Any, deflector: str) -> float:
+        ratio: float = self.particle.charge / recorded_with.particle.charge
+        ratio *= recorded_with.momentum / self.momentum
         if deflector == "electric field":
-            ratio = ratio * made_with.velocity / self.velocity
+            ratio = ratio * recorded_with.velocity / self.velocity
         return ratio
 
     @property
