@@ -70,6 +70,60 @@ def test_deleted_chunk_makes_its_shot_damaged(store, name):
     assert np.isfinite(read(store)[name][:3].values.astype(float)).all()
 
 
+@pytest.mark.parametrize("key", ["y/c/0", "image_residual/c/0"])
+def test_lost_file_of_all_shots_is_damage(store, key):
+    (store / key).unlink()
+    assert StackStore(store).damage.files == (f"{key} is missing",)
+
+
+@pytest.mark.parametrize("part", ["report", "status"])
+def test_lost_report_or_damaged_status_damages_the_shot(store, part):
+    file = store / part / "c" / "2"
+    file.unlink() if part == "report" else flip(file, 0)
+    opened = StackStore(store)
+    assert list(opened.damage.shots) == [2]
+    assert f"its {part} is" in opened.report(2)["reason"]
+
+
+def test_lost_report_of_a_failed_shot_damages_the_shot(make_night, out):
+    night = make_night(2)
+    np.save(night.path(1), 0 * night.images[1])
+    night.run(out)
+    (out / "report" / "c" / "1").unlink()
+    assert StackStore(out).damage.shots == {1: "its report is missing"}
+
+
+def test_field_of_a_failed_shot_is_damage(make_night, out):
+    night = make_night(2)
+    np.save(night.path(1), 0 * night.images[1])
+    night.run(out)
+    field(out, 1).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(field(out, 0), field(out, 1))
+    assert list(StackStore(out).damage.shots) == [1]
+
+
+@pytest.mark.parametrize("change", ["shape", "junk", "lost"])
+def test_damaged_description_of_an_array_is_found_by_verify(store, change):
+    file = store / "potential" / "zarr.json"
+    description = json.loads(file.read_text())
+    if change == "shape":
+        description["shape"][2] += 1
+    file.write_text("junk" if change == "junk" else json.dumps(description))
+    if change == "lost":
+        file.unlink()
+    assert StackStore(store).damage.files == ()
+    (problem,) = StackStore(store, every_byte=True).damage.files
+    assert problem.startswith("potential/zarr.json is damaged")
+
+
+def test_flipped_bit_of_the_last_file_is_found_by_verify(store):
+    flip(field(store, 5, "caustic"), 0)
+    flip(store / "noise_error" / "c" / "0", 0)
+    damage = StackStore(store, every_byte=True).damage
+    assert list(damage.shots) == [5]
+    assert any(problem.startswith("noise_error/c/0 is damaged") for problem in damage.files)
+
+
 def test_swapped_chunks_damage_both_shots(store):
     swap(field(store, 1), field(store, 4))
     assert np.flatnonzero(read(store).status == DAMAGED).tolist() == [1, 4]
@@ -209,6 +263,9 @@ def test_many_shots_span_chunks_without_false_alarm(any_night, tmp_path, monkeyp
     any_night.run(path, shots=[any_night.path(i) for i in range(3)])
     any_night.run(path)
     assert StackStore(path, every_byte=True).damage.files == ()
+    (path / "flux_residual" / "c" / "2").rename(path / "away")
+    assert StackStore(path).damage.files == ("flux_residual/c/2 is missing",)
+    (path / "away").rename(path / "flux_residual" / "c" / "2")
     swap(path / "name" / "c" / "0", path / "name" / "c" / "1")
     with pytest.raises(FileFormatError, match="name/c/0 does not belong to shots 0 to 1"):
         read(path)
