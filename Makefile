@@ -17,7 +17,7 @@ OLDEST := .venv-oldest
 OLDEST_TOOLS := "pytest>=8.2" "pytest-xdist>=3.6" "hypothesis>=6.100" "shapely>=2.0" "pyamg>=5.1" \
 	"pyyaml>=6.0" "threadpoolctl>=3.2"
 CORE_TESTS := tests/geometry tests/transport tests/fitting tests/physics tests/io tests/inversion tests/preprocessing \
-	tests/test_cli.py tests/test_plotting.py tests/stack/test_lazy.py tests/stack/test_run.py \
+	tests/cli/test_shot_commands.py tests/plotting tests/stack/test_lazy.py tests/stack/test_run.py \
 	tests/stack/test_statistics.py
 
 .PHONY: demo test test-pyside kernels coverage test-oldest docs gallery lint dist check-wheel format clean

@@ -12,7 +12,7 @@ With --real: how the films of a real pack were moved and turned by their texture
 edges, and where the slit near their upper right corner lies on the upright films before and after.
 Films that lie right show it at one place; where it is torn, too faint or masked, it is left out.
 
-The scans are those of tests/film/simulated_pack.py: rays counted where an exact formula puts them,
+The scans are those of benchmarks/simulated_pack.py: rays counted where an exact formula puts them,
 on films that lie askew. For each film: the energy of its protons and its doses; the protons that
 make its counting noise, by pixel, and that noise; the noise of the dose as the red channel of the
 scans tells it, with counting, grain and scanner, away from writing, over seeds; the largest
@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -37,6 +36,7 @@ import tifffile
 from numpy.typing import NDArray
 from scipy import ndimage
 
+import simulated_pack
 from napari_shadowinv import FitOptions, Recipe
 from napari_shadowinv.film import moved_corners, straightened, write_corners
 from napari_shadowinv.film.scans import upright
@@ -44,9 +44,6 @@ from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.setup import setup_from_dict
 from napari_shadowinv.pipeline import FitShot, read_pack, run_film, run_fit
 from napari_shadowinv.preprocessing import Bin
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "film"))
-import simulated_pack
 from simulated_pack import Truth, simulate
 
 HEAD = (

@@ -250,7 +250,7 @@ def fit_window() -> None:
 
 def film_window() -> None:
     """A simulated film pack: the widget, the fluence at one film, and the spectrum of a region."""
-    sys.path.insert(0, str(HERE.parents[1] / "tests" / "film"))
+    sys.path.insert(0, str(HERE.parents[1] / "benchmarks"))
     from simulated_pack import simulate
 
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):

@@ -19,7 +19,7 @@ import tifffile
 from PIL import Image
 from pydantic import ValidationError
 
-from command_line import flat, shadowinv
+from helpers.command_line import flat, shadowinv
 from napari_shadowinv import (
     FileFormatError,
     FitOptions,

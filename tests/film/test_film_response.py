@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from srim import TABLES
 
+from helpers.srim import TABLES
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film import Material, Pack, PackLayer, Response, Slab
 from napari_shadowinv.film.film_response import check_increasing, relative_strengths

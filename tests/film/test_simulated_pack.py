@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import simulated_pack
 import tifffile
 from scipy.ndimage import binary_erosion
-from simulated_pack import PITCH, Placement, Scene, Truth, simulate
 
+import simulated_pack
 from napari_shadowinv.film import Pack, PackLayer, Response, Slab
+from simulated_pack import PITCH, Placement, Scene, Truth, simulate
 
 SHAPE = (90, 120)
 ASKEW = Placement((160, 190), (82.3, 91.6), np.deg2rad(1.7), (1.5, -0.7))

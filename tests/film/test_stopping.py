@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from srim import TABLES
 
+from helpers.srim import TABLES
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.film import Stopping
 from napari_shadowinv.film.pack import MATERIALS

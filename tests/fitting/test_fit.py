@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from shots import Displacement, bump, counted, distance, noisy, on_pixels, together
 
+from helpers.fit_images import Displacement, bump, counted, distance, noisy, on_pixels, together
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitOptions, compare, fit

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from shots import bump, counted, distance, noisy, on_pixels, together
 
+from helpers.fit_images import bump, counted, distance, noisy, on_pixels, together
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InversionCancelled

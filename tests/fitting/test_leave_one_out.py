@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from shots import bump, counted, noisy, together
 
+from helpers.fit_images import bump, counted, noisy, together
 from napari_shadowinv import FitOptions, InputError, ProtonSetup
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting import LeaveOneOut, leave_one_out

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from polygons import over_pixels, shoelace
 from scipy.spatial import ConvexHull
 
+from helpers.polygons import over_pixels, shoelace
 from napari_shadowinv.geometry.density import Density, walk_edge
 
 

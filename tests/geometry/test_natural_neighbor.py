@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from polygons import clipped, power_cell, shoelace
 
+from helpers.polygons import clipped, power_cell, shoelace
 from napari_shadowinv.geometry.interpolation import natural_neighbor
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 

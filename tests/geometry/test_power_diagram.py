@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from polygons import clipped_to_rectangle, over_pixels, power_cell, power_diagram, shoelace
 
+from helpers.polygons import clipped_to_rectangle, over_pixels, power_cell, power_diagram, shoelace
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from command_line import flat, shadowinv
+from helpers.command_line import flat, shadowinv
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io import read, read_cpsa, read_radiograph, read_tracks
 from napari_shadowinv.io.cpsa import as_text

@@ -12,13 +12,13 @@ import pytest
 pytest.importorskip("napari")
 
 from napari.components import ViewerModel
-from simulated_pack import Truth, simulate
 
 from napari_shadowinv import InversionOptions, invert
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair
 from napari_shadowinv.pipeline import read_pack, run_film
+from simulated_pack import Truth, simulate
 
 
 @pytest.fixture

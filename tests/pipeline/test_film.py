@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import tifffile
 from scipy import ndimage
-from simulated_pack import Truth, simulate
 
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
 from napari_shadowinv.film import Pack, moved_corners, read_corners, write_corners
@@ -19,6 +18,7 @@ from napari_shadowinv.film.scans import upright
 from napari_shadowinv.io import read, read_toml, write
 from napari_shadowinv.pipeline import read_pack, run_film, write_layers
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_of
+from simulated_pack import Truth, simulate
 
 SHAPE, COUNT = (120, 160), 4
 

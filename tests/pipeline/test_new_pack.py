@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from command_line import flat, shadowinv
+from helpers.command_line import flat, shadowinv
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.pipeline import read_pack
 from napari_shadowinv.pipeline.new_pack import NewPack, draft_pack, write_new_pack

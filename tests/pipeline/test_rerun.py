@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from simulated_pack import simulate
 
 from napari_shadowinv import FitOptions, InputError, InversionOptions, ProtonSetup, rerun, run_stack
 from napari_shadowinv.errors import FileFormatError, InversionCancelled
@@ -36,6 +35,7 @@ from napari_shadowinv.pipeline.shot_table import shot_rows
 from napari_shadowinv.pipeline.static_checks import run_checks
 from napari_shadowinv.preprocessing import Crop, Dark, LowPassFilter, Recipe
 from napari_shadowinv.provenance import Provenance
+from simulated_pack import simulate
 
 SHAPE = (40, 48)
 LENGTHS = {"source_object_distance": 0.01, "object_image_distance": 0.3, "pixel_size": 1e-5}

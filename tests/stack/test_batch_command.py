@@ -23,7 +23,7 @@ from rich import progress
 from rich.console import Console
 from typer.testing import Result
 
-from command_line import flat, shadowinv
+from helpers.command_line import flat, shadowinv
 from napari_shadowinv import InversionOptions, invert, read
 from napari_shadowinv.cli._batch import progress_columns
 from napari_shadowinv.io.store import DONE, PENDING, StackStore

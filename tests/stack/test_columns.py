@@ -7,7 +7,7 @@ import csv
 import numpy as np
 import pytest
 
-from command_line import flat, shadowinv
+from helpers.command_line import flat, shadowinv
 from napari_shadowinv._napari.stores import shot_rows
 from napari_shadowinv.io import store_columns
 from napari_shadowinv.io.store import StackStore

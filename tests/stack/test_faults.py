@@ -22,9 +22,9 @@ import numpy as np
 import pytest
 from distributed import Client, LocalCluster
 from distributed.client import FuturesCancelledError
-from slow_reading import die, hang_once
-from store_content import content
 
+from helpers.slow_reading import die, hang_once
+from helpers.store_content import content
 from napari_shadowinv import (
     FileFormatError,
     InversionCancelled,
@@ -42,7 +42,7 @@ from napari_shadowinv.stack._worker import threads_here
 
 OPTIONS = InversionOptions(n_sites=100)
 PATIENCE = 90.0
-HERE = Path(__file__).parent
+TESTS = Path(__file__).parents[1]
 SOURCES = Path(sys.modules["napari_shadowinv"].__file__ or "").parents[1]
 
 
@@ -91,7 +91,7 @@ class InThread(threading.Thread):
 
 
 def environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(SOURCES), str(HERE)])}
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(SOURCES), str(TESTS)])}
 
 
 def test_a_worker_killed_in_the_middle_of_a_shot(night, out, expected, cluster):
@@ -116,7 +116,7 @@ DRIVER = """
     import sys
     import numpy as np
     from napari_shadowinv import InversionOptions, run_stack
-    from slow_reading import hang_once
+    from helpers.slow_reading import hang_once
 
     folder, out, address = sys.argv[1:]
     run_stack(

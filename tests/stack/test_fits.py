@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import tifffile
 import xarray as xr
-from store_content import content
 
-from command_line import flat, shadowinv
+from helpers.command_line import flat, shadowinv
+from helpers.store_content import content
 from napari_shadowinv import InputError, Recipe, run_stack, synthetic_image
 from napari_shadowinv.io import read
 from napari_shadowinv.io.store import StackStore

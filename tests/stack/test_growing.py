@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import tifffile
 import zarr
-from store_content import content
 
+from helpers.store_content import content
 from napari_shadowinv import FileFormatError, InputError, InversionOptions, read
 from napari_shadowinv._system.locking import locked
 from napari_shadowinv.io.store import DONE, PENDING, StackStore

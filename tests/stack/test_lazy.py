@@ -82,7 +82,7 @@ def test_masked_pixels_do_not_count(night):
 
 
 def test_lazy_stack_reads_only_computed_shots(night):
-    from slow_reading import log_and_read
+    from helpers.slow_reading import log_and_read
 
     stack = invert_stack(night.glob, source=night.source, options=OPTIONS, reader=log_and_read)
     assert night.reads == []
@@ -91,7 +91,7 @@ def test_lazy_stack_reads_only_computed_shots(night):
 
 
 def test_all_variables_of_a_shot_come_from_one_inversion(night):
-    from slow_reading import log_and_read
+    from helpers.slow_reading import log_and_read
 
     stack = invert_stack(night.glob, source=night.source, options=OPTIONS, reader=log_and_read)
     dask.compute(stack.potential, stack.displacement, stack.weights, stack.converged)

@@ -8,7 +8,7 @@ import pytest
 from scipy.io import savemat
 from typer.testing import CliRunner
 
-from conftest import OPTIONS
+from helpers.night import OPTIONS
 from napari_shadowinv import (
     InputError,
     InversionOptions,

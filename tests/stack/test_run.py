@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 import pytest
 import xarray as xr
-from slow_reading import log_and_read
-from store_content import content
 
+from helpers.slow_reading import log_and_read
+from helpers.store_content import content
 from napari_shadowinv import (
     FileFormatError,
     InputError,

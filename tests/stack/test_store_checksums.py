@@ -12,9 +12,9 @@ import google_crc32c
 import numpy as np
 import pytest
 import zarr
-from store_content import content
 
-from command_line import flat, shadowinv
+from helpers.command_line import flat, shadowinv
+from helpers.store_content import content
 from napari_shadowinv import FileFormatError, read
 from napari_shadowinv.io.store import DAMAGED, DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.io.store_writing import ShotWriter

@@ -13,7 +13,7 @@ import pytest
 import tifffile
 import tomli_w
 
-from command_line import flat, shadowinv
+from helpers.command_line import flat, shadowinv
 from napari_shadowinv import (
     InputError,
     InversionOptions,

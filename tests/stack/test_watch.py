@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from store_content import content
 
-from command_line import flat, shadowinv
-from conftest import OPTIONS, make_shots
+from helpers.command_line import flat, shadowinv
+from helpers.night import OPTIONS, make_shots
+from helpers.store_content import content
 from napari_shadowinv import (
     FileFormatError,
     InputError,

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from polygons import power_diagram
 
+from helpers.polygons import power_diagram
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.geometry.density import Density

@@ -14,7 +14,6 @@ import pytest
 from napari.components import ViewerModel
 from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QFileDialog
-from simulated_pack import Truth
 
 from napari_shadowinv import read, write
 from napari_shadowinv._napari import packs
@@ -27,6 +26,7 @@ from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.film import read_corners
 from napari_shadowinv.pipeline import read_pack
+from simulated_pack import Truth
 
 PATIENCE = 60_000  # ms
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from qtpy import QtWidgets
 from qtpy.QtCore import Qt
-from simulated_pack import Truth
 from typer.testing import CliRunner
 
 from napari_shadowinv._napari.layer_metadata import result_of, role_of, unit_of
@@ -20,6 +19,7 @@ from napari_shadowinv._napari.viewer_sync import _text_overlay
 from napari_shadowinv._napari.widgets import _fitting
 from napari_shadowinv.cli import app
 from napari_shadowinv.io.store import DONE
+from simulated_pack import Truth
 
 PAGES = Path(__file__).parents[3] / "docs" / "tutorials"
 PLUGIN = "Shadowgrams and proton radiographs"

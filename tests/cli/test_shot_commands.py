@@ -19,7 +19,7 @@ from scipy.io import savemat
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from command_line import content, flat, interrupted, shadowinv
+from helpers.command_line import content, flat, interrupted, shadowinv
 from napari_shadowinv import __version__
 from napari_shadowinv import preprocessing as filters
 from napari_shadowinv import preprocessing as sources

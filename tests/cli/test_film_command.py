@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated_pack import Truth, simulate
 
-from command_line import content, flat, shadowinv
+from helpers.command_line import content, flat, shadowinv
 from napari_shadowinv import read
 from napari_shadowinv.cli import _film_command
 from napari_shadowinv.film import read_corners
+from simulated_pack import Truth, simulate
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ import tifffile
 import xarray as xr
 from matplotlib.figure import Figure
 
-from command_line import content, flat, interrupted, shadowinv
+from helpers.command_line import content, flat, interrupted, shadowinv
 from napari_shadowinv.cli._flags import fit_recipe_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitOptions, LeaveOneOut, Verdict, point_spread
@@ -564,7 +564,7 @@ def test_invalid_recipes_are_refused(
 
 
 def test_the_recipe_on_the_page_works(fit_arguments: dict[str, Any]) -> None:
-    page = (Path(__file__).parents[1] / "docs" / "fit.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "fit.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     Path("page.toml").write_text(text, encoding="utf-8")
     result = shadowinv(*PAIR, "--recipe", "page.toml")
