@@ -87,7 +87,8 @@ class OpticalSetup(BeamSetup):
     def default_deflector(self, recorded_with: Any) -> LightDeflector:
         if recorded_with.wavelength != self.wavelength:
             raise InputError(
-                f"the wavelengths differ ({recorded_with.wavelength:g} and {self.wavelength:g} m) but "
+                f"the wavelengths differ ({recorded_with.wavelength:g} and "
+                f"{self.wavelength:g} m) but "
                 "no deflector was given: choose 'plasma' (angles scale with the wavelength "
                 "squared) or 'refractive index' (angles are unchanged, apart from dispersion)"
             )
