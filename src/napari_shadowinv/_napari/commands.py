@@ -13,7 +13,7 @@ from napari_shadowinv._napari import layers as results
 from napari_shadowinv._napari import notifications
 from napari_shadowinv._napari.frame import Frame, frame_of
 from napari_shadowinv._napari.kinds import main_layers
-from napari_shadowinv._napari.shots import load_radiograph, radiograph_of, shot_layer
+from napari_shadowinv._napari.shots import radiograph_of, shot_layer
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError, InversionCancelled
@@ -64,7 +64,7 @@ def refine(
     name = name_of_result(layer)
     job = refinement(layer, layer, name, psf=0.0)
     if viewer is None or not notifications.in_event_loop():
-        return list(job.run(lambda _: None, lambda: False).layer_data)
+        return list(job.work(lambda _: None, lambda: False).layer_data)
     _, tool = viewer.window.add_plugin_dock_widget("napari-shadowinv", "Invert shot")
     tool.refine_layer(layer)
     return []
@@ -163,16 +163,20 @@ def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> lis
 
 
 def _invert(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
-    from napari_shadowinv.pipeline.inversion_run import run
+    from napari_shadowinv._napari.jobs import InversionJob
     from napari_shadowinv.preprocessing import Recipe, UniformEstimate
 
-    recipe = Recipe(source=UniformEstimate(), setup=selection.setup)
-    inversion = run(recipe, load_radiograph(selection.shot, "the image"), should_stop=should_stop)
-    origins = {"source_origin": "uniform"}
+    attributes = {"source_origin": "uniform"}
     if selection.setup_origin:
-        origins["setup_origin"] = selection.setup_origin
-    result = about.Result(inversion, selection.setup, origins)
-    return main_layers(results.result_layers(result, selection.frame, selection.name))
+        attributes["setup_origin"] = selection.setup_origin
+    job = InversionJob(
+        recipe=Recipe(source=UniformEstimate(), setup=selection.setup),
+        name=selection.name,
+        frame=selection.frame,
+        attributes=attributes,
+        shot=selection.shot,
+    )
+    return main_layers(job.work(lambda _: None, should_stop).layer_data)
 
 
 def _repair(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:

@@ -1,33 +1,41 @@
 """Work on layers in a thread, with its estimated time and progress.
 
-- a fit to run: `FitJob`; its result with layers: `FinishedFit`
-- the job that refines an inversion: `refinement`
-- its estimated time and progress: `TimeEstimate`, `FitProgress`, `PACE`
+- the pattern of all jobs: `Job`, `Finished`, `ImageJob`
+- an inversion: `InversionJob`; a fit: `FitJob`; the fit that refines an inversion: `refinement`
+- time and progress of a fit: `TimeEstimate`, `FitProgress`, `PACE`
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from napari_shadowinv._napari.fit_layers import fit_layers, setup_of_fit
 from napari_shadowinv._napari.frame import Frame, frame_of
-from napari_shadowinv._napari.layer_metadata import Result, metadata_of, result_of
+from napari_shadowinv._napari.layer_metadata import (
+    KEY,
+    SOURCE,
+    Result,
+    metadata_of,
+    result_of,
+    role_of,
+)
+from napari_shadowinv._napari.layers import FullLayerData, result_layers
 from napari_shadowinv._napari.shots import load_radiograph
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitOptions
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import FitChoices
-from napari_shadowinv.pipeline import FitShot, run_fit, run_refinement
+from napari_shadowinv.pipeline import Cache, FitShot, run_fit, run_refinement
+from napari_shadowinv.pipeline.inversion_run import run
 from napari_shadowinv.pipeline.refinement import refinement_choices
 from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 if TYPE_CHECKING:
-    from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.physics.setup import Setup
 
 # Measured on two cores with two to four images of 64² to 400² px without crossing rays. Crossing
@@ -54,6 +62,7 @@ _STAGE_NAMES |= {
     "evidence": _ERROR_BARS,
 }
 _BAR_LENGTH = 1000
+_PREVIEW_ROLES = ("field", "caustic")
 
 
 def duration_in_words(seconds: float) -> str:
@@ -162,37 +171,119 @@ class FitProgress:
 def estimate_fit_time(
     shape: tuple[int, ...], images: int, fields: int, source: object, options: FitOptions
 ) -> TimeEstimate:
-    """TimeEstimate a fit with the source and options that `fit` takes."""
+    """Estimate the time of a fit with the source and options that `fit` takes."""
     samples = options.samples if options.samples > 1 else 0
     samples += _EVIDENCE_IN_SAMPLES if options.evidence else 0
     return TimeEstimate(shape, images, fields, isinstance(source, str), samples)
 
 
 @dataclass(frozen=True, eq=False)
-class FinishedFit:
-    result: Result
+class Finished:
+    """The result of a job, and the layers that show it."""
+
+    content: Any
     layer_data: list[FullLayerData]
 
     @property
-    def fit(self) -> Fit:
-        content = self.result.content
-        assert isinstance(content, Fit)
-        return content
+    def result(self) -> Result:
+        """The result behind the layers."""
+        result = result_of(self.layer_data[0][1])
+        assert result is not None
+        return result
 
 
-@dataclass(frozen=True, eq=False)
-class FitJob:
-    """A fit to run, and the frame of its layers; images and sources may be lazy."""
+class Job:
+    """Something to compute in a thread, and the layers that come of it."""
 
-    recipe: Recipe  # with the fit's choices, and the setup of the first image
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
+        """Compute the result."""
+        raise NotImplementedError
+
+    def layers(self, content: Any) -> list[FullLayerData]:
+        """Describe the layers of the result, the lowest first."""
+        raise NotImplementedError
+
+    def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> Finished:
+        """Compute the result and describe its layers, both in the thread."""
+        content = self.run(on_progress, should_stop)
+        return Finished(content, self.layers(content))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImageJob(Job):
+    """A job on the image of a layer."""
+
+    task: ClassVar[str]
+
+    recipe: Recipe
+    name: str  # of the result
+    frame: Frame
+    inputs: Sequence[tuple[str, str]] = ()  # rows of the report
+    attributes: Mapping[str, str] = field(default_factory=dict)  # origins that are saved
+    image: Any = None  # the layer
+    companions: tuple[Any, ...] = ()  # layers that lie on the image
+
+    @property
+    def image_name(self) -> str:
+        return str(self.image.name)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InversionJob(ImageJob):
+    """An inversion of a shot with its masks; image and source may be lazy."""
+
+    task = "inversion"
+
+    shot: Radiograph
+    source: Radiograph | None = None
+    cache: Cache | None = None
+    preview: bool = False
+
+    def run(
+        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
+    ) -> Inversion:
+        """Invert the shot."""
+        source = None if self.source is None else load_radiograph(self.source, "the source")
+        return run(
+            self.recipe,
+            load_radiograph(self.shot, "the image"),
+            source=source,
+            on_progress=on_progress,
+            should_stop=should_stop,
+            cache=self.cache,
+            preview=self.preview,
+        )
+
+    def layers(self, content: Inversion) -> list[FullLayerData]:
+        """Describe the layers of the inversion; of a preview only the field and its caustics."""
+        name = f"{self.name} preview" if self.preview else self.name
+        result = Result(content, content.setup, dict(self.attributes))
+        layer_data = result_layers(result, self.frame, name)
+        mask = self.shot.source_mask
+        for _, keywords, _ in layer_data:
+            if role_of(keywords) == SOURCE and mask is not None:
+                masked = Radiograph(mask.astype(float), source_mask=mask)
+                keywords["metadata"][KEY]["source_mask"] = self.recipe.move(masked).source_mask
+        if self.preview:
+            layer_data = [layer for layer in layer_data if role_of(layer[1]) in _PREVIEW_ROLES]
+        return layer_data
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FitJob(ImageJob):
+    """A fit to several images; images and sources may be lazy.
+
+    The recipe holds the choices of the fit and the setup of the first image.
+    """
+
+    task = "fit"
+
     shots: tuple[FitShot, ...]
     names: tuple[str, ...]  # of the images
-    name: str
-    frame: Frame
-    inputs: Sequence[tuple[str, str]]  # rows of the report
-    attributes: Mapping[str, str]
-    layer: Any = None  # of the first image
-    companions: tuple[Any, ...] = ()
+
+    @property
+    def image_name(self) -> str:
+        return self.names[0]
 
     @property
     def choices(self) -> FitChoices:
@@ -218,16 +309,20 @@ class FitJob:
         fields = len(choices.fields or ("B",))
         return estimate_fit_time(self.shape, len(self.names), fields, source, choices.options)
 
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FinishedFit:
-        """Fit the images and describe the layers."""
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
+        """Fit the images."""
 
         def update(progress: Progress) -> None:
             on_progress(self.progress.update(progress))
 
         fit = self.compute(update, should_stop)
         PACE.learn(self.time_estimate, sum(fit.report.seconds.values()))
-        result = Result(fit, setup_of_fit(fit), dict(self.attributes))
-        return FinishedFit(result, fit_layers(result, self.frame, self.name))
+        return fit
+
+    def layers(self, content: Fit) -> list[FullLayerData]:
+        """Describe the layers of the fit."""
+        result = Result(content, setup_of_fit(content), dict(self.attributes))
+        return fit_layers(result, self.frame, self.name)
 
     def compute(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
@@ -249,7 +344,7 @@ def _load(shot: FitShot, name: str) -> FitShot:
     return replace(shot, image=image, source=source)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Refinement(FitJob):
     """A fit to the image of an inversion, starting from the inversion."""
 
@@ -302,7 +397,7 @@ def refinement(layer: Any, image: Any, name: str, psf: float) -> Refinement:
         frame=frame_of(layer),
         inputs=inputs,
         attributes=attributes,
-        layer=image,
+        image=image,
         inversion=inversion,
         setup=setup,
     )

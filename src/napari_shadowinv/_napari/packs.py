@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from napari_shadowinv._napari.frame import Frame, frame_for
+from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.kinds import Kind
 from napari_shadowinv._napari.layer_metadata import CAME_WITH, Result, metadata_for
 from napari_shadowinv._napari.layers import FullLayerData, Limits
@@ -282,7 +283,7 @@ def _dataset_of(result: Result) -> xarray.Dataset:
     return result.content
 
 
-class FinishedPack(NamedTuple):
+class EvaluatedPack(NamedTuple):
     """The dataset of a film pack, and the painted pixels on its grid."""
 
     dataset: xarray.Dataset
@@ -290,7 +291,7 @@ class FinishedPack(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class PackJob:
+class PackJob(Job):
     """Arguments of `run_film`; corrections are written to a folder, which a failed run removes.
 
     Attributes
@@ -321,15 +322,30 @@ class PackJob:
     scales: FloatArray | None = None
     plane: int = 0
 
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FinishedPack:
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> EvaluatedPack:
         """Write the corrections and evaluate the pack."""
         try:
             pack, by_hand = self._write_corrections()
             dataset = run_film(pack, on_progress=on_progress, should_stop=should_stop)
-            return FinishedPack(dataset, by_hand)
+            return EvaluatedPack(dataset, by_hand)
         except BaseException:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise
+
+    def layers(self, content: EvaluatedPack) -> list[FullLayerData]:
+        """Describe the layers of the pack."""
+        dataset = content.dataset
+        return pack_layers(
+            pack_result(dataset),
+            pack_frame(dataset),
+            self.name,
+            by_hand=content.by_hand,
+            plane=self.plane,
+            path=self.path,
+            pack=self.pack,
+            pack_name=self.name,
+            corners=self.corners,
+        )
 
     def _write_corrections(self) -> tuple[Pack, BoolArray | None]:
         changes: dict[str, Any] = {}

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read, write
 from napari_shadowinv._napari.fit_layers import fit_layers
-from napari_shadowinv._napari.jobs import FinishedFit
+from napari_shadowinv._napari.jobs import Finished
 from napari_shadowinv._napari.layer_metadata import (
     Result,
     displacement_of,
@@ -93,7 +93,7 @@ def show(qtbot: Any) -> Callable[[Any, Fit], None]:
         job = tool.request()
         result = Result(found, found.setups[0], job.attributes)
         layer_data = fit_layers(result, job.frame, job.name)
-        tool.show_result(FinishedFit(result, layer_data), job)
+        tool.show_result(Finished(found, layer_data), job)
         qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
 
     return shown
@@ -111,7 +111,7 @@ def run(qtbot: Any) -> Callable[[Any], Any]:
         assert answers[0].error is None
         assert not answers[0].cancelled
         qtbot.waitUntil(lambda: not widget.results.busy, timeout=PATIENCE)
-        return answers[0].value.fit
+        return answers[0].value.content
 
     return pressed
 
@@ -550,9 +550,9 @@ def test_a_result_whose_first_image_is_gone_is_shown_and_placed(
     window: Any, tool: Any, qtbot: Any, messages: list[str], fitted: Fit
 ) -> None:
     # As if it had been removed: drawing right after a removal crashes Mesa at times.
-    job = replace(tool.request(), layer=object(), companions=tuple(window.layers))
+    job = replace(tool.request(), image=object(), companions=tuple(window.layers))
     result = Result(fitted, SETUPS[0], job.attributes)
-    tool.show_result(FinishedFit(result, fit_layers(result, job.frame, job.name)), job)
+    tool.show_result(Finished(result.content, fit_layers(result, job.frame, job.name)), job)
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     assert messages == ["'14.7 MeV' was deleted during its fit; the result is shown anyway"]
     # Pixels beside micrometres would take the scale bar's unit away.
@@ -637,7 +637,7 @@ def test_refine_starts_from_the_last_inversion(
     tool.refine_section.button.click()
     assert tool.panel.button.text() == "Cancel"
     qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
-    result = answers[0].value.fit
+    result = answers[0].value.content
     expected = fit(
         inversion.image,
         setups=[SETUPS[0]],
@@ -731,7 +731,7 @@ def test_choices_are_kept_between_sessions(window: Any, tool: Any, open_widget: 
     assert choices.fields == ("B", "E")
     assert choices.brightness == "free"
     assert choices.noise == "poisson"
-    assert choices.options.max_iterations == QUICK["steps"]
+    assert choices.options.max_iterations == QUICK["max_iterations"]
 
 
 def command(*words: Any) -> str:
@@ -806,7 +806,7 @@ def test_window_and_command_make_the_same_fit_and_make_it_again(
     by_flags = [
         *("fit", "fast.txt", "slow.txt", "--energies", "14.7,6", "--setup", "setup.toml"),
         *("--source", "beam.txt", "--mask", "usable.tif", "--crop-x", "4:64", "--crop-y", "0:48"),
-        *(word for name, value in QUICK.items() for word in (f"--{name}", value)),
+        *(word for name, value in QUICK.items() for word in (f"--{name.replace('_', '-')}", value)),
         *("--out", "command.shadowinv"),
     ]
     command(*by_flags)
@@ -835,7 +835,7 @@ def test_a_refined_inversion_is_made_again(
     tool.refine_section.button.click()
     qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool._refined.busy, timeout=PATIENCE)
-    result = answers[0].value.fit
+    result = answers[0].value.content
     assert result.provenance.start.image.file == "fast.tif"
     save(window, result, tmp_path / "refined.shadowinv")
     again = command("rerun", "refined.shadowinv", "--out", "again.shadowinv")
@@ -912,7 +912,7 @@ def test_what_a_file_holds_and_was_not_used_is_not_used_again(
     single.source.layers.layer = window.layers["a source"]
     assert single.request().source.path is None
     single.source.picker.set_kind("uniform")
-    inversion = single.request().inversion()
+    inversion = single.request().run()
     write(tmp_path / "b.shadowinv", inversion)
     assert "bit for bit" in command("rerun", "b.shadowinv", "--out", "again2.shadowinv")
 

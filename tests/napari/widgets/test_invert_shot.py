@@ -17,10 +17,11 @@ import pytest
 from napari.utils import progress
 
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read
+from napari_shadowinv._napari import jobs
 from napari_shadowinv._napari.frame import frame_of
 from napari_shadowinv._napari.layer_metadata import metadata_for, result_of, role_of, unit_of
 from napari_shadowinv._napari.notifications import window_text
-from napari_shadowinv._napari.widgets import _panels, invert_shot
+from napari_shadowinv._napari.widgets import _panels
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.physics.forward import synthetic_image
@@ -74,7 +75,7 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 
 def computed(tool: Any) -> Any:
     """Return the inversion of the controls, without its layers."""
-    return tool.request().inversion()
+    return tool.request().run()
 
 
 def settled(tool: Any) -> bool:
@@ -418,7 +419,7 @@ def test_a_mistake_is_told_once_and_the_viewer_lives(
     def broken(*_: Any, **__: Any) -> None:
         raise ZeroDivisionError("a fault of the program's")
 
-    monkeypatch.setattr(invert_shot, "run", broken)
+    monkeypatch.setattr(jobs, "run", broken)
     expect("a fault of the program's")
 
 

@@ -20,7 +20,7 @@ from napari_shadowinv import (
 from napari_shadowinv._napari.widgets._editors import format_number, parse_number
 from napari_shadowinv._napari.widgets._layers import crop_of, image_of, mask_of
 from napari_shadowinv._napari.widgets._stacking import StackJob
-from napari_shadowinv._napari.widgets.estimate_source import SourceRequest
+from napari_shadowinv._napari.widgets.estimate_source import SourceJob
 from napari_shadowinv._napari.widgets.forward_model import BlobRecipe, ForwardJob, ToroidRecipe
 from napari_shadowinv._napari.widgets.invert_shot import estimate_cost
 from napari_shadowinv._napari.widgets.line_profile import (
@@ -331,7 +331,7 @@ def running(recipe: Recipe) -> Any:
     "job",
     [
         lambda tmp_path: (
-            SourceRequest(TotalVariationEstimate(), Radiograph(LARGE), None, {}, preview=False).run
+            SourceJob(TotalVariationEstimate(), Radiograph(LARGE), None, {}, preview=False).run
         ),
         lambda tmp_path: running(Recipe(source=TotalVariationEstimate())),
         lambda tmp_path: running(Recipe(steps=(BackgroundFilter(degree=10),))),

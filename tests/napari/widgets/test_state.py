@@ -11,7 +11,7 @@ import pytest
 from napari.components import ViewerModel
 
 from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
-from napari_shadowinv._napari import commands
+from napari_shadowinv._napari import commands, jobs
 from napari_shadowinv._napari.layer_metadata import (
     metadata_for,
     metadata_of,
@@ -22,7 +22,6 @@ from napari_shadowinv._napari.layer_metadata import (
     source_of,
 )
 from napari_shadowinv._napari.layers import add_inversion
-from napari_shadowinv._napari.widgets import invert_shot
 from napari_shadowinv._napari.widgets._forms import dump_toml
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._stacking import StackJob
@@ -485,7 +484,7 @@ def test_what_the_core_refuses_stays_in_the_widget(
     def refuse(*_: Any, **__: Any) -> None:
         raise InputError("both masks hide the object")
 
-    monkeypatch.setattr(invert_shot, "run", refuse)
+    monkeypatch.setattr(jobs, "run", refuse)
     tool = opened(InvertShot)
     tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)

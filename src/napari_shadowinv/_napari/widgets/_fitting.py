@@ -16,7 +16,7 @@ from napari_shadowinv._napari.fit_layers import (
     start_name,
     verdict_sentence,
 )
-from napari_shadowinv._napari.jobs import FinishedFit, FitJob
+from napari_shadowinv._napari.jobs import Finished, FitJob
 from napari_shadowinv._napari.kinds import main_layers
 from napari_shadowinv._napari.layer_metadata import Result, result_of
 from napari_shadowinv._napari.notifications import window_text
@@ -30,7 +30,7 @@ from napari_shadowinv._napari.widgets._forms import (
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, fact_rows
 from napari_shadowinv._napari.widgets._plots import ObjectiveCurve
 from napari_shadowinv._napari.widgets._qt import column, timer
-from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_together
+from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
 from napari_shadowinv.fitting import Fit, Verdict
 
 _REDRAW_MS = 500
@@ -97,15 +97,10 @@ class FitView(QWidget):
         self._solutions_row.setVisible(False)
         self.report.empty()
 
-    def show_result(self, job: FitJob, finished: FinishedFit, last: LastResults) -> ResultLayers:
+    def show_result(self, job: FitJob, finished: Finished, last: LastResults) -> ResultLayers:
         """Show the layers, verdict and report of a fit; notify unless the field is determined."""
-        fit = finished.fit
-        if job.layer not in self._viewer.layers:
-            show_warning(f"'{job.names[0]}' was deleted during its fit; the result is shown anyway")
-        inputs = [layer for layer in (job.layer, *job.companions) if layer in self._viewer.layers]
-        moved = False
-        if inputs and job.recipe.setup is not None:
-            moved = place_together(self._viewer, inputs[0], job.recipe.setup, inputs[1:])
+        fit = finished.content
+        moved = place_inputs(self._viewer, job)
         self._show_verdict(fit)
         if fit.verdict is not Verdict.DETERMINED:
             text = verdict_sentence(fit)
@@ -117,7 +112,7 @@ class FitView(QWidget):
         self._alternative.show([])
         self._job, self._result = job, finished.result
         self._list_solutions(fit)
-        results = last.layers_for_next((job.layer, job.name))
+        results = last.layers_for_next((job.image, job.name))
         results.show(main_layers(finished.layer_data, also=results.layer_keys), fit=moved)
         self.results = results
         return results

@@ -16,6 +16,7 @@ from napari.utils import progress as activity
 from qtpy import QtWidgets
 from qtpy.QtCore import QObject, QSize, Qt, Signal
 
+from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.kinds import main_layers
 from napari_shadowinv._napari.notifications import USER_ERRORS, window_text
 from napari_shadowinv._napari.widgets import _qt as qt
@@ -524,15 +525,20 @@ class ToolPanel(qt.Docked):
 
     # A run
 
-    def request(self) -> Any:
-        """Return the job of the controls, with a method `run`, or raise an `InputError`."""
+    def request(self) -> Job:
+        """Return the job of the controls, or raise an `InputError`."""
         raise NotImplementedError
 
     def forget(self) -> None:
         """Clear the report of the last run."""
 
-    def show_result(self, value: Any, request: Any) -> None:
+    def show_result(self, finished: Any, job: Any) -> None:
         raise NotImplementedError
+
+    def start(self, job: Job, *, preview: bool = False) -> None:
+        """Do a job in the thread; a preview shows no progress."""
+        self._running_preview = preview
+        self.panel.run(job.work, job, quiet=preview)
 
     def _run_or_cancel(self) -> None:
         if self.panel.runner.running and not self._running_preview:
@@ -540,12 +546,11 @@ class ToolPanel(qt.Docked):
             return
         self.forget()
         try:
-            request = self.request()
+            job = self.request()
         except USER_ERRORS as error:
             self.panel.refuse(error)
             return
-        self._running_preview = False
-        self.panel.run(request.run, request)
+        self.start(job)
 
     @qt.notify_errors
     def _on_end(self, outcome: Outcome) -> None:
@@ -565,7 +570,7 @@ class LivePanel(ToolPanel):
         self._preview_timer = qt.timer(self, _SETTLE_MS, self._preview, once=True)
         self.live.toggled.connect(self.on_change)
 
-    def request(self, preview: bool = False) -> Any:
+    def request(self, preview: bool = False) -> Job:
         raise NotImplementedError
 
     def show_layers(
@@ -595,10 +600,9 @@ class LivePanel(ToolPanel):
         if is_busy or not self.isVisible():
             return
         try:
-            request = self.request(preview=True)
+            job = self.request(preview=True)
         except USER_ERRORS as error:
             # An unfinished rectangle or number is no reason for a notification.
             self.panel.say(str(error), problem=True)
             return
-        self._running_preview = True
-        self.panel.run(request.run, request, quiet=True)
+        self.start(job, preview=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from napari.utils.notifications import show_warning
 from qtpy.QtCore import QObject, Signal
 from qtpy.QtWidgets import QCheckBox
 
@@ -16,6 +17,7 @@ from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import timer
 
 if TYPE_CHECKING:
+    from napari_shadowinv._napari.jobs import ImageJob
     from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.preprocessing import Recipe
 
@@ -52,6 +54,21 @@ def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any
         layer.units = (*layer.units[:-2], *image.units[-2:])
     viewer.reset_view()
     return True
+
+
+def place_inputs(viewer: Any, job: ImageJob, *, quiet: bool = False) -> bool:
+    """Place the layers of a job with the setup's pixels; return whether they moved.
+
+    Unless `quiet`, warn if the image was deleted.
+    """
+    if job.image not in viewer.layers and not quiet:
+        show_warning(
+            f"'{job.image_name}' was deleted during its {job.task}; the result is shown anyway"
+        )
+    inputs = [layer for layer in (job.image, *job.companions) if layer in viewer.layers]
+    if not inputs or job.recipe.setup is None:
+        return False
+    return place_together(viewer, inputs[0], job.recipe.setup, inputs[1:])
 
 
 class ResultLayers(QObject):

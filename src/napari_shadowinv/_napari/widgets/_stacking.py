@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import KEY, role_of
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._results import Origins, result_frame
@@ -74,7 +75,7 @@ class StackJob:
 
 
 @dataclass(frozen=True, eq=False)
-class StackRequest:
+class StackRequest(Job):
     """A run, and everything needed to show its results as layers over its store."""
 
     job: StackJob
@@ -92,6 +93,10 @@ class StackRequest:
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
         """Invert the shots in a thread, and describe the layers once one shot is done."""
         return self.job.run(on_progress, should_stop, self._update)
+
+    def layers(self, content: RunStatus) -> list[FullLayerData]:
+        """Return the layers described by the run, which grow with it."""
+        return self.layer_data
 
     def update_limits(self, layers: Sequence[Any]) -> None:
         """Extend limits that the user has not changed to the strongest shot so far."""

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.frame import frame_of
+from napari_shadowinv._napari.jobs import Finished, Job
+from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.shots import load_radiograph
 from napari_shadowinv._napari.widgets._forms import ModelPicker, kinds_of, labelled
 from napari_shadowinv._napari.widgets._layers import LayerWatch, MaskPicker, ShotPicker, image_of
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class SourceRequest:
+class SourceJob(Job):
     estimate: Estimate
     shot: Radiograph  # its image may be lazy
     image: Any
@@ -39,6 +41,29 @@ class SourceRequest:
         source = estimated_source(self.estimate, shot, should_stop, by=by)
         report("source", 1, 1)
         return source
+
+    def layers(self, content: FloatArray) -> list[FullLayerData]:
+        """Describe the source as a layer over its image."""
+        layer: Any = self.image
+        layer_data = (
+            content,
+            {
+                "name": f"{layer.name} source{' preview' if self.preview else ''}",
+                "metadata": about.metadata_for(
+                    about.SOURCE,
+                    "",
+                    about.setup_of(layer),
+                    setup_origin=about.setup_origin_of(layer),
+                    made_from=self.made_from,
+                    source_mask=self.shot.source_mask,
+                ),
+                "colormap": layer.colormap.name,
+                "contrast_limits": tuple(layer.contrast_limits),
+                **frame_of(layer).keywords(),
+            },
+            "image",
+        )
+        return [layer_data]
 
 
 class EstimateSource(LivePanel):
@@ -64,7 +89,7 @@ class EstimateSource(LivePanel):
     def parts(self) -> dict[str, Any]:
         return {"method": self.method, "painted_is_unusable": self.masks}
 
-    def request(self, preview: bool = False) -> SourceRequest:
+    def request(self, preview: bool = False) -> SourceJob:
         layer: Any = self.image.layer
         image = image_of(layer)
         mask = self.masks.usable(layer)
@@ -73,28 +98,7 @@ class EstimateSource(LivePanel):
         made_from = {"image": layer.name, "estimate": estimate.described}
         if mask is not None:
             made_from["source_mask"] = self.masks.summary(layer)
-        return SourceRequest(
-            estimate, Radiograph(image, source_mask=mask), layer, made_from, preview
-        )
+        return SourceJob(estimate, Radiograph(image, source_mask=mask), layer, made_from, preview)
 
-    def show_result(self, value: Any, request: SourceRequest) -> None:
-        layer, preview = request.image, request.preview
-        layer_data = (
-            value,
-            {
-                "name": f"{layer.name} source{' preview' if preview else ''}",
-                "metadata": about.metadata_for(
-                    about.SOURCE,
-                    "",
-                    about.setup_of(layer),
-                    setup_origin=about.setup_origin_of(layer),
-                    made_from=request.made_from,
-                    source_mask=request.shot.source_mask,
-                ),
-                "colormap": layer.colormap.name,
-                "contrast_limits": tuple(layer.contrast_limits),
-                **frame_of(layer).keywords(),
-            },
-            "image",
-        )
-        self.show_layers(layer, [layer_data], preview)
+    def show_result(self, finished: Finished, job: SourceJob) -> None:
+        self.show_layers(job.image, finished.layer_data, job.preview)

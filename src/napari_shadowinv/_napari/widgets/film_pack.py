@@ -15,6 +15,7 @@ from qtpy.QtCore import QObject, Qt
 
 from napari_shadowinv._napari import packs
 from napari_shadowinv._napari.frame import frame_of
+from napari_shadowinv._napari.jobs import Finished
 from napari_shadowinv._napari.layer_metadata import (
     Result,
     may_be_mask,
@@ -24,7 +25,7 @@ from napari_shadowinv._napari.layer_metadata import (
     role_of,
 )
 from napari_shadowinv._napari.layer_state import dataset_of_layers
-from napari_shadowinv._napari.packs import FinishedPack, PackJob
+from napari_shadowinv._napari.packs import PackJob
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._forms import (
@@ -487,29 +488,16 @@ class FilmPack(ToolPanel):
     def _run_again(self) -> None:
         if self.panel.runner.running:
             return
-        request = self._corrected_job()
+        job = self._corrected_job()
         self.forget()
-        self.panel.run(request.run, request)
+        self.start(job)
 
-    def show_result(self, value: FinishedPack, request: PackJob) -> None:
-        dataset = value.dataset
-        result = packs.pack_result(dataset)
-        layer_data = packs.pack_layers(
-            result,
-            packs.pack_frame(dataset),
-            request.name,
-            by_hand=value.by_hand,
-            plane=request.plane,
-            path=request.path,
-            pack=request.pack,
-            pack_name=request.name,
-            corners=request.corners,
-        )
+    def show_result(self, finished: Finished, job: PackJob) -> None:
         self.corners.close()
         is_first = not self.viewer.layers
-        self.results = self._last.layers_for_next(request.path or request.name)
+        self.results = self._last.layers_for_next(job.path or job.name)
         self.results.complete.connect(partial(self._on_layers, self.results, is_first))
-        self.results.show(layer_data)
+        self.results.show(finished.layer_data)
 
     def _on_layers(self, results: ResultLayers, is_first: bool) -> None:
         for layer in results.layers:

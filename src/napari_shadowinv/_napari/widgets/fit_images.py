@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.jobs import PACE, FinishedFit, FitJob, estimate_fit_time
+from napari_shadowinv._napari.jobs import PACE, Finished, FitJob, estimate_fit_time
 from napari_shadowinv._napari.shots import radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
@@ -279,7 +279,7 @@ class FitImages(ToolPanel):
             frame=result_frame(first.layer, recipe),
             inputs=[(name, text) for name, text in (*input_rows, *_warnings_of(rows)) if text],
             attributes={name: text for name, text in origins.items() if text},
-            layer=first.layer,
+            image=first.layer,
             companions=tuple(
                 layer for layer in used_layers if layer is not None and layer is not first.layer
             ),
@@ -303,8 +303,8 @@ class FitImages(ToolPanel):
             for row, image, source, factor in zip(rows, images, sources, factors, strict=True)
         )
 
-    def show_result(self, value: FinishedFit, request: FitJob) -> None:
-        self.results = self.view.show_result(request, value, self._last)
+    def show_result(self, finished: Finished, job: FitJob) -> None:
+        self.results = self.view.show_result(job, finished, self._last)
         self.reveal(self.view.verdict)
         self._show_cost()
 

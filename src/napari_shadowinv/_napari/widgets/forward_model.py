@@ -13,6 +13,8 @@ from qtpy.QtWidgets import QLabel, QSpinBox
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.frame import Frame, frame_for, frame_of
+from napari_shadowinv._napari.jobs import Finished, Job
+from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
@@ -211,7 +213,7 @@ class Prediction:
 
 
 @dataclass(frozen=True, eq=False)
-class ForwardJob:
+class ForwardJob(Job):
     """A prediction of the image of a potential, a displacement in px, or a simulated object."""
 
     field: ArrayLike | PhantomRecipe
@@ -222,6 +224,11 @@ class ForwardJob:
     deflector: Deflector | None = None
     source: ArrayLike | None = None  # None for a uniform beam
     caustic_jacobian: float = InversionOptions.model_fields["caustic_jacobian"].default
+    name: str = ""  # of the image
+    frame: Frame = Frame()  # noqa: RUF009
+    unit: str = ""  # of the source
+    setup_origin: str = ""
+    subject: Any = None  # the layer of the field, or the name of an object
 
     def run(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
@@ -243,6 +250,24 @@ class ForwardJob:
         return Prediction(
             image, displacement, source, float(caustic.mean()), flux_inside, assumption
         )
+
+    def layers(self, content: Prediction) -> list[FullLayerData]:
+        """Describe the predicted image."""
+        # An inversion of the image uses this source.
+        inputs: dict[str, Any] = {} if content.source is None else {"source": content.source}
+        if self.setup_origin:
+            inputs["setup_origin"] = f"{about.CAME_WITH} the forward model, {self.setup_origin}"
+        # In another experiment the object may have other pixels.
+        frame = self.frame
+        if self.field_setup is not None and self.field_setup != self.setup:
+            frame = frame_for(content.image.shape, self.setup)
+        keywords = {
+            "name": self.name,
+            "metadata": about.metadata_for(about.SHOT, self.unit, self.setup, **inputs),
+            "contrast_limits": intensity_limits(content.image),
+            **frame.keywords(),
+        }
+        return [(content.image, keywords, "image")]
 
     def _source(self, shape: tuple[int, ...]) -> tuple[FloatArray | None, BoolArray | None]:
         """Return the beam that passes the object, and where the object stops it."""
@@ -345,18 +370,6 @@ def input_field(layer: Any | None, point: Any, setup: Any) -> InputField:
     return InputField(potential, to_px2, field_setup, f"A potential in {unit}.")
 
 
-@dataclass(frozen=True, eq=False)
-class _Request:
-    job: ForwardJob
-    name: str
-    frame: Frame
-    setup_origin: str
-    subject: Any  # a layer, or the name of an object
-
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Prediction:
-        return self.job.run(on_progress, should_stop)
-
-
 class ForwardModel(ToolPanel):
     """Choose an object or a potential, and predict its image."""
 
@@ -433,30 +446,39 @@ class ForwardModel(ToolPanel):
         self.height_px.setValue(int(size[0]))
         self.width_px.setValue(int(size[1]))
 
-    def request(self) -> _Request:
+    def request(self) -> ForwardJob:
         setup = self.setup.setup()
         source = None if self.source.layer is None else image_of(self.source.layer)
+        unit = about.unit_of(self.source.layer or {})
+        common: dict[str, Any] = {"source": source, "unit": unit, "setup_origin": self.setup.origin}
         if self.object.kind == _LAYER:
             layer: Any = self.potential.layer
             field = input_field(layer, self.viewer.dims.point, setup)
-            job = ForwardJob(
+            return ForwardJob(
                 field.values,
                 to_px2=field.to_px2,
                 setup=setup or field.field_setup,
                 field_setup=field.field_setup,
                 deflector=self.deflector.currentData(),
-                source=source,
+                name=f"{about.metadata_of(layer).get('name') or layer.name} image",
+                frame=frame_of(layer),
+                subject=layer,
+                **common,
             )
-            name = str(about.metadata_of(layer).get("name") or layer.name)
-            return _Request(job, f"{name} image", frame_of(layer), self.setup.origin, layer)
         recipe: Any = self.object.model()
+        title = type(recipe).title
         shape = (self.height_px.value(), self.width_px.value())
         if source is not None:
             shape = source.shape
-        job = ForwardJob(recipe, shape=shape, setup=setup, source=source)
-        name = type(recipe).title
-        frame = frame_for(shape, setup)
-        return _Request(job, f"{name} image", frame, self.setup.origin, name)
+        return ForwardJob(
+            recipe,
+            shape=shape,
+            setup=setup,
+            name=f"{title} image",
+            frame=frame_for(shape, setup),
+            subject=title,
+            **common,
+        )
 
     def _image_to_save(self) -> Savable:
         layers = [] if self.results is None else self.results.layers
@@ -523,27 +545,13 @@ class ForwardModel(ToolPanel):
         is_unlabelled = not is_field(layer)
         self.interpretation.setStyleSheet(forms.PROBLEM_STYLE if is_unlabelled else "")
 
-    def show_result(self, value: Prediction, request: _Request) -> None:
-        unit = "" if request.job.source is None else about.unit_of(self.source.layer or {})
-        # An inversion of the image uses this source.
-        inputs: dict[str, Any] = {} if value.source is None else {"source": value.source}
-        # In another experiment the object may have other pixels.
-        frame, field_setup = request.frame, request.job.field_setup
-        if field_setup is not None and field_setup != request.job.setup:
-            frame = frame_for(value.image.shape, request.job.setup)
-        if request.setup_origin:
-            inputs["setup_origin"] = f"{about.CAME_WITH} the forward model, {request.setup_origin}"
-        keywords = {
-            "name": request.name,
-            "metadata": about.metadata_for(about.SHOT, unit, request.job.setup, **inputs),
-            "contrast_limits": intensity_limits(value.image),
-            **frame.keywords(),
-        }
-        self.results = self._last.layers_for_next(request.subject)
-        self.results.show([(value.image, keywords, "image")])
+    def show_result(self, finished: Finished, job: ForwardJob) -> None:
+        self.results = self._last.layers_for_next(job.subject)
+        self.results.show(finished.layer_data)
         self.viewer.reset_view()
-        self.warning.setText(value.warning)
-        self.warning.setVisible(bool(value.warning))
+        warning = finished.content.warning
+        self.warning.setText(warning)
+        self.warning.setVisible(bool(warning))
 
 
 def _side(name: str) -> QSpinBox:

@@ -5,26 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from napari.utils.notifications import show_warning
-
-from napari_shadowinv._napari.frame import Frame
 from napari_shadowinv._napari.jobs import (
-    FinishedFit,
+    Finished,
     FitJob,
+    InversionJob,
     duration_in_words,
     name_of_result,
     refinement,
 )
 from napari_shadowinv._napari.layer_metadata import (
-    KEY,
-    SOURCE,
     Result,
     metadata_of,
     result_of,
-    role_of,
 )
 from napari_shadowinv._napari.notifications import show_caution
-from napari_shadowinv._napari.shots import load_radiograph, radiograph_of
+from napari_shadowinv._napari.shots import radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._fitting import FitView, RefineSection
@@ -38,9 +33,8 @@ from napari_shadowinv._napari.widgets._panels import (
 )
 from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, while_alive
 from napari_shadowinv._napari.widgets._results import (
-    Origins,
     ResultLayers,
-    place_together,
+    place_inputs,
     result_frame,
 )
 from napari_shadowinv._napari.widgets._saving import (
@@ -51,22 +45,19 @@ from napari_shadowinv._napari.widgets._saving import (
     shown_result,
 )
 from napari_shadowinv._system.machine import physical_memory
-from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.pipeline import Cache
-from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES, run
-from napari_shadowinv.preprocessing import Radiograph, Recipe
+from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
+from napari_shadowinv.preprocessing import Recipe
 
 if TYPE_CHECKING:
     import napari
-    from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.physics.setup import Setup
 
-_PREVIEW_ROLES = ("field", "caustic")
 # Measured on two cores with images of 0.25 to 4 Mpx and 5,000 to 1,000,000 sites, including the
 # layers of the result.
 _SECONDS_PER_PIXEL, _SECONDS_PER_SITE = 3e-6, 11e-6
@@ -117,57 +108,6 @@ def estimate_cost(
         pace * (_SECONDS_PER_PIXEL * pixels + _SECONDS_PER_SITE * sites),
         _BYTES + _BYTES_PER_PIXEL * pixels + _BYTES_PER_SITE * sites,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _FinishedInversion:
-    inversion: Inversion
-    layer_data: list[FullLayerData]
-
-
-@dataclass(frozen=True, eq=False)
-class _Request:
-    recipe: Recipe
-    shot: Radiograph  # with masks; its image and the source may be lazy
-    source: Radiograph | None
-    cache: Cache
-    image: Any
-    companions: tuple[Any, ...]
-    frame: Frame
-    origins: Origins
-    preview: bool
-    name: str
-
-    def inversion(
-        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
-    ) -> Inversion:
-        source = None if self.source is None else load_radiograph(self.source, "the source")
-        return run(
-            self.recipe,
-            load_radiograph(self.shot, "the image"),
-            source=source,
-            on_progress=on_progress,
-            should_stop=should_stop,
-            cache=self.cache,
-            preview=self.preview,
-        )
-
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> _FinishedInversion:
-        """Invert the shot and describe its layers."""
-        inversion = self.inversion(on_progress, should_stop)
-        from napari_shadowinv._napari.layers import result_layers
-
-        name = f"{self.name} preview" if self.preview else self.name
-        result = Result(inversion, inversion.setup, self.origins.attributes())
-        layer_data = result_layers(result, self.frame, name)
-        mask = self.shot.source_mask
-        for _, keywords, _ in layer_data:
-            if role_of(keywords) == SOURCE and mask is not None:
-                masked = Radiograph(mask.astype(float), source_mask=mask)
-                keywords["metadata"][KEY]["source_mask"] = self.recipe.move(masked).source_mask
-        if self.preview:
-            layer_data = [layer for layer in layer_data if role_of(layer[1]) in _PREVIEW_ROLES]
-        return _FinishedInversion(inversion, layer_data)
 
 
 class InvertShot(InversionInputs, LivePanel):
@@ -233,7 +173,7 @@ class InvertShot(InversionInputs, LivePanel):
         for signal in (*changes, self.crop.picked, edits.edited):
             signal.connect(self.on_change)
 
-    def request(self, preview: bool = False) -> _Request:
+    def request(self, preview: bool = False) -> InversionJob:
         layer: Any = self.image.layer
         image = layers.image_of(layer)
         recipe = self.recipe()
@@ -245,17 +185,20 @@ class InvertShot(InversionInputs, LivePanel):
             mask=mask,
             source_mask=self.hidden_from_source(layer),
         )
-        return _Request(
-            recipe,
-            shot,
-            self.source.measured(layer),
-            self._cache,
-            layer,
-            self.companions(layer, self.crop.layer),
-            result_frame(layer, recipe),
-            self.origins(layer, layer.name),
-            preview,
-            self._result_name(layer),
+        source = self.source.measured(layer)
+        origins = self.origins(layer, layer.name)
+        return InversionJob(
+            recipe=recipe,
+            name=self._result_name(layer),
+            frame=result_frame(layer, recipe),
+            inputs=origins.rows(),
+            attributes=origins.attributes(),
+            image=layer,
+            companions=self.companions(layer, self.crop.layer),
+            shot=shot,
+            source=source,
+            cache=self._cache,
+            preview=preview,
         )
 
     def _result_name(self, layer: Any) -> str:
@@ -274,7 +217,7 @@ class InvertShot(InversionInputs, LivePanel):
             raise InputError(
                 "there is no inversion of this image to refine: press Run first, then Refine"
             )
-        self._begin(refinement(fields[0], image, str(image.name), psf))
+        self.start(refinement(fields[0], image, str(image.name), psf))
 
     @notify_errors
     def refine_layer(self, layer: Any) -> None:
@@ -289,23 +232,15 @@ class InvertShot(InversionInputs, LivePanel):
             raise InputError(
                 "Invert shot is running: wait until it finishes, or press Cancel, then refine"
             )
-        self._begin(job)
+        self.start(job)
 
-    def _begin(self, job: FitJob) -> None:
-        self._running_preview = False
-        self.panel.run(job.run, job)
-
-    def show_result(
-        self, value: _FinishedInversion | FinishedFit, request: _Request | FitJob
-    ) -> None:
-        if isinstance(request, FitJob):
-            assert isinstance(value, FinishedFit)
-            self.previewed.hide()
-            self._refined = self.fit_view.show_result(request, value, self._last)
-            self.reveal(self.fit_view.verdict)
-        else:
-            assert isinstance(value, _FinishedInversion)
-            self._show_inversion(value, request)
+    def show_result(self, finished: Finished, job: InversionJob | FitJob) -> None:
+        if isinstance(job, InversionJob):
+            self._show_inversion(finished, job)
+            return
+        self.previewed.hide()
+        self._refined = self.fit_view.show_result(job, finished, self._last)
+        self.reveal(self.fit_view.verdict)
 
     def _on_start(self) -> None:
         # The verdict of a preview stays until the next preview.
@@ -347,32 +282,25 @@ class InvertShot(InversionInputs, LivePanel):
         facts = inversion.facts_in(setup)
         self.report.show_rows([*input_rows, *fact_rows(facts)], fact_rows(facts, details=True))
 
-    def _show_inversion(self, value: _FinishedInversion, request: _Request) -> None:
-        headline = value.inversion.headline
-        image = request.image
-        if image not in self.viewer.layers and not request.preview:
-            show_warning(
-                f"'{image.name}' was deleted during its inversion; the result is shown anyway"
-            )
-        moved = False
-        if request.recipe.setup is not None:
-            moved = place_together(self.viewer, image, request.recipe.setup, request.companions)
-        if request.preview:
+    def _show_inversion(self, finished: Finished, job: InversionJob) -> None:
+        inversion = finished.content
+        headline = inversion.headline
+        moved = place_inputs(self.viewer, job, quiet=job.preview)
+        self._reported = finished.result
+        if job.preview:
             self.verdict.show_headline(headline, "Preview: ")
-            self._reported = result_of(value.layer_data[0][1])
-            self.show_layers(image, value.layer_data, preview=True, fit=moved)
-            residual = next(f for f in value.inversion.facts if f.key == "image_residual")
+            self.show_layers(job.image, finished.layer_data, preview=True, fit=moved)
+            residual = next(f for f in inversion.facts if f.key == "image_residual")
             self.panel.say(f"{residual.title} {residual.text}")
             return
-        self._report(value.inversion, value.inversion.setup, request.origins.rows())
-        self._reported = result_of(value.layer_data[0][1])
+        self._report(inversion, inversion.setup, list(job.inputs))
         if headline.level is not Level.SOUND:
             show_caution(f"{headline.level.value.capitalize()}: {headline.text}")
         self.reveal(self.verdict)
-        self._learn_pace(value.inversion)
+        self._learn_pace(inversion)
         # They refine an earlier result and would cover the new one.
         self._refined.hide()
-        self.show_layers(image, value.layer_data, preview=False, fit=moved)
+        self.show_layers(job.image, finished.layer_data, preview=False, fit=moved)
 
     def on_change(self) -> None:
         super().on_change()
