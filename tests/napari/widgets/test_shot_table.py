@@ -11,7 +11,7 @@ import pytest
 from qtpy.QtCore import Qt
 
 from napari_shadowinv._napari.layer_metadata import role_of
-from napari_shadowinv._napari.widgets import _shot_table
+from napari_shadowinv._napari.widgets import _tables
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
@@ -170,7 +170,7 @@ def test_the_rows_are_saved_as_they_are_shown(
     folder.mkdir()
     chosen = str(folder / "new")
     monkeypatch.setattr(
-        _shot_table.QFileDialog, "getSaveFileName", staticmethod(lambda *_: (chosen, ""))
+        _tables.QFileDialog, "getSaveFileName", staticmethod(lambda *_: (chosen, ""))
     )
     tool.shots.table.save_button.click()
     rows = table_rows(folder / "new.csv")

@@ -1,42 +1,78 @@
-"""Tables with a row for each image: `NumberTable`, `ImageTable`."""
+"""Tables with a row for each image: `ImageTable` of a fit, `ShotTable` of a stack."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
 from qtpy.QtGui import QColor
-from qtpy.QtWidgets import QHeaderView, QSizePolicy, QTableWidget, QTableWidgetItem, QWidget
+from qtpy.QtWidgets import (
+    QFileDialog,
+    QHeaderView,
+    QSizePolicy,
+    QTableWidget,
+    QTableWidgetItem,
+    QWidget,
+)
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.widgets._editors import format_number, parse_number, unit_of_title
-from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, labelled
+from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, PathEdit, labelled, small_button
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, kind_of, stack_of
-from napari_shadowinv._napari.widgets._qt import column, while_alive
+from napari_shadowinv._napari.widgets._qt import column, notify_errors, side_by_side, while_alive
+from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.formats import SITES
 from napari_shadowinv.physics.setup import SETUPS, Setup
+from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table
 
 _MAX_SHOWN_ROWS = 8
+_UNITS_IN_HEADING = ("MeV", "px")
 _PROBLEM_COLOUR = QColor(PROBLEM_STYLE.removeprefix("color: ").removesuffix(";"))
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of numbers in a unit, or of names of files if the unit is None."""
+
+    name: str
+    title: str
+    unit: str | None
+    tip: str
+    width_px: int
+    default: float | None = None
+
+    @property
+    def heading(self) -> str:
+        return f"{self.title} ({self.unit})" if self.unit in _UNITS_IN_HEADING else self.title
 
 
 class NumberTable(QTableWidget):
     """A row for each image; its first cell holds the name and whether it is used."""
 
-    def __init__(self, columns: int, widths: Mapping[int, int]) -> None:
-        super().__init__(0, columns)
+    def __init__(self, title: str, columns: Sequence[Column]) -> None:
+        super().__init__(0, len(columns) + 1)
+        self._title = title
         self.verticalHeader().setVisible(False)
         self.setSelectionMode(QTableWidget.SelectionMode.NoSelection)
         self.setTextElideMode(Qt.TextElideMode.ElideMiddle)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         header = self.horizontalHeader()
         header.setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
-        for number, width in widths.items():
+        for number, spec in enumerate(columns, 1):
             header.setSectionResizeMode(number, QHeaderView.ResizeMode.Fixed)
-            header.resizeSection(number, width)
+            header.resizeSection(number, spec.width_px)
+        self.set_columns(columns)
+
+    def set_columns(self, columns: Sequence[Column]) -> None:
+        """Replace the columns after the names by as many others."""
+        self._columns = tuple(columns)
+        self.setHorizontalHeaderLabels([self._title, *(spec.heading for spec in columns)])
 
     def fill_row(self, row: int, name: str, tip: str, *, checked: bool) -> None:
         """Create the cells of a row, empty except the first."""
@@ -58,65 +94,89 @@ class NumberTable(QTableWidget):
     def is_checked(self, row: int) -> bool:
         return bool(self.item(row, 0).checkState() == Qt.CheckState.Checked)
 
-    def number(self, row: int, column: int, unit: str) -> float | None:
+    def number(self, row: int, column: int) -> float | None:
         """Return the number in a cell, None if it is empty; or raise an `InputError`."""
         item = self.item(row, column)
         exact, text = item.data(Qt.ItemDataRole.UserRole), item.text().strip()
-        if exact is not None:
-            return float(exact)
-        return parse_number(text, unit) if text else None
-
-    def write(self, row: int, column: int, value: Any, unit: str, tip: str) -> None:
-        """Show a number, or text that the user has to correct."""
-        item = self.item(row, column)
-        is_number = not isinstance(value, str) and value is not None
-        # The shown text is rounded.
-        item.setData(Qt.ItemDataRole.UserRole, value if is_number else None)
-        if not is_number:
-            item.setText(value or "")
-        else:
-            item.setText(format_number(value, unit) if unit not in ("", "MeV") else f"{value:.6g}")
-        self._check(item, unit, tip)
-
-    def _check(self, item: QTableWidgetItem, unit: str, tip: str) -> None:
-        """Mark an invalid number by its colour and tooltip."""
+        if exact is not None or not text:
+            return None if exact is None else float(exact)
         try:
-            parse_number(item.text() or "0", unit)
+            return parse_number(text, self._columns[column - 1].unit or "")
+        except InputError as error:
+            raise InputError(f"'{self.item(row, 0).text()}': {error}") from error
+
+    def write(self, row: int, column: int, value: Any) -> None:
+        """Show a number, a file's name, or text that the user has to correct."""
+        item, spec = self.item(row, column), self._columns[column - 1]
+        is_number = not isinstance(value, str) and value is not None
+        with QSignalBlocker(self):
+            # The shown text is rounded.
+            item.setData(Qt.ItemDataRole.UserRole, value if is_number else None)
+            if not is_number:
+                item.setText(value or "")
+            elif spec.unit and spec.unit not in _UNITS_IN_HEADING:
+                item.setText(format_number(value, spec.unit))
+            else:
+                item.setText(f"{value:.6g}")
+            self._mark(item, spec)
+
+    def enter(self, item: QTableWidgetItem) -> Any:
+        """Return the user's entry in a cell: a number, None, or text that is no number."""
+        value: Any = item.text().strip() or None
+        unit = self._columns[item.column() - 1].unit
+        if value is not None and unit is not None:
+            with suppress(InputError):  # the text stays for correction
+                value = parse_number(value, unit)
+        self.write(item.row(), item.column(), value)
+        return value
+
+    def _mark(self, item: QTableWidgetItem, spec: Column) -> None:
+        """Mark an invalid number by its colour and tooltip."""
+        item.setData(Qt.ItemDataRole.ForegroundRole, None)
+        item.setToolTip(f"<qt>{spec.tip}</qt>")
+        if spec.unit is None:
+            return
+        try:
+            parse_number(item.text() or "0", spec.unit)
         except InputError as error:
             item.setForeground(_PROBLEM_COLOUR)
             item.setToolTip(f"<qt>{error}</qt>")
-        else:
-            item.setData(Qt.ItemDataRole.ForegroundRole, None)
-            item.setToolTip(f"<qt>{tip}</qt>")
 
 
 _METADATA_KEY = "fit"  # entries of the rows in a layer's metadata
 _NAME, _BEAM, _BRIGHTNESS, _PSF = range(4)
-_COLUMNS = {_BRIGHTNESS: ("brightness", "Brightness", 1.0), _PSF: ("psf", "PSF σ (px)", 0.0)}
-_WIDTHS = {_BEAM: 90, _BRIGHTNESS: 76, _PSF: 72}
+_BEAM_WIDTH_PX = 90
+_IMAGE_COLUMNS = (
+    Column(
+        "brightness",
+        "Brightness",
+        "",
+        "Brightness of the image relative to the source; 1 if they are equally bright.",
+        76,
+        1.0,
+    ),
+    Column(
+        "psf",
+        "PSF σ",
+        "px",
+        "Standard deviation of the image's blur, in pixels after the steps; 0 without blur.",
+        72,
+        0.0,
+    ),
+)
 _BEAM_FIELDS = {"proton": "energy", "optical": "wavelength"}
 
 
-@dataclass(frozen=True)
-class BeamColumn:
-    """The column with the quantity that differs between the images' beams."""
-
-    name: str
-    title: str
-    unit: str
-    tip: str
-
-
-def beam_column(kind: str) -> BeamColumn:
+def beam_column(kind: str) -> Column:
     """Return the column for a kind of setup; without a setup, the relative displacement."""
     if kind not in _BEAM_FIELDS:
         tip = "Displacement in this image relative to the first image, such as 0.6."
-        return BeamColumn("strength", "Strength", "", tip)
+        return Column("strength", "Strength", "", tip, _BEAM_WIDTH_PX)
     name = _BEAM_FIELDS[kind]
     field = SETUPS[kind].model_fields[name]
     title, unit = unit_of_title(field.title or name)
     last_word = title.split()[-1].capitalize()
-    return BeamColumn(name, last_word, unit, str(field.description))
+    return Column(name, last_word, unit, str(field.description), _BEAM_WIDTH_PX)
 
 
 @dataclass(frozen=True)
@@ -173,7 +233,7 @@ class ImageTable(QWidget):
             "2-D image layers",
             lambda layer: layer.ndim == 3 and suits(layer),
         )
-        self.table = NumberTable(4, _WIDTHS)
+        self.table = NumberTable("Image", (self.beam, *_IMAGE_COLUMNS))
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
         column(self, labelled("Images", self.stacks), self.table)
         self.stacks.picked.connect(self.fill)
@@ -225,29 +285,25 @@ class ImageTable(QWidget):
         reference = self._reference
         if reference is not None and reference.plane is not None and isinstance(value, float):
             reference.store(**{self.beam.name: value})  # the planes of a stack share a setup
-        with QSignalBlocker(self.table):
-            titles = ["Image", self.beam.title, *(title for _, title, _ in _COLUMNS.values())]
-            unit = f" ({self.beam.unit})" if self.beam.unit == "MeV" else ""
-            titles[_BEAM] = f"{self.beam.title}{unit}"
-            self.table.setHorizontalHeaderLabels(titles)
-            for number, row in enumerate(self.rows):
-                is_reference = row == self._reference
-                beam = value if is_reference and kind in _BEAM_FIELDS else self._beam_of(row)
-                if is_reference and kind not in _BEAM_FIELDS:
-                    beam = 1.0
-                self.table.write(number, _BEAM, beam, self.beam.unit, self.beam.tip)
-                for column, (name, _, default) in _COLUMNS.items():
-                    entry = row.entries().get(name, default)
-                    self.table.write(number, column, entry, "", _TIPS[name])
-                cell = self.table.item(number, _BRIGHTNESS)
-                editable = Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsEditable
-                cell.setFlags(editable if is_brightness_known else Qt.ItemFlag.NoItemFlags)
+        self.table.set_columns((self.beam, *_IMAGE_COLUMNS))
+        editable = Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsEditable
+        for number, row in enumerate(self.rows):
+            is_reference = row == self._reference
+            beam = value if is_reference and kind in _BEAM_FIELDS else self._beam_of(row)
+            if is_reference and kind not in _BEAM_FIELDS:
+                beam = 1.0
+            self.table.write(number, _BEAM, beam)
+            for cell, spec in enumerate(_IMAGE_COLUMNS, _BRIGHTNESS):
+                self.table.write(number, cell, row.entries().get(spec.name, spec.default))
+            with QSignalBlocker(self.table):
+                brightness = self.table.item(number, _BRIGHTNESS)
+                brightness.setFlags(editable if is_brightness_known else Qt.ItemFlag.NoItemFlags)
                 if not is_brightness_known:
-                    cell.setText("free")
+                    brightness.setText("free")
 
     def beam_value(self, row: ImageRow) -> float:
         """Return energy, wavelength or strength of a row, or raise an `InputError`."""
-        value = self._value(row, _BEAM, self.beam.unit)
+        value = self._number(row, _BEAM)
         if value is None:
             quantity = self.beam.title.lower()
             raise InputError(
@@ -256,17 +312,14 @@ class ImageTable(QWidget):
         return value
 
     def brightness(self, row: ImageRow) -> float:
-        value = self._value(row, _BRIGHTNESS, "")
+        value = self._number(row, _BRIGHTNESS)
         return 1.0 if value is None else value
 
     def psf(self, row: ImageRow) -> float:
-        return self._value(row, _PSF, "px") or 0.0
+        return self._number(row, _PSF) or 0.0
 
-    def _value(self, row: ImageRow, column: int, unit: str) -> float | None:
-        try:
-            return self.table.number(self.rows.index(row), column, unit)
-        except InputError as error:
-            raise InputError(f"'{row.name}': {error}") from error
+    def _number(self, row: ImageRow, column: int) -> float | None:
+        return self.table.number(self.rows.index(row), column)
 
     def _beam_of(self, row: ImageRow) -> Any:
         """Return the user's entry, or else the value in the layer's setup."""
@@ -286,22 +339,13 @@ class ImageTable(QWidget):
             row.store(use=self.table.is_checked(item.row()))
             self._on_use()
             return
-        name = self.beam.name if column == _BEAM else _COLUMNS[column][0]
-        unit = self.beam.unit if column == _BEAM else ""
-        text = item.text().strip()
-        try:
-            value: Any = parse_number(text, unit) if text else None
-        except InputError:
-            value = text  # stays for correction
-        is_beam = column == _BEAM
-        is_number = isinstance(value, float)
-        if is_beam and row == self._reference and is_number and name != "strength":
+        name = self.beam.name if column == _BEAM else _IMAGE_COLUMNS[column - _BRIGHTNESS].name
+        value = self.table.enter(item)
+        is_setup = column == _BEAM and name != "strength" and row == self._reference
+        if is_setup and isinstance(value, float):
             self.reference_beam_entered.emit(value)
         else:
             row.store(**{name: value})
-        with QSignalBlocker(self.table):
-            tip = self.beam.tip if is_beam else _TIPS[name]
-            self.table.write(item.row(), column, value, unit, tip)
         self.changed.emit()
 
     def _on_use(self) -> None:
@@ -329,7 +373,132 @@ def _setup_summary(row: ImageRow) -> str:
     return f"with its own setup ({row.setup.probe}{f', {origin}' if origin else ''})"
 
 
-_TIPS = {
-    "brightness": "Brightness of the image relative to the source; 1 if they are equally bright.",
-    "psf": "Standard deviation of the image's blur, in pixels after the steps; 0 without blur.",
-}
+_SHOT_COLUMNS = (
+    Column("energy", "Energy", "MeV", "Energy of the particles; empty for the setup's energy.", 92),
+    Column(
+        "brightness",
+        "Brightness",
+        "",
+        "Brightness of the image relative to the source, by which it is divided; empty for 1.",
+        76,
+    ),
+    Column(
+        "mask",
+        "Mask",
+        None,
+        "Image of the same size, 0 at unusable pixels, with a path relative to the table; empty "
+        "for the common mask.",
+        90,
+    ),
+)
+_MASK = len(_SHOT_COLUMNS)
+_FILE_FILTER = "tables (*.csv)"
+
+
+class _TableEdit(PathEdit):
+    def ask(self) -> str:
+        path, _ = QFileDialog.getOpenFileName(self, self._title, "", _FILE_FILTER)
+        return str(path)
+
+
+class ShotTable(QWidget):
+    """The rows of a table of shots; changes are written to the file only by Save."""
+
+    changed = Signal()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._rows: list[ShotRow] = []
+        self._loaded = ""
+        self.file = _TableEdit("Table of the shots", "shots.csv")
+        self.file.edit.setToolTip(
+            "<qt>A table (.csv) with a row for each shot and the columns file, energy, setup, "
+            "brightness, mask, source, exclude.</qt>"
+        )
+        self.save_button = small_button("Save…", "Save the rows as a table (.csv).", self._save)
+        self.table = NumberTable("Shot", _SHOT_COLUMNS)
+        self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
+        column(self, labelled("", side_by_side((self.file, 1), (self.save_button, 0))), self.table)
+        self.file.changed.connect(self._load)
+        self.table.itemChanged.connect(self._on_edit)
+        self._fill()
+
+    def shots(self) -> list[ShotRow]:
+        """Return the shown rows, unchecked ones as excluded; or raise an `InputError`."""
+        if self.file.path != self._loaded:
+            self._read()
+        if not self._rows:
+            raise InputError(
+                "no table is selected: choose a .csv file with a row for each shot, with the "
+                "columns file and energy"
+            )
+        return [self._row(number) for number in range(len(self._rows))]
+
+    def _row(self, number: int) -> ShotRow:
+        row = self._rows[number]
+        changes: dict[str, Any] = {"exclude": not self.table.is_checked(number)}
+        for cell, spec in enumerate(_SHOT_COLUMNS[:-1], 1):
+            changes[spec.name] = self.table.number(number, cell)
+        mask = self.table.item(number, _MASK).text().strip()
+        if not mask or row.mask is None or mask != row.mask.name:
+            changes["mask"] = self._folder / mask if mask else None
+        entries = row.model_dump(exclude={"strength"})  # tables have another form of it
+        edited = validated(ShotRow, {**entries, **changes}, f"'{row.file.name}'")
+        return edited.model_copy(update={"strength": row.strength})
+
+    @property
+    def _folder(self) -> Path:
+        return Path(self._loaded).expanduser().parent
+
+    @notify_errors
+    def _load(self) -> None:
+        if self.file.path != self._loaded:
+            self._read()
+            self.changed.emit()
+
+    def _read(self) -> None:
+        self._rows, self._loaded = [], self.file.path
+        try:
+            if self._loaded:
+                self._rows = table_rows(Path(self._loaded).expanduser())
+        finally:
+            self._fill()
+
+    def _fill(self) -> None:
+        with QSignalBlocker(self.table):
+            self.table.setRowCount(len(self._rows))
+            for number, row in enumerate(self._rows):
+                self.table.fill_row(number, row.file.name, _tip(row), checked=not row.exclude)
+                for cell, spec in enumerate(_SHOT_COLUMNS[:-1], 1):
+                    self.table.write(number, cell, getattr(row, spec.name))
+                self.table.write(number, _MASK, "" if row.mask is None else row.mask.name)
+        self.table.setVisible(bool(self._rows))
+        self.save_button.setEnabled(bool(self._rows))
+        self.table.fit_height()
+
+    def showEvent(self, event: Any) -> None:
+        super().showEvent(event)
+        # The rows get the heights of napari's style only now.
+        self.table.fit_height()
+
+    def _on_edit(self, item: Any) -> None:
+        if item.column():
+            self.table.enter(item)
+        self.changed.emit()
+
+    @notify_errors
+    def _save(self) -> None:
+        rows = self.shots()
+        path, _ = QFileDialog.getSaveFileName(
+            self, "Save the table", self._loaded or "shots.csv", _FILE_FILTER
+        )
+        if path:
+            target = Path(path)
+            write_table(target if target.suffix else target.with_suffix(SITES.suffix), rows)
+
+
+def _tip(row: ShotRow) -> str:
+    """Return a row's file and its entries without a cell."""
+    files = {"setup": row.setup, "source": row.source}
+    entries = [f"with its own {name} ({file})" for name, file in files.items() if file is not None]
+    return f"{', '.join([str(row.file), *entries])}. Uncheck the shot to exclude it."

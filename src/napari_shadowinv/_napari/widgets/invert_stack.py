@@ -29,17 +29,19 @@ from napari_shadowinv._napari.widgets._saving import (
     shot_to_save,
     shown_result,
 )
-from napari_shadowinv._napari.widgets._shot_table import ShotTable
-from napari_shadowinv._napari.widgets._stacking import StackJob, StackRequest, placement_on
-from napari_shadowinv._napari.widgets._watching import (
+from napari_shadowinv._napari.widgets._stack_jobs import (
     FolderEdit,
+    StackJob,
+    StackRequest,
     WatchJob,
     WatchRequest,
     is_newest_in_view,
     newest_shot,
+    placement_on,
     shot_in_view,
     show_shot,
 )
+from napari_shadowinv._napari.widgets._tables import ShotTable
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.store import STORE_SUFFIX
