@@ -1,21 +1,28 @@
-"""Recipes of the controls as files, as for the commands.
+"""Recipes of the controls as files, as for the commands, and of results to repeat.
 
 - for tools that invert: `RecipeButton`; for the tool that fits: `FitRecipeButton`
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from napari.utils.notifications import show_info
 from qtpy.QtWidgets import QFileDialog, QMenu, QPushButton, QSizePolicy
 
-from napari_shadowinv._napari.layer_metadata import metadata_of, source_of
+from napari_shadowinv._napari.frame import Frame, frame_of
+from napari_shadowinv._napari.kinds import main_layers
+from napari_shadowinv._napari.layer_metadata import Result, metadata_of, result_of, source_of
+from napari_shadowinv._napari.layer_state import layers_of_result
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.shots import radiograph_layers
 from napari_shadowinv._napari.widgets._forms import TOML
 from napari_shadowinv._napari.widgets._layers import new_crop, new_mask
+from napari_shadowinv._napari.widgets._panels import Outcome
 from napari_shadowinv._napari.widgets._qt import notify_errors
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import check_output, write
@@ -25,6 +32,7 @@ from napari_shadowinv.pipeline import read_recipe, write_recipe
 from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.pipeline.inversion_run import picture_mask, plane_of
+from napari_shadowinv.pipeline.rerun import Rerun, collect_rerun
 from napari_shadowinv.preprocessing import (
     Crop,
     MeasuredSource,
@@ -32,6 +40,60 @@ from napari_shadowinv.preprocessing import (
     Recipe,
     UniformEstimate,
 )
+from napari_shadowinv.provenance import Provenance
+
+
+@dataclass(eq=False)
+class _Repetition:
+    """A result to repeat, with the files that are open, and the place of its layers."""
+
+    result: Result
+    images: list[Path] | None
+    source: Path | None
+    folder: Path
+    frame: Frame
+    name: str
+    again: Rerun | None = None
+
+    @classmethod
+    def of(cls, layer: Any, viewer: Any) -> _Repetition:
+        """Return the repetition of a layer's result; an `InputError` if it has none."""
+        result = None if layer is None else result_of(layer)
+        if result is None:
+            raise InputError("select a layer of the result to repeat")
+        content: Any = result.content
+        attributes = getattr(content, "attrs", None)
+        provenance: Provenance | None = (
+            content.provenance if attributes is None else Provenance.of(attributes)
+        )
+        paths = [metadata_of(each).get("path") or each.source.path for each in viewer.layers]
+        by_name = {Path(path).name: Path(path) for path in paths if path}
+        origins = () if provenance is None else provenance.images
+        images = [by_name[origin.file] for origin in origins if origin.file in by_name]
+        measured = [origin.source.file for origin in origins if origin.source is not None]
+        files = [Path(layer.source.path)] if layer.source.path else images
+        return cls(
+            result,
+            images if images and len(images) == len(origins) else None,
+            by_name.get(measured[0]) if measured else None,
+            files[0].parent if files else Path(),
+            frame_of(layer),
+            f"{metadata_of(layer).get('name') or layer.name} repeated",
+        )
+
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> None:
+        inputs = collect_rerun(
+            self.result.content, self.images, source=self.source, folder=self.folder
+        )
+        self.again = inputs.run(on_progress, should_stop)
+
+    def show(self, viewer: Any) -> None:
+        """Add the layers of the repeated result, and report the difference."""
+        assert self.again is not None
+        repeated = Result(self.again.content, self.result.setup, self.result.attributes)
+        add_layers(viewer, main_layers(layers_of_result(repeated, self.frame, self.name)))
+        changes = "; ".join(self.again.changes) or "nothing"
+        show_info(f"Difference: {self.again.difference}. Changed: {changes}")
 
 
 class RecipeButton(QPushButton):
@@ -50,7 +112,9 @@ class RecipeButton(QPushButton):
         menu = QMenu(self)
         menu.addAction("Load recipe…").triggered.connect(lambda: self._ask_and_load())
         menu.addAction("Save…").triggered.connect(lambda: self._ask_and_save())
+        menu.addAction("Repeat").triggered.connect(lambda: self.repeat())
         self.setMenu(menu)
+        tool.panel.runner.ended.connect(self._on_end)
 
     def _ask_and_load(self) -> None:
         path, _ = QFileDialog.getOpenFileName(self, "Load recipe", "", TOML)
@@ -61,6 +125,21 @@ class RecipeButton(QPushButton):
         path, _ = QFileDialog.getSaveFileName(self, "Save recipe", "recipe.toml", TOML)
         if path:
             self.save(Path(path))
+
+    @notify_errors
+    def repeat(self) -> None:
+        """Repeat the result of the selected layer from its files, as further layers."""
+        tool = self._tool
+        if tool.panel.runner.running:
+            raise InputError("a run is under way: wait until it finishes, or press Cancel")
+        job = _Repetition.of(tool.viewer.layers.selection.active, tool.viewer)
+        tool.panel.run(job.run, job)
+
+    @notify_errors
+    def _on_end(self, outcome: Outcome) -> None:
+        job = outcome.tag
+        if isinstance(job, _Repetition) and job.again is not None:
+            job.show(self._tool.viewer)
 
     @notify_errors
     def load(self, path: Path) -> None:
