@@ -360,45 +360,51 @@ def collect(
                         i, j = int(pixels[0, b]) + q // 2, int(pixels[1, b]) + q % 2
                         if not (first_row <= i < last_row and first_column <= j < last_column):
                             continue
-                        line = block[(i - first_row) * wide + j - first_column]
+                        p = (i - first_row) * wide + j - first_column
                         in_v = shares[0, b] if q // 2 else 1 - shares[0, b]
                         in_u = shares[1, b] if q % 2 else 1 - shares[1, b]
                         to_v = flux[b] * in_u * (shares[2, b] if q // 2 else -shares[2, b])
                         to_u = flux[b] * in_v * (shares[3, b] if q % 2 else -shares[3, b])
+                        if beam_is_free:
+                            for s in range(4):
+                                block[p, 16 + s] += in_v * in_u * first[s]
+                        if to_v == 0 and to_u == 0:  # half of the pairs of a ray and a pixel
+                            continue
                         along = frame[1] * to_v + frame[4] * to_u
                         across = frame[2] * to_v + frame[5] * to_u
                         for r in range(4):
                             steep = tables[n, 1, r, a] * along
                             plain = tables[n, 0, r, a] * across
                             for s in range(4):
-                                line[4 * r + s] -= (
+                                block[p, 4 * r + s] -= (
                                     steep * tables[m, 0, s, b] + plain * tables[m, 1, s, b]
                                 )
-                        if beam_is_free:
-                            for s in range(4):
-                                line[16 + s] += in_v * in_u * first[s]
                         if frame_is_free:
-                            line[20] += to_v
-                            line[21] += to_v * landed_y
-                            line[22] += to_v * landed_x
-                            line[23] += to_u
-                            line[24] += to_u * landed_y
-                            line[25] += to_u * landed_x
+                            block[p, 20] += to_v
+                            block[p, 21] += to_v * landed_y
+                            block[p, 22] += to_v * landed_x
+                            block[p, 23] += to_u
+                            block[p, 24] += to_u * landed_y
+                            block[p, 25] += to_u * landed_x
             entry = begins[row, column]
+            coefficient = row * potential.shape[1] + column
+            beam_pixel = potential.size + KNOT * (row * beam.shape[1] + column)
             for p in range(len(block)):
                 pixel = (first_row + p // wide) * width + first_column + p % wide
-                for s in range(26):
-                    if s < 16:
-                        unknown = (row + s // 4) * potential.shape[1] + column + s % 4
-                    elif s < 20:
-                        if not beam_is_free:
-                            continue
-                        i, j = KNOT * row + (s - 16) // 2, KNOT * column + (s - 16) % 2
-                        unknown = potential.size + i * beam.shape[1] + j
-                    else:
-                        if not frame_is_free:
-                            continue
-                        unknown = last + s - 20
-                    places[0, entry], places[1, entry] = pixel, unknown
-                    values[entry] = block[p, s]
-                    entry += 1
+                for r in range(4):
+                    for s in range(4):
+                        places[0, entry] = pixel
+                        places[1, entry] = coefficient + r * potential.shape[1] + s
+                        values[entry] = block[p, 4 * r + s]
+                        entry += 1
+                if beam_is_free:
+                    for s in range(4):
+                        places[0, entry] = pixel
+                        places[1, entry] = beam_pixel + s // 2 * beam.shape[1] + s % 2
+                        values[entry] = block[p, 16 + s]
+                        entry += 1
+                if frame_is_free:
+                    for s in range(6):
+                        places[0, entry], places[1, entry] = pixel, last + s
+                        values[entry] = block[p, 20 + s]
+                        entry += 1
