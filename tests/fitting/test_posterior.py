@@ -67,7 +67,7 @@ def test_samples_have_the_inverse_hessian_as_covariance(
     """Along any way v, v·sample is normal with the variance v·H⁻¹v."""
     scene, unknowns, matrix, free = tiny
     posterior = Posterior(scene, unknowns, np.random.default_rng(0))
-    samples = np.stack([posterior.drawn().flat() for _ in range(DRAWS)])
+    samples = np.stack([posterior.draw_sample().change.flat() for _ in range(DRAWS)])
     covariance = np.linalg.pinv(matrix[np.ix_(free, free)], rcond=1e-10, hermitian=True)
     tolerance = 4 * np.sqrt(2 / DRAWS)
     # Observables: displacements, brightness, frames; not the potential's free constant.
@@ -94,7 +94,7 @@ def test_what_is_known_does_not_vary(
     tiny: tuple[Scene, Unknowns, FloatArray, FloatArray],
 ) -> None:
     scene, unknowns, _, _ = tiny
-    sample = Posterior(scene, unknowns, np.random.default_rng(1)).drawn()
+    sample = Posterior(scene, unknowns, np.random.default_rng(1)).draw_sample().change
     assert not sample.frames[0].any()
     np.testing.assert_array_equal(sample.frames[1] != 0, scene.free_frames)
     assert sample.beam[0, 0] == 0
@@ -105,7 +105,8 @@ def test_the_same_seed_draws_the_same_samples(
 ) -> None:
     scene, unknowns, _, _ = tiny
     first, second, third = (
-        Posterior(scene, unknowns, np.random.default_rng(seed)).drawn().flat() for seed in (2, 2, 3)
+        Posterior(scene, unknowns, np.random.default_rng(seed)).draw_sample().change.flat()
+        for seed in (2, 2, 3)
     )
     np.testing.assert_array_equal(first, second)
     assert (first != third).any()
@@ -214,11 +215,43 @@ def test_open_beams_are_those_that_several_energies_cannot_exclude() -> None:
             scene, strengths=np.array(strengths)[:, None], weights=np.full((2, 24, 32), 1e6)
         )
         posterior = Posterior(shots, unknowns, np.random.default_rng(0))
-        samples = posterior.open_beams(0.05, 4, np.random.default_rng(2))
-        return float(np.sqrt(np.mean([sample[0] ** 2 for sample in samples])))
+        samples = [posterior.draw_sample() for _ in range(4)]
+        changes = posterior.open_beams(0.05, samples, np.random.default_rng(2))
+        freed = shots.with_free_beam(*changes[0].beam.shape[:1], 0.05)
+        beams = [freed.beam_changes(change)[0] for change in changes]
+        return float(np.sqrt(np.mean(np.square(beams))))
 
     assert spread([1.0, 1.0]) > 0.02
     assert spread([1.0, 0.5]) < 0.01
+
+
+def test_open_beams_have_the_joint_posterior_and_move_the_fields() -> None:
+    """Their covariance is the inverse Schur complement of a dense Hessian with a free beam."""
+    scene = replace(weak_scene((12, 16), (30.0, 100.0)), beam_modes=0, free_gains=False)
+    scene = replace(scene, free_frames=np.zeros(6, bool), weights=np.full((2, 12, 16), 1e4))
+    unknowns = scene.nothing()
+    y, x = np.indices(scene.rays.shape)
+    unknowns.potentials[0] = 2 * np.exp(-((y - 6) ** 2 + (x - 7) ** 2) / 6)
+    posterior = Posterior(scene, unknowns, np.random.default_rng(0))
+    samples = [posterior.draw_sample(1e-4) for _ in range(DRAWS)]
+    changes = posterior.open_beams(0.05, samples, np.random.default_rng(2))
+    freed = scene.with_free_beam(*changes[0].beam.shape[:1], 0.05)
+    matrix, free = dense_hessian(freed, unknowns._replace(beam=0 * changes[0].beam))
+    matrix = matrix[np.ix_(free, free)]
+    is_beam = free >= unknowns.potentials.size
+    inverse = np.linalg.pinv(matrix, rcond=1e-10, hermitian=True)
+    covariance = inverse[np.ix_(is_beam, is_beam)]
+    beams = np.stack([change.flat()[free][is_beam] for change in changes])
+    for way in np.eye(len(covariance))[[0, 1, 8, 20]]:
+        variance = ((beams @ way) ** 2).mean()
+        assert variance == pytest.approx(way @ covariance @ way, rel=4 * np.sqrt(2 / DRAWS))
+    # The fields follow the beams as those of a fixed, different beam do.
+    for change in changes[:3]:
+        moved = posterior.moved_by_beams(freed.beam_changes(change))
+        response, expected = (
+            scene.rays.displacement(each.potentials[0]) for each in (change, moved)
+        )
+        assert np.abs(response + expected).max() < 0.1 * np.abs(expected).max()
 
 
 def test_draw_variations_have_unit_rms_inside_and_the_length() -> None:

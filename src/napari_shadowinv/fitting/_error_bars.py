@@ -13,7 +13,8 @@ from napari_shadowinv.fitting.beam_error import draw_variations
 from napari_shadowinv.fitting.descent import finer
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import Measured
-from napari_shadowinv.fitting.posterior import Posterior
+from napari_shadowinv.fitting.posterior import Posterior, Sample
+from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.inversion.budget import ASSUMED_VARIATION
 from napari_shadowinv.options import FitOptions
 
@@ -24,18 +25,26 @@ _SMOOTHED_ERRORS = 4.0  # px
 
 
 def errors_by_noise(
-    scene: Scene, posterior: Posterior, size: tuple[int, int], samples: int
+    scene: Scene, samples: Sequence[Sample], size: tuple[int, int]
 ) -> FloatArray | None:
     """Return the standard deviation of each field's displacement in px, (M, 2, H, W)."""
-    if samples < 2:
+    if not samples:
         return None
-    height, width = size
+    changes = [sample.change for sample in samples]
+    return _spread(scene, changes, size, _SMOOTHED_ERRORS)
+
+
+def _spread(
+    scene: Scene, changes: Sequence[Unknowns], size: tuple[int, int], width: float
+) -> FloatArray:
+    """Root of the mean square of the displacements, smoothed over a width in px."""
+    height, across = size
     squares = np.zeros((scene.strengths.shape[1], 2, *scene.rays.size))
-    for _ in range(samples):
-        change = finer(posterior.drawn())
-        squares += np.stack([scene.rays.displacement(p) for p in change.potentials]) ** 2
-    smooth = gaussian_filter(squares / samples, (0, 0, _SMOOTHED_ERRORS, _SMOOTHED_ERRORS))
-    return np.asarray(np.sqrt(smooth[..., :height, :width]))
+    for change in changes:
+        potentials = finer(change).potentials
+        squares += np.stack([scene.rays.displacement(p) for p in potentials]) ** 2
+    smooth = gaussian_filter(squares / len(changes), (0, 0, width, width))
+    return np.asarray(np.sqrt(smooth[..., :height, :across]))
 
 
 @dataclass(frozen=True)
@@ -52,43 +61,40 @@ class BeamShifts:
 
 
 def shifts_by_beam(
-    given: Measured, scene: Scene, posterior: Posterior, options: FitOptions
+    given: Measured,
+    scene: Scene,
+    posterior: Posterior,
+    samples: Sequence[Sample],
+    options: FitOptions,
 ) -> BeamShifts | None:
-    """Return the effect of beams that differ from their sources; None if beams are fitted."""
-    if options.samples < 2 or scene.beam_modes:
+    """Return the effect of beams that differ from their sources; None if beams are fitted.
+
+    `samples` are the posterior's.
+    """
+    if not samples or scene.beam_modes:
         return None
     variation = options.beam_variation
     if variation is None:
         variation = ASSUMED_VARIATION if given.assumed else 0.0
-    height, width = given.size
     middle = posterior.scene
     rng = np.random.default_rng([options.seed, _BEAM_SEED])
     length = options.beam_scale * min(given.size)
-
-    def spread(samples: Sequence[FloatArray]) -> FloatArray:
-        """Root of the mean square of the displacements by beams, smoothed as these are."""
-        squares = np.zeros((scene.strengths.shape[1], 2, *scene.rays.size))
-        for variations in samples:
-            change = finer(posterior.moved_by_beams(variations))
-            squares += np.stack([scene.rays.displacement(p) for p in change.potentials]) ** 2
-        smoothed = gaussian_filter(squares / len(samples), (0, 0, length / 3, length / 3))
-        return np.asarray(np.sqrt(smoothed[..., :height, :width]))
-
     count = 1 if given.common else len(scene.images)
-    samples = [
+    variations = [
         np.broadcast_to(
             draw_variations(middle, length / middle.bin, count, rng), middle.beams.shape
         )
         for _ in range(_BEAM_SAMPLES)
     ]
-    by_percent = spread([0.01 * sample for sample in samples])
+    changes = [posterior.moved_by_beams(0.01 * each) for each in variations]
+    by_percent = _spread(scene, changes, given.size, length / 3)
     if not variation:
         return BeamShifts(variation, by_percent, 0 * by_percent)
     if not given.common:
         return BeamShifts(variation, by_percent, 100 * variation * by_percent)
     # Several images exclude most of the beams that would move the field far.
-    open_beams = posterior.open_beams(variation, _OPEN_BEAM_SAMPLES, rng)
-    return BeamShifts(variation, by_percent, spread(open_beams))
+    changes = posterior.open_beams(variation, samples[:_OPEN_BEAM_SAMPLES], rng)
+    return BeamShifts(variation, by_percent, _spread(scene, changes, given.size, length / 3))
 
 
 def largest_share(errors: FloatArray, displacements: FloatArray) -> float:

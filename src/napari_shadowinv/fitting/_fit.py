@@ -203,8 +203,10 @@ def fit(
             cause = name_cause(scene, best, fields, setups, on_step)
             pattern = replace(pattern, cause=cause)
     with _timed("samples", seconds):
-        errors = errors_by_noise(scene, posterior, data.size, options.samples)
-        by_beam = shifts_by_beam(data, scene, posterior, options)
+        count = options.samples if options.samples > 1 else 0
+        samples = [posterior.draw_sample() for _ in range(count)]
+        errors = errors_by_noise(scene, samples, data.size)
+        by_beam = shifts_by_beam(data, scene, posterior, samples, options)
         evidence = float("nan")
         if options.evidence:
             evidence = _log_evidence(scene, best, fields, options, on_step)

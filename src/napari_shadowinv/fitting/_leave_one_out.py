@@ -275,7 +275,7 @@ class _Work:
             rng,
             lambda: self._on_step(name, value),
         )
-        changes = [posterior.drawn(_SAMPLE_TOLERANCE) for _ in range(_SAMPLES)]
+        changes = [posterior.draw_sample(_SAMPLE_TOLERANCE).change for _ in range(_SAMPLES)]
         if large:
             changes = [finer(change) for change in changes]
         return _SampledFit(fine, finer(coarse.unknowns).with_those(members, unknowns), changes)

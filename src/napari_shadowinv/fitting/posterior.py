@@ -1,4 +1,4 @@
-"""Uncertainty of the best unknowns by the Gauss-Newton Hessian: `Posterior`.
+"""Uncertainty of the best unknowns by the Gauss-Newton Hessian: `Posterior`, `Sample`.
 
 References
 ----------
@@ -9,6 +9,7 @@ Appl. 38, 1075 (2017).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import dctn, idctn
@@ -20,18 +21,28 @@ from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.minimise import product, solve
 from napari_shadowinv.fitting.unknowns import Unknowns
 
-__all__ = ["Posterior"]
+__all__ = ["Posterior", "Sample"]
 
 _ROUGHLY, _CLOSELY = 0.05, 0.002  # the longest waves, which noise moves most, are found last
-# Beams are smooth, and how large their differences are is a guess: 0.01 makes the error 2 to 3 %
-# smaller, 0.02 8 to 12 %.
-_OPEN_BEAMS = 0.005
+# It makes the error 1 to 2 % smaller, 0.1 would 1 to 6 %; two sets of samples differ by 10 %.
+_OPEN_BEAMS = 0.05
 _MOVED_BY_BEAMS = 0.01
 _BEAM_MODES = 8
 _MOST_STEPS = 600
 _PROBES, _LANCZOS = 8, 25
 _LEAST_DETERMINED = 1e-3  # coefficients
 _OVERSHOOT, _MOST_CHANGE = 1.7, 15.0  # of λ in a step; it would approach its end too slowly
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A random change of the unknowns, and the noise that causes it.
+
+    `noise` (L, H, W) are random changes of the data over their standard deviations.
+    """
+
+    change: Unknowns
+    noise: FloatArray
 
 
 class Posterior:
@@ -78,7 +89,7 @@ class Posterior:
             signs = self._rng.choice([-1.0, 1.0], roughness.shape)
             slope = self._unknowns.zeros()
             slope.potentials[m] = prior.root_of_smoothness(m, signs)
-            solved = self._scales.times(self._unknowns.like(self._solved(slope, _ROUGHLY)))
+            solved = self._change(slope, _ROUGHLY)
             open_part = np.sqrt(roughness) * signs * dctn(solved.potentials[m], norm="ortho")
             shares = np.divide(each, roughness, out=np.zeros_like(each), where=roughness > 0)
             determined[m] = np.maximum(
@@ -91,12 +102,12 @@ class Posterior:
         weights = determined / determined.sum(axis=1, keepdims=True)
         return smoothness * np.exp(change), float((np.abs(change) * weights).sum(axis=1).max())
 
-    def drawn(self, tolerance: float = _CLOSELY) -> Unknowns:
+    def draw_sample(self, tolerance: float = _CLOSELY) -> Sample:
         """Return a random change of the unknowns, as large as the data leave possible."""
         noise = self._rng.normal(size=self._scene.images.shape)
         slope = self._linear.pulled(noise)
         slope = slope.plus(self._scene.prior.drawn(self._unknowns, self._rng))
-        return self._scales.times(self._unknowns.like(self._solved(slope, tolerance)))
+        return Sample(self._change(slope, tolerance), noise)
 
     def moved_by_beams(self, variations: FloatArray) -> Unknowns:
         """Return the change of the unknowns if the beams differ from their sources.
@@ -107,33 +118,50 @@ class Posterior:
             Differences as shares of the beams, of the shape of the scene's beams.
         """
         changes = self._scene.changed_by_beams(self._unknowns, self._counts, variations)
-        slope = self._linear.pulled(changes)
-        return self._scales.times(self._unknowns.like(self._solved(slope, _MOVED_BY_BEAMS)))
+        return self._change(self._linear.pulled(changes), _MOVED_BY_BEAMS)
 
     def open_beams(
-        self, variation: float, count: int, rng: np.random.Generator
-    ) -> list[FloatArray]:
+        self, variation: float, samples: Sequence[Sample], rng: np.random.Generator
+    ) -> list[Unknowns]:
         """Return random differences of a common beam that the images leave possible.
 
         Parameters
         ----------
         variation : float
             R.m.s. difference that is possible before the images are looked at.
-        count : int
-            Number of samples.
+        samples : sequence of Sample
+            For the beam as it is; each makes one of the differences.
         rng : numpy.random.Generator
-            For the samples.
+            For the beam's prior.
 
         Returns
         -------
-        list of ndarray, shape (L, …)
-            As `moved_by_beams` takes them.
+        list of Unknowns
+            The beam's difference, `Scene.with_free_beam`'s, with the change of the other unknowns
+            that it causes.
+
+        Notes
+        -----
+        With J and B the derivatives of the residuals by the unknowns and by the beam's cosines, H
+        and P the Hessian and the beam's prior, a sample x = H⁻¹ (Jᵀη + ξ) becomes one of both,
+        (x + δ, θ), by
+
+            [H  JᵀB; BᵀJ  BᵀB + P] (δ, θ) = (0, Bᵀ(η - Jx) + P^½ζ),
+
+        which is the response δ = -H⁻¹JᵀBθ to the sampled beam θ.
         """
         freed = self._scene.with_free_beam(_BEAM_MODES, variation)
-        beam = np.zeros((_BEAM_MODES, _BEAM_MODES))
-        posterior = Posterior(freed, self._unknowns._replace(beam=beam), rng, self._after_step)
-        changes = (posterior.drawn(_OPEN_BEAMS) for _ in range(count))
-        return [freed.beam_changes(each) for each in changes]
+        weights = freed.prior.beam_weights
+        unknowns = self._unknowns._replace(beam=np.zeros(weights.shape))
+        posterior = Posterior(freed, unknowns, rng, self._after_step)
+        changes = []
+        for sample in samples:
+            residuals = sample.noise - self._linear.pushed(sample.change)
+            pull = posterior._linear.pulled(residuals).beam
+            pull += np.sqrt(weights) * rng.normal(size=weights.shape)
+            slope = unknowns.zeros()._replace(beam=pull)
+            changes.append(posterior._change(slope, _OPEN_BEAMS))
+        return changes
 
     def log_volume(self, chances: Sequence[np.random.Generator]) -> float:
         """Return half the log-determinant of the Hessian relative to the prior of potentials.
@@ -177,10 +205,11 @@ class Posterior:
         turned = self._linear.hessian_times(change)
         return self._scales.turned(turned).flat()
 
-    def _solved(self, slope: Unknowns, tolerance: float) -> FloatArray:
-        """The scaled change of the unknowns that undoes a slope."""
+    def _change(self, slope: Unknowns, tolerance: float) -> Unknowns:
+        """The change of the unknowns that undoes a slope."""
         right = self._scales.turned(slope).flat()
-        return solve(self._times, right, tolerance=tolerance, iterations=_MOST_STEPS)
+        scaled = solve(self._times, right, tolerance=tolerance, iterations=_MOST_STEPS)
+        return self._scales.times(self._unknowns.like(scaled))
 
     def _prior_times(self, flat: FloatArray) -> FloatArray:
         """The potentials' prior in scales in which it is about the identity."""
