@@ -408,4 +408,6 @@ def copy_edits(dataset: xarray.Dataset, pack: Pack, scratch: Path, path: Path) -
 
     layers = tuple(layer.model_copy(update={"mask": copy(layer.mask)}) for layer in pack.layers)
     saved_pack = pack.model_copy(update={"corners": copy(pack.corners), "layers": layers})
-    return dataset.assign_attrs(pack=saved_pack.model_dump_json(exclude_defaults=True))
+    provenance = Provenance.of(dataset.attrs) or Provenance(kind="film pack", pack=saved_pack)
+    repeatable = provenance.model_copy(update={"pack": saved_pack})
+    return dataset.assign_attrs(provenance=repeatable.to_json())
