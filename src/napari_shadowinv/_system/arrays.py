@@ -3,7 +3,7 @@
 - values in the order of the axes, and the mask: `unpack_array`
 - the same where a mask has no meaning: `plain_array`; in any order: `unmasked`
 - image, source and mask of one shot: `unpack_shot`; several planes: `unpack_planes`
-- numbers as floats: `as_numbers`
+- numbers as floats: `as_numbers`; a plane of them: `checked_plane`; a mask: `checked_mask`
 - two masks together: `join_masks`; size of a pixel by the coordinates: `coordinate_spacing`
 - places of values in their order: `order_by_value`
 
@@ -122,6 +122,40 @@ def mask_of_each(mask: BoolArray | None, data: FloatArray) -> BoolArray | None:
     """Return a mask for each image, or none where its shape is wrong."""
     fits = mask is not None and mask.shape in (data.shape, data.shape[1:])
     return np.broadcast_to(mask, data.shape) if mask is not None and fits else None
+
+
+def checked_plane(values: Any, name: str, least: int = 1) -> AnyArray:
+    """Return real numbers in two dimensions, `least` or more each way, or raise an `InputError`."""
+    array = np.asarray(values)
+    if array.ndim != 2:
+        raise InputError(
+            f"{name} has shape {array.shape}, expected two dimensions (y, x): choose one channel "
+            "or one shot"
+        )
+    if min(array.shape) < least:
+        raise InputError(
+            f"{name} has shape {array.shape}, expected at least {least} × {least} pixels"
+        )
+    if array.dtype.kind not in "buif":
+        raise InputError(f"{name} has values of type {array.dtype}, expected real numbers")
+    return array
+
+
+def checked_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str = "image") -> BoolArray:
+    """Return a mask as booleans, all true by default, or raise an `InputError`."""
+    if mask is None:
+        return np.ones(shape, dtype=np.bool_)
+    usable = np.asarray(mask)
+    if usable.shape != shape:
+        raise InputError(f"mask has shape {usable.shape}, {name} {shape}: they must match")
+    if usable.dtype != np.bool_:
+        raise InputError(
+            f"mask has values of type {usable.dtype}, expected booleans, true where a pixel is "
+            "usable: compare it with a number, as in mask > 0"
+        )
+    if not usable.any():
+        raise InputError("mask is false everywhere, expected true where a pixel is usable")
+    return usable
 
 
 def as_numbers(name: str, values: ArrayLike) -> FloatArray:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import unpack_array, unpack_shot
+from napari_shadowinv._system.arrays import checked_mask, unpack_array, unpack_shot
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
@@ -139,7 +139,7 @@ class _SiteDomain(NamedTuple):
 def _site_domain(
     source: ArrayLike, options: InversionOptions, mask: ArrayLike | None
 ) -> _SiteDomain:
-    usable = None if mask is None else normalise.checked_mask(mask, np.shape(source))
+    usable = None if mask is None else checked_mask(mask, np.shape(source))
     check_memory(np.shape(source), normalise.bytes_per_pixel(options), "an inversion")
     beam = normalise.checked_source(source, usable)
     if usable is not None:

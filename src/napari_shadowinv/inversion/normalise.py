@@ -1,6 +1,6 @@
 """An image and a source made ready for the transport.
 
-- check and normalise: `prepare`; a source or a mask alone: `checked_source`, `checked_mask`
+- check and normalise: `prepare`; a source alone: `checked_source`
 - only normalise, many images of one source: `floored_by`
 - the margin of a free boundary, and how many sites: `margin_around`, `number_of_sites`
 """
@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from napari_shadowinv._system.arrays import checked_mask, checked_plane
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.safety import check_memory
-from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
@@ -61,9 +62,9 @@ def prepare(
     flux_scale: float | None = None,
 ) -> Prepared:
     """Check an image and its source, and bring them to the same flux, or divide by `flux_scale`."""
-    shape = _plane(image, "image").shape
+    shape = checked_plane(image, "image", _SMALLEST_SIDE).shape
     check_memory(shape, bytes_per_pixel(options), "an inversion")
-    usable = np.ones(shape, bool) if mask is None else checked_mask(mask, shape)
+    usable = checked_mask(mask, shape)
     values = _finite_image(image, "image", usable)
     negative = int((values < 0).sum())
     if negative and options.negative == "refuse":
@@ -199,7 +200,7 @@ def _warnings(
 
 def checked_source(source: ArrayLike, mask: BoolArray | None = None) -> FloatArray:
     """Return a source as floats, 0 where masked, or raise an `InputError`."""
-    shape = _plane(source, "source").shape
+    shape = checked_plane(source, "source", _SMALLEST_SIDE).shape
     if mask is not None and shape != mask.shape:
         raise InputError(f"source has shape {shape}, image {mask.shape}: they must match")
     beam = _finite_image(source, "source", np.ones(shape, bool) if mask is None else mask)
@@ -223,40 +224,8 @@ def _check_range(values: FloatArray, name: str) -> None:
         )
 
 
-def checked_mask(mask: ArrayLike, shape: tuple[int, ...]) -> BoolArray:
-    """Return a mask as booleans, or raise an `InputError`."""
-    usable = np.asarray(mask)
-    if usable.shape != shape:
-        raise InputError(f"mask has shape {usable.shape}, image {shape}: they must match")
-    if usable.dtype != bool:
-        raise InputError(
-            f"mask has values of type {usable.dtype}, expected booleans, true where a pixel is "
-            "usable: compare it with a number, as in mask > 0"
-        )
-    if not usable.any():
-        raise InputError("mask is false everywhere, expected true where a pixel is usable")
-    return usable
-
-
-def _plane(values: ArrayLike, name: str) -> AnyArray:
-    array = np.asarray(values)
-    if array.ndim != 2:
-        raise InputError(
-            f"{name} has shape {array.shape}, expected two dimensions (y, x): "
-            "choose one channel or one shot"
-        )
-    if min(array.shape) < _SMALLEST_SIDE:
-        raise InputError(
-            f"{name} has shape {array.shape}, expected at least "
-            f"{_SMALLEST_SIDE} × {_SMALLEST_SIDE} pixels"
-        )
-    if array.dtype.kind not in "buif":
-        raise InputError(f"{name} has values of type {array.dtype}, expected real numbers")
-    return array
-
-
 def _finite_image(values: ArrayLike, name: str, mask: BoolArray) -> FloatArray:
-    array = np.where(mask, _plane(values, name), 0.0).astype(np.float64)
+    array = np.where(mask, values, 0.0).astype(np.float64)
     bad = int((~np.isfinite(array)).sum())
     if bad:
         raise InputError(

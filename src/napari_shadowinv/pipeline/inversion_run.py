@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import (
     check_spacing,
+    checked_plane,
     join_masks,
     unpack_array,
     unpack_mask,
@@ -401,14 +402,7 @@ def radiograph_of(image: Shot, name: str) -> Radiograph:
 
 def plane_of(values: Any, name: str) -> FloatArray:
     """Return an image as floats; an `InputError` if it is none."""
-    array = np.asarray(values)
-    if array.ndim != 2:
-        raise InputError(
-            f"{name} has shape {array.shape}, expected two dimensions (y, x): choose one shot or "
-            "one channel"
-        )
-    if array.dtype.kind not in "buif":
-        raise InputError(f"{name} has values of type {array.dtype}, expected real numbers")
+    array = checked_plane(values, name)
     check_memory(array.shape, _BYTES_PER_PIXEL, "an image")
     return array.astype(np.float64)
 

@@ -17,7 +17,7 @@ import scipy
 from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import unpack_shot
+from napari_shadowinv._system.arrays import checked_mask, checked_plane, unpack_shot
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -165,16 +165,8 @@ def checked_pixels(
     Masked pixels, which may be NaN, are set to the mean of the usable ones.
     """
     image, _, mask = unpack_shot(image, None, mask)
-    array = np.asarray(image)
-    if array.ndim != 2 or array.size == 0:
-        raise InputError(
-            f"{name} has shape {array.shape}, expected two dimensions (y, x): "
-            "choose one channel or one shot"
-        )
-    if array.dtype.kind not in "buif":
-        raise InputError(f"{name} has values of type {array.dtype}, expected real numbers")
-    values = np.array(array, dtype=np.float64)
-    usable = _checked_mask(mask, values.shape, name)
+    values = np.array(checked_plane(image, name, 1), dtype=np.float64)
+    usable = checked_mask(mask, values.shape, name)
     bad = int((~np.isfinite(values[usable])).sum())
     if bad:
         raise InputError(
@@ -183,22 +175,6 @@ def checked_pixels(
         )
     values[~usable] = values[usable].mean()
     return values, usable
-
-
-def _checked_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str) -> BoolArray:
-    if mask is None:
-        return np.ones(shape, dtype=np.bool_)
-    usable = np.asarray(mask)
-    if usable.dtype != np.bool_:
-        raise InputError(
-            f"mask has values of type {usable.dtype}, expected booleans that are True where "
-            "a pixel is usable: compare it with a number, as in mask > 0"
-        )
-    if usable.shape != shape:
-        raise InputError(f"mask has shape {usable.shape}, {name} {shape}: they must match")
-    if not usable.any():
-        raise InputError("mask leaves no usable pixel, expected True where a pixel is usable")
-    return usable
 
 
 def checked_number(name: str, value: float, *, above: float, unit: str) -> float:

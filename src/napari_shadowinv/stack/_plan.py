@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import (
     check_spacing,
+    checked_mask,
     join_masks,
     unpack_array,
     unpack_mask,
@@ -22,7 +23,7 @@ from napari_shadowinv._system.arrays import (
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.normalise import bytes_per_pixel, checked_mask, checked_source
+from napari_shadowinv.inversion.normalise import bytes_per_pixel, checked_source
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.store import FORMAT

@@ -19,10 +19,9 @@ from pydantic import (
     model_validator,
 )
 
-from napari_shadowinv._system.arrays import plain_array, unmasked
+from napari_shadowinv._system.arrays import checked_plane, plain_array, unmasked
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup._quantities import number_in_unit, unit_in_title
 
 
@@ -272,12 +271,8 @@ def displacement_from_potential(potential: ArrayLike) -> FloatArray:
     >>> displacement_from_potential(np.tile(np.arange(4.0) ** 2, (3, 1)))[1, 0, 1:]
     array([-2., -4., -6.])
     """
-    plane = np.asarray(plain_array(potential, "potential"), dtype=np.float64)
-    if plane.ndim != 2 or min(plane.shape) < 3:
-        raise InputError(
-            f"potential has shape {plane.shape}: expected (height, width), at least 3 pixels "
-            "each way"
-        )
+    values = checked_plane(plain_array(potential, "potential"), "potential", 3)
+    plane = np.asarray(values, dtype=np.float64)
     return -np.stack([np.gradient(plane, axis=axis, edge_order=2) for axis in (0, 1)])
 
 
