@@ -24,7 +24,6 @@ eight.
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -40,8 +39,8 @@ import simulated_pack
 from napari_shadowinv import FitOptions, Recipe
 from napari_shadowinv.film import moved_corners, straightened, write_corners
 from napari_shadowinv.film.scans import upright
+from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.options import FitChoices
-from napari_shadowinv.physics.setup import setup_from_dict
 from napari_shadowinv.pipeline import FitShot, read_pack, run_film, run_fit
 from napari_shadowinv.preprocessing import Bin
 from simulated_pack import Truth, simulate
@@ -133,20 +132,16 @@ class Images:
     offset: FloatArray  # px by which the first layer's middle is off the object's
 
     @classmethod
-    def of(cls, truth: Truth, dataset: Any) -> Images:
+    def of(cls, truth: Truth, doses: FilmDoses) -> Images:
         planes = [
             np.where(*both, 0.0)
-            for both in zip(
-                dataset["usable"].values, dataset["fluence"].values.astype(float), strict=True
-            )
+            for both in zip(doses.usable, doses.fluence.astype(float), strict=True)
         ]
-        first = dataset.isel(layer=0)
-        pose = first["shift"].values, float(first["turn"])
-        _, middle, _ = upright(moved_corners(first["corners"].values, *pose, 1.0))
+        pose = doses.shifts[0], float(doses.turns[0])
+        _, middle, _ = upright(moved_corners(doses.corners[0], *pose, 1.0))
         place = truth.placements[0]
         offset = np.array(place.axes) @ (middle - np.array(place.middle)) + np.array(place.slip)
-        setups = setups_of(dataset, dataset["energy"].values)
-        return cls(planes, list(dataset["usable"].values), setups, offset)
+        return cls(planes, list(doses.usable), list(doses.setups), offset)
 
 
 def on_first_film(
@@ -159,14 +154,6 @@ def on_first_film(
     y, x = np.meshgrid(*axes, indexing="ij")
     at = np.stack([y, x]) + truth.scene.middle[:, None, None]
     return np.asarray(ndimage.map_coordinates(plane, at, order=3, mode="nearest"))
-
-
-def setups_of(dataset: Any, energies: FloatArray) -> list[Any]:
-    known = [setup_from_dict(one) for one in json.loads(dataset.attrs["setups"])]
-    return [
-        one.model_copy(update={"energy": float(energy)})
-        for one, energy in zip(known, energies, strict=True)
-    ]
 
 
 def fitted(
@@ -288,15 +275,14 @@ def print_real(pack: Path, first: int, last: int) -> None:
         layer if first <= number <= last else layer.model_copy(update={"exclude": True})
         for number, layer in enumerate(described.layers, 1)
     )
-    dataset = run_film(described.model_copy(update={"layers": layers}))
-    shape = dataset.sizes["y"], dataset.sizes["x"]
+    doses = run_film(described.model_copy(update={"layers": layers}))
+    shape = doses.dose.shape[1], doses.dose.shape[2]
     print("| film | type | shift y, x (px) | turn (°) | by | slit by edges | slit as laid |")
     print(f"|{'---|' * 7}")
     places: dict[str, list[float]] = {}
     for number in range(first, last + 1):
-        film = dataset.isel(layer=number - 1)
-        corners, shift = film["corners"].values, film["shift"].values
-        turn = float(film["turn"])
+        corners, shift = doses.corners[number - 1], doses.shifts[number - 1]
+        turn, film = float(doses.turns[number - 1]), described.layers[number - 1].film
         pixels = tifffile.imread(described.layers[number - 1].file)
         laid = moved_corners(corners, shift, turn, 1.0)
         slits = [
@@ -304,13 +290,13 @@ def print_real(pack: Path, first: int, last: int) -> None:
             for where in (corners, laid)
         ]
         cells = ["–" if slit is None else f"{slit[0]:.0f}, {slit[1]:.1f}" for slit in slits]
-        by = "texture" if bool(film["by_images"]) else "edges"
+        by = "texture" if doses.by_images[number - 1] else "edges"
         print(
-            f"| {number} | {film['film'].item()} | {shift[0]:+.1f}, {shift[1]:+.1f} | "
+            f"| {number} | {film} | {shift[0]:+.1f}, {shift[1]:+.1f} | "
             f"{np.rad2deg(turn):+.2f} | {by} | {' | '.join(cells)} |"
         )
         if by == "edges" and slits[1] is not None:
-            places.setdefault(film["film"].item(), []).append(slits[1][1])
+            places.setdefault(film, []).append(slits[1][1])
     for kind, across in places.items():
         print(f"\n{kind} laid by edges: slits within {np.ptp(across):.1f} px across.")
 

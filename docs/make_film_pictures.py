@@ -51,8 +51,8 @@ def main() -> None:
     parser.add_argument("data", type=Path, help="folder with the films")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        dataset = run_film(read_pack(pack_of_page(Path(scratch), arguments.data)))
-    figure = pack_figure(dataset, title="pack.toml")
+        doses = run_film(read_pack(pack_of_page(Path(scratch), arguments.data)))
+    figure = pack_figure(doses, title="pack.toml")
     save_with_few_colours(figure, HERE / "pictures" / "film-pack.png")
 
 

@@ -32,6 +32,7 @@ ROOMS = (
     ("preprocessing",),
     ("film",),
     ("provenance",),
+    ("film_doses",),
     ("transport",),
     ("inversion",),
     ("fitting",),

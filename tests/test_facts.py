@@ -66,7 +66,7 @@ def test_every_face_shows_the_same_texts(inversion):
 def test_facts_of_a_fit_name_images_fields_and_the_verdict(image):
     options = FitOptions(samples=0, max_iterations=20, spacing=0.25)
     result = fit([image, image[::-1]], strengths=[1, 0.8], noise=0.01, options=options)
-    facts = result.facts(["first.tif", "second.tif"])
+    facts = result.facts_with_names(["first.tif", "second.tif"])
     texts = texts_by_key(facts)
     assert texts["image_2"].startswith("second.tif, χ² ")
     assert "strength 0.8" in texts["image_2"]

@@ -1,7 +1,11 @@
-"""A result in words, for every face: `Fact`, `Headline`, `Level`.
+"""A result in words, for every face: `Fact`, `Headline`, `Level`; its kind: `ResultKind`.
 
 Results describe themselves once, as facts. The command prints them as a table, a window shows them
 as a report, a figure writes them below its panels; none of them words or rounds anything itself.
+
+A room that treats kinds of results differently has one table with an entry for each `ResultKind`:
+the class in `io.results`, the writers in `io.formats`, the figures in `plotting`, the rerun and
+the file's description in `cli`, the layers in `_napari`.
 """
 
 from __future__ import annotations
@@ -9,10 +13,40 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 from napari_shadowinv.cautions import Caution
 
-__all__ = ["Fact", "Headline", "Level", "caution_facts", "error_fact", "time_fact"]
+__all__ = ["Fact", "Headline", "Level", "ResultKind", "caution_facts", "error_fact", "time_fact"]
+
+
+class ResultKind(StrEnum):
+    """Kind of a result; its value is the attribute ``format`` of the result's file."""
+
+    INVERSION = "shadowinv result"
+    FIT = "shadowinv fit"
+    FILM_DOSES = "shadowinv film pack"
+    FIELD = (
+        "shadowinv field"  # without images: of a shot of a store, of pradformat, of another program
+    )
+
+    @classmethod
+    def of(cls, attributes: Mapping[Any, Any]) -> ResultKind:
+        """Return the kind of a dataset by its attributes."""
+        file_format = attributes.get("format")
+        if file_format in (cls.FIT, cls.FILM_DOSES):
+            return cls(str(file_format))
+        return cls.INVERSION if "report" in attributes else cls.FIELD
+
+    @classmethod
+    def from_noun(cls, noun: str) -> ResultKind:
+        """Return the kind of a provenance, by its name in a sentence."""
+        return next(kind for kind in cls if kind.noun == noun)
+
+    @property
+    def noun(self) -> str:
+        """Name in a sentence."""
+        return self.value.removeprefix("shadowinv ").replace("result", "inversion")
 
 
 class Level(StrEnum):

@@ -36,7 +36,7 @@ def test_a_pack_from_scans_to_files_for_a_fit(truth: Truth, here: Path) -> None:
     assert "Film pack" in flat(ended.output)
     dataset = read("pack.shadowinv")
     for energy in dataset["energy"].values:
-        assert f"{energy:.4g}" in ended.output
+        assert f"{energy:.3g} MeV" in ended.output
     corners = read_corners("corners.csv")
     np.testing.assert_allclose(list(corners.values()), dataset["corners"], atol=0.006)
     listed = (here / "layers" / "layers.csv").read_text().splitlines()
@@ -60,7 +60,8 @@ def test_a_pack_is_described_and_repeated(truth: Truth, here: Path) -> None:
     assert shadowinv("film", truth.pack, "-q").output == ""
     output = flat(shadowinv("info", "pack.shadowinv").output)
     assert "film pack of shadowinv" in output
-    assert "3 of 90 × 120 px" in output
+    assert "films 3, " in output
+    assert "pixels 90 × 120, " in output
     # A result may come from anybody: scans that lie elsewhere are asked for.
     refused = shadowinv("rerun", "pack.shadowinv")
     assert refused.exit_code == 2

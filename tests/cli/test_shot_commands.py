@@ -24,13 +24,16 @@ from napari_shadowinv import __version__
 from napari_shadowinv import preprocessing as filters
 from napari_shadowinv import preprocessing as sources
 from napari_shadowinv._system.machine import physical_memory
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli import _info, app
 from napari_shadowinv.cli._flags import recipe_of
 from napari_shadowinv.cli._inputs import setup_for
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.film import Pack
+from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.inversion import Inversion, invert, machine_code
 from napari_shadowinv.inversion.machine_code import code_folder
-from napari_shadowinv.inversion.variables import PACK_FORMAT, setup_from_dataset
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read, write
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.options import InversionOptions
@@ -1010,15 +1013,32 @@ def test_info_describes_the_contents(folder: Path) -> None:
 def test_a_film_pack_is_described_but_has_no_field(
     folder: Path, refused: Callable[..., None]
 ) -> None:
-    names = ("dose", "fluence", "usable")
-    planes = {name: (("layer", "y", "x"), np.ones((2, 5, 7), np.float32)) for name in names}
-    attributes = {"format": PACK_FORMAT, "package_version": "1.2", "warnings": '["film 2 is dark"]'}
-    pack = xr.Dataset(planes, {"energy": ("layer", [3.0, 5.5])}, attributes)
-    write("pack.shadowinv", pack)
-    xr.testing.assert_identical(read("pack.shadowinv"), pack)
+    plane, film = np.ones((2, 5, 7), np.float32), np.zeros(2)
+    layers = [{"film": "HDV2", "file": f"{name}.tif"} for name in "ab"]
+    doses = FilmDoses(
+        dose=plane,
+        dose_error=plane,
+        usable=plane > 0,
+        fluence=plane,
+        fluence_error=plane,
+        energies=np.array([3.0, 5.5]),
+        bands=np.ones((2, 3)),
+        shifts=np.zeros((2, 2)),
+        shift_errors=film,
+        turns=film,
+        by_images=film > 0,
+        corners=np.zeros((2, 4, 2)),
+        provenance=Provenance(
+            kind="film pack", version="1.2", pack=Pack.model_validate({"layers": layers})
+        ),
+        cautions=(Caution("film-range", "film 2 is dark"),),
+    )
+    write("pack.shadowinv", doses)
+    xr.testing.assert_identical(read("pack.shadowinv"), doses.to_dataset())
     text = flat(shadowinv("info", "pack.shadowinv").stdout)
     assert "film pack of shadowinv 1.2" in text
-    assert "2 of 5 × 7 px" in text
+    assert "films 2, 3 to 5.5 MeV" in text
+    assert "pixels 5 × 7, 100% usable" in text
     assert "film 2 is dark" in text
     refused("forward", "pack.shadowinv", names="pack.shadowinv is a film pack")
 

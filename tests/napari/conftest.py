@@ -45,7 +45,7 @@ def film_pack(tmp_path_factory: pytest.TempPathFactory) -> Truth:
 
 
 @pytest.fixture(scope="session")
-def pack_dataset(film_pack: Truth) -> Any:
+def pack_doses(film_pack: Truth) -> Any:
     return run_film(read_pack(film_pack.pack))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,53 +21,43 @@ PLUGIN = "napari-shadowinv"
 
 
 @pytest.fixture
-def file(pack_dataset: Any, tmp_path: Path) -> Path:
-    return write(tmp_path / "trio.shadowinv", pack_dataset)
+def file(pack_doses: Any, tmp_path: Path) -> Path:
+    return write(tmp_path / "trio.shadowinv", pack_doses)
 
 
 def opened(viewer: ViewerModel, file: Path) -> dict[str, Layer]:
     return {str(role_of(layer)): layer for layer in viewer.open(file, plugin=PLUGIN)}
 
 
-def without_setup(dataset: Any) -> Any:
-    bare = dataset.drop_vars("time_of_flight")
-    del bare.attrs["setups"]
-    return bare
-
-
-def test_a_pack_opens_as_stacks_of_films(
-    viewer: ViewerModel, pack_dataset: Any, file: Path
-) -> None:
+def test_a_pack_opens_as_stacks_of_films(viewer: ViewerModel, pack_doses: Any, file: Path) -> None:
     layers = opened(viewer, file)
     assert list(layers) == ["dose", "fluence", "unusable"]
     assert [layer.visible for layer in layers.values()] == [False, True, False]
-    pixel = 1e6 * pack_dataset.attrs["scan_pixel_size"] / 11  # over the magnification
+    pixel = 1e6 * pack_doses.pixel_size / 11  # over the magnification
     for layer in layers.values():
-        assert layer.data.shape == pack_dataset["fluence"].shape
+        assert layer.data.shape == pack_doses.fluence.shape
         assert layer.axis_labels == ("layer", "y", "x")
         np.testing.assert_allclose(layer.scale, (1, pixel, pixel))
-        assert metadata_of(layer)["energies"] == pack_dataset["energy"].values.tolist()
-        assert (
-            metadata_of(layer)["times_of_flight"] == pack_dataset["time_of_flight"].values.tolist()
-        )
-    np.testing.assert_array_equal(layers["fluence"].data, pack_dataset["fluence"].values)
-    np.testing.assert_array_equal(layers["dose"].data, pack_dataset["dose"].values)
-    np.testing.assert_array_equal(layers["unusable"].data == 0, pack_dataset["usable"].values)
+        assert metadata_of(layer)["energies"] == pack_doses.energies.tolist()
+        assert metadata_of(layer)["times_of_flight"] == pack_doses.times_of_flight.tolist()
+    np.testing.assert_array_equal(layers["fluence"].data, pack_doses.fluence)
+    np.testing.assert_array_equal(layers["dose"].data, pack_doses.dose)
+    np.testing.assert_array_equal(layers["unusable"].data == 0, pack_doses.usable)
 
 
 def test_a_pack_without_setup_has_the_pixels_of_its_scans(
-    viewer: ViewerModel, pack_dataset: Any, tmp_path: Path
+    viewer: ViewerModel, pack_doses: Any, tmp_path: Path
 ) -> None:
-    file = write(tmp_path / "bare.shadowinv", without_setup(pack_dataset))
+    file = write(tmp_path / "bare.shadowinv", replace(pack_doses, setups=()))
     fluence = opened(viewer, file)["fluence"]
-    np.testing.assert_allclose(fluence.scale[1:], 1e6 * pack_dataset.attrs["scan_pixel_size"])
-    assert metadata_of(fluence)["films"][1] == f"film 2: {pack_dataset['energy'].values[1]:.3g} MeV"
+    np.testing.assert_allclose(fluence.scale[1:], 1e6 * pack_doses.pixel_size)
+    assert metadata_of(fluence)["films"][1] == f"film 2: {pack_doses.energies[1]:.3g} MeV"
 
 
 def test_the_film_in_view_is_named_and_has_its_own_contrast(
-    viewer: ViewerModel, file: Path, pack_dataset: Any
+    viewer: ViewerModel, file: Path, pack_doses: Any
 ) -> None:
-    energies, times = pack_dataset["energy"].values, 1e12 * pack_dataset["time_of_flight"].values
+    energies, times = pack_doses.energies, 1e12 * pack_doses.times_of_flight
     labels = [
         f"{energy:.3g} MeV, {time:.3g} ps" for energy, time in zip(energies, times, strict=True)
     ]
@@ -90,7 +82,7 @@ def test_the_film_in_view_is_named_and_has_its_own_contrast(
 
 
 def test_saved_layers_are_the_whole_pack_again(
-    viewer: ViewerModel, pack_dataset: Any, file: Path, tmp_path: Path
+    viewer: ViewerModel, pack_doses: Any, file: Path, tmp_path: Path
 ) -> None:
     layers = opened(viewer, file)
     layers["dose"].visible = True
@@ -98,65 +90,66 @@ def test_saved_layers_are_the_whole_pack_again(
     layers["fluence"].colormap = "gray"
     assert layers["fluence"].save(str(copy), plugin=PLUGIN)
     again = read(copy)
-    for name in pack_dataset.variables:
-        np.testing.assert_array_equal(again[name].values, pack_dataset[name].values)
+    original = pack_doses.to_dataset()
+    for name in original.variables:
+        np.testing.assert_array_equal(again[name].values, original[name].values)
     reopened = opened(viewer, copy)
     assert reopened["fluence"].colormap.name == "gray"
     assert not reopened["dose"].visible
 
 
 def test_warnings_are_told_when_a_pack_is_opened(
-    viewer: ViewerModel, pack_dataset: Any, tmp_path: Path, messages: list[str]
+    viewer: ViewerModel, pack_doses: Any, tmp_path: Path, messages: list[str]
 ) -> None:
-    warned = pack_dataset.assign_attrs(warnings='["film 2 is too dark"]')
+    warned = pack_doses.to_dataset(attributes={"warnings": '["film 2 is too dark"]'})
     opened(viewer, write(tmp_path / "dark.shadowinv", warned))
     assert messages == ["dark.shadowinv: film 2 is too dark"]
 
 
-def test_a_spectrum_is_the_mean_of_usable_pixels(pack_dataset: Any) -> None:
+def test_a_spectrum_is_the_mean_of_usable_pixels(pack_doses: Any) -> None:
     region = np.zeros((80, 100), bool)
     region[30:50, 10:40] = True
-    region = region[: pack_dataset.sizes["y"], : pack_dataset.sizes["x"]]
+    region = region[: pack_doses.dose.shape[1], : pack_doses.dose.shape[2]]
     for inside in (None, region):
-        spectrum = packs.spectrum_in(pack_dataset, inside)
+        spectrum = packs.spectrum_in(pack_doses, inside)
         for k in range(3):
-            used = pack_dataset["usable"].values[k] & (True if inside is None else inside)
-            fluence = pack_dataset["fluence"].values[k][used].astype(float)
+            used = pack_doses.usable[k] & (True if inside is None else inside)
+            fluence = pack_doses.fluence[k][used].astype(float)
             assert spectrum.fluence[k] == pytest.approx(fluence.mean(), rel=1e-12)
-            assert spectrum.error[k] == np.median(pack_dataset["fluence_error"].values[k][used])
-    nothing = packs.spectrum_in(pack_dataset, np.zeros_like(region))
+            assert spectrum.error[k] == np.median(pack_doses.fluence_error[k][used])
+    nothing = packs.spectrum_in(pack_doses, np.zeros_like(region))
     assert np.isnan(nothing.fluence).all()
 
 
-def test_images_for_a_fit_know_setup_energy_and_usable_pixels(pack_dataset: Any) -> None:
-    lost = pack_dataset.copy(deep=True)
-    lost["usable"].values[1] = False
+def test_images_for_a_fit_know_setup_energy_and_usable_pixels(pack_doses: Any) -> None:
+    lost = deepcopy(pack_doses)
+    lost.usable[1] = False
     frame = packs.pack_frame(lost)
     layers = [Layer.create(*layer_data) for layer_data in packs.film_layers(lost, frame, "trio")]
-    first, _, last = (f"{energy:.3g} MeV" for energy in pack_dataset["energy"].values)
+    first, _, last = (f"{energy:.3g} MeV" for energy in pack_doses.energies)
     assert [layer.name for layer in layers] == [f"film 1, {first}", f"film 3, {last}"]
     for layer, k in zip(layers, (0, 2), strict=True):
-        usable = lost["usable"].values[k]
+        usable = lost.usable[k]
         setup: Any = setup_of(layer)
-        assert setup.energy == lost["energy"].values[k]
+        assert setup.energy == lost.energies[k]
         np.testing.assert_array_equal(usable_of(layer), usable)
-        np.testing.assert_array_equal(layer.data, np.where(usable, lost["fluence"].values[k], 0))
+        np.testing.assert_array_equal(layer.data, np.where(usable, lost.fluence[k], 0))
         np.testing.assert_allclose(layer.scale, 1e6 * setup.object_pixel_size)
 
 
-def test_faint_layers_with_the_dose_of_the_last_film_are_marked(pack_dataset: Any) -> None:
-    flat = pack_dataset.copy(deep=True)
-    usable = flat["usable"].values
+def test_faint_layers_with_the_dose_of_the_last_film_are_marked(pack_doses: Any) -> None:
+    flat = deepcopy(pack_doses)
+    usable = flat.usable
     for scale, is_measured in ((2.5, False), (4.0, True)):
         # Electrons leave 0.1 Gy in the last film; what protons and they leave before it.
         for k, dose in enumerate((10.0, 0.1 * scale, 0.1)):
-            flat["dose"].values[k] = np.where(usable[k], dose, np.nan)
+            flat.dose[k] = np.where(usable[k], dose, np.nan)
         assert list(packs.spectrum_in(flat).is_measured) == [True, is_measured, False]
 
 
-def test_layers_that_are_no_measurement_are_marked(pack_dataset: Any) -> None:
-    assert list(packs.spectrum_in(pack_dataset).is_measured) == [True, True, False]
-    faint = pack_dataset.copy(deep=True)
-    faint["fluence_error"].values[0] = faint["fluence"].values[0]
-    faint["usable"].values[1] = False
+def test_layers_that_are_no_measurement_are_marked(pack_doses: Any) -> None:
+    assert list(packs.spectrum_in(pack_doses).is_measured) == [True, True, False]
+    faint = deepcopy(pack_doses)
+    faint.fluence_error[0] = faint.fluence[0]
+    faint.usable[1] = False
     assert not packs.spectrum_in(faint).is_measured.any()

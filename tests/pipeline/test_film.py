@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from scipy import ndimage
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
 from napari_shadowinv.film import Pack, moved_corners, read_corners, write_corners
 from napari_shadowinv.film.scans import upright
+from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read, read_toml, write
 from napari_shadowinv.pipeline import read_pack, run_film, write_layers
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_of
@@ -30,7 +32,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
 
 
 @pytest.fixture(scope="module")
-def dataset(truth: Truth):
+def doses(truth: Truth):
     return run_film(read_pack(truth.pack))
 
 
@@ -53,19 +55,19 @@ def changed(truth: Truth, tmp_path: Path) -> Callable[..., Path]:
     return write_pack
 
 
-def laid(truth: Truth, dataset, layer: int) -> tuple[np.ndarray, np.ndarray]:
+def laid(truth: Truth, doses, layer: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions and middle of the upright film on its scan, after its shift and turn."""
     scale = truth.scene.magnifications[layer] / truth.scene.magnifications[0]
-    pose = dataset["shift"].values[layer], float(dataset["turn"][layer])
-    return upright(moved_corners(dataset["corners"].values[layer], *pose, scale))[:2]
+    pose = doses.shifts[layer], float(doses.turns[layer])
+    return upright(moved_corners(doses.corners[layer], *pose, scale))[:2]
 
 
-def on_films(truth: Truth, dataset, plane: Callable[[int], np.ndarray], layer: int) -> np.ndarray:
-    """Return the truth on a film's pixels, as the dataset's pixels lie on it."""
-    axes, middle = laid(truth, dataset, layer)
+def on_films(truth: Truth, doses, plane: Callable[[int], np.ndarray], layer: int) -> np.ndarray:
+    """Return the truth on a film's pixels, as the doses's pixels lie on it."""
+    axes, middle = laid(truth, doses, layer)
     place = truth.placements[layer]
     scale = truth.scene.magnifications[layer] / truth.scene.magnifications[0]
-    steps = np.moveaxis(np.indices((dataset.sizes["y"], dataset.sizes["x"]), dtype=float), 0, -1)
+    steps = np.moveaxis(np.indices((doses.dose.shape[1], doses.dose.shape[2]), dtype=float), 0, -1)
     steps -= (np.array(steps.shape[:2]) - 1) / 2
     on_scan = scale * steps @ axes + middle
     at = (on_scan - np.array(place.middle)) @ np.array(place.axes).T
@@ -73,45 +75,46 @@ def on_films(truth: Truth, dataset, plane: Callable[[int], np.ndarray], layer: i
     return ndimage.map_coordinates(plane(layer), np.moveaxis(at, -1, 0), order=3, mode="nearest")
 
 
-def test_places_of_a_packs_pixels_are_in_metres(dataset) -> None:
-    pixel = dataset.attrs["scan_pixel_size"]
+def test_places_of_a_packs_pixels_are_in_metres(doses) -> None:
+    pixel = doses.pixel_size
+    labelled = doses.to_dataset()
     for name in ("y", "x"):
-        assert dataset[name].attrs["units"] == "m"
-        np.testing.assert_allclose(dataset[name], pixel * np.arange(dataset.sizes[name]))
+        assert labelled[name].attrs["units"] == "m"
+        np.testing.assert_allclose(labelled[name], pixel * np.arange(labelled.sizes[name]))
 
 
-def test_doses_equal_the_exposure_of_the_films(truth: Truth, dataset) -> None:
+def test_doses_equal_the_exposure_of_the_films(truth: Truth, doses) -> None:
     scales = truth.scene.magnifications / truth.scene.magnifications[0]
     for layer in range(COUNT):
-        usable = dataset["usable"].values[layer]
+        usable = doses.usable[layer]
         assert usable[20:-20, 20:-20].mean() > 0.85
         # As on the first film: behind it the same protons cover more.
-        dose = dataset["dose"].values[layer] / scales[layer] ** 2
-        error = dataset["dose_error"].values[layer] / dataset["dose"].values[layer]
-        ratio = (dose / on_films(truth, dataset, truth.dose, layer))[usable]
+        dose = doses.dose[layer] / scales[layer] ** 2
+        error = doses.dose_error[layer] / doses.dose[layer]
+        ratio = (dose / on_films(truth, doses, truth.dose, layer))[usable]
         assert ratio.mean() == pytest.approx(1, abs=0.005)
         assert (ratio - 1).std() == pytest.approx(np.sqrt((error[usable] ** 2).mean()), rel=0.3)
 
 
-def test_fluences_equal_the_beam(truth: Truth, dataset) -> None:
+def test_fluences_equal_the_beam(truth: Truth, doses) -> None:
     scene = truth.scene
     scales = scene.magnifications / scene.magnifications[0]
     for layer in range(COUNT - 1):
-        usable = dataset["usable"].values[layer]
-        true = on_films(truth, dataset, scene.fluence, layer) * scales[layer] ** 2
-        away = dataset["fluence"].values[layer] - true
+        usable = doses.usable[layer]
+        true = on_films(truth, doses, scene.fluence, layer) * scales[layer] ** 2
+        away = doses.fluence[layer] - true
         assert abs(away[usable].mean()) < 0.02 * true.mean()
-        error = dataset["fluence_error"].values[layer]
+        error = doses.fluence_error[layer]
         assert (away / error)[usable].std() == pytest.approx(1, abs=0.35)
-    np.testing.assert_allclose(dataset["peak"], scene.energies, rtol=1e-3)
-    assert (dataset["energy_low"] < dataset["peak"]).all()
-    assert (dataset["peak"] <= dataset["energy_high"]).all()
+    np.testing.assert_allclose(doses.bands[:, 0], scene.energies, rtol=1e-3)
+    assert (doses.bands[:, 1] < doses.bands[:, 0]).all()
+    assert (doses.bands[:, 0] <= doses.bands[:, 2]).all()
 
 
-def test_films_lie_on_each_other(truth: Truth, dataset) -> None:
+def test_films_lie_on_each_other(truth: Truth, doses) -> None:
     places = []
     for layer, place in enumerate(truth.placements):
-        axes, middle = laid(truth, dataset, layer)
+        axes, middle = laid(truth, doses, layer)
         away = np.array(place.axes) @ (middle - np.array(place.middle)) + np.array(place.slip)
         places.append(away)
         turned = np.arctan2(axes[0, 1], axes[0, 0]) - np.arctan2(*place.axes[0][::-1])
@@ -120,58 +123,59 @@ def test_films_lie_on_each_other(truth: Truth, dataset) -> None:
     # The edges alone leave them where the pack left them.
     slips = np.array([place.slip for place in truth.placements])
     assert np.abs(slips - slips.mean(axis=0)).max() > 1.5
-    assert dataset["by_images"].values.all()
-    assert "fields shift that content too" in dataset.attrs["warnings"]
+    assert doses.by_images.all()
+    assert "fields shift that content too" in doses.headline.text
 
 
-def test_the_setups_know_energy_depth_and_pixel(truth: Truth, dataset, tmp_path: Path) -> None:
-    table = write_layers(dataset, tmp_path / "layers")[-1]
+def test_the_setups_know_energy_depth_and_pixel(truth: Truth, doses, tmp_path: Path) -> None:
+    table = write_layers(doses, tmp_path / "layers")[-1]
     rows = rows_of(table, ShotRow)
     assert [row.file.name for row in rows] == [f"layer_{k:02d}.tif" for k in range(1, COUNT + 1)]
     for layer, row in enumerate(rows):
         setup = read_toml(row.setup)
-        assert setup["energy"] == pytest.approx(dataset["energy"].values[layer])
+        assert setup["energy"] == pytest.approx(doses.energies[layer])
         assert setup["pixel_size"] == pytest.approx(truth.scene.pixel_size, rel=1e-3)
         assert setup["object_image_distance"] == pytest.approx(truth.scene.distances[layer])
-        used = dataset["usable"].values[layer]
+        used = doses.usable[layer]
         np.testing.assert_array_equal(read(row.mask).image > 0, used)
         image = read(row.file).image
-        np.testing.assert_allclose(image[used], dataset["fluence"].values[layer][used], rtol=1e-6)
-    first, last = dataset["time_of_flight"].values[[0, -1]]
+        np.testing.assert_allclose(image[used], doses.fluence[layer][used], rtol=1e-6)
+    first, last = doses.times_of_flight[:: COUNT - 1]
     assert 0.4e-9 < first < 0.42e-9
     assert last < first
 
 
-def test_layers_in_pradformat_hold_their_setups(truth: Truth, dataset, tmp_path: Path) -> None:
-    table = write_layers(dataset, tmp_path / "layers", form="pradformat")[-1]
+def test_layers_in_pradformat_hold_their_setups(truth: Truth, doses, tmp_path: Path) -> None:
+    table = write_layers(doses, tmp_path / "layers", form="pradformat")[-1]
     for layer, row in enumerate(rows_of(table, ShotRow)):
         layer_image = read(row.file)
-        used = dataset["usable"].values[layer]
-        np.testing.assert_array_equal(
-            layer_image.image[used], dataset["fluence"].values[layer][used]
-        )
-        assert layer_image.setup.energy == pytest.approx(dataset["energy"].values[layer])
+        used = doses.usable[layer]
+        np.testing.assert_array_equal(layer_image.image[used], doses.fluence[layer][used])
+        assert layer_image.setup.energy == pytest.approx(doses.energies[layer])
         assert layer_image.setup.object_pixel_size == pytest.approx(
             truth.scene.pixel_size, rel=1e-3
         )
         assert row.setup is None
-    bare = dataset.copy()
-    del bare.attrs["setups"]
+    bare = replace(doses, setups=())
     with pytest.raises(InputError, match="pradformat needs a setup"):
         write_layers(bare, tmp_path / "other", form="pradformat")
 
 
-def test_it_is_written_and_read(dataset, tmp_path: Path) -> None:
-    path = write(tmp_path / "pack.shadowinv", dataset)
-    again = read(path)
-    assert again.attrs == dataset.attrs
-    for name in dataset.variables:
-        np.testing.assert_array_equal(again[name], dataset[name])
+def test_it_is_written_and_read(doses, tmp_path: Path) -> None:
+    path = write(tmp_path / "pack.shadowinv", doses)
+    labelled, again = doses.to_dataset(), read(path)
+    assert again.attrs == labelled.attrs
+    for name in labelled.variables:
+        np.testing.assert_array_equal(again[name], labelled[name])
+    rebuilt = FilmDoses.from_dataset(again)
+    assert rebuilt.facts == doses.facts
+    assert rebuilt.headline == doses.headline
+    assert (rebuilt.pack, rebuilt.setups) == (doses.pack, doses.setups)
     with pytest.raises(FileFormatError, match=r"pack.h5.*expected"):
-        write(tmp_path / "pack.h5", dataset)
+        write(tmp_path / "pack.h5", doses)
 
 
-def test_one_scan_of_all_films(truth: Truth, dataset, changed) -> None:
+def test_one_scan_of_all_films(truth: Truth, doses, changed) -> None:
     scans = [tifffile.imread(file) for file in truth.files]
     rows = [np.concatenate(scans[k : k + 2], axis=1) for k in (0, 2)]
     pack = changed(
@@ -183,7 +187,7 @@ def test_one_scan_of_all_films(truth: Truth, dataset, changed) -> None:
     tifffile.imwrite(joint_scan, np.concatenate(rows), photometric="rgb", **dots)
     result = run_film(read_pack(pack))
     inner = np.s_[:, 20:-20, 20:-20]
-    from_joint, separate = result["dose"].values[inner], dataset["dose"].values[inner]
+    from_joint, separate = result.dose[inner], doses.dose[inner]
     assert np.median(np.abs(from_joint / separate - 1)) < 0.01
     missing = pack.read_text().replace("[[layers]]", '[[layers]]\nfilm = "HDV2"\n\n[[layers]]', 1)
     pack.write_text(missing)
@@ -191,21 +195,21 @@ def test_one_scan_of_all_films(truth: Truth, dataset, changed) -> None:
         run_film(read_pack(pack))
 
 
-def test_a_lost_film_is_bridged(truth: Truth, dataset, changed) -> None:
+def test_a_lost_film_is_bridged(truth: Truth, doses, changed) -> None:
     pack = read_pack(changed(('file = "film_02.tif"', "exclude = true")))
     result = run_film(pack)
-    assert not result["usable"].values[1].any()
-    assert np.isnan(result["dose"].values[1]).all()
-    with_film, bridged = dataset["fluence"].values[1], result["fluence"].values[1]
+    assert not result.usable[1].any()
+    assert np.isnan(result.dose[1]).all()
+    with_film, bridged = doses.fluence[1], result.fluence[1]
     if len(with_film) == len(bridged) + 1:  # films behind the first are smaller on it
         with_film = (with_film[1:] + with_film[:-1]) / 2
     inner = np.s_[30:-30, 30:-30]
     assert abs(np.median(bridged[inner] / with_film[inner]) - 1) < 0.15
-    assert np.isnan(result["corners"].values[1]).all()
+    assert np.isnan(result.corners[1]).all()
 
 
 @pytest.mark.parametrize("way", [np.s_[::-1, ::-1], np.s_[:, ::-1]])
-def test_films_laid_another_way_round(truth: Truth, dataset, changed, way) -> None:
+def test_films_laid_another_way_round(truth: Truth, doses, changed, way) -> None:
     pack = changed()
     scan = tifffile.imread(truth.files[1])[way]
     (pack.parent / "film_02.tif").unlink()
@@ -216,30 +220,30 @@ def test_films_laid_another_way_round(truth: Truth, dataset, changed, way) -> No
         run_film(read_pack(pack))
     right = changed(('file = "film_02.tif"', f'file = "film_02.tif"\n{entry}'))
     result = run_film(read_pack(right))
-    np.testing.assert_allclose(result["dose"], dataset["dose"], rtol=1e-3)
+    np.testing.assert_allclose(result.dose, doses.dose, rtol=1e-3)
     # Corners are those on the scan as it is.
     height, width = scan.shape[:2]
     sizes = np.array([height, width]) - 1
     flips = np.array([way[0].step == -1, True])
-    on_scan = np.where(flips, sizes - result["corners"].values[1], result["corners"].values[1])
-    want = dataset["corners"].values[1]
+    on_scan = np.where(flips, sizes - result.corners[1], result.corners[1])
+    want = doses.corners[1]
     gap = np.linalg.norm(on_scan[:, None] - want[None], axis=-1).min(axis=1)
     assert gap.max() < 0.1
 
 
-def test_corners_lie_on_the_films_of_the_scans(truth: Truth, dataset) -> None:
-    assert np.abs(dataset["shift"].values).max() > 0.5
-    np.testing.assert_allclose(dataset["corners"], truth.corners, atol=0.1)
+def test_corners_lie_on_the_films_of_the_scans(truth: Truth, doses) -> None:
+    assert np.abs(doses.shifts).max() > 0.5
+    np.testing.assert_allclose(doses.corners, truth.corners, atol=0.1)
 
 
-def test_corners_given_again_change_nothing(truth: Truth, dataset, changed, tmp_path: Path) -> None:
-    again = dict(zip("1234", dataset["corners"].values, strict=True))
+def test_corners_given_again_change_nothing(truth: Truth, doses, changed, tmp_path: Path) -> None:
+    again = dict(zip("1234", doses.corners, strict=True))
     write_corners(tmp_path / "corners.csv", again)
     result = run_film(read_pack(changed(first='corners = "corners.csv"')))
     # Shifts are found again, and so are the warnings that they bring.
-    np.testing.assert_allclose(result["shift"], dataset["shift"], atol=0.05)
-    assert "fields shift that content too" in result.attrs["warnings"]
-    assert len(result.attrs["warnings"]) == len(dataset.attrs["warnings"])
+    np.testing.assert_allclose(result.shifts, doses.shifts, atol=0.05)
+    assert "fields shift that content too" in result.headline.text
+    assert len(result.cautions) == len(doses.cautions)
 
 
 def test_a_corner_inside_the_film_is_refused(truth: Truth, changed, tmp_path: Path) -> None:
@@ -250,7 +254,7 @@ def test_a_corner_inside_the_film_is_refused(truth: Truth, changed, tmp_path: Pa
         run_film(read_pack(changed(first='corners = "corners.csv"')))
 
 
-def test_films_seen_from_the_detector_are_mirrored(truth: Truth, dataset, changed) -> None:
+def test_films_seen_from_the_detector_are_mirrored(truth: Truth, doses, changed) -> None:
     pack = changed(('seen_from = "source"', 'seen_from = "detector"'))
     for file in truth.files:
         (pack.parent / file.name).unlink()
@@ -258,29 +262,29 @@ def test_films_seen_from_the_detector_are_mirrored(truth: Truth, dataset, change
         dots = {"resolution": (300, 300), "resolutionunit": "INCH"}
         tifffile.imwrite(pack.parent / file.name, scan, photometric="rgb", **dots)
     result = run_film(read_pack(pack))
-    np.testing.assert_allclose(result["dose"], dataset["dose"], rtol=1e-3)
-    assert "from the detector, mirrored" in result.attrs["seen_from"]
+    np.testing.assert_allclose(result.dose, doses.dose, rtol=1e-3)
+    assert "from the detector, mirrored" in result.pack.seen_from_text
     # Corners are those on the scans as they are.
     width = scan.shape[1]
-    expected = dataset["corners"].values[:, [1, 0, 3, 2]] * [1, -1] + [0, width - 1]
-    np.testing.assert_allclose(result["corners"], expected, atol=0.1)
+    expected = doses.corners[:, [1, 0, 3, 2]] * [1, -1] + [0, width - 1]
+    np.testing.assert_allclose(result.corners, expected, atol=0.1)
 
 
 def test_the_side_of_the_films_is_asked_for(truth: Truth, changed) -> None:
     result = run_film(read_pack(changed(('seen_from = "source"\n', ""))))
-    assert "B has the wrong sign; give seen_from" in result.attrs["warnings"]
-    assert result.attrs["seen_from"] == "the source (assumed)"
+    assert "B has the wrong sign; give seen_from" in result.headline.text
+    assert result.pack.seen_from_text == "the source (assumed)"
 
 
-def test_corners_from_a_table(truth: Truth, dataset, changed, tmp_path: Path) -> None:
+def test_corners_from_a_table(truth: Truth, doses, changed, tmp_path: Path) -> None:
     write_corners(
         tmp_path / "corners.csv",
         {str(k + 1): film_corners for k, film_corners in enumerate(truth.corners)},
     )
     pack = read_pack(changed(first='corners = "corners.csv"\nalign = "edges"'))
     result = run_film(pack)
-    np.testing.assert_allclose(result["corners"], truth.corners, atol=0.01)
-    assert not result["by_images"].values.any()
+    np.testing.assert_allclose(result.corners, truth.corners, atol=0.01)
+    assert not result.by_images.any()
     write_corners(tmp_path / "corners.csv", {"7": truth.corners[0]})
     with pytest.raises(InputError, match="corners of a film '7': expected numbers of layers"):
         run_film(pack)
@@ -301,11 +305,11 @@ def write_fiducials(path: Path, truth: Truth, films: range, *, mirrored: int = -
                 rows.writerow([layer + 1, name, f"{y:.3f}", f"{x:.3f}"])
 
 
-def places_of(truth: Truth, dataset) -> np.ndarray:
+def places_of(truth: Truth, doses) -> np.ndarray:
     """Where the middles of the upright films are in the pack, px, and how they are turned."""
     places = []
-    for layer, place in enumerate(truth.placements[: dataset.sizes["layer"]]):
-        axes, middle = laid(truth, dataset, layer)
+    for layer, place in enumerate(truth.placements[: doses.dose.shape[0]]):
+        axes, middle = laid(truth, doses, layer)
         away = np.array(place.axes) @ (middle - np.array(place.middle)) + np.array(place.slip)
         turn = np.arctan2(axes[0, 1], axes[0, 0]) - np.arctan2(*place.axes[0][::-1])
         places.append([*away, turn])
@@ -317,10 +321,10 @@ def test_films_are_laid_on_each_other_by_fiducials(truth: Truth, changed, tmp_pa
     result = run_film(read_pack(changed(first='fiducials = "fiducials.csv"')))
     places = places_of(truth, result)
     assert (np.abs(places - places.mean(axis=0)) < [0.05, 0.05, 5e-4]).all()
-    assert (result["shift_error"].values < 0.5).all()
+    assert (result.shift_errors < 0.5).all()
     # They distinguish the displacement by fields from films that slipped.
-    assert not result["by_images"].values.any()
-    assert result.attrs["warnings"] == "[]"
+    assert not result.by_images.any()
+    assert not result.cautions
 
 
 def test_deeper_films_are_magnified_about_the_axis(truth: Truth, changed, tmp_path: Path) -> None:
@@ -329,18 +333,18 @@ def test_deeper_films_are_magnified_about_the_axis(truth: Truth, changed, tmp_pa
     marks = 'fiducials = "fiducials.csv"'
     about_middle = run_film(read_pack(changed(first=marks)))
     scale = (truth.scene.magnifications / truth.scene.magnifications[0])[-1]
-    _, _, size = upright(about_middle["corners"].values[0])
+    _, _, size = upright(about_middle.corners[0])
     # So that the last film is shifted by whole px: a point p about the middle is there at p - s.
     shift = np.array([2, -3])
     axis = (size - 1) / 2 + shift / (1 / scale - 1)
     about_axis = run_film(read_pack(changed(first=f"{marks}\naxis = {axis.tolist()}")))
-    first, last = (about_axis["dose"].values[k] for k in (0, -1))
+    first, last = (about_axis.dose[k] for k in (0, -1))
     inner = np.s_[20:-20, 20:-20]
-    np.testing.assert_allclose(first[inner], about_middle["dose"].values[0][inner], rtol=1e-5)
-    expected = np.roll(about_middle["dose"].values[-1], -shift, axis=(0, 1))
+    np.testing.assert_allclose(first[inner], about_middle.dose[0][inner], rtol=1e-5)
+    expected = np.roll(about_middle.dose[-1], -shift, axis=(0, 1))
     np.testing.assert_allclose(last[inner], expected[inner], rtol=1e-5)
     # Corners do not depend on the centre of magnification: they can be given again.
-    np.testing.assert_allclose(about_axis["corners"], about_middle["corners"], atol=1e-9)
+    np.testing.assert_allclose(about_axis.corners, about_middle.corners, atol=1e-9)
     with pytest.raises(ValueError, match="axis is given and no setup"):
         Pack.model_validate({"layers": [{"film": "HDV2"}], "axis": [1, 2]})
 
@@ -351,23 +355,22 @@ def test_films_without_fiducials_are_reported(truth: Truth, changed, tmp_path: P
     places = places_of(truth, result)[:-1]
     assert np.ptp(places[:, :2], axis=0).max() < 0.1
     assert (
-        f"films {COUNT} have no fiducials and were aligned by their edges"
-        in result.attrs["warnings"]
+        f"films {COUNT} have no fiducials and were aligned by their edges" in result.headline.text
     )
-    np.testing.assert_array_equal(result["shift"][-1], 0)
+    np.testing.assert_array_equal(result.shifts[-1], 0)
 
 
 def test_fiducials_of_a_film_on_its_face(truth: Truth, changed, tmp_path: Path) -> None:
     table, first = tmp_path / "fiducials.csv", 'fiducials = "fiducials.csv"'
     write_fiducials(table, truth, range(COUNT))
-    before = run_film(read_pack(changed(first=first)))["corners"].values[1]
+    before = run_film(read_pack(changed(first=first))).corners[1]
     scan = tifffile.imread(truth.files[1])
     (tmp_path / "film_02.tif").unlink()
     tifffile.imwrite(tmp_path / "film_02.tif", scan[:, ::-1], photometric="rgb")
     write_fiducials(table, truth, range(COUNT), mirrored=1)
     said = ('file = "film_02.tif"', 'file = "film_02.tif"\nmirrored = true')
     pack = read_pack(changed(said, first=f"{first}\npixel_size = 84.667e-6"))
-    mirrored = run_film(pack)["corners"].values[1]
+    mirrored = run_film(pack).corners[1]
     as_before = mirrored[[1, 0, 3, 2]] * [1, -1] + [0, scan.shape[1] - 1]
     np.testing.assert_allclose(as_before, before, atol=0.1)
 
@@ -390,7 +393,7 @@ def test_wrong_fiducials_are_refused(
         run_film(read_pack(changed(first='fiducials = "fiducials.csv"')))
 
 
-def test_layers_from_a_table(truth: Truth, dataset, changed) -> None:
+def test_layers_from_a_table(truth: Truth, doses, changed) -> None:
     entries = read_toml(truth.pack)
     pack = changed()
     with (pack.parent / "layers.csv").open("w", newline="") as file:
@@ -446,9 +449,9 @@ def test_wrong_scans_are_refused(truth: Truth, changed, spoil, message: str) -> 
 def test_film_that_is_too_dark_is_reported(truth: Truth, changed) -> None:
     table = 'calibration = "HDV2.csv"\ndose_range = [0.0, 300.0]'
     result = run_film(read_pack(changed(('calibration = "HDV2.csv"', table))))
-    assert "of the pixels are darker than the calibration covers" in result.attrs["warnings"]
-    inside = result["usable"].values[0]
-    assert result["dose"].values[0][inside].max() <= 301
+    assert "of the pixels are darker than the calibration covers" in result.headline.text
+    inside = result.usable[0]
+    assert result.dose[0][inside].max() <= 301
 
 
 @pytest.mark.parametrize(
@@ -482,6 +485,6 @@ def test_real_films_are_not_moved_by_lines_of_equal_dose(shared_data: Path) -> N
     ]
     result = run_film(Pack.model_validate({"layers": layers, "films": {"EBT3": film}}))
     # Edges and the slit that is cut into all of them agree within 2 px.
-    assert np.ptp(result["shift"].values, axis=0).max() < 2
-    assert np.ptp(result["turn"].values) < np.deg2rad(0.3)
-    assert (result["shift_error"].values > 2).all()
+    assert np.ptp(result.shifts, axis=0).max() < 2
+    assert np.ptp(result.turns) < np.deg2rad(0.3)
+    assert (result.shift_errors > 2).all()

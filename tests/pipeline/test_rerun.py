@@ -14,6 +14,7 @@ import tifffile
 
 from napari_shadowinv import FitOptions, InputError, InversionOptions, ProtonSetup, rerun, run_stack
 from napari_shadowinv.errors import FileFormatError, InversionCancelled
+from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read_dataset, write
 from napari_shadowinv.io.store import read_stack
 from napari_shadowinv.options import FitChoices
@@ -117,13 +118,13 @@ def leave_one_out(folder: Path) -> Example:
 
 def film_pack(folder: Path) -> Example:
     truth = simulate(folder, layers=3, shape=(60, 80), seed=2, b_peak=2.0, e_peak=0.0, strata=4)
-    dataset = run_film(read_pack(truth.pack))
-    return Example(write(Path("pack.shadowinv"), dataset), folder / "film_02.tif")
+    doses = run_film(read_pack(truth.pack))
+    return Example(write(Path("pack.shadowinv"), doses), folder / "film_02.tif")
 
 
 def energy_windows(folder: Path) -> Example:
-    pack = film_pack(folder)
-    table = write_layers(pack.dataset, folder)[-1]
+    doses = FilmDoses.from_dataset(film_pack(folder).dataset)
+    table = write_layers(doses, folder)[-1]
     steps = (Crop(y=(14, 46), x=(20, 60)),)
     recipe = Recipe(steps=steps, fit=FitChoices(options=PLAIN))
     shots = read_rows(shot_rows([table], {}, {}), recipe)

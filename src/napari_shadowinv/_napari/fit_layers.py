@@ -12,7 +12,6 @@ from napari_shadowinv._napari.frame import Frame
 from napari_shadowinv._napari.kinds import KINDS, layer_name
 from napari_shadowinv._napari.layer_metadata import KEY, Result, metadata_for, role_of
 from napari_shadowinv._napari.layers import FullLayerData, dataset_layers, symmetric_limits
-from napari_shadowinv._napari.notifications import window_text
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting import FIELDS
 from napari_shadowinv.physics.units import intensity_limits
@@ -28,13 +27,13 @@ _MAX_BEAM_DIFFERENCE = 1e-6  # relative to the mean
 
 
 def fit_layers(
-    result: Result, frame: Frame, name: str, *, alone: bool = False
+    result: Result[Fit], frame: Frame, name: str, *, alone: bool = False
 ) -> list[FullLayerData]:
     """Describe the layers of a fit, the lowest first; the first of several fields is visible.
 
     With `alone`, as for a file, they include the images and all alternative solutions.
     """
-    fit = _fit_of(result)
+    fit = result.content
     facts = _facts(result, fit, name)
     layers = _image_layers(fit, frame, name, facts, with_images=alone)
     if alone:
@@ -52,7 +51,7 @@ def fit_layers(
         if field.uncertainty is not None:
             variables["displacement_uncertainty"] = ("component", "y", "x"), field.uncertainty
         title = f"{_field_title(name, fit, field)}{verdict_suffix(fit)}"
-        layer_data = _field_layers(variables, field, setup_of_fit(fit), frame, title, facts)
+        layer_data = _field_layers(variables, field, fit.setup, frame, title, facts)
         if number:
             _set_part(layer_data, field.name)
         for _, keywords, _ in layer_data:
@@ -61,9 +60,11 @@ def fit_layers(
     return layers
 
 
-def alternative_layers(result: Result, number: int, frame: Frame, name: str) -> list[FullLayerData]:
+def alternative_layers(
+    result: Result[Fit], number: int, frame: Frame, name: str
+) -> list[FullLayerData]:
     """Describe the fields of an alternative solution, the fit's basin `number`."""
-    fit = _fit_of(result)
+    fit = result.content
     basin = fit.basins[number]
     layers: list[FullLayerData] = []
     for m, field in reversed(list(enumerate(fit.fields))):
@@ -71,7 +72,7 @@ def alternative_layers(result: Result, number: int, frame: Frame, name: str) -> 
         layer_data = _field_layers(
             {"displacement": (("component", "y", "x"), displacement)},
             field,
-            setup_of_fit(fit),
+            fit.setup,
             frame,
             _field_title(f"{name} {start_name(basin)}", fit, field),
             _facts(result, fit, name),
@@ -95,24 +96,7 @@ def verdict_suffix(fit: Fit) -> str:
     return "" if fit.verdict is Verdict.DETERMINED else f" ({fit.verdict.value})"
 
 
-def verdict_sentence(fit: Fit) -> str:
-    """Return the verdict and its reason as a sentence."""
-    return f"the fit's verdict is '{fit.verdict.value}': {window_text(fit.explanation)}"
-
-
-def setup_of_fit(fit: Fit) -> Setup | None:
-    """Return the setup of the fields, which is the first image's."""
-    return fit.setups[0] if fit.setups else None
-
-
-def _fit_of(result: Result) -> Fit:
-    from napari_shadowinv.fitting import Fit
-
-    assert isinstance(result.content, Fit)
-    return result.content
-
-
-def _facts(result: Result, fit: Fit, name: str) -> dict[str, Any]:
+def _facts(result: Result[Fit], fit: Fit, name: str) -> dict[str, Any]:
     """Collect the metadata that all layers of a fit share."""
     return {
         "result": result,
@@ -153,7 +137,7 @@ def _image_layers(
     fit: Fit, frame: Frame, name: str, facts: dict[str, Any], *, with_images: bool
 ) -> list[FullLayerData]:
     """Describe hidden layers of the re-projections, the residuals and a non-uniform beam."""
-    setup = setup_of_fit(fit)
+    setup = fit.setup
     grey = intensity_limits(fit.images[0])
     means = [image[use].mean() for image, use in zip(fit.images, fit.mask, strict=True)]
     percent = np.where(fit.mask, 100 * fit.residual / np.array(means)[:, None, None], np.nan)

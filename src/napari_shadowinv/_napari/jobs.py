@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from napari_shadowinv._napari.fit_layers import fit_layers, setup_of_fit
+from napari_shadowinv._napari.fit_layers import fit_layers
 from napari_shadowinv._napari.frame import Frame, frame_of
 from napari_shadowinv._napari.layer_metadata import (
     KEY,
@@ -185,7 +185,7 @@ class Finished:
     layer_data: list[FullLayerData]
 
     @property
-    def result(self) -> Result:
+    def result(self) -> Result[Any]:
         """The result behind the layers."""
         result = result_of(self.layer_data[0][1])
         assert result is not None
@@ -321,7 +321,7 @@ class FitJob(ImageJob):
 
     def layers(self, content: Fit) -> list[FullLayerData]:
         """Describe the layers of the fit."""
-        result = Result(content, setup_of_fit(content), dict(self.attributes))
+        result = Result(content, content.setup, dict(self.attributes))
         return fit_layers(result, self.frame, self.name)
 
     def compute(
@@ -377,7 +377,7 @@ def refinement(layer: Any, image: Any, name: str, psf: float) -> Refinement:
     """
     result = result_of(layer)
     if result is None or not isinstance(result.content, Inversion):
-        kind = "a fit" if result is not None and isinstance(result.content, Fit) else "no inversion"
+        kind = "no result" if result is None else f"a {result.content.kind.noun}"
         raise InputError(
             f"layer '{layer.name}' shows {kind}: select a layer of an inversion's result, such as "
             "the field"

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
-    import xarray
-
-    from napari_shadowinv.fitting import Fit
-    from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.io.results import AnyResult
     from napari_shadowinv.physics.setup import Setup
 
 KEY = "napari-shadowinv"
@@ -27,11 +24,14 @@ CAME_WITH = "came with"
 """Start of the origin of a setup from a file or sample; other setups are the user's."""
 
 
+Content = TypeVar("Content", bound="AnyResult", covariant=True)
+
+
 @dataclass(frozen=True, eq=False)
-class Result:
+class Result(Generic[Content]):
     """The complete result that its layers show, with everything needed to save it."""
 
-    content: Inversion | Fit | xarray.Dataset  # a dataset if a file contains only a field
+    content: Content
     setup: Setup | None = None
     attributes: Mapping[str, str] = field(default_factory=dict)  # its origins, in words
 
@@ -105,7 +105,7 @@ def may_be_mask(layer: Any) -> bool:
     return role_of(layer) in (None, MASK)
 
 
-def result_of(layer: Any) -> Result | None:
+def result_of(layer: Any) -> Result[AnyResult] | None:
     """Return the result that a layer belongs to, or None."""
     result = metadata_of(layer).get("result")
     return result if isinstance(result, Result) else None

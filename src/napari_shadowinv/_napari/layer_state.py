@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._napari.fit_layers import fit_layers, verdict_sentence
+from napari_shadowinv._napari.fit_layers import fit_layers
 from napari_shadowinv._napari.frame import Frame, frame_for, frame_of, matrix_of
 from napari_shadowinv._napari.kinds import main_layers
 from napari_shadowinv._napari.layer_metadata import (
@@ -21,17 +22,17 @@ from napari_shadowinv._napari.layer_metadata import (
     metadata_of,
     role_of,
 )
-from napari_shadowinv._napari.layers import FullLayerData, result_layers
-from napari_shadowinv._napari.packs import pack_frame, pack_layers, pack_result, warnings_of_pack
-from napari_shadowinv.cautions import Caution
+from napari_shadowinv._napari.layers import FullLayerData, field_layers, result_layers
+from napari_shadowinv._napari.packs import pack_layers
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.variables import is_fit, is_pack, setup_from_dataset
+from napari_shadowinv.facts import ResultKind
+from napari_shadowinv.inversion.variables import setup_from_dataset
+from napari_shadowinv.io.results import result_from_dataset
 
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.fitting import Fit
-    from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.io.results import AnyResult
 
 _LOOKS, _NAME = "napari_layers", "napari_name"
 
@@ -39,6 +40,7 @@ _LOOKS, _NAME = "napari_layers", "napari_name"
 _COMPUTED_ATTRIBUTES = {_LOOKS, _NAME, "format", "options", "report", "image_residual", "errors_si"}
 _COMPUTED_ATTRIBUTES |= {"setup", "provenance", "package_version", "created"}
 _COMPUTED_ATTRIBUTES |= {"verdict", "explanation", "folded", "fields", "setups"}
+_COMPUTED_ATTRIBUTES |= {"warnings", "seen_from", "scan_pixel_size"}
 
 _PLACEMENT = ("scale", "translate", "units")
 _TRANSFORM = ("rotate", "shear", "affine")
@@ -53,34 +55,33 @@ _COMMON_KEYWORDS = ("name", "visible", "opacity", "blending", *_PLACEMENT, *_TRA
 
 
 def layers_of_result(
-    result: Result, frame: Frame, name: str = "", *, cells: bool = False
+    result: Result[AnyResult], frame: Frame, name: str = "", *, cells: bool = False
 ) -> list[FullLayerData]:
-    """Describe the layers of any result, the lowest first."""
-    from napari_shadowinv.fitting import Fit
-
-    if isinstance(result.content, Fit):
-        return fit_layers(result, frame, name, alone=True)
-    if _is_pack(result):
-        return pack_layers(result, frame, name)
-    return result_layers(result, frame, name, cells=cells)
+    """Describe the layers of any result, the lowest first; with `cells`, also its power cells."""
+    functions: dict[ResultKind, Callable[..., list[FullLayerData]]] = {
+        ResultKind.INVERSION: partial(result_layers, cells=cells),
+        ResultKind.FIT: partial(fit_layers, alone=True),
+        ResultKind.FILM_DOSES: pack_layers,
+        ResultKind.FIELD: field_layers,
+    }
+    return functions[result.content.kind](result, frame, name)
 
 
 def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]:
     """Describe the saved layers of a result, the main layers, and its image."""
     name = dataset.attrs.get(_NAME, name)
     looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
-    if is_pack(dataset.attrs):
-        layers = pack_layers(pack_result(dataset), pack_frame(dataset), name)
-        return _with_looks(layers, looks)
-    setup = setup_from_dataset(dataset)
+    content = result_from_dataset(dataset)
+    setup = setup_from_dataset(dataset) or content.setup
     result = Result(
-        _content(dataset),
+        content,
         setup,
         {key: value for key, value in dataset.attrs.items() if key not in _COMPUTED_ATTRIBUTES},
     )
     placement = next(iter(looks.values()), {})
     shape = dataset.sizes["y"], dataset.sizes["x"]
-    frame = frame_for(shape, setup, **{key: placement.get(key) for key in _PLACEMENT})
+    places = {key: placement.get(key) for key in _PLACEMENT}
+    frame = frame_for(shape, setup, **places, pixel_size=dataset.attrs.get("scan_pixel_size"))
     if all(name in placement for name in _TRANSFORM):  # not in files of older versions
         frame = replace(
             frame,
@@ -133,7 +134,7 @@ def missing_layers(viewer: Any, layer: Any) -> list[FullLayerData]:
     return missing
 
 
-def _shown_inputs(viewer: Any, result: Result | None) -> set[str]:
+def _shown_inputs(viewer: Any, result: Result[AnyResult] | None) -> set[str]:
     """Return roles that a viewer shows as the shot and its source, unchanged by any step."""
     content = None if result is None else result.content
     recipe = getattr(getattr(content, "provenance", None), "recipe", None)
@@ -153,54 +154,22 @@ def _shown_inputs(viewer: Any, result: Result | None) -> set[str]:
     }
 
 
-def warnings_for(result: Result) -> tuple[Caution, ...]:
-    """Return the reasons to doubt a result."""
-    from napari_shadowinv.fitting import Fit
-    from napari_shadowinv.inversion import Inversion
-
-    content = result.content
-    if _is_pack(result):
-        return warnings_of_pack(content)  # type: ignore[arg-type]
-    if isinstance(content, Inversion):
-        return content.report.warnings
-    if isinstance(content, Fit) and content.verdict_caution:
-        return (replace(content.verdict_caution, text=verdict_sentence(content)),)
-    return ()
-
-
-def dataset_of_layers(layers: Sequence[FullLayerData], result: Result) -> xarray.Dataset:
+def dataset_of_layers(layers: Sequence[FullLayerData], result: Result[AnyResult]) -> xarray.Dataset:
     """Return the dataset of a result with its layers' appearance and painted caustics."""
-    import xarray as xr
-
-    from napari_shadowinv.fitting import Fit
+    from napari_shadowinv.inversion import Inversion
 
     content = result.content
     looks = {layer_key(keywords): _look(keywords, kind) for _, keywords, kind in layers}
     name = next((metadata_of(keywords).get("name") for _, keywords, _ in layers), None)
-    attributes = {_LOOKS: json.dumps(looks), **({} if name is None else {_NAME: name})}
-    if isinstance(content, xr.Dataset):
-        return content.assign_attrs(attributes)
-    attributes = {**result.attributes, **attributes}
-    if isinstance(content, Fit):
+    attributes = {**result.attributes, _LOOKS: json.dumps(looks)}
+    if name is not None:
+        attributes[_NAME] = name
+    if not isinstance(content, Inversion):
         return content.to_dataset(attributes=attributes)
     for data, keywords, _ in layers:
         if role_of(keywords) == "caustic":
             content = replace(content, caustic=np.asarray(data) > 0)
     return content.to_dataset(result.setup, attributes=attributes)
-
-
-def _is_pack(result: Result) -> bool:
-    return is_pack(getattr(result.content, "attrs", {}))
-
-
-def _content(dataset: xarray.Dataset) -> Inversion | Fit | xarray.Dataset:
-    """Return the result in a dataset, or the dataset if it contains only a field."""
-    from napari_shadowinv.fitting import Fit
-    from napari_shadowinv.inversion import Inversion
-
-    if is_fit(dataset.attrs):
-        return Fit.from_dataset(dataset)
-    return Inversion.from_dataset(dataset) if "report" in dataset.attrs else dataset
 
 
 def _look(keywords: dict[str, Any], kind: str) -> dict[str, Any]:

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.inversion.field import RetrievedField
+    from napari_shadowinv.io.results import AnyResult
     from napari_shadowinv.physics.setup import Setup
 
 FullLayerData = tuple[Any, dict[str, Any], str]
@@ -141,20 +143,26 @@ def add_layers(
     return added
 
 
-def result_layers(
-    result: Result, frame: Frame, name: str = "", *, cells: bool = False
+def field_layers(
+    result: Result[RetrievedField], frame: Frame, name: str = ""
 ) -> list[FullLayerData]:
-    """Describe the layers of an inversion or of a field only; with `cells`, its power cells."""
+    """Describe the layers of a field without images."""
+    dataset = result.content.dataset
+    field = dataset[[variable for variable in _FIELD_VARIABLES if variable in dataset]]
+    return dataset_layers(field, result.setup, frame, name, _shared_metadata(result, name))
+
+
+def _shared_metadata(result: Result[AnyResult], name: str) -> dict[str, Any]:
+    return {"result": result, "made_from": dict(result.attributes), "name": name}
+
+
+def result_layers(
+    result: Result[Inversion], frame: Frame, name: str = "", *, cells: bool = False
+) -> list[FullLayerData]:
+    """Describe the layers of an inversion; with `cells`, its power cells."""
     import xarray as xr
 
-    from napari_shadowinv.inversion import Inversion
-
     content = result.content
-    facts = {"result": result, "made_from": dict(result.attributes), "name": name}
-    if isinstance(content, xr.Dataset):
-        field = content[[variable for variable in _FIELD_VARIABLES if variable in content]]
-        return dataset_layers(field, result.setup, frame, name, facts)
-    assert isinstance(content, Inversion)
     dataset = xr.Dataset(
         {name: (dims, getattr(content, name)) for name, (dims, _, _) in VARIABLES.items()}
     )
@@ -164,7 +172,7 @@ def result_layers(
         result.setup,
         frame,
         name,
-        facts,
+        _shared_metadata(result, name),
         cells=diagram,
         suffix=trust_label(content),
     )

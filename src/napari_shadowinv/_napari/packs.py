@@ -1,6 +1,6 @@
 """A film pack as layers.
 
-- the dataset of `run_film` as stacks with a plane for each film: `pack_layers`
+- the doses of `run_film` as stacks with a plane for each film: `pack_layers`
 - each film as an image to invert or fit: `film_layers`
 - the mean spectrum in a region: `spectrum_in`
 - pixels painted by hand: `painted_by_hand`
@@ -8,13 +8,12 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,20 +25,12 @@ from napari_shadowinv._napari.layers import FullLayerData, Limits
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
-from napari_shadowinv.cautions import Caution
-from napari_shadowinv.errors import InputError
 from napari_shadowinv.film import Pack, read_corners, write_corners
 from napari_shadowinv.film.scans import common_shape, upright
+from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read_radiograph, replacing, write
 from napari_shadowinv.io.formats import TIFF
-from napari_shadowinv.physics.setup import setup_from_dict
 from napari_shadowinv.pipeline import run_film
-from napari_shadowinv.provenance import Provenance
-
-if TYPE_CHECKING:
-    import xarray
-
-    from napari_shadowinv.physics.setup import Setup
 
 FLUENCE, DOSE, UNUSABLE = "fluence", "dose", "unusable"
 PER_AREA = "1/(m² MeV)"
@@ -56,7 +47,6 @@ EXCLUDED, BY_HAND = 1, 2
 _LABEL_COLOURS = ["transparent", "#5dff5d", "#00c8ff"]
 _MIN_SIGNIFICANCE = 2.0  # fluence over its error, dose over that of a flat background
 _MAX_BACKGROUND_SHARE = 0.05  # of the largest dose; above, the last film sees the beam
-_MIN_TIME_IN_NS = 1e-9  # s; shorter times are in ps
 _LIMITS_PERCENTILES = (0.1, 99.7)
 _MAX_DARK_FRACTION = 0.3  # of the upper limit, for limits that start at zero
 
@@ -76,7 +66,7 @@ class Spectrum(NamedTuple):
 
 
 def pack_layers(
-    result: Result,
+    result: Result[FilmDoses],
     frame: Frame,
     name: str,
     *,
@@ -89,7 +79,7 @@ def pack_layers(
     Parameters
     ----------
     result : Result
-        With the dataset of `run_film` as its content.
+        With the doses of `run_film` as its content.
     frame : Frame
     name : str
         Name of the pack, with which the layers' names start.
@@ -100,22 +90,22 @@ def pack_layers(
     **facts
         Metadata of each layer.
     """
-    dataset = _dataset_of(result)
-    usable = dataset["usable"].values.astype(bool)
+    doses = result.content
+    times = doses.times_of_flight
     films = {
-        "films": film_labels(dataset),
-        "energies": dataset["energy"].values.tolist(),
-        "times_of_flight": _times(dataset),
+        "films": [doses.film_label(k) for k in range(len(doses.energies))],
+        "energies": doses.energies.tolist(),
+        "times_of_flight": None if times is None else times.tolist(),
     }
     layers = []
     for kind in KINDS:
-        data: AnyArray = dataset[kind.variable].values
+        data: AnyArray = getattr(doses, kind.variable)
         look: dict[str, Any] = {}
         if kind.type == "labels":
-            data, look = _labels(usable, by_hand)
-        metadata: dict[str, Any] = {**films, **facts, "result": result}
+            data, look = _labels(doses.usable, by_hand)
+        metadata: dict[str, Any] = {**films, **facts, "result": result, "main": True}
         if kind.type == "image":
-            limits = [_limits(film, used) for film, used in zip(data, usable, strict=True)]
+            limits = [_limits(film, used) for film, used in zip(data, doses.usable, strict=True)]
             metadata["limits"] = limits
             look = {"colormap": kind.colormap, "contrast_limits": limits[plane]}
         keywords = {
@@ -130,115 +120,64 @@ def pack_layers(
     return layers
 
 
-def film_layers(dataset: xarray.Dataset, frame: Frame, name: str) -> list[FullLayerData]:
+def film_layers(doses: FilmDoses, frame: Frame, name: str) -> list[FullLayerData]:
     """Describe an image of each film's fluence, with the metadata that an inversion needs.
 
     Films without usable pixels are omitted; in others, unusable pixels are zero. Without setups,
     the metadata contain the displacements in a magnetic field relative to each other. Only the
     first image is visible.
     """
-    setups = _setups(dataset)
     layers: list[FullLayerData] = []
-    for k, used in enumerate(dataset["usable"].values.astype(bool)):
+    for k, used in enumerate(doses.usable):
         if not used.any():
             continue
-        image = np.where(used, dataset["fluence"].values[k], 0.0)
+        image = np.where(used, doses.fluence[k], 0.0)
         layer = shot_layer(
             image,
-            f"film {_number(dataset, k)}, {float(dataset['energy'][k]):.3g} MeV",
-            setups[k] if setups else None,
+            f"film {k + 1}, {doses.energies[k]:.3g} MeV",
+            doses.setups[k] if doses.setups else None,
             _limits(image, used),
             frame=frame,
-            setup_origin=f"{CAME_WITH} {name}" if setups else None,
+            setup_origin=f"{CAME_WITH} {name}" if doses.setups else None,
             usable=used,
-            part=str(_number(dataset, k)),
-            energies=[float(dataset["energy"][k])],
-            strength=None if setups else float(dataset["strength"][k]),
+            part=str(k + 1),
+            energies=[float(doses.energies[k])],
+            strength=None if doses.setups else float(doses.strengths[k]),
         )
         layer[1]["visible"] = not layers
         layers.append(layer)
     return layers
 
 
-def pack_result(dataset: xarray.Dataset) -> Result:
-    """Return the result behind a pack's layers, with the setup of its first film, if any."""
-    setups = _setups(dataset)
-    return Result(dataset, setups[0] if setups else None)
-
-
-def pack_frame(dataset: xarray.Dataset) -> Frame:
+def pack_frame(doses: FilmDoses) -> Frame:
     """Return the frame with pixels of the object plane, or of the first scan without a setup."""
-    setups = _setups(dataset)
-    shape = dataset["fluence"].shape
-    side = dataset.attrs.get("scan_pixel_size")
-    return frame_for(shape, setups[0] if setups else None, pixel_size=side)
+    return frame_for(doses.fluence.shape, doses.setup, pixel_size=doses.pixel_size)
 
 
-def pack_of(dataset: xarray.Dataset) -> Pack:
-    """Return the pack that a dataset was computed from, or raise an `InputError`."""
-    provenance = Provenance.of(dataset.attrs)
-    if provenance is None or provenance.pack is None:
-        raise InputError("the result has no readable film pack: convert its scans again")
-    return provenance.pack
-
-
-def warnings_of_pack(dataset: xarray.Dataset) -> tuple[Caution, ...]:
-    """Return the warnings about the dataset of a pack."""
-    return tuple(map(Caution.from_json, json.loads(dataset.attrs.get("warnings", "[]"))))
-
-
-def relative_scales(dataset: xarray.Dataset) -> FloatArray:
-    """Return the magnification of each film relative to the first."""
-    magnifications = np.array([setup.magnification for setup in _setups(dataset)])
-    return (
-        magnifications / magnifications[0]
-        if magnifications.size
-        else np.ones(dataset.sizes["layer"])
-    )
-
-
-def film_labels(dataset: xarray.Dataset) -> list[str]:
-    """Return number, energy and time of flight of each film as text."""
-    texts = []
-    times = _times(dataset)
-    for k in range(dataset.sizes["layer"]):
-        text = f"film {_number(dataset, k)}: {float(dataset['energy'][k]):.3g} MeV"
-        if times is not None:
-            time = times[k]
-            text += (
-                f", {1e12 * time:.3g} ps" if time < _MIN_TIME_IN_NS else f", {1e9 * time:.3g} ns"
-            )
-        texts.append(text if dataset["usable"].values[k].any() else f"{text}, excluded")
-    return texts
-
-
-def spectrum_in(dataset: xarray.Dataset, region: BoolArray | None = None) -> Spectrum:
+def spectrum_in(doses: FilmDoses, region: BoolArray | None = None) -> Spectrum:
     """Return the mean fluence of each film over the usable pixels of a region; None is all."""
-    usable = dataset["usable"].values.astype(bool)
-    inside = usable if region is None else usable & region
+    inside = doses.usable if region is None else doses.usable & region
 
-    def reduce(name: str, statistic: Callable[[AnyArray], Any]) -> FloatArray:
-        films = zip(dataset[name].values, inside, strict=True)
+    def reduce(planes: FloatArray, statistic: Callable[[AnyArray], Any]) -> FloatArray:
+        films = zip(planes, inside, strict=True)
         return np.array(
             [statistic(plane[used]) if used.any() else np.nan for plane, used in films], float
         )
 
-    fluence = reduce("fluence", partial(np.mean, dtype=np.float64))
-    error = reduce("fluence_error", np.median)
+    fluence = reduce(doses.fluence, partial(np.mean, dtype=np.float64))
+    error = reduce(doses.fluence_error, np.median)
     is_measured = fluence > _MIN_SIGNIFICANCE * error  # False for NaN
     is_measured[-1] = False
-    dose = reduce("dose", partial(np.mean, dtype=np.float64))
+    dose = reduce(doses.dose, partial(np.mean, dtype=np.float64))
     background = dose[-1]
     is_faint = dose < _MAX_BACKGROUND_SHARE * np.nanmax(dose, initial=0.0)
     is_measured &= ~(is_faint & (dose - background < _MIN_SIGNIFICANCE * background))
-    bands = np.stack([dataset["energy_low"].values, dataset["energy_high"].values], axis=1)
-    return Spectrum(dataset["energy"].values, fluence, error, bands, is_measured)
+    return Spectrum(doses.energies, fluence, error, doses.bands[:, 1:], is_measured)
 
 
-def painted_by_hand(labels: AnyArray, dataset: xarray.Dataset) -> BoolArray:
+def painted_by_hand(labels: AnyArray, doses: FilmDoses) -> BoolArray:
     """Return the pixels of a pack's labels that the user painted."""
-    usable = dataset["usable"].values.astype(bool)
-    return np.asarray((labels == BY_HAND) | (usable & (labels > 0)))
+    return np.asarray((labels == BY_HAND) | (doses.usable & (labels > 0)))
 
 
 def _labels(usable: BoolArray, by_hand: BoolArray | None) -> tuple[AnyArray, dict[str, Any]]:
@@ -261,32 +200,10 @@ def _limits(plane: AnyArray, used: BoolArray) -> Limits:
     return (low, bright) if bright > low else (low, low + 1.0)
 
 
-def _setups(dataset: xarray.Dataset) -> list[Setup]:
-    entries = json.loads(dataset.attrs.get("setups", "[]"))
-    return [setup_from_dict(entry, "the pack's setup") for entry in entries]
-
-
-def _times(dataset: xarray.Dataset) -> list[float] | None:
-    if "time_of_flight" not in dataset.coords:
-        return None
-    return [float(time) for time in dataset["time_of_flight"].values]
-
-
-def _number(dataset: xarray.Dataset, k: int) -> int:
-    return int(dataset["layer"].values[k])
-
-
-def _dataset_of(result: Result) -> xarray.Dataset:
-    import xarray as xr
-
-    assert isinstance(result.content, xr.Dataset)
-    return result.content
-
-
 class EvaluatedPack(NamedTuple):
-    """The dataset of a film pack, and the painted pixels on its grid."""
+    """The doses of a film pack, and the painted pixels on its grid."""
 
-    dataset: xarray.Dataset
+    doses: FilmDoses
     by_hand: BoolArray | None
 
 
@@ -326,18 +243,18 @@ class PackJob(Job):
         """Write the corrections and evaluate the pack."""
         try:
             pack, by_hand = self._write_corrections()
-            dataset = run_film(pack, on_progress=on_progress, should_stop=should_stop)
-            return EvaluatedPack(dataset, by_hand)
+            doses = run_film(pack, on_progress=on_progress, should_stop=should_stop)
+            return EvaluatedPack(doses, by_hand)
         except BaseException:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise
 
     def layers(self, content: EvaluatedPack) -> list[FullLayerData]:
         """Describe the layers of the pack."""
-        dataset = content.dataset
+        doses = content.doses
         return pack_layers(
-            pack_result(dataset),
-            pack_frame(dataset),
+            Result(doses, doses.setup),
+            pack_frame(doses),
             self.name,
             by_hand=content.by_hand,
             plane=self.plane,
@@ -392,10 +309,10 @@ def _resize(planes: BoolArray, shape: tuple[int, int]) -> BoolArray:
     return planes[:, rows[:, None], columns] & inside
 
 
-def copy_edits(dataset: xarray.Dataset, pack: Pack, scratch: Path, path: Path) -> xarray.Dataset:
+def copy_edits(doses: FilmDoses, scratch: Path, path: Path) -> FilmDoses:
     """Copy corrections from the folder `scratch` next to the result's file at `path`.
 
-    The returned dataset names the copies, such as ``result_corners.csv``.
+    The pack of the returned doses names the copies, such as ``result_corners.csv``.
     """
     overwrite = path.exists()  # the dialog has asked
 
@@ -406,8 +323,8 @@ def copy_edits(dataset: xarray.Dataset, pack: Pack, scratch: Path, path: Path) -
             shutil.copyfile(file, temporary)
         return path.with_name(f"{path.stem}_{file.name}")
 
+    pack = doses.pack
     layers = tuple(layer.model_copy(update={"mask": copy(layer.mask)}) for layer in pack.layers)
     saved_pack = pack.model_copy(update={"corners": copy(pack.corners), "layers": layers})
-    provenance = Provenance.of(dataset.attrs) or Provenance(kind="film pack", pack=saved_pack)
-    repeatable = provenance.model_copy(update={"pack": saved_pack})
-    return dataset.assign_attrs(provenance=repeatable.to_json())
+    provenance = doses.provenance.model_copy(update={"pack": saved_pack})
+    return replace(doses, provenance=provenance)

@@ -84,7 +84,7 @@ def _matches(pattern: str) -> list[Path]:
 @as_file_errors
 def _read_file(path: Path) -> list[FullLayerData]:
     from napari_shadowinv._napari.layer_metadata import result_of
-    from napari_shadowinv._napari.layer_state import layers_of_dataset, warnings_for
+    from napari_shadowinv._napari.layer_state import layers_of_dataset
     from napari_shadowinv._napari.shots import radiograph_layers
     from napari_shadowinv.io import Radiograph, read
 
@@ -96,7 +96,7 @@ def _read_file(path: Path) -> list[FullLayerData]:
     layers = layers_of_dataset(content, path.stem)
     _show_in_window(layers)
     result = result_of(layers[0][1])
-    for caution in () if result is None else warnings_for(result):
+    for caution in () if result is None else result.content.cautions:
         show_caution(f"{path.name}: {caution.text}")
     return layers
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv._napari.layer_metadata import Result
     from napari_shadowinv._napari.layers import FullLayerData
+    from napari_shadowinv.io.results import AnyResult
 
 
 def write_result(path: str, layers: Sequence[FullLayerData]) -> list[str]:
@@ -59,7 +60,9 @@ def dataset_to_save(layers: Sequence[FullLayerData]) -> xarray.Dataset:
     return dataset_of_layers(parts, result)
 
 
-def _common_result(layers: Sequence[FullLayerData]) -> tuple[list[FullLayerData], Result]:
+def _common_result(
+    layers: Sequence[FullLayerData],
+) -> tuple[list[FullLayerData], Result[AnyResult]]:
     from napari_shadowinv._napari.layer_metadata import result_of
 
     results = {
@@ -80,7 +83,7 @@ def _common_result(layers: Sequence[FullLayerData]) -> tuple[list[FullLayerData]
     return [layer for layer in layers if result_of(layer[1]) is common], common
 
 
-def _warn_of_changes(layers: Sequence[FullLayerData], result: Result) -> None:
+def _warn_of_changes(layers: Sequence[FullLayerData], result: Result[AnyResult]) -> None:
     """Warn about layers whose data differ from the file."""
     from napari_shadowinv._napari.frame import Frame
     from napari_shadowinv._napari.layer_metadata import layer_key

@@ -71,7 +71,7 @@ def demo_table(
 ) -> Table:
     """Build the table of a demo: the quality of the inversion and its true error."""
     rows = [
-        headline_row(inversion, setup),
+        headline_row(inversion.headline_in(setup)),
         ("setup", setup_text(setup, shape=inversion.image.shape)),
         *fact_rows(inversion.facts_in(setup)),
         ("error", _errors_text(fields, "Retrieved")),

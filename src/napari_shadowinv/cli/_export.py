@@ -14,11 +14,12 @@ import numpy as np
 from napari_shadowinv.cli._outputs import make_folder, protect_store
 from napari_shadowinv.cli._terminal import escape_invisible
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion.variables import display_unit, setup_from_dataset
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
 from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.io.store import DAMAGED, DONE, STATUS_NAMES, StackStore, read_stack
+from napari_shadowinv.physics.labels import display_unit
 from napari_shadowinv.pipeline.rerun import provenance_of
 
 if TYPE_CHECKING:

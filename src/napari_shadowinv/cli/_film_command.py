@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli import _flags, _outputs
-from napari_shadowinv.cli._summary import Rows, two_columns
+from napari_shadowinv.cli._summary import fact_rows, two_columns, written_rows
 from napari_shadowinv.cli._terminal import is_interrupted, notify_errors, progress_bars, say
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import ResultKind
 
 if TYPE_CHECKING:
-    import xarray
     from rich.table import Table
 
     from napari_shadowinv.film import Pack
+    from napari_shadowinv.film_doses import FilmDoses
 
 LayersFormat = Literal["tiff", "pradformat"]
 # Help of options, where it is longer than a line.
@@ -78,9 +77,11 @@ def film(
     Finds and straightens the films, masks handwriting and damage, aligns the layers, and
     unfolds the proton spectrum in every pixel.
     """
+    import numpy as np
+
     from napari_shadowinv.film import write_corners
     from napari_shadowinv.io import replacing
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PACK_WRITERS, SITES
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, SITES, suffixes_for
     from napari_shadowinv.pipeline import read_pack, write_layers
     from napari_shadowinv.pipeline.film_files import LAYERS_TABLE
 
@@ -93,7 +94,7 @@ def film(
         )
     result, figure = _outputs.result_and_figure(pack, out, figure)
     outputs: dict[Path, tuple[str, ...]] = {
-        result: tuple(PACK_WRITERS),
+        result: suffixes_for(ResultKind.FILM_DOSES),
         figure: FIGURE_SUFFIXES,
     }
     if corners is not None:
@@ -103,21 +104,24 @@ def film(
     _outputs.check_outputs(outputs, overwrite)
     content = read_pack(pack)
     _outputs.protect(list(outputs), [pack, *content.files])
-    dataset = _run_pack(content, quiet)
+    doses = _run_pack(content, quiet)
     written = [result, figure]
-    write_pack(dataset, pack.name, result, figure, overwrite)
+    _outputs.write_result(doses, [str(pack)], result, figure, overwrite)
     if layers is not None:
-        written.append(write_layers(dataset, layers, form=layers_format, overwrite=overwrite)[-1])
+        written.append(write_layers(doses, layers, form=layers_format, overwrite=overwrite)[-1])
     if corners is not None:
-        points = dataset["corners"].dropna("layer")
-        corners_by_film = {str(int(film["layer"])): film.values for film in points}
+        corners_by_film = {
+            str(number): places
+            for number, places in enumerate(doses.corners, 1)
+            if np.isfinite(places).all()
+        }
         with replacing(corners, overwrite) as temporary:
             write_corners(temporary, corners_by_film)
         written.append(corners)
     if not quiet:
-        say(layer_table(dataset))
-        rows = [*pack_rows(dataset), ("written", ", ".join(map(str, written)))]
-        say(two_columns("Film pack", rows))
+        say(film_table(doses))
+        facts = [fact for fact in doses.facts if not fact.is_detail]
+        say(two_columns("Film pack", [*fact_rows(facts), *written_rows(written)]))
 
 
 def _write_new(folder: Path, pack: Path | None, overwrite: bool) -> None:
@@ -135,62 +139,23 @@ def _write_new(folder: Path, pack: Path | None, overwrite: bool) -> None:
     say(two_columns("New pack", [*rows, ("written", str(path))]))
 
 
-def _run_pack(pack: Pack, quiet: bool) -> xarray.Dataset:
+def _run_pack(pack: Pack, quiet: bool) -> FilmDoses:
     from napari_shadowinv.pipeline import run_film
 
     with nullcontext() if quiet else progress_bars() as show:
         return run_film(pack, on_progress=show, should_stop=is_interrupted)
 
 
-def write_pack(
-    dataset: xarray.Dataset, name: str, result: Path, figure: Path, overwrite: bool
-) -> None:
-    """Write a pack's dataset and its figure, both or none of them."""
-    from napari_shadowinv.plotting import pack_figure
-
-    figures = {figure: pack_figure(dataset, title=name)}
-    _outputs.write_with_figures(dataset, figures, result, overwrite)
-
-
-def layer_table(dataset: xarray.Dataset) -> Table:
-    """Build a table of the energy, dose and alignment of each layer."""
-    import numpy as np
+def film_table(doses: FilmDoses) -> Table:
+    """Build a table of the energy, dose and alignment of each film."""
     from rich import box
     from rich.table import Table
 
+    rows = doses.film_texts()
     table = Table(box=box.SIMPLE)
-    names = ["layer", "film", "MeV"]
-    if "time_of_flight" in dataset.coords:
-        names.append("flight (ns)")
-    for name in (*names, "median Gy", "usable", "shift y, x (px)", "±"):
+    table.add_column("layer", justify="right")
+    for name in rows[0]:
         table.add_column(name, justify="left" if name == "film" else "right")
-    for k in range(dataset.sizes["layer"]):
-        layer = dataset.isel(layer=k)
-        usable = layer["usable"].values
-        is_usable = bool(usable.any())
-        dose = f"{np.median(layer['dose'].values[usable]):.3g}" if is_usable else "left out"
-        shift = ", ".join(f"{value:+.1f}" for value in layer["shift"].values)
-        times = [float(layer["time_of_flight"])] if "time_of_flight" in layer.coords else []
-        table.add_row(
-            str(int(layer["layer"])),
-            layer["film"].item(),
-            f"{float(layer['energy']):.4g}",
-            *(f"{1e9 * time:.4g}" for time in times),
-            dose,
-            f"{usable.mean():.0%}",
-            shift if is_usable else "",
-            f"{float(layer['shift_error']):.1f}" if is_usable else "",
-        )
+    for number, cells in enumerate(rows, 1):
+        table.add_row(str(number), *cells.values())
     return table
-
-
-def pack_rows(dataset: xarray.Dataset) -> Rows:
-    """Describe the layers of a pack's dataset."""
-    sizes = dataset.sizes
-    rows = [("images", f"{sizes['layer']} of {sizes['y']} × {sizes['x']} px, [y, x]")]
-    if "scan_pixel_size" in dataset.attrs:
-        rows.append(("pixel", f"{1e6 * dataset.attrs['scan_pixel_size']:.4g} µm on the film"))
-    if "seen_from" in dataset.attrs:
-        rows.append(("seen from", dataset.attrs["seen_from"]))
-    cautions = map(Caution.from_json, json.loads(dataset.attrs["warnings"]))
-    return rows + [("warning", caution.text) for caution in cautions]

@@ -16,6 +16,7 @@ from napari_shadowinv.cli._terminal import (
     say,
     warn_of_setups,
 )
+from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.io.formats import IMAGE_TITLES
 
 # Help of arguments, where it is longer than a line.
@@ -114,7 +115,7 @@ def fit(
     bars, re-projections, residuals and a verdict to one file, and a figure next to it.
     """
     from napari_shadowinv.cli import _fit_result, _static_result
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, FIT_WRITERS
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, suffixes_for
     from napari_shadowinv.pipeline import write_recipe
     from napari_shadowinv.pipeline.fit_shots import read_rows
     from napari_shadowinv.pipeline.shot_table import shot_rows
@@ -125,12 +126,12 @@ def fit(
         lists["brightness"], brightness = brightness, None
     rows = shot_rows(images, {"setup": setup}, lists)
     first = rows[0].file
-    target = Path(f"{first.stem}_fit{next(iter(FIT_WRITERS))}") if out is None else out
+    target = Path(f"{first.stem}_fit{RESULT.suffix}") if out is None else out
     result, figure = _outputs.result_and_figure(first, target, figure)
     checks: dict[str, Any] = {"left_out": leave_one_out, "window": energy_window}
     _static_result.check_requests(len(rows), **checks, fiducials=fiducials, result=result)
     figures = [figure, *_static_result.static_figures(figure, **checks)]
-    outputs = {result: tuple(FIT_WRITERS), **dict.fromkeys(figures, FIGURE_SUFFIXES)}
+    outputs = {result: suffixes_for(ResultKind.FIT), **dict.fromkeys(figures, FIGURE_SUFFIXES)}
     if save_recipe is not None:
         outputs[save_recipe] = (".toml",)
     _outputs.check_outputs(outputs, overwrite)
@@ -154,7 +155,7 @@ def fit(
     with nullcontext() if quiet else progress_bars() as show:
         callbacks: dict[str, Any] = {"on_progress": show, "should_stop": is_interrupted}
         static = run_checks(chosen, shots, result_fit, names=short, **checks, **callbacks)
-    _fit_result.write_fit(result_fit, names, result, figure, overwrite, static)
+    _outputs.write_result(result_fit, names, result, figure, overwrite, static)
     if save_recipe is not None:
         setups = {shot.setup for shot in shots}
         (common,) = setups if len(setups) == 1 else (None,)

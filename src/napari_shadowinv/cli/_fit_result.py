@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from napari_shadowinv._typing import FloatArray
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.pipeline import FitShot
-    from napari_shadowinv.pipeline.static_checks import StaticChecks
     from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.provenance import Provenance
 
@@ -98,28 +97,6 @@ def comparison_table(fits: Sequence[Fit]) -> Table:
     return table
 
 
-def write_fit(
-    fit: Fit,
-    names: Sequence[str],
-    out: Path,
-    report: Path,
-    overwrite: bool,
-    static: StaticChecks | None = None,
-) -> None:
-    """Write a fit and its figures, all or none; `names` are the files of the images."""
-    from napari_shadowinv.cli._outputs import write_with_figures
-    from napari_shadowinv.cli._static_result import check_figures
-    from napari_shadowinv.io.files import text_of
-    from napari_shadowinv.plotting import fit_figure
-
-    title = ", ".join(text_of(Path(name).name) for name in names)
-    dataset, figures = fit.to_dataset(), {report: fit_figure(fit, title=title)}
-    if static is not None:
-        dataset = static.add_to(dataset)
-        figures |= check_figures(static, fit, report, title)
-    write_with_figures(dataset, figures, out, overwrite)
-
-
 def fit_table(fit: Fit, names: Sequence[str], written: Sequence[Path]) -> Table:
     """Build the table of a fit: its verdict, images, fields and files."""
     rows = [*fit_rows(fit, names), *[("written", str(path)) for path in written]]
@@ -142,11 +119,10 @@ def fit_file_rows(dataset: xarray.Dataset) -> Rows:
 
     fit = Fit.from_dataset(dataset)
     provenance = fit.provenance
-    names = [] if provenance is None else [origin.file for origin in provenance.images]
     return [
         ("kind", f"fit of shadowinv {dataset.attrs['package_version']}"),
         ("created", str(dataset.attrs["created"])),
-        *fit_rows(fit, names),
+        *fit_rows(fit),
         *static_file_rows(dataset),
         *([] if provenance is None else _provenance_rows(provenance)),
         ("options", options_text(fit.options.model_dump())),
@@ -173,9 +149,8 @@ def _provenance_rows(provenance: Provenance) -> Rows:
 
 def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:
     """Return the size and setup of the images, and the facts; `names` are of the images."""
-    setup = fit.setups[0] if fit.setups else None
     return [
-        *fact_rows(fit.facts(names)),
+        *fact_rows(fit.facts_with_names(names) if names else fit.facts),
         ("size", size_text(fit.images[0])),
-        ("setup", setup_text(setup, shape=fit.images[0].shape)),
+        ("setup", setup_text(fit.setup, shape=fit.images[0].shape)),
     ]

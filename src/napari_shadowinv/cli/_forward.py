@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -28,9 +29,7 @@ class Field:
 
 def field_from(path: Path, variable: str | None = None) -> Field:
     """Read a displacement from a result, or from an array in px or px²."""
-    from napari_shadowinv.inversion.variables import is_fit, is_pack, setup_from_dataset
     from napari_shadowinv.io import read_dataset, read_radiograph
-    from napari_shadowinv.io.dataset import require
     from napari_shadowinv.io.formats import kind_of
     from napari_shadowinv.io.hdf5 import read_hdf5
     from napari_shadowinv.io.images import read_npy
@@ -41,33 +40,34 @@ def field_from(path: Path, variable: str | None = None) -> Field:
     if variable is not None or kind == "mat":
         return Field(_displacement(path, read_radiograph(path, variable=variable).image))
     if kind in ("hdf5", "shadowinv"):
-        dataset = read_dataset(path)
-        if is_fit(dataset.attrs):
-            return _read_fit_field(path, dataset)
-        if is_pack(dataset.attrs):
-            raise _no_field(path, "a film pack")
-        source = dataset["source"].values if "source" in dataset else None
-        require(dataset, ("displacement",))
-        displacement = _displacement(path, dataset["displacement"].values)
-        return Field(displacement, source, setup_from_dataset(dataset))
+        return _field_of_result(path, read_dataset(path))
     if kind == "npy":
         return Field(_displacement(path, read_npy(path)))
     raise _no_field(path, f"a {kind.upper()} picture")
 
 
 @as_file_errors
-def _read_fit_field(path: Path, dataset: xarray.Dataset) -> Field:
-    """Read the only field of a fit, with the beam of its first image."""
-    from napari_shadowinv.fitting import Fit
+def _field_of_result(path: Path, dataset: xarray.Dataset) -> Field:
+    """Return the only field in the dataset of a result, with the beam of its first image."""
+    import numpy as np
 
-    fit = Fit.from_dataset(dataset)
-    names = [field.name for field in fit.fields]
+    from napari_shadowinv.inversion.variables import setup_from_dataset
+    from napari_shadowinv.io.results import result_from_dataset
+
+    result = result_from_dataset(dataset)
+    names = json.loads(dataset.attrs.get("fields", "[]"))
     if len(names) > 1:
         raise InputError(
             f"{path} has the fields {', '.join(names)}: choose one with --variable "
             f"displacement_{names[0]}"
         )
-    return Field(fit.fields[0].displacement, fit.source[0], fit.setups[0] if fit.setups else None)
+    if "displacement" not in dataset:
+        raise _no_field(path, f"a {result.kind.noun}")
+    displacement = _displacement(path, dataset["displacement"].values)
+    source = dataset["source"].values if "source" in dataset else None
+    if source is not None and source.ndim == 3:
+        source = np.asarray(source[0])
+    return Field(displacement, source, setup_from_dataset(dataset) or result.setup)
 
 
 def _displacement(path: Path, array: AnyArray) -> FloatArray:

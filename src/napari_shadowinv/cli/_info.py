@@ -12,6 +12,7 @@ from napari_shadowinv import __version__
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cli import _summary
+from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.physics.setup import setup_warnings
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from napari_shadowinv._typing import AnyArray
     from napari_shadowinv.io import Radiograph
     from napari_shadowinv.io.formats import Format
+    from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.provenance import Provenance
 
 PACKAGES = (
@@ -132,38 +134,64 @@ def _array_rows(array: AnyArray) -> _summary.Rows:
 
 
 def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
-    from napari_shadowinv.cli._film_command import pack_rows
     from napari_shadowinv.cli._fit_result import fit_file_rows
-    from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.inversion.variables import is_fit, is_pack, setup_from_dataset
-    from napari_shadowinv.physics.units import peak_facts
 
-    if is_fit(dataset.attrs):
-        return fit_file_rows(dataset)
-    if is_pack(dataset.attrs):
-        version = dataset.attrs["package_version"]
-        first, last = dataset["energy"].values[[0, -1]]
-        energies = ("energies", f"{first:.4g} to {last:.4g} MeV")
-        return [("kind", f"film pack of shadowinv {version}"), energies, *pack_rows(dataset)]
-    setup = setup_from_dataset(dataset)
-    displacement = dataset["displacement"].values
-    experiment = [
-        ("image", _summary.size_text(displacement[0])),
-        ("setup", _summary.setup_text(setup, shape=displacement.shape[1:])),
-    ]
-    if "options" not in dataset.attrs:
-        is_foreign = dataset.attrs.get("format") == "pradformat"
-        kind = "pradformat inversion" if is_foreign else "field retrieved by another program"
-        return [("kind", kind), *experiment, *_summary.fact_rows(peak_facts(displacement, setup))]
-    inversion = Inversion.from_dataset(dataset)
+    rows_by_kind = {
+        ResultKind.INVERSION: _inversion_rows,
+        ResultKind.FIT: fit_file_rows,
+        ResultKind.FILM_DOSES: _film_rows,
+        ResultKind.FIELD: _field_rows,
+    }
+    return rows_by_kind[ResultKind.of(dataset.attrs)](dataset)
+
+
+def _inversion_rows(dataset: xarray.Dataset) -> _summary.Rows:
+    from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.inversion.variables import setup_from_dataset
+
+    inversion, setup = Inversion.from_dataset(dataset), setup_from_dataset(dataset)
     return [
-        _summary.headline_row(inversion, setup),
+        _summary.headline_row(inversion.headline_in(setup)),
         ("kind", f"result of shadowinv {dataset.attrs['package_version']}"),
         ("created", str(dataset.attrs["created"])),
         *_origin_rows(inversion.provenance),
-        *experiment,
+        *_experiment_rows(inversion.displacement, setup),
         *_summary.fact_rows(inversion.facts_in(setup)),
         ("options", _summary.options_text(inversion.options.model_dump())),
+    ]
+
+
+def _film_rows(dataset: xarray.Dataset) -> _summary.Rows:
+    from napari_shadowinv.film_doses import FilmDoses
+
+    doses = FilmDoses.from_dataset(dataset)
+    return [
+        ("kind", f"film pack of shadowinv {doses.provenance.version}"),
+        ("created", doses.created),
+        *_summary.fact_rows(doses.facts),
+    ]
+
+
+def _field_rows(dataset: xarray.Dataset) -> _summary.Rows:
+    from napari_shadowinv.inversion.field import RetrievedField
+
+    field = RetrievedField.from_dataset(dataset)
+    kind = "field retrieved by another program"
+    if dataset.attrs.get("format") == "pradformat":
+        kind = "pradformat inversion"
+    elif "options" in dataset.attrs:
+        kind = f"field of a shot of shadowinv {dataset.attrs['package_version']}"
+    return [
+        ("kind", kind),
+        *_experiment_rows(field.displacement, field.setup),
+        *_summary.fact_rows(field.facts),
+    ]
+
+
+def _experiment_rows(displacement: AnyArray, setup: Setup | None) -> _summary.Rows:
+    return [
+        ("image", _summary.size_text(displacement[0])),
+        ("setup", _summary.setup_text(setup, shape=displacement.shape[1:])),
     ]
 
 

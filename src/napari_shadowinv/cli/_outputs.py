@@ -12,12 +12,10 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.formats import PNG, PRADFORMAT, RESULT
 
 if TYPE_CHECKING:
-    import xarray
-    from matplotlib.figure import Figure
-
-    from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.io.results import AnyResult
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Radiograph, Recipe
+    from napari_shadowinv.pipeline.static_checks import StaticChecks
+    from napari_shadowinv.preprocessing import Recipe
 
 
 def result_and_figure(image: Path, out: Path | None, report: Path | None) -> tuple[Path, Path]:
@@ -94,27 +92,28 @@ def make_folder(path: Path) -> None:
         ) from None
 
 
-def write_inversion(
-    inversion: Inversion, shot: Radiograph, out: Path, report: Path, overwrite: bool
+def write_result(
+    result: AnyResult,
+    names: Sequence[str],
+    out: Path,
+    figure: Path,
+    overwrite: bool,
+    checks: StaticChecks | None = None,
 ) -> None:
-    """Write the result and the figure of an inversion, both or neither."""
-    from napari_shadowinv.io.files import text_of
-    from napari_shadowinv.plotting import report_figure
-
-    title = "" if shot.path is None else text_of(shot.path.name)
-    figure = report_figure(inversion, inversion.setup, title=title)
-    write_with_figures(inversion, {report: figure}, out, overwrite)
-
-
-def write_with_figures(
-    result: Inversion | xarray.Dataset, figures: Mapping[Path, Figure], out: Path, overwrite: bool
-) -> None:
-    """Write a result and its figures, all or none."""
+    """Write a result and its figures, all or none; the names of its files are the title."""
+    from napari_shadowinv.cli._static_result import check_figures
     from napari_shadowinv.io import replacing, write
+    from napari_shadowinv.io.files import text_of
+    from napari_shadowinv.plotting import result_figure
     from napari_shadowinv.plotting.figures import DOTS_PER_INCH
 
+    title = ", ".join(text_of(Path(name).name) for name in names)
+    dataset, figures = result.to_dataset(), {figure: result_figure(result, title=title)}
+    if checks is not None:
+        dataset = checks.add_to(dataset)
+        figures |= check_figures(checks, getattr(result, "setups", ()), figure, title)
     with ExitStack() as stack:
-        for path, figure in figures.items():
+        for path, page in figures.items():
             temporary = stack.enter_context(replacing(path, overwrite))
-            figure.savefig(temporary, dpi=DOTS_PER_INCH)
-        write(out, result, overwrite=overwrite)
+            page.savefig(temporary, dpi=DOTS_PER_INCH)
+        write(out, dataset, overwrite=overwrite)

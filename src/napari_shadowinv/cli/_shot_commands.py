@@ -20,6 +20,7 @@ from napari_shadowinv.cli._terminal import (
     warn_of_setups,
 )
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.options import InversionOptions
 
 # Help of arguments, where it is longer than a line.
@@ -105,12 +106,12 @@ def invert(
     and a figure next to it.
     """
     from napari_shadowinv.cli._summary import summary
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT_WRITERS
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, suffixes_for
     from napari_shadowinv.pipeline import write_recipe
     from napari_shadowinv.pipeline.files import read_part
 
     result, figure = _outputs.result_and_figure(image, out, figure)
-    outputs = {result: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}
+    outputs = {result: suffixes_for(ResultKind.INVERSION), figure: FIGURE_SUFFIXES}
     if save_recipe is not None:
         outputs[save_recipe] = (".toml",)
     _outputs.check_outputs(outputs, overwrite)
@@ -130,7 +131,7 @@ def invert(
     chosen = chosen.model_copy(update={"setup": _inputs.setup_for(setup, shot, chosen)})
     _outputs.check_setup(result, chosen.setup)
     inversion = invert_shot(chosen, shot, _inputs.source_from(chosen, image, channel), quiet)
-    _outputs.write_inversion(inversion, shot, result, figure, overwrite)
+    _outputs.write_result(inversion, [str(image)], result, figure, overwrite)
     if save_recipe is not None:
         write_recipe(save_recipe, chosen, overwrite=overwrite)
     if not quiet:
@@ -171,20 +172,22 @@ def rerun(
     With the same files and version, the result is identical bit for bit.
     """
     from napari_shadowinv.cli import _rerun
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT_WRITERS
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, suffixes_for
     from napari_shadowinv.pipeline.rerun import collect_rerun
 
     target = out or Path(f"{result.stem}_again{result.suffix}")
     again_out, figure = _outputs.result_and_figure(result, target, figure)
-    _outputs.check_outputs({again_out: tuple(RESULT_WRITERS), figure: FIGURE_SUFFIXES}, overwrite)
+    suffixes = suffixes_for(ResultKind.INVERSION)
+    _outputs.check_outputs({again_out: suffixes, figure: FIGURE_SUFFIXES}, overwrite)
     inputs = collect_rerun(result, image, source=source, other_folders=other_folders)
     _rerun.check_rerun(inputs, result, again_out, figure, overwrite)
     warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in inputs.shots)
     with nullcontext() if quiet else progress_bars() as show:
         again = inputs.run(show, is_interrupted)
-    _rerun.write_rerun(again, inputs, result, again_out, figure, overwrite)
+    names = [str(file) for file in inputs.files[: len(inputs.shots)]] or [str(result)]
+    _outputs.write_result(again.content, names, again_out, figure, overwrite, again.checks)
     if not quiet:
-        say(_rerun.rerun_table(again, inputs, [again_out, figure]))
+        say(_rerun.rerun_table(again, names, [again_out, figure]))
     _rerun.exit_unless_sound(again, again_out)
 
 

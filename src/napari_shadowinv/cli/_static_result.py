@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from napari_shadowinv.fitting import Fit, FitWindows, LeaveOneOut
+    from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.pipeline.static_checks import StaticChecks
 
 
@@ -59,14 +60,16 @@ def static_figures(report: Path, *, left_out: bool, window: int | None) -> list[
     ]
 
 
-def check_figures(checks: StaticChecks, fit: Fit, report: Path, title: str) -> dict[Path, Figure]:
+def check_figures(
+    checks: StaticChecks, setups: Sequence[Setup], report: Path, title: str
+) -> dict[Path, Figure]:
     """Return the figures of the checks by file."""
     from napari_shadowinv.plotting import left_out_figure, windows_figure
 
     left_out, windows = static_figures(report, left_out=True, window=1)
     figures = {}
     if checks.left_out is not None:
-        figures[left_out] = left_out_figure(checks.left_out, fit.setups, title=title)
+        figures[left_out] = left_out_figure(checks.left_out, setups, title=title)
     if checks.windows is not None:
         figures[windows] = windows_figure(checks.windows, title=title)
     return figures

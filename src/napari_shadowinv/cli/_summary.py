@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from napari_shadowinv._typing import AnyArray
-    from napari_shadowinv.facts import Fact
+    from napari_shadowinv.facts import Fact, Headline
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Radiograph
@@ -39,16 +39,15 @@ def two_columns(title: str, rows: Rows) -> Table:
     return table
 
 
-def headline_row(inversion: Inversion, setup: Setup | None) -> tuple[str, str]:
+def headline_row(headline: Headline) -> tuple[str, str]:
     """Return the headline of a result; the name of the row is the level of trust."""
-    headline = inversion.headline_in(setup)
     return (headline.level.value, headline.text)
 
 
 def summary(inversion: Inversion, shot: Radiograph, written: list[Path]) -> Table:
     """Build the table of an inversion: its headline, its input, its quality and its files."""
     rows = [
-        headline_row(inversion, inversion.setup),
+        headline_row(inversion.headline),
         ("image", f"{shot.path}, {size_text(inversion.image)}"),
         *provenance_rows(inversion.provenance),
         ("setup", setup_text(inversion.setup, shot, inversion.image.shape)),

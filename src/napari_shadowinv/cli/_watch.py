@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, exit_unless_reliable, split_names
 from napari_shadowinv.cli._terminal import (
     cancel_exit_code,
@@ -75,7 +74,7 @@ class _WatchPrinter:
         summary = f"  {summary}  {outcome.seconds:.2f} s{waiting}{doubts}"
         name = _shorten_name(name, _LINE_COLUMNS - len(summary))
         self._print(self.out, f"{name}{summary}", _style(doubts))
-        for warning in _warnings_of(status.result):
+        for warning in status.result.cautions:
             if warning.code not in self.warned:
                 self.warned.add(warning.code)
                 self._print(self.err, f"warning: {status.name}: {warning.text}", "yellow")
@@ -92,14 +91,6 @@ def _shorten_name(name: str, columns: int) -> str:
     """Cut the start of a long name; its end identifies the file."""
     columns = max(columns, _MIN_NAME_COLUMNS)
     return name if len(name) <= columns else f"…{name[1 - columns :]}"
-
-
-def _warnings_of(result: Inversion | Fit) -> tuple[Caution, ...]:
-    from napari_shadowinv.fitting import Fit
-
-    if not isinstance(result, Fit):
-        return result.report.warnings
-    return () if result.verdict_caution is None else (result.verdict_caution,)
 
 
 def _shot_summary(result: Inversion | Fit) -> tuple[str, str]:

@@ -18,11 +18,17 @@ from napari_shadowinv._system.validation import CheckedModel, nearest
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.stopping import Stopping
-from napari_shadowinv.physics.setup import Setup, setup_from_dict
+from napari_shadowinv.physics.setup import ProtonSetup, setup_from_dict
 
 __all__ = ["FILM_TYPES", "MATERIALS", "FilmType", "Material", "Pack", "PackLayer", "Slab"]
 
 _CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+
+_SEEN_FROM = {
+    None: "the source (assumed)",
+    "source": "the source",
+    "detector": "the source (scans from the detector, mirrored)",
+}
 
 
 class Material(CheckedModel):
@@ -303,11 +309,16 @@ class Pack(CheckedModel):
         """Return the type of a layer's film."""
         return self.film_types[layer.film]
 
+    @property
+    def seen_from_text(self) -> str:
+        """Side from which the upright films are seen, in words."""
+        return _SEEN_FROM[self.seen_from]
+
     def is_mirrored(self, layer: PackLayer) -> bool:
         """Return whether the scan of a layer is mirrored against the view from the source."""
         return layer.mirrored != (self.seen_from == "detector")
 
-    def setups(self, energies: ArrayLike, pixel_size: float | None) -> tuple[Setup, ...]:
+    def setups(self, energies: ArrayLike, pixel_size: float | None) -> tuple[ProtonSetup, ...]:
         """Return the setup of each layer, on common pixels at the object; empty without a setup.
 
         Parameters
@@ -326,6 +337,7 @@ class Pack(CheckedModel):
         if values["kind"] != "proton" or values.get("species", "proton") != "proton":
             raise InputError("the pack's setup is not one of protons, whose stopping is known")
         first = setup_from_dict({**values, "energy": float(in_mev[0])}, "setup")
+        assert isinstance(first, ProtonSetup)
         common = {"pixel_size": first.object_pixel_size, "detector_pixel_size": None}
         return tuple(
             first.model_copy(

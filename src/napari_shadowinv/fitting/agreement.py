@@ -10,7 +10,7 @@ import numpy as np
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.variables import label
+from napari_shadowinv.physics.labels import label
 from napari_shadowinv.physics.setup import Setup
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -14,24 +14,28 @@ from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Level, caution_facts, error_fact, time_fact
+from napari_shadowinv.facts import (
+    Fact,
+    Headline,
+    Level,
+    ResultKind,
+    caution_facts,
+    error_fact,
+    time_fact,
+)
 from napari_shadowinv.fitting.beam_error import BeamError
 from napari_shadowinv.fitting.verdict import Verdict
 from napari_shadowinv.inversion.variables import (
     BEAM_UNCERTAINTY,
-    FIT_FORMAT,
-    FLUX_DENSITY,
-    PIXEL,
     UNCERTAINTY,
     belongs,
     dataset_from_field,
-    label,
-    numbers_of,
 )
 from napari_shadowinv.options import FIELDS, FitOptions
+from napari_shadowinv.physics.labels import FLUX_DENSITY, PIXEL, label, numbers_of
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
 from napari_shadowinv.physics.units import PeakError, ShownField, peak_facts, shown_fields
-from napari_shadowinv.provenance import Provenance
+from napari_shadowinv.provenance import ImageOrigin, Provenance
 
 if TYPE_CHECKING:
     import xarray
@@ -225,6 +229,8 @@ class Fit:
         How it was made, if that is known: from which files, and by which recipe.
     """
 
+    kind: ClassVar = ResultKind.FIT
+
     images: FloatArray
     mask: BoolArray
     strengths: FloatArray
@@ -267,12 +273,34 @@ class Fit:
     @property
     def warnings(self) -> tuple[Caution, ...]:
         """Reasons to doubt the images, each with the name of its image."""
-        images = () if self.provenance is None else self.provenance.images
         return tuple(
             caution.about(each.file or f"image {number}")
-            for number, each in enumerate(images, 1)
+            for number, each in enumerate(self._origins, 1)
             for caution in each.warnings
         )
+
+    @property
+    def setup(self) -> Setup | None:
+        """The experiment of the first image, in which the fields are shown; None if unknown."""
+        return self.setups[0] if self.setups else None
+
+    @property
+    def cautions(self) -> tuple[Caution, ...]:
+        """Reasons to doubt the result: its verdict, unless determined, and of its images."""
+        if self.verdict is Verdict.DETERMINED:
+            return self.warnings
+        text = f"the fit's verdict is '{self.verdict}': {self.explanation}"
+        return (Caution("verdict", text), *self.warnings)
+
+    @property
+    def headline(self) -> Headline:
+        """Verdict and its reason, warnings and convergence in one line."""
+        texts = [f"{self.verdict.upper()}: {self.explanation}", *map(str, self.warnings)]
+        level = Level.DOUBTFUL if self.cautions else Level.SOUND
+        if not self.report.converged:
+            level = Level.FAILED
+            texts.append(f"not converged in {self.report.iterations} steps")
+        return Headline(level, "; ".join(texts))
 
     @property
     def verdict_caution(self) -> Caution | None:
@@ -281,13 +309,18 @@ class Fit:
             return None
         return Caution("verdict", self.explanation)
 
-    def facts(self, names: Sequence[str] = ()) -> tuple[Fact, ...]:
-        """Return the result in words, as every face shows it.
+    @property
+    def facts(self) -> tuple[Fact, ...]:
+        """The result in words, as every face shows it."""
+        return self.facts_with_names([each.file for each in self._origins])
+
+    def facts_with_names(self, names: Sequence[str]) -> tuple[Fact, ...]:
+        """Return the facts with names of the images, which may be empty.
 
         Parameters
         ----------
-        names : sequence of str, optional
-            Names of the images. Default: their numbers.
+        names : sequence of str
+            A name for each image, or none.
         """
         is_determined = self.verdict is Verdict.DETERMINED
         level = Level.SOUND if is_determined else Level.DOUBTFUL
@@ -313,6 +346,10 @@ class Fit:
         """Return the largest magnitude of a field with its total error, in the unit shown."""
         return shown.peak_text(self.peak_error(field, shown))
 
+    @property
+    def _origins(self) -> tuple[ImageOrigin, ...]:
+        return () if self.provenance is None else self.provenance.images
+
     def _image_facts(self, names: Sequence[str]) -> Iterator[Fact]:
         for k, chi2 in enumerate(self.chi2):
             parts = [names[k]] if names and names[k] else []
@@ -329,7 +366,7 @@ class Fit:
             yield Fact(f"image_{k + 1}", f"Image {k + 1}", ", ".join(parts))
 
     def _field_fact(self, field: FittedField) -> Fact:
-        setup, deflector = self.setups[0] if self.setups else None, FIELDS[field.name]
+        setup, deflector = self.setup, FIELDS[field.name]
         (pixels,) = shown_fields([field.displacement], None, mask=self.used)
         error = self.peak_error(field, pixels)
         peaks = peak_facts(field.displacement, setup, deflector, mask=self.used, error=error)
@@ -353,18 +390,13 @@ class Fit:
             text = f"NO, not in {self.report.iterations} iterations: allow more (--max-iterations)"
             yield Fact("converged", "Converged", text, Level.FAILED)
 
-    def to_dataset(
-        self,
-        setups: tuple[Setup, ...] | None = None,
-        *,
-        attributes: Mapping[str, str] | None = None,
-    ) -> xarray.Dataset:
+    def to_dataset(self, *, attributes: Mapping[str, str] | None = None) -> xarray.Dataset:
         """Return everything as one labelled dataset, with units.
+
+        The first setup adds fields in SI units, and coordinates in metres.
 
         Parameters
         ----------
-        setups : tuple of Setup, optional
-            The first adds fields in SI units, and coordinates in metres. Default: the fit's.
         attributes : mapping of str to str, optional
             Further attributes.
 
@@ -377,23 +409,21 @@ class Fit:
         """
         import xarray as xr
 
-        used_setups = self.setups if setups is None else setups
-        setup = used_setups[0] if used_setups else None
         history = {
-            "format": FIT_FORMAT,
+            "format": self.kind.value,
             "options": self.options.model_dump_json(),
             "report": json.dumps(dataclasses.asdict(self.report)),
             "verdict": self.verdict.value,
             "explanation": self.explanation,
             "folded": self.folded,
             "fields": json.dumps([field.name for field in self.fields]),
-            "setups": json.dumps([each.model_dump(mode="json") for each in used_setups]),
+            "setups": json.dumps([each.model_dump(mode="json") for each in self.setups]),
         }
         if self.provenance is not None:
             history["provenance"] = self.provenance.to_json()
         merged = xr.Dataset()
         for field in self.fields:
-            part = dataset_from_field(field.displacement, field.potential, setup)
+            part = dataset_from_field(field.displacement, field.potential, self.setup)
             part = part.drop_vars(
                 [name for name in part.data_vars if not belongs(name, field.name)]
             )

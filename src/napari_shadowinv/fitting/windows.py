@@ -10,13 +10,8 @@ import numpy as np
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.result import Fit
-from napari_shadowinv.inversion.variables import (
-    PIXEL,
-    UNCERTAINTY,
-    belongs,
-    dataset_from_field,
-    label,
-)
+from napari_shadowinv.inversion.variables import UNCERTAINTY, belongs, dataset_from_field
+from napari_shadowinv.physics.labels import PIXEL, label
 from napari_shadowinv.physics.setup import Setup
 
 if TYPE_CHECKING:

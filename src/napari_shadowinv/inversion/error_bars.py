@@ -52,8 +52,9 @@ from napari_shadowinv.inversion._invert import invert, plan_sites
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, floored_by, prepare
 from napari_shadowinv.inversion.readout import LinearReadout, read_out
 from napari_shadowinv.inversion.result import Inversion
-from napari_shadowinv.inversion.variables import dataset_from_field, label
+from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.labels import label
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.transport.linear import FactorisedLaplacian, LaplacianSolver
 from napari_shadowinv.transport.objective import TransportObjective

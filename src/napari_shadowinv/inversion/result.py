@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -15,17 +15,20 @@ from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Headline, Level, caution_facts, error_fact, time_fact
+from napari_shadowinv.facts import (
+    Fact,
+    Headline,
+    Level,
+    ResultKind,
+    caution_facts,
+    error_fact,
+    time_fact,
+)
 from napari_shadowinv.inversion.budget import Errors
 from napari_shadowinv.inversion.solution_checks import image_residual
-from napari_shadowinv.inversion.variables import (
-    FORMAT,
-    VARIABLES,
-    dataset_from_field,
-    label,
-    numbers_of,
-)
+from napari_shadowinv.inversion.variables import VARIABLES, dataset_from_field
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.labels import label, numbers_of
 from napari_shadowinv.physics.units import peak_facts, shown_fields
 from napari_shadowinv.provenance import Provenance
 
@@ -144,6 +147,8 @@ class Inversion:
         Recipe and input files, if it was made by a recipe.
     """
 
+    kind: ClassVar = ResultKind.INVERSION
+
     image: FloatArray
     source: FloatArray
     potential: FloatArray
@@ -165,6 +170,11 @@ class Inversion:
     def errors(self) -> Errors | None:
         """Error budget of the displacement; see `Report`."""
         return self.report.errors
+
+    @property
+    def cautions(self) -> tuple[Caution, ...]:
+        """Reasons to doubt the result."""
+        return self.report.warnings
 
     @property
     def error_rows(self) -> list[tuple[str, str]]:
@@ -313,7 +323,7 @@ class Inversion:
             errors of the setup's main field) are JSON texts in the attributes.
         """
         history = {
-            "format": FORMAT,
+            "format": self.kind.value,
             "options": self.options.model_dump_json(),
             "report": json.dumps(dataclasses.asdict(self.report)),
             "image_residual": self.report.image_residual,

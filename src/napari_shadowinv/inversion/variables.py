@@ -3,13 +3,8 @@
 - label a field, with units: `dataset_from_field`
 - the names, dimensions and units alone: `variable_labels`
 - the setup that a dataset was made with: `setup_from_dataset`
-- the kind of a result, a fit or a film pack: `is_fit`, `is_pack`; variables of a fit of one field:
-  `fit_labels`
+- variables of a fit of one field: `fit_labels`
 - the labels of files of earlier versions: `update_labels`
-
-Units are spelled as pint parses them, because napari passes the units of an xarray's coordinates on
-to it.
-For pint ``px`` is a length, 1/96 inch, and ``flux`` a femtolux.
 """
 
 from __future__ import annotations
@@ -19,46 +14,45 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from napari_shadowinv import __version__
 from napari_shadowinv._system.safety import as_input_errors
-from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.physics.labels import (
+    FLUX_DENSITY,
+    PIXEL,
+    PIXEL_AREA,
+    PLANE,
+    label,
+    place_coordinates,
+    place_label,
+)
 
 if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import Setup, SIField
 
-FORMAT = "shadowinv result"
-FIT_FORMAT = "shadowinv fit"
-PACK_FORMAT = "shadowinv film pack"
-
-PIXEL = "pixel"
-PIXEL_AREA = "pixel**2"
-FLUX_DENSITY = "1/pixel**2"
 _FLUX = "1"
 _EARLIER_UNITS = {"px": PIXEL, "px²": PIXEL_AREA, "flux": _FLUX, "flux/px²": FLUX_DENSITY}
 
-_PLANE = ("y", "x")
 _VECTORS = ("component", "y", "x")
 _SITE_VECTORS = ("site", "component")
 
 # Attribute of Inversion: dimensions, units, long name.
 VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
-    "potential": (_PLANE, PIXEL_AREA, "Normalised deflection potential"),
+    "potential": (PLANE, PIXEL_AREA, "Normalised deflection potential"),
     "displacement": (_VECTORS, PIXEL, "Displacement of the ray through each pixel"),
     "sites": (_SITE_VECTORS, PIXEL, "Positions of the sites"),
     "weights": (("site",), PIXEL_AREA, "Weights of the power diagram"),
     "site_mass": (("site",), _FLUX, "Source flux in each site's cell"),
     "site_flux": (("site",), _FLUX, "Image flux in each site's power cell"),
     "site_displacement": (_SITE_VECTORS, PIXEL, "Centroid of each site's cell minus the site"),
-    "image": (_PLANE, FLUX_DENSITY, "Image, scaled to the flux of the source"),
-    "source": (_PLANE, FLUX_DENSITY, "Undisturbed beam"),
-    "reprojection": (_PLANE, FLUX_DENSITY, "Source as displaced by the retrieved field"),
-    "residual": (_PLANE, FLUX_DENSITY, "Image minus re-projection"),
-    "caustic": (_PLANE, "1", "The map folds or its Jacobian is below the threshold"),
-    "mask": (_PLANE, "1", "Pixels that were used"),
+    "image": (PLANE, FLUX_DENSITY, "Image, scaled to the flux of the source"),
+    "source": (PLANE, FLUX_DENSITY, "Undisturbed beam"),
+    "reprojection": (PLANE, FLUX_DENSITY, "Source as displaced by the retrieved field"),
+    "residual": (PLANE, FLUX_DENSITY, "Image minus re-projection"),
+    "caustic": (PLANE, "1", "The map folds or its Jacobian is below the threshold"),
+    "mask": (PLANE, "1", "Pixels that were used"),
 }
 
 UNCERTAINTY = (_VECTORS, PIXEL, "Standard deviation of the displacement")
@@ -84,7 +78,7 @@ def dataset_from_field(
         "displacement": (_VECTORS, displacement, label(*VARIABLES["displacement"][1:]))
     }
     if potential is not None:
-        variables["potential"] = (_PLANE, potential, label(*VARIABLES["potential"][1:]))
+        variables["potential"] = (PLANE, potential, label(*VARIABLES["potential"][1:]))
     attrs = {
         "package_version": __version__,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -92,7 +86,7 @@ def dataset_from_field(
     }
     if setup is not None:
         for field in _vectors_first(setup):
-            dims, values = (_VECTORS, displacement) if field.is_vector else (_PLANE, potential)
+            dims, values = (_VECTORS, displacement) if field.is_vector else (PLANE, potential)
             if values is not None:
                 converted = setup.field_in_si(field.name, values)
                 variables[field.name] = dims, converted, label(field.unit, field.long_name)
@@ -109,7 +103,7 @@ def variable_labels(
         name: (dims, label(unit, long_name)) for name, (dims, unit, long_name) in VARIABLES.items()
     }
     for field in () if setup is None else _vectors_first(setup):
-        dims = _VECTORS if field.is_vector else _PLANE
+        dims = _VECTORS if field.is_vector else PLANE
         labels[field.name] = dims, label(field.unit, field.long_name)
     return labels
 
@@ -129,14 +123,6 @@ def fit_labels(
 def belongs(variable: object, field: str) -> bool:
     """Return whether a variable makes sense for a field: ∫E dz of a magnetic one does not."""
     return _ASSUMES.get(str(variable), field) == field
-
-
-def numbers_of(dataset: xarray.Dataset, name: str) -> AnyArray:
-    """Return a variable of a result as an array; a `ValueError` if it holds no numbers."""
-    values = np.ascontiguousarray(dataset[name].values)
-    if values.dtype.kind not in "buif":
-        raise ValueError(f"{name} holds {values.dtype} values, expected numbers")
-    return values
 
 
 def setup_from_dataset(dataset: xarray.Dataset) -> Setup | None:
@@ -159,55 +145,6 @@ SETUPS_LABEL = {"units": "1", "long_name": "Setup of the shot (JSON)"}
 """Attributes of the variable ``setup`` of a stack whose shots have setups of their own."""
 
 
-def is_fit(attributes: Mapping[Any, Any]) -> bool:
-    """Return whether the attributes of a dataset belong to a fit."""
-    return bool(attributes.get("format") == FIT_FORMAT)
-
-
-def is_pack(attributes: Mapping[Any, Any]) -> bool:
-    """Return whether the attributes of a dataset belong to a film pack."""
-    return bool(attributes.get("format") == PACK_FORMAT)
-
-
-def label(units: str, long_name: str) -> dict[str, str]:
-    """Return the attributes of a variable."""
-    return {"units": units, "long_name": long_name}
-
-
-def place_label(name: str, plane: str = "object plane") -> dict[str, str]:
-    """Return the attributes of pixels' places along y or x in metres."""
-    return label("m", f"{name} in the {plane}")
-
-
-def place_coordinates(
-    shape: tuple[int, int], pixel_size: float | None, plane: str = "object plane"
-) -> dict[str, Any]:
-    """Return y and x of the pixels in metres, or their indices if their size is unknown.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Height and width of the image.
-    pixel_size : float or None
-        Size of a pixel in that plane, in metres.
-    plane : str, optional
-        The plane for the long names.
-    """
-    coordinates: dict[str, Any] = {}
-    for name, count in zip(_PLANE, shape, strict=True):
-        index = np.arange(count, dtype=np.float64)
-        if pixel_size is None:
-            coordinates[name] = (name, index, label(PIXEL, f"{name} in the {plane}"))
-        else:
-            coordinates[name] = (name, index * pixel_size, place_label(name, plane))
-    return coordinates
-
-
-def display_unit(units: str) -> str:
-    """Return the attribute ``units`` as figures print it: px² for ``pixel**2``."""
-    return units.replace("**2", "²").replace("pixel", "px")
-
-
 def update_labels(dataset: xarray.Dataset) -> xarray.Dataset:
     """Return the dataset of a file with today's units and coordinates.
 
@@ -217,7 +154,7 @@ def update_labels(dataset: xarray.Dataset) -> xarray.Dataset:
     for variable in dataset.variables.values():
         if variable.attrs.get("units") in _EARLIER_UNITS:
             variable.attrs["units"] = _EARLIER_UNITS[variable.attrs["units"]]
-    for name in _PLANE:
+    for name in PLANE:
         places = dataset.coords.get(f"{name}_si")
         if places is not None and places.dims == (name,):
             metres = {name: (name, places.values, place_label(name))}

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.variables import FORMAT, is_fit, is_pack, update_labels
+from napari_shadowinv.facts import ResultKind
+from napari_shadowinv.inversion.variables import update_labels
 from napari_shadowinv.io.hdf5 import check_arrays, check_hdf5_seal, hdf5_in_memory
 
 if TYPE_CHECKING:
@@ -32,8 +33,7 @@ def write_result(path: Path, dataset: xarray.Dataset) -> None:
             checked = {"fletcher32": True} if variable.ndim else {}
             encoding[str(name)] = {**packed, **checked, **fill}
     # A field that was read from a file of another format still says so.
-    says_so = is_fit(dataset.attrs) or is_pack(dataset.attrs)
-    marked = dataset if says_so else dataset.assign_attrs(format=FORMAT)
+    marked = dataset.assign_attrs(format=ResultKind.of(dataset.attrs).value)
     # From this version of the format on, the file's own structures have checksums.
     with (
         hdf5_in_memory(path, seal=True) as content,

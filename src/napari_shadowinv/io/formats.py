@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 from napari_shadowinv._system.safety import as_file_errors, check_regular
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.facts import ResultKind
 
 _HEAD_BYTES = 4100  # they hold every mark
 _EXCERPT_BYTES = 64  # they show the kind of a file without a mark
@@ -39,8 +40,7 @@ class Format:
     named_reader: str = ""  # the same, of a path and the name of an array, or the tracks to count
     image_writer: str = ""  # of a path, an image and its pixel size (m) or None
     result_writer: str = ""  # of a path and a dataset
-    fit_writer: str = ""  # of a path and a fit's dataset
-    pack_writer: str = ""  # of a path and a film pack's dataset
+    results: tuple[ResultKind, ...] = ()  # kinds of the results that it writes
     is_scan: bool = False  # may it be a scan of film, whose grey levels fall with dose
 
     @property
@@ -97,15 +97,14 @@ PCO = Format("b16", (".b16",), "PCO .b16", ((0, b"PCO-"), (0, b"pco-")), reader=
 RESULT = Format(
     "shadowinv", (".shadowinv",), ".shadowinv", _HDF5, test="pradformat:is_result",
     holds=("result",), reader="dataset:read_result", named_reader="hdf5:read_plane",
-    result_writer="dataset:write_result", fit_writer="dataset:write_result",
-    pack_writer="dataset:write_result",
+    result_writer="dataset:write_result", results=tuple(ResultKind),
 )
 # The reader of all other HDF5 files: it says which array can be named.
 PRADFORMAT = Format(
     "hdf5", (".h5", ".hdf5"), "pradformat HDF5", _HDF5,
     holds=("image", "result"), reader="pradformat:read_pradformat",
     named_reader="hdf5:read_plane", result_writer="pradformat:write_pradformat",
-    fit_writer="pradformat:write_pradformat",
+    results=(ResultKind.INVERSION, ResultKind.FIT, ResultKind.FIELD),
 )
 CPSA = Format(
     "cpsa", (".cpsa",), "CR-39 .cpsa", unmarked="binary",
@@ -116,7 +115,10 @@ SPE = Format(
     "spe", (".spe",), "Princeton .spe", ((2996, b"\x67\x45\x23\x01"), (4098, b"\x55\x55")),
     unmarked="binary", reader="camera:read_spe",
 )
-SITES = Format("sites", (".csv",), holds=(), result_writer="dataset:write_sites")
+SITES = Format(
+    "sites", (".csv",), holds=(), result_writer="dataset:write_sites",
+    results=(ResultKind.INVERSION,),
+)
 TEXT = Format(
     "text", (".txt", SITES.suffix, ".dat", ".asc"), "numbers as .txt, .csv or .dat",
     unmarked="text", reader="text:read_text",
@@ -151,11 +153,14 @@ def _collect_suffixes(formats: Iterable[Format]) -> frozenset[str]:
     return frozenset(suffix for each in formats for suffix in each.suffixes)
 
 
-def _collect_writers(
-    kind: Literal["image_writer", "result_writer", "fit_writer", "pack_writer"],
-) -> dict[str, str]:
-    writers = {suffix: getattr(each, kind) for each in FORMATS for suffix in each.suffixes}
-    return {suffix: writer for suffix, writer in writers.items() if writer}
+def formats_for(kind: ResultKind) -> tuple[Format, ...]:
+    """Return the formats that hold a kind of result, the complete one first."""
+    return tuple(each for each in FORMATS if kind in each.results)
+
+
+def suffixes_for(kind: ResultKind) -> tuple[str, ...]:
+    """Return the endings of files for a kind of result, the usual one first."""
+    return tuple(suffix for each in formats_for(kind) for suffix in each.suffixes)
 
 
 READABLE = _join_titles(each.title for each in FORMATS)
@@ -164,10 +169,10 @@ RADIOGRAPH_SUFFIXES = _collect_suffixes(each for each in FORMATS if "image" in e
 SCAN_SUFFIXES = _collect_suffixes(each for each in FORMATS if each.is_scan)
 # Endings that napari opens itself: the manifest leaves them out, so that nobody has to choose.
 OPENED_BY_NAPARI = SCAN_SUFFIXES | {".npy", SITES.suffix}
-IMAGE_WRITERS = _collect_writers("image_writer")  # by the ending
-RESULT_WRITERS = _collect_writers("result_writer")
-FIT_WRITERS = _collect_writers("fit_writer")
-PACK_WRITERS = _collect_writers("pack_writer")
+# By the ending.
+IMAGE_WRITERS = {
+    suffix: each.image_writer for each in FORMATS if each.image_writer for suffix in each.suffixes
+}
 FIGURE_SUFFIXES = (PNG.suffix, ".pdf", ".svg")
 NEW_SHOTS = f"*{TIFF.suffix}"  # names in a folder that is watched
 

@@ -22,11 +22,9 @@ import numpy as np
 from napari_shadowinv._system.safety import as_file_errors, check_regular
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.inversion.variables import (
-    FORMAT,
     dataset_from_field,
-    is_fit,
-    is_pack,
     setup_from_dataset,
 )
 from napari_shadowinv.io.dataset import require
@@ -57,8 +55,7 @@ def is_result(path: Path) -> bool:
     if not h5py.is_hdf5(path):
         return False
     attributes = _root_attributes(path)
-    is_fit_or_pack = is_fit(attributes) or is_pack(attributes)
-    return is_fit_or_pack or str(attributes.get("format", "")).startswith(FORMAT)
+    return str(attributes.get("format", "")).startswith(tuple(ResultKind))
 
 
 @as_file_errors
@@ -194,8 +191,7 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
 
     Of a fit's other parts, only the verdict is kept, in the description.
     """
-    fields = json.loads(dataset.attrs["fields"]) if is_fit(dataset.attrs) else ()
-    check_pradformat_fields(fields)
+    check_pradformat_fields(json.loads(dataset.attrs.get("fields", "[]")))
     require(dataset, ("displacement", "potential"))
     setup = check_pradformat_setup(setup_from_dataset(dataset))
     angle = setup.deflection_angle(dataset["displacement"].values)
@@ -208,8 +204,8 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
         **_beam_attributes(setup),
         "description": "Power-diagram inversion by napari-shadowinv",
     }
-    if fields:
-        verdict = dataset.attrs["verdict"]
+    verdict = dataset.attrs.get("verdict")
+    if verdict:
         attributes["description"] = f"Fit of the forward model by napari-shadowinv: {verdict}"
     provenance = Provenance.of(dataset.attrs)
     if provenance is not None:

@@ -17,7 +17,7 @@ import numpy as np
 from napari_shadowinv._system.safety import as_file_errors, small_text
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion.variables import is_pack
+from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.formats import CPSA, Format, format_of
 from napari_shadowinv.io.images import film_warnings, to_grey
@@ -140,7 +140,7 @@ def read_radiograph(
     """Read an image, as by `read`; a result raises a `FileFormatError`, too."""
     content = read(path, channel=channel, variable=variable)
     if not isinstance(content, Radiograph):
-        if is_pack(content.attrs):
+        if ResultKind.of(content.attrs) is ResultKind.FILM_DOSES:
             raise FileFormatError(
                 f"{path} is a film pack: expected one image; write its layers with shadowinv film "
                 "--layers"

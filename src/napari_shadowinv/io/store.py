@@ -24,7 +24,6 @@ from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.inversion.variables import (
     SETUPS_LABEL,
     fit_labels,
-    place_label,
     setup_from_dataset,
     update_labels,
     variable_labels,
@@ -43,6 +42,7 @@ from napari_shadowinv.io.store_checksums import (
     is_along_shots,
 )
 from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, Column, columns_of
+from napari_shadowinv.physics.labels import place_label
 
 if TYPE_CHECKING:
     import xarray

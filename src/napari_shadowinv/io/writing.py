@@ -9,22 +9,20 @@ import numpy as np
 
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.variables import is_fit, is_pack
+from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.io.files import check_output, replacing
 from napari_shadowinv.io.formats import (
-    FIT_WRITERS,
     IMAGE_WRITERS,
-    PACK_WRITERS,
-    RESULT_WRITERS,
+    formats_for,
     function,
+    suffixes_for,
 )
 
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.fitting import Fit
-    from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.inversion.error_bars import Uncertainty
+    from napari_shadowinv.io.results import AnyResult
     from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["write"]
@@ -32,7 +30,7 @@ __all__ = ["write"]
 
 def write(
     path: str | Path,
-    result: Inversion | Uncertainty | Fit | xarray.Dataset | AnyArray,
+    result: AnyResult | Uncertainty | xarray.Dataset | AnyArray,
     *,
     setup: Setup | None = None,
     overwrite: bool = False,
@@ -45,10 +43,10 @@ def write(
         For a result: ``.shadowinv`` for all of it, ``.h5`` for pradformat, ``.csv`` for the
         sites; for a fit ``.shadowinv``, or ``.h5`` for its field alone. For an image: ``.tif``
         (float32), ``.npy``, ``.png`` (16 bits, its largest value white).
-    result : Inversion, Uncertainty, Fit, xarray.Dataset, or ndarray of shape (H, W)
+    result : Inversion, Uncertainty, Fit, FilmDoses, xarray.Dataset, or ndarray of shape (H, W)
         Result or image to write.
     setup : Setup, optional
-        Adds SI units; pradformat needs it. A dataset and a fit bring their own.
+        Adds SI units; pradformat needs it. A dataset, a fit and film doses bring their own.
     overwrite : bool
         Whether an existing file may be replaced.
 
@@ -63,7 +61,7 @@ def write(
         ending names no format for this.
     InputError
         If pradformat is asked for without the setup of a particle beam, or a setup is given for
-        a fit.
+        a fit or film doses.
 
     Examples
     --------
@@ -78,33 +76,28 @@ def write(
             _write_image(temporary, result, setup)
         return Path(path)
     dataset = _as_dataset(result, setup)
-    writers = _writers_of(dataset)
-    check_output(path, overwrite, suffixes=writers)
+    kind = ResultKind.of(dataset.attrs)
+    check_output(path, overwrite, suffixes=suffixes_for(kind))
     with replacing(path, overwrite) as temporary:
-        function(writers[temporary.suffix.lower()])(temporary, dataset)
+        suffix = temporary.suffix.lower()
+        (file_format,) = (each for each in formats_for(kind) if suffix in each.suffixes)
+        function(file_format.result_writer)(temporary, dataset)
     return Path(path)
 
 
-def _writers_of(dataset: xarray.Dataset) -> dict[str, str]:
-    if is_pack(dataset.attrs):
-        return PACK_WRITERS
-    return FIT_WRITERS if is_fit(dataset.attrs) else RESULT_WRITERS
-
-
 def _as_dataset(
-    result: Inversion | Uncertainty | Fit | xarray.Dataset, setup: Setup | None
+    result: AnyResult | Uncertainty | xarray.Dataset, setup: Setup | None
 ) -> xarray.Dataset:
-    from napari_shadowinv.fitting import Fit
-
     if _is_dataset(result):
         return result
-    if not isinstance(result, Fit):
+    if setup is None:
+        return result.to_dataset()
+    from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.inversion.error_bars import Uncertainty
+
+    if isinstance(result, Inversion | Uncertainty):
         return result.to_dataset(setup)
-    if setup is not None:
-        raise InputError(
-            "received a setup for a fit, which has those of its images: give them to fit()"
-        )
-    return result.to_dataset()
+    raise InputError(f"received a setup for a {result.kind.noun}, which has its own: leave it out")
 
 
 def _is_dataset(result: Any) -> TypeGuard[xarray.Dataset]:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from napari_shadowinv import __version__
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
@@ -29,19 +26,14 @@ from napari_shadowinv.film import (
     unfold,
     usable_pixels,
 )
-from napari_shadowinv.film.film_response import relative_strengths
 from napari_shadowinv.film.registration import EDGES
 from napari_shadowinv.film.scans import common_shape, upright
+from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.fitting.measurements import estimated_noise
-from napari_shadowinv.inversion.variables import PACK_FORMAT, PIXEL, place_coordinates
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.images import Scan
 from napari_shadowinv.pipeline._film_inputs import Film, in_parallel, read_films, to_scan_frame
 from napari_shadowinv.provenance import ImageOrigin, Provenance
-
-if TYPE_CHECKING:
-    import xarray
-
 
 __all__ = ["run_film"]
 
@@ -49,17 +41,6 @@ _MAX_SIZE_DEVIATION = 0.1  # from the median size
 _MAX_PIXEL_DEVIATION = 0.01
 _MAX_DARK_SHARE = 0.01  # of a film's pixels
 _CUT_APART_PX = 3.0  # films whose sides differ by more were not cut together
-_PER_AREA = "1/(m² MeV)"
-_UNITS = {"dose": "Gy", "dose_error": "Gy", "fluence": _PER_AREA, "fluence_error": _PER_AREA}
-_UNITS |= {"usable": "1", "by_images": "1", "turn": "rad"}
-
-_SEEN_FROM = {
-    None: "the source (assumed)",
-    "source": "the source",
-    "detector": "the source (scans from the detector, mirrored)",
-}
-
-ByLayer = dict[str, tuple[tuple[str, ...], Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +55,7 @@ class _Doses:
 
 def run_film(
     pack: Pack, *, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
-) -> xarray.Dataset:
+) -> FilmDoses:
     """Convert the scans of a pack to doses, and these to fluences at each film's energy.
 
     Films are located on their scans, straightened and aligned, and their marks are masked.
@@ -89,17 +70,9 @@ def run_film(
 
     Returns
     -------
-    xarray.Dataset
-        By layer, y and x: ``dose`` in Gy and ``fluence`` in protons per m² and MeV, both as on the
-        first film, each with its standard deviation, and ``usable``. By layer: ``energy`` of the
-        protons that its fluence represents, the energy whose Bragg ``peak`` lies in its film, and
-        the band around it (MeV); ``strength``, the displacement of these protons by a magnetic
-        field relative to the first layer's; with a setup ``time_of_flight`` (s); the ``corners``
-        of the film on its scan (px); ``shift``, ``shift_error`` (px) and ``turn`` (rad) of its
-        alignment, and whether it was aligned ``by_images``.
-        Attribute ``warnings``: reasons to doubt the result. Films are shown as seen from the
-        source, which decides the sign of a magnetic field; attribute ``seen_from`` records how
-        the pack describes its scans.
+    FilmDoses
+        With the pack, by which it can be repeated. Films are shown as seen from the source, which
+        decides the sign of a magnetic field.
 
     Raises
     ------
@@ -152,12 +125,17 @@ def run_film(
     )
     planes["dose_error"] *= planes["dose"]
     planes |= {"fluence": spectra.fluence, "fluence_error": spectra.error}
-    by_film = _layer_variables(pack, films, cut, poses)
-    warnings = _warnings(aligned, doses, poses, pack)
-    setups = pack.setups(spectra.energies, pixel)
-    provenance = Provenance(kind="film pack", pack=pack, images=_scans(pack, films))
-    return _dataset(
-        pack, response, spectra.energies, setups, pixel, planes, by_film, warnings, provenance
+    stored = {name: plane.astype(np.float32) for name, plane in planes.items() if name != "usable"}
+    return FilmDoses(
+        **stored,
+        usable=planes["usable"],
+        **_film_values(pack, films, cut, poses),
+        energies=spectra.energies,
+        bands=np.array([(band.peak, band.low, band.high) for band in response.bands]),
+        provenance=Provenance(kind="film pack", pack=pack, images=_scans(pack, films)),
+        cautions=tuple(_warnings(aligned, doses, poses, pack)),
+        pixel_size=pixel,
+        setups=pack.setups(spectra.energies, pixel),
     )
 
 
@@ -291,29 +269,29 @@ def _stack_planes(
     return planes
 
 
-def _layer_variables(
+def _film_values(
     pack: Pack, films: list[Film], corners: Mapping[int, FloatArray], poses: Poses
-) -> ByLayer:
+) -> dict[str, Any]:
+    """Collect alignment and corners of each layer, NaN for excluded ones."""
     count = len(pack.layers)
-    values: ByLayer = {
-        "shift": (("layer", "component"), np.full((count, 2), np.nan)),
-        "turn": (("layer",), np.full(count, np.nan)),
-        "shift_error": (("layer",), np.full(count, np.nan)),
-        "by_images": (("layer",), np.zeros(count, dtype=bool)),
-        "corners": (("layer", "corner", "component"), np.full((count, 4, 2), np.nan)),
-    }
+    shifts, on_scans = np.full((count, 2), np.nan), np.full((count, 4, 2), np.nan)
+    turns, errors = np.full(count, np.nan), np.full(count, np.nan)
+    by_images = np.zeros(count, dtype=bool)
     for k, film in enumerate(films):
         at = film.number - 1
-        values["shift"][1][at] = poses.shifts[k]
-        values["turn"][1][at] = poses.turns[k]
-        values["shift_error"][1][at] = poses.errors[k]
-        values["by_images"][1][at] = poses.by_images[k]
+        shifts[at], turns[at] = poses.shifts[k], poses.turns[k]
+        errors[at], by_images[at] = poses.errors[k], poses.by_images[k]
         layer = pack.layers[at]
-        _, on_scan = to_scan_frame(
+        _, on_scans[at] = to_scan_frame(
             film.scan, corners[film.number], layer.turned, pack.is_mirrored(layer)
         )
-        values["corners"][1][at] = on_scan
-    return values
+    return {
+        "shifts": shifts,
+        "shift_errors": errors,
+        "turns": turns,
+        "by_images": by_images,
+        "corners": on_scans,
+    }
 
 
 def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) -> list[Caution]:
@@ -359,50 +337,3 @@ def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) 
         )
         cautions.append(Caution("film-side", text))
     return cautions
-
-
-def _dataset(
-    pack: Pack,
-    response: Response,
-    energies: FloatArray,
-    setups: Sequence[Any],
-    pixel: float | None,
-    planes: dict[str, Any],
-    by_film: ByLayer,
-    warnings: list[Caution],
-    provenance: Provenance,
-) -> xarray.Dataset:
-    import xarray as xr
-
-    bands = response.bands
-    variables: dict[str, Any] = {}
-    for name, values in planes.items():
-        stored = values if name == "usable" else values.astype(np.float32)
-        variables[name] = (("layer", "y", "x"), stored, {"units": _UNITS[name]})
-    for name, (dims, values) in by_film.items():
-        variables[name] = (dims, values, {"units": _UNITS.get(name, PIXEL)})
-    coordinates: dict[str, Any] = {
-        "layer": np.arange(1, len(bands) + 1),
-        "film": ("layer", [layer.film for layer in pack.layers]),
-        "energy": ("layer", energies, {"units": "MeV"}),
-        "peak": ("layer", [band.peak for band in bands], {"units": "MeV"}),
-        "energy_low": ("layer", [band.low for band in bands], {"units": "MeV"}),
-        "energy_high": ("layer", [band.high for band in bands], {"units": "MeV"}),
-        "strength": ("layer", relative_strengths(energies), {"units": "1"}),
-        **place_coordinates(planes["dose"].shape[1:], pixel, "film's plane"),
-    }
-    attributes: dict[str, Any] = {
-        "format": PACK_FORMAT,
-        "package_version": __version__,
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "provenance": provenance.to_json(),
-        "warnings": json.dumps([asdict(caution) for caution in warnings]),
-        "seen_from": _SEEN_FROM[pack.seen_from],
-    }
-    if pixel is not None:
-        attributes["scan_pixel_size"] = pixel
-    if setups:
-        flight = [setup.time_of_flight for setup in setups]
-        coordinates["time_of_flight"] = ("layer", flight, {"units": "s"})
-        attributes["setups"] = json.dumps([setup.model_dump(mode="json") for setup in setups])
-    return xr.Dataset(variables, coordinates, attributes)

@@ -7,25 +7,20 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.film import Pack, PackLayer
-from napari_shadowinv.inversion.variables import is_pack
+from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read_toml, replacing, write
 from napari_shadowinv.io.formats import PRADFORMAT, SITES, TIFF
 from napari_shadowinv.io.pradformat import write_radiograph
-from napari_shadowinv.physics.setup import setup_from_dict
 from napari_shadowinv.pipeline.shot_table import rows_of
-
-if TYPE_CHECKING:
-    import xarray
 
 __all__ = ["LAYERS_TABLE", "read_pack", "write_layers"]
 
@@ -60,7 +55,7 @@ def read_pack(path: Path) -> Pack:
 
 
 def write_layers(
-    dataset: xarray.Dataset,
+    doses: FilmDoses,
     folder: Path,
     *,
     form: Literal["tiff", "pradformat"] = "tiff",
@@ -74,7 +69,7 @@ def write_layers(
 
     Parameters
     ----------
-    dataset : xarray.Dataset
+    doses : FilmDoses
         Result of `run_film`.
     folder : Path
         Created if it does not exist.
@@ -91,31 +86,28 @@ def write_layers(
     FileFormatError
         If a file exists, unless `overwrite`, or cannot be written.
     InputError
-        If the dataset does not come from a film pack, or has no setup, which pradformat needs.
+        If the doses have no setup, which pradformat needs.
     """
-    if not is_pack(dataset.attrs):
-        raise InputError("expected the dataset of a film pack, as shadowinv film writes it")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FileFormatError(
             f"{folder} cannot be created as a folder ({error.strerror}): choose another name"
         ) from None
-    setups = [setup_from_dict(entry) for entry in json.loads(dataset.attrs.get("setups", "[]"))]
+    setups = doses.setups
     if form == "pradformat" and not setups:
         raise InputError("pradformat needs a setup: give the pack's distances, or write TIFF")
     written, rows = [], []
-    for k, number in enumerate(dataset["layer"].values):
-        name = f"layer_{int(number):02d}"
-        used = dataset["usable"].values[k]
+    for k, used in enumerate(doses.usable):
+        name = f"layer_{k + 1:02d}"
         row = {"mask": f"{name}_mask{TIFF.suffix}"}
-        fluence = np.where(used, dataset["fluence"].values[k], 0.0)
+        fluence = np.where(used, doses.fluence[k], 0.0)
         written.append(write(folder / row["mask"], used.astype(np.float32), overwrite=overwrite))
         if form == "pradformat":
             row["file"] = f"{name}{PRADFORMAT.suffix}"
-            what = f"Film {int(number)} of a pack, fluence in protons per m² and MeV"
+            description = f"Film {k + 1} of a pack, fluence in protons per m² and MeV"
             with replacing(folder / row["file"], overwrite) as temporary:
-                write_radiograph(temporary, fluence, setups[k], what)
+                write_radiograph(temporary, fluence, setups[k], description)
             written.append(folder / row["file"])
         else:
             row["file"] = f"{name}{TIFF.suffix}"
@@ -124,8 +116,8 @@ def write_layers(
             row["setup"] = f"{name}.toml"
             written.append(_write_setup(folder / row["setup"], setups[k].model_dump(), overwrite))
         elif not setups:
-            row["energy"] = f"{dataset['energy'].values[k]:.6g}"
-            row["strength"] = f"{dataset['strength'].values[k]:.6g}"
+            row["energy"] = f"{doses.energies[k]:.6g}"
+            row["strength"] = f"{doses.strengths[k]:.6g}"
         if not used.any():
             row["exclude"] = "yes"
         rows.append(row)

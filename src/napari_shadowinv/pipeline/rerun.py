@@ -20,12 +20,14 @@ from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.fitting.windows import PREFIX
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read_dataset
 from napari_shadowinv.io.files import sha256
+from napari_shadowinv.io.results import result_from_dataset
 from napari_shadowinv.pipeline._film import run_film
 from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import FitShot, run_fit
@@ -37,6 +39,8 @@ from napari_shadowinv.provenance import MaskOrigin, Origin, Provenance
 
 if TYPE_CHECKING:
     import xarray
+
+    from napari_shadowinv.io.results import AnyResult
 
 __all__ = ["IDENTICAL", "Rerun", "RerunInputs", "collect_rerun", "provenance_of", "rerun"]
 
@@ -50,8 +54,8 @@ class Rerun:
 
     Attributes
     ----------
-    content : Inversion, Fit or Dataset
-        The result; of a film pack its dataset.
+    content : Inversion, Fit or FilmDoses
+        The result.
     dataset : Dataset
         All of it, with the images left out of a fit and its windows.
     checks : StaticChecks
@@ -62,7 +66,7 @@ class Rerun:
         Difference of the results, `IDENTICAL` if there is none.
     """
 
-    content: Any
+    content: AnyResult
     dataset: xarray.Dataset
     checks: StaticChecks
     changes: tuple[str, ...]
@@ -108,6 +112,11 @@ class RerunInputs:
     changes: tuple[str, ...] = ()
 
     @property
+    def kind(self) -> ResultKind:
+        """Kind of the result."""
+        return ResultKind.from_noun(self.provenance.kind)
+
+    @property
     def has_left_out(self) -> bool:
         """Whether the first result has the images of a fit left out one by one."""
         return "left_out_chi2" in self.dataset
@@ -123,18 +132,15 @@ class RerunInputs:
     ) -> Rerun:
         """Repeat the result, and compare it with the first."""
         callbacks: dict[str, Any] = {"on_progress": on_progress, "should_stop": should_stop}
-        kind, before, checks = self.provenance.kind, self.provenance, StaticChecks()
-        content: Any
-        if kind == "film pack":
-            assert before.pack is not None
+        before, checks = self.provenance, StaticChecks()
+        content: AnyResult
+        if before.pack is not None:
             content = run_film(before.pack, **callbacks)
-            dataset = content
-        elif kind == "inversion":
-            content = self._invert(self.recipe, **callbacks)
-            dataset = content.to_dataset()
-        else:
+        elif self.kind is ResultKind.FIT:
             content, checks = self._fit(**callbacks)
-            dataset = checks.add_to(content.to_dataset())
+        else:
+            content = self._invert(self.recipe, **callbacks)
+        dataset = checks.add_to(content.to_dataset())
         after = Provenance.of(dataset.attrs)
         changes = [*self.changes, *([] if after is None else _image_changes(before, after))]
         difference = _difference(self.dataset, dataset)
@@ -184,7 +190,7 @@ class RerunInputs:
 
 
 def rerun(
-    result: Path | str | Inversion | Fit | xarray.Dataset,
+    result: Path | str | AnyResult | xarray.Dataset,
     images: Sequence[Shot] | Shot | None = None,
     *,
     source: Path | str | None = None,
@@ -198,7 +204,7 @@ def rerun(
 
     Parameters
     ----------
-    result : path, Dataset, Inversion or Fit
+    result : path, Dataset, Inversion, Fit or FilmDoses
         An inversion, a fit with its images left out and windows, a film pack, or the dataset of
         one shot of a stack, which is inverted without another shot to start from.
     images : sequence of path, array_like or Radiograph, optional
@@ -231,7 +237,7 @@ def rerun(
 
 
 def collect_rerun(
-    result: Path | str | Inversion | Fit | xarray.Dataset,
+    result: Path | str | AnyResult | xarray.Dataset,
     images: Sequence[Shot] | Shot | None = None,
     *,
     source: Path | str | None = None,
@@ -247,7 +253,7 @@ def collect_rerun(
     if isinstance(result, (str, Path)):
         dataset, name = read_dataset(result), str(result)
         folder = Path(result).parent
-    elif isinstance(result, (Inversion, Fit)):
+    elif not hasattr(result, "data_vars"):
         dataset = result.to_dataset()
     provenance = _checked_provenance(dataset, name)
     listed: Any = () if images is None else images
@@ -286,8 +292,7 @@ def _checked_provenance(dataset: xarray.Dataset, name: str) -> Provenance:
             "choose one in Python, as in read_stack(path).isel(shot=3)"
         )
     if "report" in dataset.attrs:  # not of a shot of a stack, a film pack or a field alone
-        kind = Fit if "verdict" in dataset.attrs else Inversion
-        as_file_errors(lambda _: kind.from_dataset(dataset))(name)
+        as_file_errors(lambda _: result_from_dataset(dataset))(name)
     provenance = provenance_of(dataset)
     if provenance is None:
         raise InputError(f"{name} {_defect(dataset)}")

@@ -1,4 +1,10 @@
-"""Figures of an inversion or a fit for a logbook or a talk.
+"""Figures of results for a logbook or a talk.
+
+- the figure of any result: `result_figure`; of each kind: `report_figure`, `fit_figure`,
+  `pack_figure`
+- tests of one static field: `left_out_figure`, `windows_figure`
+- fields side by side: `comparison_figure`; a figure's file: `save_figure`
+- a stack as a movie: `write_film`
 
 The figures use matplotlib's objects and no pyplot, so they neither need a window nor
 disturb the figures of a notebook.
@@ -8,7 +14,12 @@ from napari_shadowinv.plotting._film_figure import pack_figure
 from napari_shadowinv.plotting._fit_figure import fit_figure
 from napari_shadowinv.plotting._movie import in_few_colours, stack_frames, write_film
 from napari_shadowinv.plotting._static_figure import left_out_figure, windows_figure
-from napari_shadowinv.plotting.figures import comparison_figure, report_figure, save_figure
+from napari_shadowinv.plotting.figures import (
+    comparison_figure,
+    report_figure,
+    result_figure,
+    save_figure,
+)
 
 __all__ = [
     "comparison_figure",
@@ -17,6 +28,7 @@ __all__ = [
     "left_out_figure",
     "pack_figure",
     "report_figure",
+    "result_figure",
     "save_figure",
     "stack_frames",
     "windows_figure",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -10,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.cautions import Caution
+from napari_shadowinv.facts import Level
 from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR, Grid, Panel, Scale
 
 if TYPE_CHECKING:
-    import xarray
     from matplotlib.figure import Figure
+
+    from napari_shadowinv.film_doses import FilmDoses
 
 _COLUMNS = 4
 _PANEL_SHARE = 0.75  # of the usual size of a panel
@@ -25,7 +25,7 @@ _FINE_BLUR_PX = 1.0  # the overlay shows the structure between the two blurs
 _COARSE_BLUR_PX = 20.0
 
 
-def pack_figure(dataset: xarray.Dataset, *, title: str | None = None) -> Figure:
+def pack_figure(doses: FilmDoses, *, title: str | None = None) -> Figure:
     """Show the dose of each film of a pack, and three neighbouring films in one picture.
 
     Masked pixels are light grey. In the last panel, three aligned films add up to grey;
@@ -33,7 +33,7 @@ def pack_figure(dataset: xarray.Dataset, *, title: str | None = None) -> Figure:
 
     Parameters
     ----------
-    dataset : xarray.Dataset
+    doses : FilmDoses
         Result of `run_film`.
     title : str, optional
         A heading, such as the pack's name.
@@ -45,43 +45,40 @@ def pack_figure(dataset: xarray.Dataset, *, title: str | None = None) -> Figure:
     """
     import matplotlib as mpl
 
-    doses, usable = dataset["dose"].values, dataset["usable"].values
-    count, *sides = doses.shape
+    planes, usable = doses.dose, doses.usable
+    count, *sides = planes.shape
     shape = sides[0], sides[1]
     panels_shown = count + (count >= 3)
     columns = min(_COLUMNS, panels_shown)
     width, height = (_PANEL_SHARE * side for side in _panels.panel_size(shape))
     grid = Grid(-(-panels_shown // columns), columns, width, height, foot=0.1, head=0.0)
-    header = _header(dataset, int(grid.figure_size[0] * _LETTERS_PER_INCH))
+    header = _header(doses, int(grid.figure_size[0] * _LETTERS_PER_INCH))
     grid = Grid(grid.rows, columns, width, height, foot=0.1, head=0.52 + 0.18 * len(header))
     with mpl.rc_context(_panels.STYLE):
         figure, panels = _panels.new_page(grid, Scale(1.0, "px"), title)
         for k in range(count):
-            _draw_dose(panels[k], doses[k], usable[k], _layer_title(dataset, k))
+            _draw_dose(panels[k], planes[k], usable[k], doses.film_label(k))
         if count >= 3:
-            _draw_overlay(panels[count], doses, usable)
+            _draw_overlay(panels[count], planes, usable)
         for panel in panels[panels_shown:]:
             panel.axes.remove()
         _panels.write_header(figure, header, grid)
     return figure
 
 
-def _header(dataset: xarray.Dataset, letters: int) -> list[tuple[str, str]]:
-    low, high = dataset["energy"].values[[0, -1]]
-    lines = [(f"{dataset.sizes['layer']} films, {low:.3g} to {high:.3g} MeV", QUIET_COLOUR)]
-    for caution in map(Caution.from_json, json.loads(dataset.attrs["warnings"])):
-        lines += [(line, ALARM_COLOUR) for line in textwrap.wrap(caution.text, letters)]
+def _header(doses: FilmDoses, letters: int) -> list[tuple[str, str]]:
+    facts = [fact for fact in doses.facts if not fact.is_detail]
+    cautions = [fact.text for fact in facts if fact.level is not Level.SOUND]
+    line = _panels.fact_line(fact for fact in facts if fact.level is Level.SOUND)
+    lines = [(part, QUIET_COLOUR) for part in textwrap.wrap(line, letters)]
+    for text in cautions:
+        lines += [(part, ALARM_COLOUR) for part in textwrap.wrap(text, letters)]
     return lines
-
-
-def _layer_title(dataset: xarray.Dataset, k: int) -> str:
-    layer = dataset.isel(layer=k)
-    return f"{int(layer['layer'])}: {float(layer['energy']):.3g} MeV, {layer['film'].item()}"
 
 
 def _draw_dose(panel: Panel, dose: FloatArray, usable: BoolArray, title: str) -> None:
     if not usable.any():
-        panel.axes.set_title(f"{title}: left out")
+        panel.axes.set_title(title)
         panel.axes.set_axis_off()
         return
     middle = tuple(slice(side // 8, side - side // 8) for side in dose.shape)  # edges may be burnt

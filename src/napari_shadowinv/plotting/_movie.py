@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion.variables import display_unit, setup_from_dataset
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.files import replacing
+from napari_shadowinv.physics.labels import display_unit
 from napari_shadowinv.physics.units import PREFIXED_UNITS, prefix_for
 from napari_shadowinv.plotting._panels import STYLE, choose_grid, image_scale, new_page
 

@@ -12,9 +12,12 @@ from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.physics.units import prefix_for
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from napari_shadowinv.facts import Fact
     from napari_shadowinv.physics.setup import Setup
 
 ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR = "#b00020", "#1b6e3c", "0.3"
@@ -145,6 +148,11 @@ def write_header(
     for number, (text, colour) in enumerate(lines):
         y = 1 - (top + 0.18 * number) / height
         figure.text(0.2 / width, y, text, size=10, color=colour, va="top")
+
+
+def fact_line(facts: Iterable[Fact]) -> str:
+    """Return facts as one line of text, to be wrapped."""
+    return "  ·  ".join(f"{fact.title}: {fact.text}" for fact in facts)
 
 
 def write_footer(figure: Figure, lines: list[tuple[str, str]], grid: Grid) -> None:

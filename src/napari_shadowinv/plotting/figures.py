@@ -1,9 +1,9 @@
-"""Whole figures: one shot on a page, or fields side by side."""
+"""Whole figures: any result or one shot on a page, or fields side by side."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.physics.units import intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
@@ -25,12 +26,15 @@ from napari_shadowinv.plotting._drawing import (
     draw_side_by_side,
     outline_caustics,
 )
+from napari_shadowinv.plotting._film_figure import pack_figure
+from napari_shadowinv.plotting._fit_figure import fit_figure
 from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR, Panel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.io.results import AnyResult
     from napari_shadowinv.physics.setup import Setup
 
 DOTS_PER_INCH = 160  # of a figure's file
@@ -50,7 +54,7 @@ def report_figure(
     ----------
     inversion : Inversion
     setup : Setup, optional
-        Gives axes in metres and the field in SI units; pixels without.
+        Gives axes in metres and the field in SI units. Default: the inversion's, or else pixels.
     title : str, optional
         A heading, such as the shot's name.
 
@@ -61,6 +65,7 @@ def report_figure(
     """
     import matplotlib as mpl
 
+    setup = inversion.setup if setup is None else setup
     shape = inversion.potential.shape
     (field,) = shown_fields([inversion.displacement], setup, mask=inversion.mask)
     width = _panels.choose_grid(shape, panels=6).figure_size[0]
@@ -103,8 +108,10 @@ def comparison_figure(
     ----------
     fields : mapping of str to array_like, shape (2, H, W)
         Displacements in px by name; the first is the reference.
-    setup, title
-        As for `report_figure`.
+    setup : Setup, optional
+        Gives axes in metres and fields in SI units; pixels without.
+    title : str, optional
+        A heading.
     caption : str
         A line below.
 
@@ -132,6 +139,35 @@ def comparison_figure(
         draw_side_by_side(panels, in_units)
         _panels.write_footer(figure, [(caption, QUIET_COLOUR)], grid)
     return figure
+
+
+def result_figure(result: AnyResult, *, title: str | None = None) -> Figure:
+    """Show a result on a page.
+
+    Parameters
+    ----------
+    result : Inversion, Fit or FilmDoses
+    title : str, optional
+        A heading, such as the name of the image.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure with an Agg canvas; write it with `save_figure`.
+
+    Raises
+    ------
+    InputError
+        If it is a field alone.
+    """
+    figures: dict[ResultKind, Callable[..., Figure]] = {
+        ResultKind.INVERSION: report_figure,
+        ResultKind.FIT: fit_figure,
+        ResultKind.FILM_DOSES: pack_figure,
+    }
+    if result.kind not in figures:
+        raise InputError(f"received a {result.kind.noun} without images: expected a whole result")
+    return figures[result.kind](result, title=title)
 
 
 def save_figure(path: str | Path, figure: Figure, overwrite: bool = False) -> Path:

@@ -6,6 +6,7 @@ import csv
 import shutil
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,13 @@ from napari_shadowinv import read, write
 from napari_shadowinv._napari import packs
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of, usable_of
 from napari_shadowinv._napari.layers import add_layers
-from napari_shadowinv._napari.packs import BY_HAND, film_layers, pack_frame, pack_of
+from napari_shadowinv._napari.packs import BY_HAND, film_layers, pack_frame
 from napari_shadowinv._napari.widgets.film_pack import FilmPack, NewPackDialog
 from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.film import read_corners
+from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.pipeline import read_pack
 from simulated_pack import Truth
 
@@ -51,9 +53,9 @@ def wait(qtbot: Any) -> Callable[[Any], None]:
 
 
 @pytest.fixture
-def evaluated(viewer: ViewerModel, tool: Any, pack_dataset: Any, tmp_path: Path) -> Any:
+def evaluated(viewer: ViewerModel, tool: Any, pack_doses: Any, tmp_path: Path) -> Any:
     """The widget with a result that was opened from a file."""
-    viewer.open(write(tmp_path / "trio.shadowinv", pack_dataset), plugin="napari-shadowinv")
+    viewer.open(write(tmp_path / "trio.shadowinv", pack_doses), plugin="napari-shadowinv")
     return tool
 
 
@@ -67,7 +69,7 @@ def scratch_of(tool: Any) -> list[Path]:
 
 
 def test_a_run_shows_the_fluences_of_the_films(
-    window: Any, open_widget: Any, film_pack: Truth, pack_dataset: Any, wait: Callable[[Any], None]
+    window: Any, open_widget: Any, film_pack: Truth, pack_doses: Any, wait: Callable[[Any], None]
 ) -> None:
     tool = open_widget("Film pack")
     tool.path.edit.setText(str(film_pack.pack))
@@ -79,12 +81,12 @@ def test_a_run_shows_the_fluences_of_the_films(
         "trio unusable",
     ]
     fluence = of_role(window, "fluence")
-    np.testing.assert_array_equal(fluence.data, pack_dataset["fluence"].values)
+    np.testing.assert_array_equal(fluence.data, pack_doses.fluence)
     assert window.layers.selection.active is fluence
     assert tool.packs.layer is fluence
-    first, _, last = (f"{energy:.3g}" for energy in pack_dataset["energy"].values)
+    first, _, last = (f"{energy:.3g}" for energy in pack_doses.energies)
     assert tool.report.texts()["Films"] == f"3, {first} to {last} MeV"
-    used = pack_dataset["usable"].values
+    used = pack_doses.usable
     means = [
         plane[mask].astype(float).mean() for plane, mask in zip(fluence.data, used, strict=True)
     ]
@@ -99,15 +101,15 @@ def test_a_run_shows_the_fluences_of_the_films(
     assert len(window.layers) == 3
 
 
-def test_the_spectrum_follows_the_region(evaluated: Any, pack_dataset: Any, qtbot: Any) -> None:
+def test_the_spectrum_follows_the_region(evaluated: Any, pack_doses: Any, qtbot: Any) -> None:
     tool = evaluated
     tool._draw_region()
     scale = tool.packs.layer.scale[1:]
     assert tool.regions.layer.name.endswith("region")
 
     def mean(rows: slice, columns: slice) -> list[float]:
-        used = pack_dataset["usable"].values[:, rows, columns]
-        fluence = pack_dataset["fluence"].values[:, rows, columns]
+        used = pack_doses.usable[:, rows, columns]
+        fluence = pack_doses.fluence[:, rows, columns]
         return [film[mask].astype(float).mean() for film, mask in zip(fluence, used, strict=True)]
 
     region = tool.regions.layer
@@ -123,16 +125,16 @@ def test_the_spectrum_follows_the_region(evaluated: Any, pack_dataset: Any, qtbo
 
 
 def test_corners_are_shown_dragged_and_used(
-    viewer: ViewerModel, evaluated: Any, pack_dataset: Any, wait: Callable[[Any], None], qtbot: Any
+    viewer: ViewerModel, evaluated: Any, pack_doses: Any, wait: Callable[[Any], None], qtbot: Any
 ) -> None:
     tool = evaluated
     of_role(viewer, "unusable").data[0, 40:44, 50:55] = BY_HAND
     viewer.dims.set_current_step(0, 1)
     tool.show_corners.click()
-    corners = pack_dataset["corners"].values
+    corners = pack_doses.corners
     np.testing.assert_allclose(tool.corners.polygon.data[0], corners[1], atol=1e-4)
     assert tool.corners.scan.rgb
-    assert tool.corners.corners(pack_dataset) is None
+    assert tool.corners.corners(pack_doses) is None
     moved = corners + np.array([[-2.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     tool.corners.polygon.data = [moved[1]]
     viewer.dims.set_current_step(0, 2)
@@ -141,17 +143,17 @@ def test_corners_are_shown_dragged_and_used(
     tool.corners.polygon.data = [moved[2]]
     tool.run_again.click()
     wait(tool)
-    dataset = tool._selected()[1]
-    assert dataset is not pack_dataset
-    table = read_corners(pack_of(dataset).corners)
+    doses = tool._selected()[1]
+    assert doses is not pack_doses
+    table = read_corners(doses.pack.corners)
     np.testing.assert_allclose(table["1"], corners[0], atol=0.006)
     np.testing.assert_allclose(table["2"], moved[1], atol=0.006)
     np.testing.assert_allclose(table["3"], moved[2], atol=0.006)
     assert list(table) == ["1", "2", "3"]
     # Marks stay in their places, although the films are a pixel higher now.
-    height = dataset.sizes["y"]
-    assert height == pack_dataset.sizes["y"] + 1
-    spot = dataset["usable"].values[0, 38:46, 48:57]
+    height = doses.dose.shape[1]
+    assert height == pack_doses.dose.shape[1] + 1
+    spot = doses.usable[0, 38:46, 48:57]
     assert spot.sum() == spot.size - 20
     marks = tool._partner(tool.packs.layer, "unusable")
     assert (marks.data[0, 38:46, 48:57][~spot] == BY_HAND).all()
@@ -177,7 +179,7 @@ def test_a_polygon_that_is_no_film_is_one_sentence(viewer: ViewerModel, evaluate
 def test_painted_pixels_are_not_used(
     viewer: ViewerModel,
     evaluated: Any,
-    pack_dataset: Any,
+    pack_doses: Any,
     wait: Callable[[Any], None],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -189,12 +191,12 @@ def test_painted_pixels_are_not_used(
     assert marks.mode == "paint"
     assert marks.selected_label == BY_HAND
     spot = np.s_[1, 30:36, 40:48]
-    assert pack_dataset["usable"].values[spot].all()
+    assert pack_doses.usable[spot].all()
     marks.data[spot] = BY_HAND
     tool.run_again.click()
     wait(tool)
-    dataset = tool._selected()[1]
-    usable = dataset["usable"].values
+    doses = tool._selected()[1]
+    usable = doses.usable
     assert not usable[spot].any()
     assert usable[0, 30:36, 40:48].all()
     marks = tool._partner(tool.packs.layer, "unusable")
@@ -204,16 +206,16 @@ def test_painted_pixels_are_not_used(
     file = tmp_path / "mended.shadowinv"
     monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_, **__: (str(file), ""))
     tool.save.click()
-    again = read(file)
-    np.testing.assert_array_equal(again["usable"].values, usable)
-    mask = pack_of(again).layers[1].mask
+    again = FilmDoses.from_dataset(read(file))
+    np.testing.assert_array_equal(again.usable, usable)
+    mask = again.pack.layers[1].mask
     assert mask == tmp_path / "mended_mask_02.tif"
     assert not read(mask).image[30:36, 40:48].any()
     # Rubbed out, they count again.
     marks.data[spot] = 0
     tool.run_again.click()
     wait(tool)
-    assert tool._selected()[1]["usable"].values[spot].all()
+    assert tool._selected()[1].usable[spot].all()
 
 
 def test_cancelling_leaves_nothing(
@@ -272,13 +274,13 @@ def test_mistakes_are_one_sentence_in_the_widget(
 
 
 def test_films_become_images_that_can_be_fitted(
-    viewer: ViewerModel, evaluated: Any, qtbot: Any, pack_dataset: Any, wait: Callable[[Any], None]
+    viewer: ViewerModel, evaluated: Any, qtbot: Any, pack_doses: Any, wait: Callable[[Any], None]
 ) -> None:
     evaluated.to_fit.click()
     wait(evaluated)
     images = [layer for layer in viewer.layers if role_of(layer) == "shot"]
     assert [layer.name for layer in images] == [
-        f"film {k}, {energy:.3g} MeV" for k, energy in enumerate(pack_dataset["energy"].values, 1)
+        f"film {k}, {energy:.3g} MeV" for k, energy in enumerate(pack_doses.energies, 1)
     ]
     fit = FitImages(viewer)
     qtbot.addWidget(fit)
@@ -291,7 +293,7 @@ def test_films_become_images_that_can_be_fitted(
     qtbot.addWidget(invert)
     invert.image.layer = images[1]
     request = invert.request()
-    np.testing.assert_array_equal(request.shot.mask, pack_dataset["usable"].values[1])
+    np.testing.assert_array_equal(request.shot.mask, pack_doses.usable[1])
     assert request.recipe.setup == setup_of(images[1])
 
 
@@ -312,15 +314,14 @@ def test_layers_are_written_with_a_table(
 
 
 def test_without_a_setup_films_know_how_strongly_they_are_displaced(
-    viewer: ViewerModel, pack_dataset: Any, qtbot: Any
+    viewer: ViewerModel, pack_doses: Any, qtbot: Any
 ) -> None:
-    bare = pack_dataset.drop_vars("time_of_flight")
-    del bare.attrs["setups"]
+    bare = replace(pack_doses, setups=())
     add_layers(viewer, film_layers(bare, pack_frame(bare), "trio"))
     fit = FitImages(viewer)
     qtbot.addWidget(fit)
     fit.source.picker.set_kind("unknown")
-    strengths = pack_dataset["strength"].values
+    strengths = pack_doses.strengths
     in_fit = [shot.strength[0] for shot in fit.request().shots]
     np.testing.assert_allclose(in_fit, strengths)
     # The first that is used is the reference, whatever the pack's first film is.

@@ -14,7 +14,6 @@ from qtpy.QtWidgets import QDoubleSpinBox, QPushButton, QWidget
 from napari_shadowinv._napari.fit_layers import (
     alternative_layers,
     start_name,
-    verdict_sentence,
 )
 from napari_shadowinv._napari.jobs import Finished, FitJob
 from napari_shadowinv._napari.kinds import main_layers
@@ -70,7 +69,7 @@ class FitView(QWidget):
         super().__init__()
         self._viewer, self._panel = viewer, panel
         self._job: FitJob | None = None
-        self._result: Result | None = None
+        self._result: Result[Any] | None = None
         self._alternative = ResultLayers(viewer, self)
         self.results: ResultLayers | None = None
         self.curve = ObjectiveCurve()
@@ -103,12 +102,14 @@ class FitView(QWidget):
         moved = place_inputs(self._viewer, job)
         self._show_verdict(fit)
         if fit.verdict is not Verdict.DETERMINED:
-            text = verdict_sentence(fit)
+            text = window_text(fit.cautions[0].text)
             show_warning(text[:1].upper() + text[1:])
         input_warnings = {text for name, text in job.inputs if name == "Warning"}
         texts = [caution.text for caution in fit.warnings]
         rows = [("Warning", window_text(text)) for text in texts if text not in input_warnings]
-        self.report.show_rows([*rows, *job.inputs, *fact_rows(fit.facts(job.names), details=None)])
+        self.report.show_rows(
+            [*rows, *job.inputs, *fact_rows(fit.facts_with_names(job.names), details=None)]
+        )
         self._alternative.show([])
         self._job, self._result = job, finished.result
         self._list_solutions(fit)
@@ -128,7 +129,7 @@ class FitView(QWidget):
             self._result = result
             self._show_verdict(result.content)
             rows = [("Warning", window_text(caution.text)) for caution in result.content.warnings]
-            self.report.show_rows([*rows, *fact_rows(result.content.facts(), details=None)])
+            self.report.show_rows([*rows, *fact_rows(result.content.facts, details=None)])
 
     def _show_verdict(self, fit: Fit) -> None:
         is_determined = fit.verdict is Verdict.DETERMINED

@@ -47,7 +47,7 @@ from napari_shadowinv.provenance import Provenance
 class _Repetition:
     """A result to repeat, with the files that are open, and the place of its layers."""
 
-    result: Result
+    result: Result[Any]
     images: list[Path] | None
     source: Path | None
     folder: Path

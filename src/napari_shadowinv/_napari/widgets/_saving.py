@@ -18,9 +18,19 @@ from napari_shadowinv._napari.widgets._qt import notify_errors
 from napari_shadowinv._napari.widgets._results import ResultLayers
 from napari_shadowinv._napari.writer import dataset_to_save
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import write
-from napari_shadowinv.io.formats import NPY, PNG, PRADFORMAT, RESULT, SITES, TIFF, Format
+from napari_shadowinv.io.formats import (
+    NPY,
+    PNG,
+    PRADFORMAT,
+    RESULT,
+    SITES,
+    TIFF,
+    Format,
+    formats_for,
+)
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.widgets._panels import ToolPanel
@@ -34,7 +44,7 @@ _TITLES = {
     NPY: "Image, NumPy array",
     PNG: "Image, 16-bit PNG",
 }
-RESULT_FORMATS, IMAGE_FORMATS = (RESULT, PRADFORMAT, SITES), (TIFF, NPY, PNG)
+IMAGE_FORMATS = (TIFF, NPY, PNG)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,18 +72,11 @@ def shown_result(viewer: Any, preferred: Iterable[Any] = ()) -> Any:
 
 def result_to_save(viewer: Any, layer: Any) -> Savable:
     """Collect the result that a layer belongs to, with the appearance of its layers."""
-    from napari_shadowinv.fitting import Fit
-    from napari_shadowinv.inversion import Inversion
-
     result = result_of(layer)
     if result is None:
         raise InputError(f"'{layer.name}' shows no result: select a layer of a result")
     layer_data = [each.as_layer_data_tuple() for each in viewer.layers if result_of(each) is result]
-    formats: tuple[Format, ...] = (RESULT,)
-    if isinstance(result.content, Inversion):
-        formats = RESULT_FORMATS if _has_particles(result.setup) else (RESULT, SITES)
-    elif isinstance(result.content, Fit) and _has_particles(result.setup):
-        formats = (RESULT, PRADFORMAT)
+    formats = _formats_for(result.content.kind, result.setup)
     name = str(metadata_of(layer).get("name") or layer.name)
     return Savable(name, dataset_to_save(layer_data), formats)
 
@@ -87,13 +90,13 @@ def shot_to_save(viewer: Any, layer: Any) -> Savable:
     shots = metadata_of(layer).get("shots", ())
     name = Path(shots[index]).stem if index < len(shots) else str(index)
     dataset = shot_of_store(Path(store), index)
-    particles = _has_particles(setup_from_dataset(dataset))
-    formats = (RESULT, PRADFORMAT) if particles else (RESULT,)
+    formats = _formats_for(ResultKind.of(dataset.attrs), setup_from_dataset(dataset))
     return Savable(f"{metadata_of(layer).get('name', '')} {name}", dataset, formats)
 
 
-def _has_particles(setup: Setup | None) -> bool:
-    return setup is not None and setup.kind == "proton"
+def _formats_for(kind: ResultKind, setup: Setup | None) -> tuple[Format, ...]:
+    has_particles = setup is not None and setup.in_pradformat
+    return tuple(each for each in formats_for(kind) if has_particles or each is not PRADFORMAT)
 
 
 class SaveButton(QPushButton):

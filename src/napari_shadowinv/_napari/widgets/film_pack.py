@@ -25,6 +25,7 @@ from napari_shadowinv._napari.layer_metadata import (
     role_of,
 )
 from napari_shadowinv._napari.layer_state import dataset_of_layers
+from napari_shadowinv._napari.notifications import window_text
 from napari_shadowinv._napari.packs import PackJob
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets import _qt as qt
@@ -36,7 +37,7 @@ from napari_shadowinv._napari.widgets._forms import (
     wrapping_label,
 )
 from napari_shadowinv._napari.widgets._layers import LayerPicker, LayerWatch, mask_of, new_shapes
-from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, ToolPanel
+from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, ToolPanel, fact_rows
 from napari_shadowinv._napari.widgets._plots import COLOURS, Plot
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.hidden_files import temporary_folder
@@ -57,10 +58,8 @@ from napari_shadowinv.pipeline.new_pack import (
 )
 
 if TYPE_CHECKING:
-    import xarray
-
     import napari
-    from napari_shadowinv.film import Pack
+    from napari_shadowinv.film_doses import FilmDoses
 
 _COLUMNS = ("Scan", "Film", "Filters in front of the film")
 _MIN_SIZE_PX = (620, 560)
@@ -172,8 +171,7 @@ class CornerEditor(QObject):
         super().__init__(parent)
         self._viewer = viewer
         self._films: Any = None  # the fluence layer
-        self._dataset: Any = None
-        self._pack: Any = None
+        self._doses: Any = None
         self._plane = 0
         self._moved: dict[int, FloatArray] = {}  # by plane
         self._read: tuple[Path | None, Scan | None] = None, None
@@ -186,11 +184,11 @@ class CornerEditor(QObject):
     def shown(self) -> bool:
         return self.polygon is not None and self.polygon in self._viewer.layers
 
-    def show(self, films: Any, dataset: xarray.Dataset, pack: Pack) -> None:
+    def show(self, films: Any, doses: FilmDoses) -> None:
         """Show the displayed film of a pack's layer; changes to another pack are discarded."""
-        if dataset is not self._dataset:
+        if doses is not self._doses:
             self.close()
-        self._films, self._dataset, self._pack = films, dataset, pack
+        self._films, self._doses = films, doses
         self._show(plane_in_view(self._viewer, films))
 
     def close(self) -> None:
@@ -198,24 +196,20 @@ class CornerEditor(QObject):
         for layer in (self.polygon, self.scan):
             if layer is not None and layer in self._viewer.layers:
                 self._viewer.layers.remove(layer)
-        self.scan = self.polygon = self._dataset = None
+        self.scan = self.polygon = self._doses = None
         self._moved = {}
 
-    def corners(self, dataset: xarray.Dataset) -> dict[str, FloatArray] | None:
+    def corners(self, doses: FilmDoses) -> dict[str, FloatArray] | None:
         """Return the corners of all films by number; None if the user moved none."""
-        if dataset is not self._dataset:
+        if doses is not self._doses:
             return None
         self._store_changes()
         if not self._moved:
             return None
-        numbers = dataset["layer"].values
-        corners = {
-            k: film for k, film in enumerate(dataset["corners"].values) if np.isfinite(film).all()
-        }
+        corners = {k: film for k, film in enumerate(doses.corners) if np.isfinite(film).all()}
         try:
             return {
-                str(numbers[k]): checked_corners(film)
-                for k, film in (corners | self._moved).items()
+                str(k + 1): checked_corners(film) for k, film in (corners | self._moved).items()
             }
         except InputError as error:
             raise InputError(f"{error}; press Show corners to reset them") from None
@@ -231,13 +225,13 @@ class CornerEditor(QObject):
                 f"{', '.join(str(len(vertices)) for vertices in shapes)} corners: expected one "
                 "polygon with the four corners of the film"
             )
-        old_corners = self._moved.get(self._plane, self._dataset["corners"].values[self._plane])
+        old_corners = self._moved.get(self._plane, self._doses.corners[self._plane])
         if np.abs(shapes[0] - old_corners).max() > _MIN_MOVE_PX:
             self._moved[self._plane] = shapes[0]
 
     def _show(self, plane: int) -> None:
-        corners = self._moved.get(plane, self._dataset["corners"].values[plane])
-        text = packs.film_labels(self._dataset)[plane]
+        corners = self._moved.get(plane, self._doses.corners[plane])
+        text = self._doses.film_label(plane)
         if not np.isfinite(corners).all():
             raise InputError(
                 f"{text}: the layer is excluded and shows no film; choose another film"
@@ -279,7 +273,7 @@ class CornerEditor(QObject):
 
     def _scan_of(self, plane: int) -> AnyArray:
         """Return the pixels of a film's scan with eight bits."""
-        path = self._pack.layers[plane].file or self._pack.scan
+        path = self._doses.pack.layers[plane].file or self._doses.pack.scan
         if path != self._read[0] or self._read[1] is None:
             self._read = path, read_scan(path)
         scan = self._read[1]
@@ -469,18 +463,18 @@ class FilmPack(ToolPanel):
 
     def _corrected_job(self) -> PackJob:
         """Return the job for the selected pack with the user's corrections."""
-        layer, dataset = self._selected()
+        layer, doses = self._selected()
         metadata = metadata_of(layer)
         labels = self._partner(layer, packs.UNUSABLE)
-        by_hand = None if labels is None else packs.painted_by_hand(labels.data, dataset)
+        by_hand = None if labels is None else packs.painted_by_hand(labels.data, doses)
         return PackJob(
-            metadata.get("pack") or packs.pack_of(dataset),
+            metadata.get("pack") or doses.pack,
             metadata.get("path", ""),
             metadata.get("pack_name") or layer.name.removesuffix(_title(packs.FLUENCE)).strip(),
             self._new_folder(),
-            self.corners.corners(dataset) or metadata.get("corners"),
+            self.corners.corners(doses) or metadata.get("corners"),
             by_hand,
-            packs.relative_scales(dataset),
+            doses.scales,
             plane_in_view(self.viewer, layer),
         )
 
@@ -509,15 +503,15 @@ class FilmPack(ToolPanel):
 
     # The chosen result
 
-    def _selected(self) -> tuple[Any, xarray.Dataset]:
+    def _selected(self) -> tuple[Any, FilmDoses]:
         layer = self.packs.layer
         result = None if layer is None else result_of(layer)
         if result is None:
             raise InputError(
                 "there is no result of a film pack: press Run first, or open a .shadowinv file"
             )
-        dataset: Any = result.content
-        return layer, dataset
+        doses: Any = result.content
+        return layer, doses
 
     def _partner(self, layer: Any, role: str) -> Any | None:
         """Return the layer of the same result with a role, or None."""
@@ -529,8 +523,8 @@ class FilmPack(ToolPanel):
         has_result = self.packs.layer is not None
         self.actions.setVisible(has_result)
         if has_result:
-            _, dataset = self._selected()
-            self.report.show_rows(_rows(dataset))
+            _, doses = self._selected()
+            self.report.show_rows(_rows(doses))
         self.update_plot()
 
     def _schedule_plot(self) -> None:
@@ -543,14 +537,14 @@ class FilmPack(ToolPanel):
         if layer is None:
             self.plot.show_spectrum(None)
             return
-        _, dataset = self._selected()
+        _, doses = self._selected()
         try:
             region = mask_of(self.regions.layer, layer, painted_is_unusable=False)
         except InputError as error:
             self.show_problem(str(error))
             return
         where = "of the whole film" if region is None else "in the region"
-        self.plot.show_spectrum(packs.spectrum_in(dataset, region), where)
+        self.plot.show_spectrum(packs.spectrum_in(doses, region), where)
 
     @qt.notify_errors
     def _draw_region(self) -> None:
@@ -559,8 +553,8 @@ class FilmPack(ToolPanel):
 
     @qt.notify_errors
     def _show_corners(self) -> None:
-        layer, dataset = self._selected()
-        self.corners.show(layer, dataset, packs.pack_of(dataset))
+        layer, doses = self._selected()
+        self.corners.show(layer, doses)
         self.panel.say(
             "Drag the corners. Move the slider to show other films. Then press Run again."
         )
@@ -583,27 +577,27 @@ class FilmPack(ToolPanel):
 
     @qt.notify_errors
     def _add_fit_images(self) -> None:
-        layer, dataset = self._selected()
+        layer, doses = self._selected()
         for role in (packs.DOSE, packs.FLUENCE, packs.UNUSABLE):
             partner = self._partner(layer, role)
             if partner is not None:
                 partner.visible = False
-        layer_data = packs.film_layers(dataset, frame_of(layer), layer.name)
+        layer_data = packs.film_layers(doses, frame_of(layer), layer.name)
         self.fit_images = ResultLayers(self.viewer, self)
         self.fit_images.show(layer_data, select=False)
 
     @qt.notify_errors
     def _write_layers(self) -> None:
-        _, dataset = self._selected()
+        _, doses = self._selected()
         folder = QtWidgets.QFileDialog.getExistingDirectory(
             self, "Folder for the images of the films"
         )
         if folder:
-            show_info(f"Wrote {write_layers(dataset, Path(folder))[-1]}")
+            show_info(f"Wrote {write_layers(doses, Path(folder))[-1]}")
 
     @qt.notify_errors
     def _save(self) -> None:
-        layer, dataset = self._selected()
+        layer, doses = self._selected()
         name, _ = QtWidgets.QFileDialog.getSaveFileName(
             self, "Save the result", f"pack{RESULT.suffix}", f"results (*{RESULT.suffix})"
         )
@@ -615,7 +609,7 @@ class FilmPack(ToolPanel):
         result = result_of(layer)
         assert result is not None
         saved = Result(
-            packs.copy_edits(dataset, packs.pack_of(dataset), scratch, path),
+            packs.copy_edits(doses, scratch, path),
             result.setup,
             result.attributes,
         )
@@ -629,19 +623,10 @@ class FilmPack(ToolPanel):
         return self._scratch / str(next(self._folders))
 
 
-def _rows(dataset: xarray.Dataset) -> list[tuple[str, str]]:
+def _rows(doses: FilmDoses) -> list[tuple[str, str]]:
     """Return the report of a pack as rows; warnings come last."""
-    energies, sizes = dataset["energy"].values, dataset.sizes
-    empty = ~dataset["usable"].values.any(axis=(1, 2))
-    rows = [
-        ("Films", f"{len(energies)}, {energies[0]:.3g} to {energies[-1]:.3g} MeV"),
-        ("Pixels", f"{sizes['y']} × {sizes['x']}, {dataset['usable'].values.mean():.0%} usable"),
-    ]
-    if "seen_from" in dataset.attrs:
-        rows.append(("Seen from", dataset.attrs["seen_from"]))
-    if empty.any():
-        rows.append(("Excluded", "film " + ", ".join(map(str, dataset["layer"].values[empty]))))
-    return rows + [("Warning", caution.text) for caution in packs.warnings_of_pack(dataset)]
+    cautions = [("Warning", window_text(caution.text)) for caution in doses.cautions]
+    return [*fact_rows(doses.facts), *cautions]
 
 
 def _title(role: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +47,7 @@ from napari_shadowinv._napari.widgets._saving import (
 )
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Level
+from napari_shadowinv.facts import Level, ResultKind
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
@@ -144,7 +145,7 @@ class InvertShot(InversionInputs, LivePanel):
         self.fit_view = FitView(self.viewer, self.panel)
         self._refined = ResultLayers(self.viewer, self)
         self.verdict, self.report = VerdictLine(), FoldedReport()
-        self._reported: Result | None = None
+        self._reported: Result[Any] | None = None
         save = SaveButton(
             self,
             lambda: result_to_save(self.viewer, shown_result(self.viewer, self._result_layers())),
@@ -266,14 +267,22 @@ class InvertShot(InversionInputs, LivePanel):
         result = None if layer is None else result_of(layer)
         if result is None or result is self._reported or self.panel.runner.running:
             return
-        if isinstance(result.content, Fit):
-            self._empty_report()
-            self.fit_view.follow()
-        elif isinstance(result.content, Inversion):
-            self.fit_view.empty()
-            self._report(result.content, result.setup, [])
-            self._reported = result
-            self.reveal(self.verdict)
+        actions: dict[ResultKind, Callable[[Result[Any]], None]] = {
+            ResultKind.FIT: self._follow_fit,
+            ResultKind.INVERSION: self._follow_inversion,
+        }
+        if result.content.kind in actions:
+            actions[result.content.kind](result)
+
+    def _follow_fit(self, result: Result[Fit]) -> None:
+        self._empty_report()
+        self.fit_view.follow()
+
+    def _follow_inversion(self, result: Result[Inversion]) -> None:
+        self.fit_view.empty()
+        self._report(result.content, result.setup, [])
+        self._reported = result
+        self.reveal(self.verdict)
 
     def _report(
         self, inversion: Inversion, setup: Setup | None, input_rows: list[tuple[str, str]]
