@@ -15,9 +15,19 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.cautions import Caution
 
-__all__ = ["Fact", "Headline", "Level", "ResultKind", "caution_facts", "error_fact", "time_fact"]
+__all__ = [
+    "Fact",
+    "Headline",
+    "Level",
+    "ResultKind",
+    "caution_facts",
+    "error_fact",
+    "masked_fact",
+    "time_fact",
+]
 
 
 class ResultKind(StrEnum):
@@ -89,6 +99,9 @@ class Fact:
         Not sound if it is a reason to doubt the result.
     is_detail : bool
         Whether it describes the work of the solver rather than the result. Windows fold it away.
+    short : str
+        The value in a few words, for one line about a result and for the title of a panel; empty
+        if it has no place there.
     """
 
     key: str
@@ -96,11 +109,18 @@ class Fact:
     text: str
     level: Level = Level.SOUND
     is_detail: bool = False
+    short: str = ""
 
 
 def caution_facts(cautions: Iterable[Caution]) -> list[Fact]:
     """Return cautions as facts."""
     return [Fact(each.code, "Warning", each.text, Level.DOUBTFUL) for each in cautions]
+
+
+def masked_fact(mask: BoolArray) -> list[Fact]:
+    """Return the share of the pixels that a mask of used pixels excludes, if there are any."""
+    excluded = 1 - float(mask.mean())
+    return [Fact("masked", "Masked", f"{excluded:.2%} of the pixels")] if excluded else []
 
 
 def error_fact(name: str, text: str) -> Fact:

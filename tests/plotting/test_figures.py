@@ -124,7 +124,7 @@ def test_figure_shows_sites_warnings_and_failure(make_inversion: Make) -> None:
     good = report_figure(make_inversion((30, 30)))
     bad = report_figure(make_inversion((30, 30), converged=False, warnings=()))
     text = " ".join(item.get_text() for item in good.texts)
-    assert "17 sites" in text
+    assert "Sites: 17" in text
     assert "1 negative pixel was set to zero" in text
     assert "not converged" not in text
     assert "not converged" in " ".join(item.get_text() for item in bad.texts)

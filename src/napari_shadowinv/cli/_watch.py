@@ -94,25 +94,14 @@ def _shorten_name(name: str, columns: int) -> str:
 
 
 def _shot_summary(result: Inversion | Fit) -> tuple[str, str]:
-    """Return the numbers of a shot, and the doubts about them."""
+    """Return the facts of a shot in a few words, and the doubts about them."""
     from napari_shadowinv.facts import Level
-    from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.physics.units import shown_fields, with_error
 
-    if not isinstance(result, Inversion):
-        doubts = "" if result.report.converged else "  NOT converged"
-        return f"{result.verdict}  χ² {result.chi2.max():.3g}", doubts
-    report, errors = result.report, result.errors
-    (field,) = shown_fields([result.displacement], result.setup, mask=result.mask)
-    error = None if errors is None else errors.of_peak
-    peak = with_error(field.largest, error.share if error else 0.0)
-    count = len(report.warnings)
-    warnings = f", {count} warning{'s' if count > 1 else ''}" if count else ""
-    level = "" if result.headline.level is Level.SOUND else f"  {result.headline.level.value}"
-    return (
-        f"peak {field.symbol} {peak} {field.unit}  residual {100 * report.image_residual:.3g} %",
-        f"{'' if report.converged else '  NOT converged'}{level}{warnings}",
-    )
+    level, count = result.headline.level, len(result.cautions)
+    doubts = "" if level is Level.SOUND else f"  {level}"
+    if count:
+        doubts += f", {count} warning{'s' if count > 1 else ''}"
+    return "  ".join(fact.short for fact in result.facts if fact.short), doubts
 
 
 def run_watch(

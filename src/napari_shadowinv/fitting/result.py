@@ -21,6 +21,7 @@ from napari_shadowinv.facts import (
     ResultKind,
     caution_facts,
     error_fact,
+    masked_fact,
     time_fact,
 )
 from napari_shadowinv.fitting.beam_error import BeamError
@@ -256,7 +257,7 @@ class Fit:
         return np.asarray(self.mask.any(axis=0))
 
     @property
-    def error_rows(self) -> list[tuple[str, str]]:
+    def _error_rows(self) -> list[tuple[str, str]]:
         """The errors of the displacement in words: names and texts."""
         report = self.report
         if np.isnan(report.uncertainty):
@@ -325,12 +326,12 @@ class Fit:
         is_determined = self.verdict is Verdict.DETERMINED
         level = Level.SOUND if is_determined else Level.DOUBTFUL
         return (
-            Fact("verdict", "Verdict", str(self.verdict), level),
+            Fact("verdict", "Verdict", str(self.verdict), level, short=str(self.verdict)),
             Fact("verdict", "Reason" if is_determined else "Warning", self.explanation, level),
             *caution_facts(self.warnings),
             *self._image_facts(names),
             *(self._field_fact(field) for field in self.fields),
-            *(error_fact(name, text) for name, text in self.error_rows),
+            *(error_fact(name, text) for name, text in self._error_rows),
             *self._solution_facts(),
             time_fact(self.report.seconds),
         )
@@ -341,10 +342,6 @@ class Fit:
         if np.isnan(share):
             return None
         return PeakError(share, self.report.beam.name if self.report.beam else "noise")
-
-    def peak_text(self, field: FittedField, shown: ShownField) -> str:
-        """Return the largest magnitude of a field with its total error, in the unit shown."""
-        return shown.peak_text(self.peak_error(field, shown))
 
     @property
     def _origins(self) -> tuple[ImageOrigin, ...]:
@@ -363,7 +360,8 @@ class Fit:
             if k and self.options.align != "none":
                 dy, dx = self.frames[k][[0, 3]]
                 parts.append(f"shifted by y {dy:+.3g}, x {dx:+.3g} px")
-            yield Fact(f"image_{k + 1}", f"Image {k + 1}", ", ".join(parts))
+            text = ", ".join(parts)
+            yield Fact(f"image_{k + 1}", f"Image {k + 1}", text, short=f"χ² {chi2:.3g}")
 
     def _field_fact(self, field: FittedField) -> Fact:
         setup, deflector = self.setup, FIELDS[field.name]
@@ -382,13 +380,14 @@ class Fit:
                 "away"
             )
             yield Fact("alternative", "Alternative", text)
+        yield from masked_fact(self.mask)
         if self.folded:
             yield Fact("crossed_rays", "Crossed rays", f"{self.folded:.1%} of the pixels")
         if self.report.converged:
             yield Fact("converged", "Converged", f"in {self.report.iterations} iterations")
         else:
             text = f"NO, not in {self.report.iterations} iterations: allow more (--max-iterations)"
-            yield Fact("converged", "Converged", text, Level.FAILED)
+            yield Fact("converged", "Converged", text, Level.FAILED, short="NOT converged")
 
     def to_dataset(self, *, attributes: Mapping[str, str] | None = None) -> xarray.Dataset:
         """Return everything as one labelled dataset, with units.

@@ -22,6 +22,7 @@ from napari_shadowinv.facts import (
     ResultKind,
     caution_facts,
     error_fact,
+    masked_fact,
     time_fact,
 )
 from napari_shadowinv.inversion.budget import Errors
@@ -254,9 +255,11 @@ class Inversion:
                 "image_residual",
                 "Image residual",
                 f"{100 * report.image_residual:.3g} % of the mean (r.m.s.)",
+                short=f"residual {100 * report.image_residual:.3g} %",
             ),
             *(error_fact(name, text) for name, text in self.error_rows),
             Fact("caustics", "Caustics", f"{self.caustic.mean():.2%} of the pixels"),
+            *masked_fact(self.mask),
             *(
                 Fact(key, title, ", ".join(f"{side} {share:.2%}" for side, share in flow.items()))
                 for key, (title, flow) in flows.items()
@@ -268,6 +271,7 @@ class Inversion:
                 f"{report.residual:.2g} of a cell, tolerance {report.tolerance:.2g}: "
                 f"{'converged' if report.converged else 'NOT converged'}",
                 convergence,
+                short="" if report.converged else "NOT converged",
             ),
             Fact(
                 "sites",

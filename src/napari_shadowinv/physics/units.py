@@ -103,10 +103,15 @@ class ShownField:
         row, column = np.unravel_index(np.nanargmax(self.magnitude), self.magnitude.shape)
         return int(row), int(column)
 
+    def short_peak_text(self, error: PeakError | None = None) -> str:
+        """Write the largest magnitude with its error."""
+        share = error.share if error else 0.0
+        return f"peak {self.symbol} {with_error(self.largest, share)} {self.unit}"
+
     def peak_text(self, error: PeakError | None = None) -> str:
         """Write the largest magnitude, path-integrated fields also in MG·µm."""
         share, cause = (error.share, error.cause) if error else (0.0, "")
-        text = f"peak {self.symbol} {with_error(self.largest, share)} {self.unit}"
+        text = self.short_peak_text(error)
         if self.unit.endswith("T·m"):
             prefix = self.unit.removesuffix("T·m")
             power = next(power for power, name in _PREFIXES.items() if name == prefix)
@@ -169,11 +174,13 @@ def peak_facts(
     (pixels,) = shown_fields([displacement], None, mask=mask)
     row, column = pixels.peak
     text = f"{pixels.peak_text(error)}, at y = {row}, x = {column} px"
-    facts = [Fact("displacement", "Displacement", text)]
-    if setup is not None:
-        (field,) = shown_fields([displacement], setup, deflector, mask=mask)
-        facts.insert(0, Fact("field", "Field", field.peak_text(error)))
-    return facts
+    if setup is None:
+        return [Fact("displacement", "Displacement", text, short=pixels.short_peak_text(error))]
+    (field,) = shown_fields([displacement], setup, deflector, mask=mask)
+    return [
+        Fact("field", "Field", field.peak_text(error), short=field.short_peak_text(error)),
+        Fact("displacement", "Displacement", text),
+    ]
 
 
 def shown_potential(potential: FloatArray, setup: Setup | None) -> tuple[FloatArray, str]:

@@ -57,7 +57,7 @@ def pack_figure(doses: FilmDoses, *, title: str | None = None) -> Figure:
     with mpl.rc_context(_panels.STYLE):
         figure, panels = _panels.new_page(grid, Scale(1.0, "px"), title)
         for k in range(count):
-            _draw_dose(panels[k], planes[k], usable[k], doses.film_label(k))
+            _draw_dose(panels[k], planes[k], usable[k], _film_title(doses, k))
         if count >= 3:
             _draw_overlay(panels[count], planes, usable)
         for panel in panels[panels_shown:]:
@@ -74,6 +74,11 @@ def _header(doses: FilmDoses, letters: int) -> list[tuple[str, str]]:
     for text in cautions:
         lines += [(part, ALARM_COLOUR) for part in textwrap.wrap(text, letters)]
     return lines
+
+
+def _film_title(doses: FilmDoses, k: int) -> str:
+    label = doses.film_label(k)
+    return f"{label[:1].upper()}{label[1:]}, {doses.pack.layers[k].film}"
 
 
 def _draw_dose(panel: Panel, dose: FloatArray, usable: BoolArray, title: str) -> None:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.fitting import FIELDS, Fit, FittedField, Verdict
+from napari_shadowinv.facts import Fact, Level
+from napari_shadowinv.fitting import FIELDS, Fit, FittedField
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.units import ShownField, intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
@@ -21,7 +22,7 @@ from napari_shadowinv.plotting._drawing import (
     draw_potential,
     outline_caustics,
 )
-from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR, Grid, Panel
+from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, Grid, Panel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -68,14 +69,16 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
     letters = int(grid.figure_size[0] * _LETTERS_PER_INCH)
     heading = title and textwrap.shorten(title, int(letters * 0.7), placeholder=" …")
     header = _header(fit, letters)
-    footer = _footer(fit, [in_units for in_units, _ in fields], letters)
+    facts = fit.facts_with_names(())
+    of_images = [fact for fact in facts if fact.key.startswith("image_")]
+    footer = _panels.footer_lines(facts, fit.headline.text, letters)
     grid = replace(grid, foot=0.12 + 0.18 * len(footer), head=0.52 + 0.18 * len(header))
     with mpl.rc_context(_panels.STYLE):
         figure, panels = _panels.new_page(grid, _panels.image_scale(shape, setup), heading)
         for k in range(count):
             for j, kind in enumerate(kinds):
                 place = j * columns + k if upright else k * columns + j
-                _draw_image(panels[place], fit, k, kind)
+                _draw_image(panels[place], fit, k, kind, of_images[k])
         for m, (field, error) in enumerate(fields):
             row = panels[(rows + m) * columns : (rows + m + 1) * columns]
             _draw_fitted(row, fit, fit.fields[m], field, error)
@@ -102,12 +105,12 @@ def _field_in_units(fit: Fit, field: FittedField) -> tuple[ShownField, ShownFiel
     return in_units, error
 
 
-def _draw_image(panel: Panel, fit: Fit, k: int, kind: str) -> None:
+def _draw_image(panel: Panel, fit: Fit, k: int, kind: str, fact: Fact) -> None:
     mean = float(fit.source[k].mean())
     if kind == "Residual":
         used = fit.residual[k][fit.mask[k]]
         noise = float(np.sqrt((used**2).mean() / fit.chi2[k])) if fit.chi2[k] > 0 else 1.0
-        title = f"Residual: χ² {fit.chi2[k]:.3g}"
+        title = f"Residual: {fact.short}"
         residual = np.where(fit.mask[k], fit.residual[k] / noise, np.nan)
         draw_differences(panel, residual, title, "Residual (σ)", _MAX_RESIDUAL_SIGMA)
         return
@@ -170,22 +173,6 @@ def _magnitude_error(fit: Fit, field: FittedField) -> FloatArray | None:
 
 
 def _header(fit: Fit, letters: int) -> list[tuple[str, str]]:
-    """The verdict and why, each line with its colour."""
-    colour = GOOD_COLOUR if fit.verdict is Verdict.DETERMINED else ALARM_COLOUR
-    summary = "; ".join([f"{fit.verdict.upper()}: {fit.explanation}", *map(str, fit.warnings)])
-    lines = [(line, colour) for line in textwrap.wrap(summary, letters)]
-    if not fit.report.converged:
-        lines.append((f"⚠ not converged in {fit.report.iterations} steps", ALARM_COLOUR))
-    return lines
-
-
-def _footer(fit: Fit, fields: list[ShownField], letters: int) -> list[tuple[str, str]]:
-    facts = [fit.peak_text(*each) for each in zip(fit.fields, fields, strict=True)]
-    facts += [f"{name}: {text}" for name, text in fit.error_rows]
-    facts.append(f"brightness {', '.join(f'{factor:.3g}' for factor in fit.brightness)}")
-    if not fit.mask.all():
-        facts.append(f"hatched: masked, {100 * (1 - fit.mask.mean()):.2g} % of the pixels")
-    if fit.folded:
-        facts.append(f"rays cross over {fit.folded:.1%} of the image")
-    facts.append(f"{fit.report.iterations} steps in {sum(fit.report.seconds.values()):.1f} s")
-    return [(line, QUIET_COLOUR) for line in textwrap.wrap("  ·  ".join(facts), letters)]
+    """Return the lines of the headline, each with its colour."""
+    colour = GOOD_COLOUR if fit.headline.level is Level.SOUND else ALARM_COLOUR
+    return [(line, colour) for line in textwrap.wrap(fit.headline.text, letters)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.cautions import CAUTION_CODES
 from napari_shadowinv.physics.units import prefix_for
 
 if TYPE_CHECKING:
@@ -150,9 +152,22 @@ def write_header(
         figure.text(0.2 / width, y, text, size=10, color=colour, va="top")
 
 
+_LEGENDS = {"masked": "hatched", "caustics": "outlined", "crossed_rays": "outlined"}
+
+
 def fact_line(facts: Iterable[Fact]) -> str:
     """Return facts as one line of text, to be wrapped."""
-    return "  ·  ".join(f"{fact.title}: {fact.text}" for fact in facts)
+    titles = {key: f" ({look})" for key, look in _LEGENDS.items()}
+    return "  ·  ".join(f"{fact.title}{titles.get(fact.key, '')}: {fact.text}" for fact in facts)
+
+
+def footer_lines(facts: Iterable[Fact], headline: str, letters: int) -> list[tuple[str, str]]:
+    """Return the facts that a headline does not contain as lines; long ones have their own."""
+    shown = [fact for fact in facts if fact.key not in CAUTION_CODES and fact.text not in headline]
+    is_long = {fact: len(fact.text) > letters // 2 for fact in shown}
+    paragraphs = [fact_line(fact for fact in shown if not is_long[fact])]
+    paragraphs += [fact_line([fact]) for fact in shown if is_long[fact]]
+    return [(line, QUIET_COLOUR) for text in paragraphs for line in textwrap.wrap(text, letters)]
 
 
 def write_footer(figure: Figure, lines: list[tuple[str, str]], grid: Grid) -> None:

@@ -70,7 +70,8 @@ def report_figure(
     (field,) = shown_fields([inversion.displacement], setup, mask=inversion.mask)
     width = _panels.choose_grid(shape, panels=6).figure_size[0]
     header = _header(inversion, setup, columns=int(width * 12))
-    footer = _footer(inversion, columns=int(width * 14))
+    facts = inversion.facts_in(setup)
+    footer = _panels.footer_lines(facts, inversion.headline_in(setup).text, int(width * 14))
     grid = _panels.choose_grid(shape, panels=6, foot=0.12 + 0.18 * len(footer), title=bool(title))
     grid = replace(grid, head=(0.52 if title else 0.22) + 0.18 * len(header))
     with mpl.rc_context(_panels.STYLE):
@@ -89,7 +90,8 @@ def report_figure(
         outline_caustics(panels[2], inversion.caustic)
         reprojection = hidden(inversion.reprojection / mean)
         draw_intensity(panels[3], reprojection, "Re-projection", limits)
-        _draw_residual(panels[4], inversion)
+        residual = next(fact for fact in facts if fact.key == "image_residual")
+        _draw_residual(panels[4], inversion, residual.short.capitalize())
         draw_cuts(panels[5], field)
         _panels.write_footer(figure, footer, grid)
     return figure
@@ -188,34 +190,8 @@ def _header(inversion: Inversion, setup: Setup | None, columns: int) -> list[tup
     return [(line, colour) for line in textwrap.wrap(headline.text, columns)]
 
 
-def _footer(inversion: Inversion, columns: int) -> list[tuple[str, str]]:
-    """Lines below the panels, each with its colour, wrapped to a number of letters."""
-    report = inversion.report
-    facts = [
-        f"flux residual {report.residual:.1e} (tolerance {report.tolerance:.0e})",
-        f"{report.iterations} steps in {sum(report.seconds.values()):.1f} s",
-    ]
-    share = 100 * float(inversion.caustic.mean())
-    if share:
-        facts.append(f"caustics (outlined) {share:.2g} % of the pixels")
-    if not inversion.mask.all():
-        facts.append(f"hatched: masked, {100 * (1 - inversion.mask.mean()):.2g} % of the pixels")
-    sites = f"{report.n_sites:,} sites; {report.sites_reason}".removesuffix("; ")
-    lines = [
-        *textwrap.wrap("  ·  ".join(facts), columns),
-        *textwrap.wrap(sites, columns),
-        *[
-            line
-            for name, text in inversion.error_rows
-            for line in textwrap.wrap(f"{name}: {text}", columns)
-        ],
-    ]
-    return [(line, QUIET_COLOUR) for line in lines]
-
-
-def _draw_residual(panel: Panel, inversion: Inversion) -> None:
+def _draw_residual(panel: Panel, inversion: Inversion, title: str) -> None:
     """Show image minus re-projection in percent of the mean."""
     residual = np.where(inversion.mask, inversion.residual, np.nan)
     percent = 100 * residual / inversion.image[inversion.mask].mean()
-    title = f"Residual: {100 * inversion.report.image_residual:.3g} % rms"
     draw_differences(panel, percent, title, "Difference (% of mean)", _MAX_RESIDUAL_PERCENT)
