@@ -212,3 +212,30 @@ def test_kernels_release_the_interpreter():
     ]
     assert len(kernels) > 100
     assert [kernel[:2] for kernel in kernels if not kernel[2].get("nogil")] == []
+
+
+RESULT_CLASSES = {"Inversion", "Fit", "FilmDoses", "RetrievedField", "ResultKind"}
+MAX_DISPATCHES = 12
+
+
+def dispatches_of(tree: ast.AST) -> Iterator[int]:
+    """Lines that treat kinds of results differently: tests of a class or kind, and tables."""
+
+    def names_result(*nodes: ast.AST) -> bool:
+        names = {part.id for node in nodes for part in ast.walk(node) if isinstance(part, ast.Name)}
+        return bool(names & RESULT_CLASSES)
+
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance":
+            if names_result(node.args[1]):
+                yield node.lineno
+        elif isinstance(node, ast.Compare):
+            if names_result(node.left, *node.comparators):
+                yield node.lineno
+        elif isinstance(node, ast.Dict) and names_result(*filter(None, node.keys)):
+            yield node.lineno
+
+
+def test_few_places_treat_kinds_of_results_differently():
+    places = [f"{path.name}:{line}" for path, tree in TREES.items() for line in dispatches_of(tree)]
+    assert len(places) <= MAX_DISPATCHES, places

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.inversion import Inversion, count_sites
@@ -37,8 +39,7 @@ def needed_shares(stack: Stack, should_stop: ShouldStop | None = None) -> list[f
             raise
         except Exception:  # the error is reported when it is its turn
             continue
-        assert isinstance(inversion, Inversion)
-        needed.append(inversion.report.n_sites / most)
+        needed.append(cast("Inversion", inversion).report.n_sites / most)
         if len(needed) == _DECIDING_SHOTS:
             break
     return needed
