@@ -25,6 +25,8 @@ import numpy as np
 from napari_shadowinv import (
     InversionOptions,
     ProtonSetup,
+    Recipe,
+    RunOptions,
     invert,
     read,
     run_stack,
@@ -112,7 +114,13 @@ def make_store(path: Path) -> None:
     source = 100 + 10 * rng.random(SHAPE)
     blobs = [gaussian_blob(SHAPE, 2 + n, 4.0, (10, 12 + n)) for n in range(4)]
     shots = np.stack([synthetic_image(blob.displacement, source) for blob in blobs])
-    run_stack(shots, path, source=source, setup=SETUP, options=OPTIONS, variables=VARIABLES)
+    run_stack(
+        shots,
+        path,
+        Recipe(setup=SETUP, options=OPTIONS),
+        source=source,
+        run=RunOptions(variables=VARIABLES),
+    )
 
 
 def make_result(path: Path) -> None:

@@ -142,10 +142,16 @@ def _result(path: Path) -> None:
 
 
 def _store(path: Path) -> None:
-    from napari_shadowinv.stack import run_stack
+    from napari_shadowinv import Recipe, RunOptions, run_stack
 
     shots = np.stack([_shot(), _shot()[::-1]]).astype(float)
-    run_stack(shots, path, options=_few_sites(), setup=_setup(), scheduler="threads", workers=1)
+    run_stack(
+        shots,
+        path,
+        Recipe(options=_few_sites(), setup=_setup()),
+        scheduler="threads",
+        run=RunOptions(workers=1),
+    )
 
 
 def _toml(path: Path) -> None:

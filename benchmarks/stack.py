@@ -27,7 +27,7 @@ import numpy as np
 import psutil  # dask needs it, too
 from distributed import Client
 
-from napari_shadowinv import InversionOptions, Recipe, run, run_stack, synthetic_image
+from napari_shadowinv import InversionOptions, Recipe, RunOptions, run, run_stack, synthetic_image
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import Cache
@@ -91,7 +91,9 @@ def warm_up(shots: int, folder: Path, scheduler: Any) -> None:
     few = np.ones((shots, 24, 24)) + np.eye(24)
     options = InversionOptions(n_sites=100, threads=1)
     out = folder / "warm.shadowinv.zarr"
-    run_stack(few, out, options=options, scheduler=scheduler, overwrite=True)
+    run_stack(
+        few, out, Recipe(options=options), scheduler=scheduler, run=RunOptions(overwrite=True)
+    )
 
 
 def on_workers(count: int, timed: Callable[[Client], float], folder: Path) -> float:
@@ -140,12 +142,12 @@ def speedup(arguments: argparse.Namespace, folder: Path) -> None:
         run_stack(
             shots.shots,
             folder / "night.shadowinv.zarr",
+            shots.recipe,
             source=shots.source,
             reader=shots.reader,
-            recipe=shots.recipe,
             scheduler=client,
-            overwrite=True,
             on_progress=lambda told: told.outcome and ended.append(told.outcome),
+            run=RunOptions(overwrite=True),
         )
         return time.perf_counter() - start
 
@@ -209,8 +211,8 @@ def stream(arguments: argparse.Namespace, folder: Path) -> None:
         run_stack(
             paths,
             out,
+            Recipe(options=InversionOptions(threads=1)),
             source=np.full((100, 100), 1000.0),
-            options=InversionOptions(threads=1),
             reader=streamed,
             scheduler=client,
             on_progress=note,

@@ -23,7 +23,14 @@ import imageio.v3 as iio
 import numpy as np
 import tifffile
 
-from napari_shadowinv import InversionOptions, Recipe, run_stack, watch_stack
+from napari_shadowinv import (
+    InversionOptions,
+    Recipe,
+    RunOptions,
+    WatchOptions,
+    run_stack,
+    watch_stack,
+)
 from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import RunStatus, read_shot
 
@@ -77,11 +84,11 @@ def kept_up(folder: Path, recipe: Recipe, count: int, rate: float) -> str:
     watch_stack(
         live,
         folder / f"live_{rate:g}.shadowinv.zarr",
+        recipe,
         source=iio.imread(BURNER / "Image_00000.bmp").astype(float),
         reader=partial(read_shot, channel=None),
-        recipe=recipe,
-        shots=count,
         on_progress=note,
+        watch=WatchOptions(max_shots=count),
     )
     thread.join()
     names = sorted(stored)[3:]  # the first decide on sites
@@ -106,7 +113,9 @@ def against_a_run(folder: Path, recipe: Recipe, count: int) -> None:
             ends.append(time.perf_counter())
 
     out = folder / "there.shadowinv.zarr"
-    watch_stack(live, out, source=source, recipe=recipe, shots=count, on_progress=note)
+    watch_stack(
+        live, out, recipe, source=source, on_progress=note, watch=WatchOptions(max_shots=count)
+    )
     watched = (ends[-1] - ends[2]) / (count - 3)  # the first decide on sites
     times: list[float] = []
     files = sorted(live.glob("*.tif"))
@@ -119,11 +128,10 @@ def against_a_run(folder: Path, recipe: Recipe, count: int) -> None:
         run_stack(
             some,
             folder / "run.shadowinv.zarr",
+            with_all,
             source=source,
-            recipe=with_all,
-            warm_start=count,
             scheduler="synchronous",
-            overwrite=True,
+            run=RunOptions(warm_start=count, overwrite=True),
         )
         times.append(time.perf_counter() - began)
     run = (times[1] - times[0]) / (count - 1)
@@ -143,10 +151,9 @@ def many(folder: Path, count: int) -> None:
     watch_stack(
         live,
         folder / "many.shadowinv.zarr",
-        pattern="*.npy",
-        options=InversionOptions(n_sites=200),
-        shots=count,
+        Recipe(options=InversionOptions(n_sites=200)),
         on_progress=lambda news: ends.append(time.perf_counter()) if news.outcome else None,
+        watch=WatchOptions(pattern="*.npy", max_shots=count),
     )
     part = max(1, count // 10)
     early, late = (

@@ -41,7 +41,14 @@ TASKS: dict[str, tuple[str, ...]] = {
     "Describe the experiment, for SI units": ("ProtonSetup", "OpticalSetup"),
     "Estimate the error of a field": ("uncertainty", "Uncertainty"),
     "Fit one or several images, also where rays cross": ("fit", "FitOptions", "Fit"),
-    "Invert many shots": ("run_stack", "invert_stack", "watch_stack", "stack_statistics"),
+    "Invert many shots": (
+        "run_stack",
+        "RunOptions",
+        "watch_stack",
+        "WatchOptions",
+        "invert_stack",
+        "stack_statistics",
+    ),
     "Predict an image, or compare with linear theory": (
         "synthetic_image",
         "project",
@@ -94,7 +101,7 @@ def write_pages(app: Sphinx, config: Config) -> None:
 
 
 def parameters_page() -> str:
-    from napari_shadowinv import FitOptions, InversionOptions
+    from napari_shadowinv import FitOptions, InversionOptions, RunOptions, WatchOptions
     from napari_shadowinv.options import FitChoices
     from napari_shadowinv.physics.setup import SETUPS
     from napari_shadowinv.preprocessing import ESTIMATES, STEPS, MeasuredSource
@@ -122,6 +129,14 @@ def parameters_page() -> str:
         "In napari under *Options*; in Python the arguments of "
         "{py:class}`~napari_shadowinv.InversionOptions`.",
         table_of(InversionOptions.model_fields),
+        "## Run options",
+        "Of many shots; flags of `shadowinv batch`, in Python the arguments of "
+        "{py:class}`~napari_shadowinv.RunOptions`. See [](../batch.md).",
+        table_of(RunOptions.model_fields),
+        "## Watch options",
+        "Of a watched folder; flags of `shadowinv watch`, in Python the arguments of "
+        "{py:class}`~napari_shadowinv.WatchOptions`.",
+        table_of(WatchOptions.model_fields),
         "## Fit choices",
         "What a fit finds and what is known. In a recipe `[fit]`; on the command line flags of "
         "`shadowinv fit`. See [](../fit.md).",

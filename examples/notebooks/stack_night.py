@@ -18,6 +18,8 @@ from matplotlib.figure import Figure
 from napari_shadowinv import (
     InversionOptions,
     OpticalSetup,
+    Recipe,
+    RunOptions,
     invert_stack,
     read,
     run_stack,
@@ -67,12 +69,8 @@ print(f"Dashboard: http://127.0.0.1:{port}/status")
 # %%
 setup = OpticalSetup(wavelength=532e-9, object_image_distance=0.3, pixel_size=20e-6)
 good = sorted(path for path in night.glob("shot_*.tif") if path.stat().st_size)
-stack = invert_stack(
-    good,
-    source=night / "reference.tif",
-    options=InversionOptions(n_sites=2000),
-    setup=setup,
-)
+recipe = Recipe(options=InversionOptions(n_sites=2000), setup=setup)
+stack = invert_stack(good, recipe, source=night / "reference.tif")
 one = stack.potential.isel(shot=2).compute()
 print(f"{stack.sizes['shot']} shots; the third has a peak of {float(one.max()):.1f} px²")
 
@@ -86,10 +84,9 @@ print(f"{stack.sizes['shot']} shots; the third has a peak of {float(one.max()):.
 result = run_stack(
     str(night / "shot_*.tif"),
     night / "night.shadowinv.zarr",
+    recipe,
     source=night / "reference.tif",
-    options=InversionOptions(n_sites=2000),
-    setup=setup,
-    overwrite=True,
+    run=RunOptions(overwrite=True),
 )
 for name, status in zip(result.name.values, result.status.values, strict=True):
     if status == 2:

@@ -6,7 +6,7 @@ from .fitting import Fit, FitOptions, fit
 from .inversion import Inversion, Report, invert, plan_sites
 from .inversion.error_bars import Uncertainty, uncertainty
 from .io import Radiograph, read, write
-from .options import InversionOptions
+from .options import InversionOptions, RunOptions, WatchOptions
 from .physics.forward import synthetic_image
 from .physics.poisson import poisson_invert
 from .physics.projection import project, project_potential
@@ -34,7 +34,9 @@ __all__ = [
     "Recipe",
     "Report",
     "Rerun",
+    "RunOptions",
     "Uncertainty",
+    "WatchOptions",
     "__version__",
     "add_inversion",
     "fit",

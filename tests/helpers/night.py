@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from napari_shadowinv import InversionOptions, synthetic_image
+import numpy as np
+from pydantic import BaseModel
+
+from napari_shadowinv import InversionOptions, Recipe, RunOptions, synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 
 SHAPE = (24, 28)
@@ -19,3 +22,18 @@ def make_shots(count: int) -> tuple[np.ndarray, np.ndarray]:
         for i in range(count)
     ]
     return np.stack([synthetic_image(blob.displacement, source) for blob in blobs]), source
+
+
+def grouped(choices: dict[str, Any], model: type[BaseModel] | None = RunOptions) -> dict[str, Any]:
+    """Group choices into the arguments of `run_stack`, `watch_stack` or `invert_stack`."""
+    fields = {"options": "options", "setup": "setup", "filters": "steps"}
+    parts = {fields[name]: value for name, value in choices.items() if name in fields}
+    names = set() if model is None else set(model.model_fields)
+    arguments = {k: v for k, v in choices.items() if k not in names and k not in fields}
+    if parts:
+        filled = {name: value for name, value in parts.items() if value is not None}
+        arguments.setdefault("recipe", Recipe(**filled))
+    if model is not None:
+        options = model(**{name: choices[name] for name in names & choices.keys()})
+        arguments["run" if model is RunOptions else "watch"] = options
+    return arguments

@@ -486,11 +486,11 @@ def test_the_first_shots_decide_for_a_stack(tmp_path):
     shots.mkdir()
     for number in range(4):
         np.save(shots / f"{number}.npy", easy)
-    choices = {"options": options, "variables": ("displacement", "sites")}
-    store = run_stack(str(shots / "*.npy"), out, **choices)
+    run = {"variables": ("displacement", "sites")}
+    store = run_stack(str(shots / "*.npy"), out, Recipe(options=options), run=run)
     assert store.sizes["site"] == alone[0]
     np.save(shots / "4.npy", hard)
-    store = run_stack(str(shots / "*.npy"), out, **choices)
+    store = run_stack(str(shots / "*.npy"), out, Recipe(options=options), run=run)
     assert store.sizes == {**store.sizes, "shot": 5, "site": alone[0]}
     assert (store.discretisation_error.values[:4] < store.discretisation_error.values[4]).all()
     reasons = {json.loads(str(text))["sites_reason"] for text in store.report.values}
@@ -498,7 +498,7 @@ def test_the_first_shots_decide_for_a_stack(tmp_path):
     missed = "the accuracy of 3 % is not reached: with the sites of the first shots"
     warned = [str(json.loads(str(text))["warnings"]) for text in store.report.values]
     assert [missed in text for text in warned] == 4 * [False] + [True]
-    lazy = invert_stack(np.stack([easy, hard]), options=options)
+    lazy = invert_stack(np.stack([easy, hard]), Recipe(options=options))
     assert lazy.sizes["site"] == alone[1]
 
 
@@ -514,7 +514,7 @@ def test_every_way_to_an_inversion_knows_whether_the_beam_was_measured(tmp_path)
     assert recorded.beam_sensitivity.rms > 0
     for beam, is_measured in (({}, False), ({"source": np.ones(image.shape)}, True)):
         out = tmp_path / f"{is_measured}.shadowinv.zarr"
-        store = run_stack(image[None], out, options=options, **beam)
+        store = run_stack(image[None], out, Recipe(options=options), **beam)
         (report,) = (json.loads(str(text)) for text in store.report.values)
         assert (report["errors"]["beam"] is None) == is_measured
 

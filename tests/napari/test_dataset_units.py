@@ -11,7 +11,7 @@ import xarray as xr
 from napari.components import ViewerModel
 
 from napari import __version__ as napari_version
-from napari_shadowinv import invert_stack, read, write
+from napari_shadowinv import Recipe, invert_stack, read, write
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import update_labels
 from napari_shadowinv.physics.setup import OpticalSetup
@@ -54,7 +54,7 @@ def test_field_in_metres_lies_over_a_layer_of_its_pixels(
         write(path, dataset)
         dataset = read(path)
     if origin == "stack":
-        dataset = invert_stack(inversion.image[np.newaxis], setup=SETUP).isel(shot=0)
+        dataset = invert_stack(inversion.image[np.newaxis], Recipe(setup=SETUP)).isel(shot=0)
     viewer = ViewerModel()
     size_um = PIXEL_M * 1e6
     image = viewer.add_image(inversion.image, scale=(size_um, size_um), units=("um", "um"))

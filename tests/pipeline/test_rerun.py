@@ -138,8 +138,10 @@ def shot_of_stack(folder: Path) -> Example:
     paths = record(folder)
     options = InversionOptions(n_sites=150)
     recipe = Recipe(steps=STEPS, mask=Path("mask.tif"), setup=SETUPS[0], options=options)
-    arguments = {"recipe": recipe, "scheduler": "synchronous", "dtype": "float64"}
-    run_stack(paths, "a.shadowinv.zarr", source="beam.npy", **arguments)
+    run = {"dtype": "float64"}
+    run_stack(
+        paths, "a.shadowinv.zarr", recipe, source="beam.npy", scheduler="synchronous", run=run
+    )
     return Example(read_stack(Path("a.shadowinv.zarr")).isel(shot=1).load(), paths[1])
 
 

@@ -320,8 +320,8 @@ def test_a_source_beside_the_shot_in_its_file_is_found(tmp_path: Path, image: Fl
     recipe = Recipe(source=MeasuredSource(variable="beam"), options=OPTIONS)
     assert_same(run(recipe, shot), invert(image, source=beam, options=OPTIONS))
     with pytest.raises(InputError, match="but names no file"):
-        invert_stack(np.stack([image, image]), recipe=recipe)
-    stack = invert_stack(np.stack([image, image]), recipe=recipe, source=beam)
+        invert_stack(np.stack([image, image]), recipe)
+    stack = invert_stack(np.stack([image, image]), recipe, source=beam)
     np.testing.assert_array_equal(stack.displacement[1], run(recipe, shot).displacement)
 
 

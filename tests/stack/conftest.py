@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.night import OPTIONS, make_shots
+from helpers.night import OPTIONS, grouped, make_shots
 from napari_shadowinv import invert, plan_sites, run_stack
 
 
@@ -25,9 +25,9 @@ class Night:
         return str(self.folder / "shot_*.npy")
 
     def run(self, out: Path, **changes):
-        """Invert its files into a store; arguments of `run_stack` may differ."""
-        arguments = {"shots": self.glob, "source": self.source, "options": OPTIONS, **changes}
-        return run_stack(arguments.pop("shots"), out, **arguments)
+        """Invert its files into a store; choices of `run_stack` may differ."""
+        choices = {"shots": self.glob, "source": self.source, "options": OPTIONS, **changes}
+        return run_stack(choices.pop("shots"), out, **grouped(choices))
 
     def path(self, index: int) -> Path:
         return self.folder / f"shot_{index}.npy"

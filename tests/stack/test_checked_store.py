@@ -15,7 +15,7 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
-from napari_shadowinv import InversionOptions, run_stack
+from napari_shadowinv import InversionOptions, Recipe, run_stack
 from napari_shadowinv.cli import app
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.store import DAMAGED, DONE, StackStore, read_stack
@@ -28,7 +28,9 @@ OPTIONS = InversionOptions(n_sites=100)
 @pytest.fixture
 def store(night, tmp_path) -> Path:
     path = tmp_path / "run.shadowinv.zarr"
-    run_stack(night.images[:2], path, source=night.source, options=OPTIONS, scheduler="threads")
+    run_stack(
+        night.images[:2], path, Recipe(options=OPTIONS), source=night.source, scheduler="threads"
+    )
     return path
 
 

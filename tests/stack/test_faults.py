@@ -29,6 +29,7 @@ from napari_shadowinv import (
     FileFormatError,
     InversionCancelled,
     InversionOptions,
+    Recipe,
     invert_stack,
     read,
 )
@@ -218,7 +219,7 @@ def plans_made() -> int:
 
 def test_lazy_stack_plans_sites_once_in_each_worker(make_night, cluster):
     night = make_night(12)
-    stack = invert_stack(night.images, source=night.source, options=OPTIONS)
+    stack = invert_stack(night.images, Recipe(options=OPTIONS), source=night.source)
     expected = stack.potential.compute(scheduler="synchronous")
     with Client(cluster, set_as_default=False) as client:
         client.run(count_plans)

@@ -15,7 +15,7 @@ import xarray as xr
 
 from helpers.command_line import flat, shadowinv
 from helpers.store_content import content
-from napari_shadowinv import InputError, Recipe, run_stack, synthetic_image
+from napari_shadowinv import InputError, Recipe, RunOptions, run_stack, synthetic_image
 from napari_shadowinv.io import read
 from napari_shadowinv.io.store import StackStore
 from napari_shadowinv.options import FitChoices, FitOptions
@@ -71,7 +71,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_each_shot_of_an_array_is_fitted_alone(images: Any, out: Path) -> None:
     recipe = Recipe(setup=SETUPS[0], fit=CHOICES)
-    store = run_stack(images, out, recipe=recipe, scheduler="synchronous", dtype="float64")
+    store = run_stack(images, out, recipe, scheduler="synchronous", run=RunOptions(dtype="float64"))
     assert store["status"].values.tolist() == [1, 1, 1]
     for index, plane in enumerate(images):
         alone = run_fit(recipe, [plane])
@@ -94,7 +94,7 @@ def test_the_store_does_not_depend_on_workers(images: Any, tmp_path: Path) -> No
     contents = []
     for name, engine in (("one", "synchronous"), ("two", "threads")):
         path = tmp_path / f"{name}.shadowinv.zarr"
-        run_stack(images, path, recipe=recipe, scheduler=engine, workers=2)
+        run_stack(images, path, recipe, scheduler=engine, run=RunOptions(workers=2))
         contents.append({key: data for key, data in content(path).items() if "potential" in key})
     assert contents[0]
     assert contents[0] == contents[1]
@@ -104,7 +104,7 @@ def test_a_shot_fails_alone_and_the_rest_is_resumed(images: Any, out: Path) -> N
     recipe = Recipe(fit=CHOICES)
     spoilt = images.copy()
     spoilt[1] = 0
-    first = run_stack(spoilt, out, recipe=recipe, scheduler="synchronous")
+    first = run_stack(spoilt, out, recipe, scheduler="synchronous")
     assert first["status"].values.tolist() == [1, 2, 1]
     assert "no flux" in StackStore(out).report(1)["reason"]
     before = content(out)
@@ -112,7 +112,7 @@ def test_a_shot_fails_alone_and_the_rest_is_resumed(images: Any, out: Path) -> N
     again = run_stack(
         spoilt,
         out,
-        recipe=recipe,
+        recipe,
         scheduler="synchronous",
         on_progress=lambda news: names.append(news.engine),
     )
@@ -121,15 +121,20 @@ def test_a_shot_fails_alone_and_the_rest_is_resumed(images: Any, out: Path) -> N
     assert content(out) == before
     other_recipe = Recipe(fit=CHOICES.model_copy(update={"psf": 1.0}))
     with pytest.raises(InputError, match=r"different fit \(psf: None there, 1.0 now\)"):
-        run_stack(spoilt, out, recipe=other_recipe, scheduler="synchronous")
+        run_stack(spoilt, out, other_recipe, scheduler="synchronous")
     with pytest.raises(InputError, match="different fit"):
-        run_stack(spoilt, out, scheduler="synchronous", variables=("potential", "displacement"))
+        run_stack(
+            spoilt,
+            out,
+            scheduler="synchronous",
+            run=RunOptions(variables=("potential", "displacement")),
+        )
 
 
 def test_error_bars_are_stored_if_they_are_made(images: Any, out: Path) -> None:
     options = HASTY.model_copy(update={"samples": 2})
     recipe = Recipe(fit=CHOICES.model_copy(update={"options": options}))
-    store = run_stack(images[:1], out, recipe=recipe, scheduler="synchronous")
+    store = run_stack(images[:1], out, recipe, scheduler="synchronous")
     assert store["displacement_uncertainty"].attrs["units"] == "pixel"
     assert float(store["displacement_uncertainty"].min()) > 0
     assert float(store["uncertainty"][0]) == run_fit(recipe, [images[0]]).report.uncertainty
@@ -151,13 +156,13 @@ def test_stack_of_fits_refuses_wrong_input_before_writing(
     fields, steps = changes.pop("fields", None), changes.pop("steps", ())
     recipe = Recipe(steps=steps, fit=CHOICES.model_copy(update={"fields": fields}))
     with pytest.raises(InputError, match=words):
-        run_stack(images, out, recipe=recipe, scheduler="synchronous", **changes)
+        run_stack(images, out, recipe, scheduler="synchronous", run=changes)
     assert not out.exists()
 
 
 def test_a_lazy_stack_does_not_fit(images: Any) -> None:
     with pytest.raises(InputError, match="invert_stack inverts: use run_stack"):
-        invert_stack(images, recipe=Recipe(fit=CHOICES))
+        invert_stack(images, Recipe(fit=CHOICES))
 
 
 # Several images of each shot
@@ -165,7 +170,9 @@ def test_a_lazy_stack_does_not_fit(images: Any) -> None:
 
 def test_images_of_one_object_are_fitted_together(folder: Path, out: Path) -> None:
     recipe = Recipe(fit=CHOICES)
-    store = run_stack("shots.csv", out, recipe=recipe, scheduler="synchronous", dtype="float64")
+    store = run_stack(
+        "shots.csv", out, recipe, scheduler="synchronous", run=RunOptions(dtype="float64")
+    )
     assert store["name"].values.tolist() == ["s0", "s1"]
     for index in range(2):
         shots = [
@@ -188,7 +195,7 @@ def test_images_of_one_object_are_fitted_together(folder: Path, out: Path) -> No
 
 def test_changed_table_is_refused_and_longer_table_grows(folder: Path, out: Path) -> None:
     recipe = Recipe(fit=CHOICES)
-    run_stack("shots.csv", out, recipe=recipe, scheduler="synchronous")
+    run_stack("shots.csv", out, recipe, scheduler="synchronous")
     text = Path("shots.csv").read_text()
     for name in ("low", "high"):
         tifffile.imwrite(f"{name}2.tif", tifffile.imread(f"{name}1.tif") * np.float32(2))
@@ -196,27 +203,27 @@ def test_changed_table_is_refused_and_longer_table_grows(folder: Path, out: Path
     Path("shots.csv").write_text("\n".join([text, *more]))
     choices = CHOICES.model_copy(update={"noise": None})
     with pytest.raises(InputError, match="different fit"):
-        run_stack("shots.csv", out, recipe=Recipe(fit=choices), scheduler="synchronous")
-    store = run_stack("shots.csv", out, recipe=recipe, scheduler="synchronous")
+        run_stack("shots.csv", out, Recipe(fit=choices), scheduler="synchronous")
+    store = run_stack("shots.csv", out, recipe, scheduler="synchronous")
     assert store["name"].values.tolist() == ["s0", "s1", "s2"]
     Path("shots.csv").write_text(
         Path("shots.csv").read_text().replace("s1,high1.tif,5.0", "s1,high1.tif,6")
     )
     with pytest.raises(InputError, match=r"shot 1 \(s1\) has changed"):
-        run_stack("shots.csv", out, recipe=recipe, scheduler="synchronous")
+        run_stack("shots.csv", out, recipe, scheduler="synchronous")
     Path("shots.csv").write_text(text)
     tifffile.imwrite("low0.tif", image(5).astype(np.float32))
     with pytest.raises(InputError, match="different shots"):
-        run_stack("shots.csv", out, recipe=recipe, scheduler="synchronous")
+        run_stack("shots.csv", out, recipe, scheduler="synchronous")
     Path("shots.csv").write_text("\n".join([text, *more]))
     with pytest.raises(InputError, match=r"shot 0 \(s0\) has changed"):
-        run_stack("shots.csv", out, recipe=recipe, scheduler="synchronous")
+        run_stack("shots.csv", out, recipe, scheduler="synchronous")
 
 
 def test_a_shot_with_another_setup_fails_alone(folder: Path, out: Path) -> None:
     text = Path("shots.csv").read_text()
     Path("shots.csv").write_text(text.replace("s1,low1.tif,14.7", "s1,low1.tif,13"))
-    store = run_stack("shots.csv", out, recipe=Recipe(fit=CHOICES), scheduler="synchronous")
+    store = run_stack("shots.csv", out, Recipe(fit=CHOICES), scheduler="synchronous")
     assert store["status"].values.tolist() == [1, 2]
     assert "setup of its first image differs" in StackStore(out).report(1)["reason"]
 

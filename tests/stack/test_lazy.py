@@ -13,7 +13,14 @@ import pytest
 import tifffile
 import xarray as xr
 
-from napari_shadowinv import FileFormatError, InputError, InversionOptions, invert, invert_stack
+from napari_shadowinv import (
+    FileFormatError,
+    InputError,
+    InversionOptions,
+    Recipe,
+    invert,
+    invert_stack,
+)
 from napari_shadowinv.physics.setup import OpticalSetup
 from napari_shadowinv.stack import _worker
 
@@ -41,7 +48,9 @@ def plans_made(monkeypatch):
 @pytest.mark.parametrize("boundary", ["closed", "free"])
 def test_each_shot_has_the_variables_of_its_own_inversion(night, optical_setup, boundary):
     options = OPTIONS.model_copy(update={"boundary": boundary})
-    stack = invert_stack(night.images, source=night.source, options=options, setup=optical_setup)
+    stack = invert_stack(
+        night.images, Recipe(options=options, setup=optical_setup), source=night.source
+    )
     computed = stack.compute()
     assert computed.sizes == stack.sizes
     for index, image in enumerate(night.images):
@@ -60,7 +69,7 @@ def test_each_shot_has_the_variables_of_its_own_inversion(night, optical_setup, 
 
 
 def test_lazy_stack_without_source_has_a_uniform_beam(night):
-    stack = invert_stack(night.images, options=OPTIONS)
+    stack = invert_stack(night.images, Recipe(options=OPTIONS))
     alone = invert(night.images[2], options=OPTIONS)
     shot = stack.isel(shot=2).compute()
     np.testing.assert_allclose(shot.potential, alone.potential, atol=1e-9)
@@ -72,11 +81,11 @@ def test_masked_pixels_do_not_count(night):
     mask = np.ones(night.source.shape, bool)
     mask[3:6, 4:9] = False
     spoilt = np.where(mask, night.images, np.nan)
-    stack = invert_stack(spoilt, source=night.source, mask=mask, options=OPTIONS)
+    stack = invert_stack(spoilt, Recipe(options=OPTIONS), source=night.source, mask=mask)
     alone = invert(night.images[1], source=night.source, mask=mask, options=OPTIONS)
     np.testing.assert_array_equal(stack.potential[1], alone.potential)
     np.testing.assert_array_equal(stack["mask"], mask)
-    uniform = invert_stack(spoilt, mask=mask, options=OPTIONS)
+    uniform = invert_stack(spoilt, Recipe(options=OPTIONS), mask=mask)
     alone = invert(night.images[1], mask=mask, options=OPTIONS)
     np.testing.assert_allclose(uniform.potential[1], alone.potential, atol=1e-9)
 
@@ -84,7 +93,9 @@ def test_masked_pixels_do_not_count(night):
 def test_lazy_stack_reads_only_computed_shots(night):
     from helpers.slow_reading import log_and_read
 
-    stack = invert_stack(night.glob, source=night.source, options=OPTIONS, reader=log_and_read)
+    stack = invert_stack(
+        night.glob, Recipe(options=OPTIONS), source=night.source, reader=log_and_read
+    )
     assert night.reads == []
     stack.potential.isel(shot=slice(3, 5)).compute()
     assert sorted(night.reads) == ["shot_3", "shot_4"]
@@ -93,14 +104,16 @@ def test_lazy_stack_reads_only_computed_shots(night):
 def test_all_variables_of_a_shot_come_from_one_inversion(night):
     from helpers.slow_reading import log_and_read
 
-    stack = invert_stack(night.glob, source=night.source, options=OPTIONS, reader=log_and_read)
+    stack = invert_stack(
+        night.glob, Recipe(options=OPTIONS), source=night.source, reader=log_and_read
+    )
     dask.compute(stack.potential, stack.displacement, stack.weights, stack.converged)
     assert sorted(night.reads) == [f"shot_{i}" for i in range(6)]
 
 
 @pytest.mark.parametrize("scheduler", ["synchronous", "threads"])
 def test_sites_are_made_once_for_shots_with_one_source(night, plans_made, scheduler):
-    stack = invert_stack(night.images, source=night.source, options=OPTIONS)
+    stack = invert_stack(night.images, Recipe(options=OPTIONS), source=night.source)
     stack[["potential", "sites"]].compute(scheduler=scheduler, num_workers=4)
     assert len(plans_made) == 1
 
@@ -142,7 +155,7 @@ def test_plans_depend_on_source_mask_and_options(night, plans_made):
 
 def test_the_result_does_not_depend_on_scheduler_chunks_or_order(night):
     def potential(shots: object) -> xr.DataArray:
-        return invert_stack(shots, source=night.source, options=OPTIONS).potential
+        return invert_stack(shots, Recipe(options=OPTIONS), source=night.source).potential
 
     expected = potential(night.images).compute(scheduler="synchronous").values
     chunked = da.from_array(night.images, chunks=(4, 10, 28))
@@ -154,7 +167,7 @@ def test_the_result_does_not_depend_on_scheduler_chunks_or_order(night):
 
 
 def test_the_graph_holds_the_source_once(night):
-    stack = invert_stack(night.images, source=night.source, options=OPTIONS)
+    stack = invert_stack(night.images, Recipe(options=OPTIONS), source=night.source)
     graph = dict(stack.potential.data.__dask_graph__())
     beams = [key for key in graph if str(key).startswith("beam-")]
     assert len(beams) == 1
@@ -164,7 +177,7 @@ def test_the_graph_holds_the_source_once(night):
 
 def test_a_source_for_each_shot(night, plans_made):
     sources = np.stack([night.source * (1 + 0.1 * (i // 3) * np.eye(24, 28)) for i in range(6)])
-    stack = invert_stack(night.images, source=sources, options=OPTIONS)
+    stack = invert_stack(night.images, Recipe(options=OPTIONS), source=sources)
     assert stack.sites.dims == ("shot", "site", "component")
     shots = stack[["potential", "sites", "source"]].compute(scheduler="synchronous")
     assert len(plans_made) == 2  # equal sources share their sites
@@ -173,33 +186,33 @@ def test_a_source_for_each_shot(night, plans_made):
         np.testing.assert_array_equal(shots.potential[index], alone.potential)
         np.testing.assert_array_equal(shots.sites[index], alone.sites)
     free = OPTIONS.model_copy(update={"boundary": "free"})
-    ragged = invert_stack(night.images, source=sources, options=free)
+    ragged = invert_stack(night.images, Recipe(options=free), source=sources)
     assert "site" not in ragged.dims
     alone = invert(night.images[4], source=sources[4], options=free)
     np.testing.assert_array_equal(ragged.potential[4], alone.potential)
     with pytest.raises(InputError, match=r"'site_flux' \(sites differ between shots"):
-        invert_stack(night.images, source=sources, options=free, variables=["site_flux"])
+        invert_stack(night.images, Recipe(options=free), source=sources, variables=["site_flux"])
     with pytest.raises(InputError, match="got 2 sources for 6 shots"):
-        invert_stack(night.images, source=sources[:2], options=OPTIONS)
+        invert_stack(night.images, Recipe(options=OPTIONS), source=sources[:2])
 
 
 def test_warm_start_agrees_within_tolerance_in_fewer_steps(night):
     alike = np.stack([night.images[1] * (1 + 0.001 * i * np.eye(24, 28)) for i in range(6)])
     options = InversionOptions(n_sites=600, tolerance=1e-4)
-    cold = invert_stack(alike, source=night.source, options=options)
-    warm = invert_stack(alike, source=night.source, options=options, warm_start=3)
+    cold = invert_stack(alike, Recipe(options=options), source=night.source)
+    warm = invert_stack(alike, Recipe(options=options), source=night.source, warm_start=3)
     cold, warm = (s[["potential", "iterations"]].compute() for s in (cold, warm))
     np.testing.assert_allclose(warm.potential, cold.potential, atol=2e-3)
     assert (warm.iterations[[0, 3]] == cold.iterations[[0, 3]]).all()
     assert warm.iterations[[1, 2, 4, 5]].sum() < cold.iterations[[1, 2, 4, 5]].sum()
     # Where a slice begins does not change it.
-    part = invert_stack(alike, source=night.source, options=options, warm_start=3)
+    part = invert_stack(alike, Recipe(options=options), source=night.source, warm_start=3)
     np.testing.assert_array_equal(part.potential.isel(shot=5), warm.potential.isel(shot=5))
 
 
 class TestInputs:
     def potential(self, shots, **more) -> np.ndarray:
-        return invert_stack(shots, options=OPTIONS, **more).potential.compute().values
+        return invert_stack(shots, Recipe(options=OPTIONS), **more).potential.compute().values
 
     @pytest.fixture
     def expected(self, night) -> np.ndarray:
@@ -214,13 +227,13 @@ class TestInputs:
 
     def test_a_glob_is_sorted_by_number(self, make_night):
         night = make_night(12)
-        stack = invert_stack(night.glob, options=OPTIONS)
+        stack = invert_stack(night.glob, Recipe(options=OPTIONS))
         assert list(stack.name.values) == [f"shot_{i}.npy" for i in range(12)]
 
     def test_pages_of_a_tiff(self, night, expected, tmp_path):
         film = tmp_path / "film.tif"
         tifffile.imwrite(film, night.images, photometric="minisblack")
-        stack = invert_stack(film, source=night.source, options=OPTIONS)
+        stack = invert_stack(film, Recipe(options=OPTIONS), source=night.source)
         assert stack.name.values[4] == "film.tif[4]"
         np.testing.assert_array_equal(stack.potential, expected)
 
@@ -231,7 +244,7 @@ class TestInputs:
             coords={"shot": [3, 1, 4, 9, 5, 2]},
         )
         for labelled in (shots, shots.to_dataset(name="image").assign(other=shots)):
-            stack = invert_stack(labelled, source=night.source, options=OPTIONS)
+            stack = invert_stack(labelled, Recipe(options=OPTIONS), source=night.source)
             np.testing.assert_array_equal(stack.potential.sel(shot=4), expected[2])
 
     def test_a_list_of_images(self, night, expected):
@@ -275,7 +288,7 @@ class TestInputs:
 
 def test_a_bad_shot_is_named_when_it_is_computed(night):
     night.images[3] = 0
-    stack = invert_stack(night.images, source=night.source, options=OPTIONS)
+    stack = invert_stack(night.images, Recipe(options=OPTIONS), source=night.source)
     stack.potential.isel(shot=2).compute()
     with pytest.raises(InputError, match="shot 3: image has no positive pixel"):
         stack.potential.compute()
@@ -283,7 +296,9 @@ def test_a_bad_shot_is_named_when_it_is_computed(night):
 
 def test_lazy_stack_computes_only_requested_variables(night):
     setup = OpticalSetup(wavelength=5e-7, object_image_distance=0.3, pixel_size=1e-5)
-    stack = invert_stack(night.images, setup=setup, variables=["potential_si"], options=OPTIONS)
+    stack = invert_stack(
+        night.images, Recipe(setup=setup, options=OPTIONS), variables=["potential_si"]
+    )
     quality = {"converged", "flux_residual", "image_residual", "iterations"}
     quality |= {"noise_error", "discretisation_error"}
     assert set(stack.data_vars) == {"potential_si", *quality}

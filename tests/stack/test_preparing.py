@@ -8,11 +8,13 @@ import pytest
 from scipy.io import savemat
 from typer.testing import CliRunner
 
-from helpers.night import OPTIONS
+from helpers.night import OPTIONS, grouped
 from napari_shadowinv import (
     InputError,
     InversionOptions,
     ProtonSetup,
+    Recipe,
+    RunOptions,
     invert,
     invert_stack,
     read,
@@ -74,8 +76,8 @@ def test_sources_are_guessed_from_filtered_shots(night, out, bare, usable):
         "options": OPTIONS,
         "variables": ("potential", "source", "weights"),
     }
-    written = run_stack(shots, out, **arguments, dtype="float64")
-    lazy = invert_stack(shots, **arguments)
+    written = run_stack(shots, out, **grouped({**arguments, "dtype": "float64"}))
+    lazy = invert_stack(shots, **grouped(arguments, None))
     assert (written.status == DONE).all()
     for index in (0, 3):
         expected = alone(shots[index], usable, bare)
@@ -98,14 +100,16 @@ def test_a_measured_source_is_blurred_as_its_shots(night, out):
     )
     sources = np.stack([night.source] * 6)
     for source in (night.source, sources):
-        stack = invert_stack(night.images, source=source, filters=blur, options=OPTIONS)
+        stack = invert_stack(night.images, Recipe(steps=blur, options=OPTIONS), source=source)
         np.testing.assert_array_equal(stack.potential[1].compute(), expected.potential)
         np.testing.assert_array_equal(stack.source.values.reshape(-1, 24, 28)[0], expected.source)
 
 
 def test_a_uniform_beam_is_shared_and_may_be_flattened(night):
     flatten = (HighPassFilter(width=9.0),)
-    stack = invert_stack(night.images, source=UniformEstimate(), filters=flatten, options=OPTIONS)
+    stack = invert_stack(
+        night.images, Recipe(steps=flatten, options=OPTIONS), source=UniformEstimate()
+    )
     assert stack.sites.dims == ("site", "component")
     expected = invert(high_pass(night.images[2], 9.0), options=OPTIONS)
     np.testing.assert_allclose(stack.potential[2].compute(), expected.potential, rtol=0, atol=1e-9)
@@ -162,7 +166,7 @@ def test_nonsense_is_refused_before_anything_is_computed(night, out, arguments, 
 def test_an_estimate_that_cannot_be_made_fails_its_shot_alone(night, out):
     spoilt = night.images.copy()
     spoilt[2] = 0
-    written = run_stack(spoilt, out, source=LowPassEstimate(width=6), options=OPTIONS)
+    written = run_stack(spoilt, out, Recipe(options=OPTIONS), source=LowPassEstimate(width=6))
     assert list(written.status) == [1, 1, 2, 1, 1, 1]
 
 
@@ -232,13 +236,11 @@ def test_doubts_of_a_source_are_in_the_report_of_each_shot(night, out):
         run_stack(
             shots,
             out,
+            Recipe(setup=near, options=OPTIONS),
             source=source,
             source_mask=source_mask,
-            setup=near,
-            options=OPTIONS,
-            variables=("potential", "source"),
-            overwrite=True,
             scheduler="synchronous",
+            run=RunOptions(variables=("potential", "source"), overwrite=True),
         )
         for index in (0, 1):
             warnings = str(StackStore(out).report(index)["warnings"])

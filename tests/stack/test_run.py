@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from helpers.night import grouped
 from helpers.slow_reading import log_and_read
 from helpers.store_content import content
 from napari_shadowinv import (
@@ -17,6 +18,8 @@ from napari_shadowinv import (
     InputError,
     InversionCancelled,
     InversionOptions,
+    Recipe,
+    RunOptions,
     invert_stack,
     read,
     run_stack,
@@ -45,7 +48,9 @@ def stop_after(count: int):
 
 def test_store_equals_the_lazy_stack(night, out, optical_setup):
     written = night.run(out, shots=night.images, setup=optical_setup)
-    lazy = invert_stack(night.images, source=night.source, options=OPTIONS, setup=optical_setup)
+    lazy = invert_stack(
+        night.images, Recipe(options=OPTIONS, setup=optical_setup), source=night.source
+    )
     assert (written.status == DONE).all()
     assert written.potential.dtype == np.float32
     assert written.potential.chunks[0] == (1,) * 6
@@ -82,12 +87,11 @@ def test_stored_variables_can_be_chosen_and_sites_stand_once(night, out, boundar
     written = run_stack(
         night.images,
         out,
+        Recipe(options=options),
         source=night.source,
-        options=options,
-        variables=names,
-        dtype="float64",
+        run=RunOptions(variables=names, dtype="float64"),
     )
-    lazy = invert_stack(night.images, source=night.source, options=options)
+    lazy = invert_stack(night.images, Recipe(options=options), source=night.source)
     assert written.sites.dims == ("site", "component")
     assert written.source.dims == ("y", "x")
     assert "potential" not in written
@@ -98,7 +102,13 @@ def test_stored_variables_can_be_chosen_and_sites_stand_once(night, out, boundar
 def test_the_bytes_do_not_depend_on_threads_or_order(night, out, tmp_path):
     other_store = tmp_path / "other.shadowinv.zarr"
     night.run(out, shots=night.images, scheduler="synchronous")
-    run_stack(night.images, other_store, source=night.source, options=OPTIONS, workers=3)
+    run_stack(
+        night.images,
+        other_store,
+        Recipe(options=OPTIONS),
+        source=night.source,
+        run=RunOptions(workers=3),
+    )
     assert content(out) == content(other_store)
 
 
@@ -127,7 +137,7 @@ def test_a_run_goes_on_where_it_stopped(night, out):
     # Finished shots are neither read nor written again.
     assert not {f"shot_{i}" for i in done} & set(night.reads[reads:])
     assert first.items() <= content(out).items()
-    lazy = invert_stack(night.images, source=night.source, options=OPTIONS)
+    lazy = invert_stack(night.images, Recipe(options=OPTIONS), source=night.source)
     np.testing.assert_allclose(after.potential, lazy.potential, rtol=1e-6, atol=1e-6)
 
 
@@ -174,10 +184,14 @@ def test_each_shot_brings_its_own_source(night, out):
         np.save(path, night.source + 5 * index * np.eye(24, 28))
     sources[2].write_bytes(b"")
     written = run_stack(
-        night.glob, out, source=sources, options=OPTIONS, variables=("potential", "sites")
+        night.glob,
+        out,
+        Recipe(options=OPTIONS),
+        source=sources,
+        run=RunOptions(variables=("potential", "sites")),
     )
     assert list(np.flatnonzero(written.status == FAILED)) == [2]
-    lazy = invert_stack(night.images[4:5], source=np.load(sources[4]), options=OPTIONS)
+    lazy = invert_stack(night.images[4:5], Recipe(options=OPTIONS), source=np.load(sources[4]))
     np.testing.assert_allclose(written.potential[4], lazy.potential[0], rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(written.sites[4], lazy.sites)
 
@@ -191,15 +205,15 @@ def test_a_warm_start_does_not_depend_on_where_a_run_stopped(night, out, tmp_pat
         "scheduler": "synchronous",
     }
     other_store = tmp_path / "other.shadowinv.zarr"
-    run_stack(night.images, other_store, **arguments)
+    run_stack(night.images, other_store, **grouped(arguments))
     spoilt = night.images.copy()
-    run_stack(spoilt, out, **arguments)
+    run_stack(spoilt, out, **grouped(arguments))
     # As if the run had been killed after the first shot of the second three.
     for index in (4, 5):
         (out / "status" / "c" / str(index)).unlink()
         for path in (out / "weights" / "c" / str(index)).rglob("*"):
             path.write_bytes(b"torn")
-    run_stack(spoilt, out, **arguments)
+    run_stack(spoilt, out, **grouped(arguments))
     assert content(out, "weights") == content(other_store, "weights")
 
 
@@ -273,16 +287,16 @@ class TestRefusals:
         mine.mkdir()
         (mine / "chapter.txt").write_text("years of work")
         with pytest.raises(FileFormatError, match="is not a stack of shots"):
-            run_stack(night.images, mine, overwrite=True)
+            run_stack(night.images, mine, run=RunOptions(overwrite=True))
         assert (mine / "chapter.txt").read_text() == "years of work"
 
     @pytest.mark.parametrize(
         ("changes", "words"),
         [
             ({"scheduler": "quick"}, "scheduler is 'quick'"),
-            ({"workers": 0}, "workers is 0"),
-            ({"dtype": "int8"}, "dtype is 'int8'"),
-            ({"warm_start": 0}, "warm_start is 0"),
+            ({"workers": 0}, "'workers' is 0: workers must be at least 1"),
+            ({"dtype": "int8"}, "must be 'float32' or 'float64'"),
+            ({"warm_start": 0}, "warm start must be at least 1"),
         ],
     )
     def test_arguments_that_mean_nothing(self, night, tmp_path, changes, words):
@@ -308,7 +322,11 @@ def test_overwriting_begins_anew(night, out):
     night.run(out, shots=night.images)
     other_options = InversionOptions(n_sites=60)
     written = run_stack(
-        night.images[:2], out, source=night.source, options=other_options, overwrite=True
+        night.images[:2],
+        out,
+        Recipe(options=other_options),
+        source=night.source,
+        run=RunOptions(overwrite=True),
     )
     assert written.sizes["shot"] == 2
     assert [path.name for path in out.parent.glob(".*")] == []
@@ -341,8 +359,8 @@ def test_reader_text_has_module_and_choices():
 def test_fields_of_binned_shots_have_the_units_of_binned_pixels(night, out, optical_setup):
     arguments = {"source": night.source, "options": OPTIONS, "setup": optical_setup}
     arguments["filters"] = (Bin(factor=2),)
-    written = run_stack(night.images[:1], out, dtype="float64", **arguments)
-    lazy = invert_stack(night.images[:1], **arguments)
+    written = run_stack(night.images[:1], out, **grouped({**arguments, "dtype": "float64"}))
+    lazy = invert_stack(night.images[:1], **grouped(arguments, None))
     angle = lazy["deflection_angle"].values
     np.testing.assert_allclose(written["deflection_angle"], angle, rtol=1e-12)
     assert setup_from_dataset(written).object_pixel_size == 2 * optical_setup.object_pixel_size

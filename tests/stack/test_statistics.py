@@ -8,6 +8,8 @@ import pytest
 from napari_shadowinv import (
     InputError,
     InversionOptions,
+    Recipe,
+    RunOptions,
     invert_stack,
     run_stack,
     stack_statistics,
@@ -17,7 +19,9 @@ OPTIONS = InversionOptions(n_sites=100)
 
 
 def test_statistics_equal_numpy_and_are_lazy(night, optical_setup):
-    stack = invert_stack(night.images, source=night.source, options=OPTIONS, setup=optical_setup)
+    stack = invert_stack(
+        night.images, Recipe(options=OPTIONS, setup=optical_setup), source=night.source
+    )
     statistics = stack_statistics(stack)
     assert all(variable.chunks for variable in statistics.data_vars.values())
     computed = statistics.compute()
@@ -36,9 +40,11 @@ def test_shots_that_failed_do_not_count(night, tmp_path):
     images = night.images.copy()
     images[2] = 0
     out = tmp_path / "night.shadowinv.zarr"
-    written = run_stack(images, out, source=night.source, options=OPTIONS, dtype="float64")
+    written = run_stack(
+        images, out, Recipe(options=OPTIONS), source=night.source, run=RunOptions(dtype="float64")
+    )
     good = [0, 1, 3, 4, 5]
-    alone = invert_stack(night.images[good], source=night.source, options=OPTIONS)
+    alone = invert_stack(night.images[good], Recipe(options=OPTIONS), source=night.source)
     statistics, expected = stack_statistics(written), stack_statistics(alone)
     np.testing.assert_allclose(statistics.potential_mean, expected.potential_mean, rtol=1e-9)
     np.testing.assert_allclose(statistics.potential_std, expected.potential_std, rtol=1e-9)
@@ -48,7 +54,7 @@ def test_shots_that_failed_do_not_count(night, tmp_path):
 
 
 def test_one_shot_has_no_spread(night):
-    stack = invert_stack(night.images[:1], source=night.source, options=OPTIONS)
+    stack = invert_stack(night.images[:1], Recipe(options=OPTIONS), source=night.source)
     assert np.isnan(stack_statistics(stack).potential_std).all()
 
 

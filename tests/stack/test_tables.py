@@ -14,10 +14,12 @@ import tifffile
 import tomli_w
 
 from helpers.command_line import flat, shadowinv
+from helpers.night import grouped
 from napari_shadowinv import (
     InputError,
     InversionOptions,
     Recipe,
+    RunOptions,
     invert,
     invert_stack,
     read,
@@ -79,7 +81,8 @@ def pack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiled: None) -> Pat
 def inverted(shots: Any, out: Path, **more: Any) -> Any:
     """The store of a table, made in this process."""
     arguments = {"setup": SETUP, "options": OPTIONS, "source": "beam.npy"} | more
-    return run_stack(shots, out, scheduler="synchronous", dtype="float64", **arguments)
+    arguments["dtype"] = "float64"
+    return run_stack(shots, out, scheduler="synchronous", **grouped(arguments))
 
 
 def test_one_field_at_three_energies_is_one_field_in_si(pack: Path, out: Path) -> None:
@@ -95,7 +98,7 @@ def test_one_field_at_three_energies_is_one_field_in_si(pack: Path, out: Path) -
     # In px they are as different as the momenta.
     peaks = np.hypot(*store["displacement"].values.swapaxes(0, 1)).max(axis=(1, 2))
     assert peaks[0] / peaks[2] == pytest.approx(at(30.0).momentum / at(5.0).momentum, rel=0.03)
-    lazy = invert_stack(pack, setup=SETUP, options=OPTIONS, source="beam.npy")
+    lazy = invert_stack(pack, Recipe(setup=SETUP, options=OPTIONS), source="beam.npy")
     np.testing.assert_allclose(lazy["path_integrated_b"], field, rtol=1e-9, atol=1e-12 * strongest)
     for stack in (store, lazy):
         assert [setup_from_dataset(stack.isel(shot=k)) for k in range(3)] == list(map(at, ENERGIES))
@@ -112,7 +115,7 @@ def test_a_row_is_inverted_as_alone(pack: Path, out: Path) -> None:
     free = InversionOptions(tolerance=1e-3, boundary="free", flux="known")
     recipe = Recipe(steps=(Bin(factor=2),), setup=SETUP, options=free)
     pack = table(*rows, header=header)
-    store = run_stack(pack, out, recipe=recipe, source=beam(), dtype="float64")
+    store = run_stack(pack, out, recipe, source=beam(), run=RunOptions(dtype="float64"))
     alone = run(
         recipe.model_copy(update={"setup": at(5.0)}),
         np.load("film0.npy") / 1.25,
@@ -146,7 +149,10 @@ def test_images_of_uniform_beams_are_relative_to_their_mean(pack: Path, out: Pat
     pack = table("film0.npy,", "film1.npy,mask.npy", header="file,mask")
     store = inverted(pack, out, source=None, setup=None, variables=("image", "displacement"))
     files = run_stack(
-        ["film0.npy"], out.with_name("f.shadowinv.zarr"), options=OPTIONS, variables=("image",)
+        ["film0.npy"],
+        out.with_name("f.shadowinv.zarr"),
+        Recipe(options=OPTIONS),
+        run=RunOptions(variables=("image",)),
     )
     np.testing.assert_allclose(store["image"][0], files["image"][0], rtol=1e-6)
     assert float(store["image"][1].values[4:].mean()) == pytest.approx(1, rel=1e-9)
@@ -336,13 +342,10 @@ def test_a_row_is_repeated_from_its_provenance(pack: Path) -> None:
     pack = table("film0.npy,5,1.25,beam.npy", header="file,energy,brightness,source")
     stack = describe_stack(
         pack,
+        Recipe(setup=SETUP, options=options),
         variables=None,
         source=None,
         mask=None,
-        recipe=Recipe(setup=SETUP, options=options),
-        options=None,
-        setup=None,
-        filters=(),
         source_mask=None,
         reader=read_shot,
         warm_start=1,
@@ -366,9 +369,10 @@ def test_worker_processes_receive_all_of_a_row(pack: Path, out: Path) -> None:
     np.save("mask.npy", np.ones(SHAPE))
     pack = table("film0.npy,5,mask.npy", "film2.npy,30,", header="file,energy,mask")
     arguments = {"setup": SETUP, "options": OPTIONS, "source": beam(), "dtype": "float64"}
-    in_process = run_stack(pack, out, scheduler="synchronous", **arguments)
+    in_process = run_stack(pack, out, scheduler="synchronous", **grouped(arguments))
     other_store = out.with_name("other.shadowinv.zarr")
-    in_worker = run_stack(pack, other_store, scheduler="processes", workers=1, **arguments)
+    arguments["workers"] = 1
+    in_worker = run_stack(pack, other_store, scheduler="processes", **grouped(arguments))
     assert in_worker["status"].values.tolist() == [DONE, DONE]
     np.testing.assert_array_equal(in_worker["displacement"], in_process["displacement"])
     np.testing.assert_array_equal(in_worker["path_integrated_b"], in_process["path_integrated_b"])

@@ -16,12 +16,14 @@ import numpy as np
 import pytest
 
 from helpers.command_line import flat, shadowinv
-from helpers.night import OPTIONS, make_shots
+from helpers.night import OPTIONS, grouped, make_shots
 from helpers.store_content import content
 from napari_shadowinv import (
     FileFormatError,
     InputError,
     InversionOptions,
+    Recipe,
+    WatchOptions,
     invert,
     plan_sites,
     read,
@@ -45,7 +47,7 @@ class Watched:
         self.error: Exception | None = None
         self._stop = threading.Event()
         defaults = {"source": SOURCE, "options": OPTIONS, "pattern": "*.npy", "settle": SETTLE}
-        self._choices = defaults | choices
+        self._choices = grouped(defaults | choices, WatchOptions)
         self._thread = threading.Thread(target=self._watch)
 
     def _watch(self) -> None:
@@ -153,7 +155,7 @@ def test_watch_equals_a_run_and_later_shots_need_fewer_steps(folder, out, tmp_pa
     from napari_shadowinv import run_stack
 
     files = [folder / f"shot_{index}.npy" for index in range(6)]
-    run = run_stack(files, tmp_path / "run.shadowinv.zarr", source=SOURCE, options=OPTIONS)
+    run = run_stack(files, tmp_path / "run.shadowinv.zarr", Recipe(options=OPTIONS), source=SOURCE)
     np.testing.assert_array_equal(cold.displacement, run.displacement)
     scale = float(np.abs(run.displacement).max())
     np.testing.assert_allclose(warm.displacement, run.displacement, atol=5e-3 * scale)
@@ -194,7 +196,7 @@ def test_the_accuracy_decides_once_how_many_sites_all_shots_get(folder, out):
 
     files = [folder / f"shot_{index}.npy" for index in range(3)]
     run_store = out.with_name("run.shadowinv.zarr")
-    run_stack(files, run_store, source=SOURCE, options=options)
+    run_stack(files, run_store, Recipe(options=options), source=SOURCE)
     assert StackStore(run_store).attributes["chosen_sites"] == chosen
 
 
@@ -352,7 +354,7 @@ def test_a_batch_goes_on_with_a_store_only_if_shots_start_afresh(folder, out, tm
 def test_a_hundred_frames_cost_alike_and_leave_no_thread(folder, out, opened_paths):
     count = 100
     opened: list[int] = []  # files, before each shot that ends
-    with Watched(folder, out, shots=count) as watch:
+    with Watched(folder, out, max_shots=count) as watch:
         opened_paths.clear()
         for number in range(count):
             np.save(folder / f"shot_{number:03d}.npy", IMAGES[number % 6])
@@ -374,7 +376,7 @@ def test_a_hundred_frames_cost_alike_and_leave_no_thread(folder, out, opened_pat
 
 def test_it_ends_after_so_many_shots_or_when_nothing_arrives(folder, out):
     put(folder, *range(4))
-    with Watched(folder, out, shots=2) as watch:
+    with Watched(folder, out, max_shots=2) as watch:
         watch.until(lambda: not watch._thread.is_alive())
     assert len(watch.result.shot) == 2
     assert watch.events[-1].waiting == 2
@@ -448,7 +450,7 @@ def test_wrong_folder_or_pattern_is_refused_at_once(folder, out, tmp_path):
     (tmp_path / "file").touch()
     refused(names="is a file: expected a folder", place=tmp_path / "file")
     refused("--pattern", "inner/*.tif", names="the pattern is 'inner/*.tif'")
-    refused("--idle", "0", names="idle is 0: expected a number above 0")
+    refused("--idle", "0", names="'idle' is 0.0: idle time (s) must be greater than 0")
     refused("--source", tmp_path / "none.tif", names="none.tif")
     sources = np.stack([SOURCE, SOURCE])
     with pytest.raises(InputError, match="got 2 sources, and the shots are still to arrive"):

@@ -66,7 +66,7 @@ INVERT: dict[str, Callable[..., Any]] = {
     "invert": lambda image, mask=None: invert(image, mask=mask, options=OPTIONS),
     "run": lambda image, mask=None: run(Recipe(options=OPTIONS), image, mask=mask),
     "invert_stack": lambda image, mask=None: (
-        invert_stack(_stack_of(image), mask=mask, options=OPTIONS).isel(shot=1).compute()
+        invert_stack(_stack_of(image), Recipe(options=OPTIONS), mask=mask).isel(shot=1).compute()
     ),
     "fit": lambda image, mask=None: _measured(image, mask),
     "fit a list": lambda image, mask=None: _measured([image], mask),
@@ -151,9 +151,9 @@ def test_stack_with_different_masks_is_refused(burnt: np.ma.MaskedArray[Any, Any
     shots = np.ma.stack([burnt, np.ma.MaskedArray(SHOT)])
 
     with pytest.raises(InputError, match="different masks"):
-        invert_stack(shots, options=OPTIONS)
+        invert_stack(shots, Recipe(options=OPTIONS))
     with pytest.raises(InputError, match="dask array of masked arrays"):
-        invert_stack(da.from_array(shots), options=OPTIONS)
+        invert_stack(da.from_array(shots), Recipe(options=OPTIONS))
 
 
 @pytest.mark.parametrize(
@@ -253,12 +253,12 @@ def test_coordinates_must_agree_with_the_setup(image: xr.DataArray, passes: bool
     stack = xr.concat([image, image], "shot")
     if passes:
         assert run(recipe, image).setup == SETUP
-        assert invert_stack(stack, setup=SETUP, options=OPTIONS).sizes["shot"] == 2
+        assert invert_stack(stack, Recipe(setup=SETUP, options=OPTIONS)).sizes["shot"] == 2
         return
     with pytest.raises(InputError, match=r"pixels of .* m"):
         run(recipe, image)
     with pytest.raises(InputError, match=r"pixels of .* m"):
-        invert_stack(stack, setup=SETUP, options=OPTIONS)
+        invert_stack(stack, Recipe(setup=SETUP, options=OPTIONS))
 
 
 def test_uneven_coordinates_are_refused() -> None:

@@ -38,6 +38,8 @@ from napari_shadowinv.io.store import (
 )
 
 if TYPE_CHECKING:
+    from napari_shadowinv.options import RunOptions
+    from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.stack import RunStatus
 
 EXIT_FAILED_SHOTS = 1
@@ -63,31 +65,30 @@ def _remaining_text(status: RunStatus) -> str:
 def run_batch(
     shots: list[str],
     out: Path,
+    recipe: Recipe,
+    run: RunOptions,
     *,
     channel: str | None,
     variable: str | None,
-    variables: str | None,
     resume: bool,
     quiet: bool,
-    **choices: Any,
+    scheduler: str,
 ) -> None:
-    """Invert all shots into a store, with `choices` of `run_stack`, and print a summary."""
-    from napari_shadowinv.stack import read_shot, run_stack
+    """Invert all shots into a store, and print a summary."""
+    from napari_shadowinv.stack import run_stack
 
-    _check_store(out, resume or choices["redo_failed"], choices["overwrite"])
-    selection: dict[str, Any] = {"channel": channel}
-    if variable is not None:
-        selection["variable"] = variable
+    _check_store(out, resume, run.overwrite)
     try:
         with _ProgressBar(quiet) as bar:
             run_stack(
                 shots[0] if len(shots) == 1 else shots,
                 out,
-                variables=None if variables is None else split_names(variables),
-                reader=functools.partial(read_shot, **selection),
+                recipe,
+                reader=shot_reader(channel, variable),
+                run=run,
+                scheduler=scheduler,
                 on_progress=bar.update,
                 should_stop=is_interrupted,
-                **choices,
             )
     except (KeyboardInterrupt, InversionCancelled):
         counts = _counts_text(StackStore(out)) if out.exists() else "nothing written"
@@ -107,9 +108,13 @@ def exit_unless_reliable(store: StackStore) -> None:
         raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
-def split_names(text: str) -> tuple[str, ...]:
-    """Split a list of names at its commas."""
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+def shot_reader(channel: str | None, variable: str | None) -> Any:
+    """Return the reader of the shots' files."""
+    from napari_shadowinv.stack import read_shot
+
+    # A reader is part of a store's identity: only a variable that is there names itself.
+    named: dict[str, Any] = {} if variable is None else {"variable": variable}
+    return functools.partial(read_shot, channel=channel, **named)
 
 
 def _is_reliable(report: Mapping[str, Any]) -> bool:

@@ -18,7 +18,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from typer import Argument, Option
 
-from napari_shadowinv._system.validation import nearest, validated
+from napari_shadowinv._system.validation import Model, nearest, validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import IMAGE_TITLES
 from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
@@ -125,12 +125,15 @@ def _type_of(field: FieldInfo) -> tuple[Any, str | None]:
     return str, "FIRST:LAST" if kinds[0] is not str else None
 
 
-def _flag(flag: str, field: FieldInfo, panel: str, text: str) -> tuple[str, inspect.Parameter]:
+def _flag(
+    flag: str, field: FieldInfo, panel: str | None, text: str
+) -> tuple[str, inspect.Parameter]:
     kind, metavar = _type_of(field)
     extra = field.json_schema_extra
     if isinstance(extra, dict):
         metavar = str(extra.get("metavar", metavar or "")) or None
-    option = Option(f"--{flag}", help=text, metavar=metavar, rich_help_panel=panel)
+    name = f"--{flag}/--no-{flag}" if kind is bool and field.default else f"--{flag}"
+    option = Option(name, help=text, metavar=metavar, rich_help_panel=panel)
     name = flag.replace("-", "_")
     annotation = Annotated[kind | None, option]  # type: ignore[valid-type]
     keyword = inspect.Parameter.KEYWORD_ONLY
@@ -153,7 +156,7 @@ def _step_flags(steps: Iterable[type[Step]], panel: str) -> Flags:
 
 
 def _option_flags(
-    model: type[BaseModel], default_panel: str, without: Collection[str] = ()
+    model: type[BaseModel], default_panel: str | None, without: Collection[str] = ()
 ) -> Flags:
     """Return the flags of a model's fields; a field may name its own panel."""
     flags = []
@@ -162,7 +165,14 @@ def _option_flags(
             continue
         extra = field.json_schema_extra
         panel = extra.get("panel", default_panel) if isinstance(extra, dict) else default_panel
-        flags.append(_flag(name.replace("_", "-"), field, str(panel), _field_help(field)))
+        flags.append(
+            _flag(
+                name.replace("_", "-"),
+                field,
+                None if panel is None else str(panel),
+                _field_help(field),
+            )
+        )
     return flags
 
 
@@ -218,6 +228,18 @@ def _lower_first(text: str) -> str:
 def takes_recipe(command: Callable[..., None]) -> Callable[..., None]:
     """Add a flag for each parameter of a recipe to a command with the argument `flags`."""
     return _with_flags(command, dict(_recipe_flags()))
+
+
+def takes_run(model: type[BaseModel]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Add a flag for each parameter of a recipe, and for each choice of a run, to a command."""
+    flags = {**dict(_option_flags(model, None)), **dict(_recipe_flags())}
+    return lambda command: _with_flags(command, flags)
+
+
+def run_options(model: type[Model], flags: dict[str, Any]) -> Model:
+    """Return the choices of a run from the flags of `takes_run`, and remove these."""
+    chosen = {name: flags.pop(name) for name in model.model_fields if name in flags}
+    return validated(model, chosen, "flags")
 
 
 def takes_fit(command: Callable[..., None]) -> Callable[..., None]:

@@ -10,15 +10,13 @@ import typer
 from napari_shadowinv.cli import _flags, _outputs
 from napari_shadowinv.cli._inputs import recipe_for_shots
 from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups
+from napari_shadowinv.options import RunOptions
 
 # Help of options, where it is longer than a line.
 HELP = {
     "source": "Undisturbed beam: one image, or a glob matching one image per shot. Default: "
     "uniform.",
-    "variables": "Variables to store, separated by commas. Default: "
-    "potential,displacement,caustic.",
     "scheduler": "Address of a dask scheduler (tcp://host:8786), threads, or processes (default).",
-    "workers": "Number of shots processed at once on this machine. Default: one per core.",
     "format": "tiff (float32, one file per shot and component), pradformat (one file per shot), or "
     "csv (a table with one row per shot).",
     "shots": "A quoted glob, a list of files, a multi-page TIFF with one shot per page, or a table "
@@ -55,7 +53,7 @@ shot, file, energy, setup
 
 
 @notify_errors
-@_flags.takes_recipe
+@_flags.takes_run(RunOptions)
 def batch(
     shots: Annotated[
         list[str],
@@ -73,18 +71,9 @@ def batch(
     channel: _flags.Channel = None,
     variable: _flags.Variable = None,
     clip_negative: _flags.ClipNegative = False,
-    variables: Annotated[str | None, typer.Option(help=HELP["variables"])] = None,
-    warm_start: Annotated[
-        int, typer.Option(metavar="N", help="Initialise from the previous shot, in groups of N.")
-    ] = 1,
     scheduler: Annotated[str | None, typer.Option(help=HELP["scheduler"])] = None,
-    workers: Annotated[int | None, typer.Option(help=HELP["workers"])] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Resume an interrupted run and append new shots.")
-    ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Discard an earlier run.")] = False,
-    redo_failed: Annotated[
-        bool, typer.Option("--redo-failed", help="Resume, and retry failed shots.")
     ] = False,
     quiet: _flags.Quiet = False,
     *,
@@ -93,6 +82,7 @@ def batch(
     """Invert or fit many shots into one store; an interrupted run can be resumed."""
     from napari_shadowinv.cli._batch import run_batch
 
+    run = _flags.run_options(RunOptions, flags)
     chosen = recipe_for_shots(
         flags,
         recipe,
@@ -105,23 +95,19 @@ def batch(
         source_mask=source_mask,
     )
     if save_recipe is not None:
-        _outputs.save_recipe(save_recipe, chosen, [recipe, setup, options], overwrite)
+        _outputs.save_recipe(save_recipe, chosen, [recipe, setup, options], run.overwrite)
     if not quiet:
         warn_of_setups([(chosen.setup, None)])
     run_batch(
         shots,
         out,
+        chosen,
+        run,
         channel=channel,
         variable=variable,
-        variables=variables,
-        resume=resume,
+        resume=resume or run.redo_failed,
         quiet=quiet,
-        recipe=chosen,
-        warm_start=warm_start,
         scheduler=scheduler or "processes",
-        workers=workers,
-        overwrite=overwrite,
-        redo_failed=redo_failed,
     )
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, exit_unless_reliable, split_names
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, exit_unless_reliable, shot_reader
 from napari_shadowinv.cli._terminal import (
     cancel_exit_code,
     is_interrupted,
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.options import WatchOptions
+    from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.stack import RunStatus
 
 _LINE_COLUMNS = 100
@@ -107,33 +110,28 @@ def _shot_summary(result: Inversion | Fit) -> tuple[str, str]:
 def run_watch(
     folder: Path,
     out: Path,
+    recipe: Recipe,
+    watch: WatchOptions,
     *,
     channel: str | None,
     variable: str | None,
-    variables: str | None,
-    pattern: str,
     quiet: bool,
-    **choices: Any,
 ) -> None:
-    """Watch a folder with `choices` of `watch_stack`; print a line for each shot and a summary."""
+    """Watch a folder; print a line for each shot and a summary."""
     from rich.console import Console
 
-    from napari_shadowinv.stack import read_shot, watch_stack
+    from napari_shadowinv.stack import watch_stack
 
-    selection: dict[str, Any] = {"channel": channel}
-    if variable is not None:
-        selection["variable"] = variable
-    printer = _WatchPrinter(folder, pattern, quiet, Console(), Console(stderr=True))
+    printer = _WatchPrinter(folder, watch.pattern, quiet, Console(), Console(stderr=True))
     with suppress(KeyboardInterrupt, InversionCancelled):
         watch_stack(
             folder,
             out,
-            pattern=pattern,
-            variables=None if variables is None else split_names(variables),
-            reader=functools.partial(read_shot, **selection),
+            recipe,
+            reader=shot_reader(channel, variable),
+            watch=watch,
             on_progress=printer.update,
             should_stop=is_interrupted,
-            **choices,
         )
     _print_summary(printer.status, out, quiet)
 

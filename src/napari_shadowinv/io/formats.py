@@ -174,7 +174,6 @@ IMAGE_WRITERS = {
     suffix: each.image_writer for each in FORMATS if each.image_writer for suffix in each.suffixes
 }
 FIGURE_SUFFIXES = (PNG.suffix, ".pdf", ".svg")
-NEW_SHOTS = f"*{TIFF.suffix}"  # names in a folder that is watched
 
 _FOREIGN_FORMATS = {
     b"PK\x03\x04": "a zip archive (such as NPZ or XLSX)",

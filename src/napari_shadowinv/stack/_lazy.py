@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.variables import SETUPS_LABEL, variable_labels
 from napari_shadowinv.io.store import with_places
 from napari_shadowinv.io.store_columns import INVERSIONS, column_values, columns_of
-from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack import _plan
 from napari_shadowinv.stack._shots import Stack
@@ -26,19 +25,13 @@ from napari_shadowinv.stack._worker import Beam, Work
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Step
-
 
 def invert_stack(
     shots: Any,
+    recipe: Recipe | None = None,
     *,
     source: Any = None,
     mask: ArrayLike | None = None,
-    recipe: Recipe | None = None,
-    options: InversionOptions | None = None,
-    setup: Setup | None = None,
-    filters: Sequence[Step] = (),
     source_mask: ArrayLike | None = None,
     reader: Reader = read_shot,
     warm_start: int = 1,
@@ -55,20 +48,15 @@ def invert_stack(
         a glob such as ``"shots/*.tif"``, sorted so that 2 comes before 10; a TIFF with a page for
         each shot; or a table (CSV) with a row for each shot, which may have its own energy, setup,
         brightness, mask and source. Files are read by the tasks that invert them.
+    recipe : Recipe, optional
+        Steps of each shot and of a measured source, setup and options. Without `threads` in the
+        options, shots that are inverted simultaneously share the cores.
     source : array (y, x), path, Estimate, or as `shots`, optional
         The undisturbed beam, one for all shots or one for each, or an estimate of
         `napari_shadowinv.preprocessing` from each shot. Default: uniform, with intensities in the
         result relative to each shot's mean.
     mask : array_like of bool, shape (H, W), optional
         The pixels that can be used in all shots; see `napari_shadowinv.invert`.
-    options : InversionOptions, optional
-        Choices. Without `threads`, shots that are inverted simultaneously share the cores.
-    setup : Setup, optional
-        Adds fields in SI units.
-    recipe : Recipe, optional
-        Recipe of each shot, instead of `options`, `setup` and `filters`.
-    filters : sequence of Step, optional
-        Steps for each shot and a measured source; steps that flatten the image exclude a source.
     source_mask : array_like of bool, shape (H, W), optional
         Pixels without the object; an estimate of the source uses only these.
     variables : collection of str, optional
@@ -104,7 +92,7 @@ def invert_stack(
     >>> import numpy as np
     >>> from napari_shadowinv import InversionOptions
     >>> shots = np.ones((3, 20, 20))
-    >>> stack = invert_stack(shots, options=InversionOptions(n_sites=50))
+    >>> stack = invert_stack(shots, Recipe(options=InversionOptions(n_sites=50)))
     >>> dict(stack.potential.sizes)
     {'shot': 3, 'y': 20, 'x': 20}
     >>> float(abs(stack.displacement.isel(shot=1)).max())
@@ -118,13 +106,10 @@ def invert_stack(
         )
     stack = _plan.describe_stack(
         shots,
+        recipe,
         variables=variables,
         source=source,
         mask=mask,
-        recipe=recipe,
-        options=options,
-        setup=setup,
-        filters=filters,
         source_mask=source_mask,
         reader=reader,
         warm_start=warm_start,

@@ -21,7 +21,7 @@ from napari_shadowinv._system.arrays import (
     unpack_mask,
 )
 from napari_shadowinv._system.safety import check_memory
-from napari_shadowinv._system.validation import as_model, check_instance
+from napari_shadowinv._system.validation import check_instance
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, checked_source
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
@@ -36,7 +36,6 @@ from napari_shadowinv.preprocessing import (
     MeasuredSource,
     Radiograph,
     Recipe,
-    Step,
     UniformEstimate,
 )
 from napari_shadowinv.provenance import Origin
@@ -65,14 +64,11 @@ FITTED = ("potential", "displacement", "displacement_uncertainty")
 
 def describe_stack(
     shots: Any,
+    recipe: Recipe | None,
     *,
     variables: Collection[str] | None,
     source: Any,
     mask: ArrayLike | None,
-    recipe: Recipe | None,
-    options: InversionOptions | None,
-    setup: Setup | None,
-    filters: Sequence[Step],
     source_mask: ArrayLike | None,
     reader: Reader,
     warm_start: int,
@@ -82,7 +78,8 @@ def describe_stack(
         raise InputError(
             f"warm_start is {warm_start}: expected a number of shots, or 1 to disable it"
         )
-    resolved = _recipe(recipe, options, setup, filters)
+    check_instance(recipe, Recipe, "recipe")
+    resolved = Recipe() if recipe is None else recipe
     if isinstance(source, Estimate):
         resolved = resolved.model_copy(update={"source": source})
         source = None
@@ -278,24 +275,6 @@ def _fit_stack(
             )
     defaults = tuple(name for name in FITTED if name in labels)
     return replace(stack, variables=tuple(variables or defaults))
-
-
-def _recipe(
-    recipe: Recipe | None,
-    options: InversionOptions | None,
-    setup: Setup | None,
-    filters: Sequence[Step],
-) -> Recipe:
-    """Return the recipe, or a recipe of the other keywords."""
-    check_instance(recipe, Recipe, "recipe")
-    if recipe is None:
-        options = as_model(InversionOptions, options, "options")
-        return Recipe(steps=tuple(filters), setup=setup, options=options)
-    keywords = {"options": options, "setup": setup, "filters": tuple(filters) or None}
-    for name, value in keywords.items():
-        if value is not None:
-            raise InputError(f"got a recipe and {name}: say so in the recipe")
-    return recipe
 
 
 def _shared_beam(inputs: Inputs, sources: Any) -> Beam | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._system.locking import locked
 from napari_shadowinv._system.machine import clear_up_when_terminated
 from napari_shadowinv._system.progress import ShouldStop
-from napari_shadowinv._system.validation import check_instance
-from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv._system.validation import as_model, check_instance
+from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_store_path
@@ -26,7 +26,7 @@ from napari_shadowinv.io.store_writing import (
     remove_unfinished,
     summarise,
 )
-from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.options import RunOptions
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._engines import Engine, WorkerDiedError, engine_for, is_local
 from napari_shadowinv.stack._plan import STORED, describe_stack
@@ -40,8 +40,6 @@ from napari_shadowinv.stack._worker import ShotOutcome, TaskContext, run_shots
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Step
 
 _POLL_S = 0.25  # between two looks at the engine and at `should_stop`
 
@@ -49,22 +47,14 @@ _POLL_S = 0.25  # between two looks at the engine and at `should_stop`
 def run_stack(
     shots: Any,
     out: str | Path,
+    recipe: Recipe | None = None,
     *,
     source: Any = None,
     mask: ArrayLike | None = None,
-    recipe: Recipe | None = None,
-    options: InversionOptions | None = None,
-    setup: Setup | None = None,
-    filters: Sequence[Step] = (),
     source_mask: ArrayLike | None = None,
     reader: Reader = read_shot,
-    warm_start: int = 1,
-    variables: Collection[str] | None = None,
-    dtype: str = "float32",
+    run: RunOptions | None = None,
     scheduler: Any = None,
-    workers: int | None = None,
-    overwrite: bool = False,
-    redo_failed: bool = False,
     on_progress: OnStatus | None = None,
     should_stop: ShouldStop | None = None,
 ) -> xarray.Dataset:
@@ -77,24 +67,17 @@ def run_stack(
 
     Parameters
     ----------
-    shots, source, mask, recipe, options, setup, filters, source_mask, reader, warm_start
+    shots, recipe, source, mask, source_mask, reader
         As for `invert_stack`. To resume a store, they and earlier shots must be the same. In
         a table of shots to fit, rows with the same ``shot`` are images of one object.
     out : str or Path
         The store, ``name.shadowinv.zarr``.
-    variables : collection of str, optional
-        Variables to store. Default: potential, displacement and caustic, at a million pixels 13 MB
-        a shot before compression; the rest can be computed from them and the image. For a fit:
-        potential, displacement and its error bars.
-    dtype : {"float32", "float64"}, optional
-        Type of stored images; sites, weights and scalars keep 64 bits.
+    run : RunOptions, optional
+        Choices of the run: stored variables and their type, workers, warm start, whether to
+        overwrite the store or to repeat failed shots. A mapping is converted.
     scheduler : str, distributed.Client, cluster or None, optional
         ``"threads"``, ``"processes"``, ``"synchronous"``, the address of a scheduler, a client or
         a cluster. Default: dask's current client, else threads. The results do not depend on it.
-    workers : int, optional
-        Shots that are inverted simultaneously on this machine. Default: the number of cores.
-    overwrite, redo_failed : bool, optional
-        Discard the content of the store; repeat shots that failed before.
     on_progress : callable, optional
         Receives a `RunStatus` at the start and after each shot.
     should_stop : callable, optional
@@ -117,21 +100,19 @@ def run_stack(
         If `should_stop` returned true; the store can be resumed.
     """
     path = check_store_path(out)
-    stored = stored_type(dtype)
+    run = as_model(RunOptions, run, "run")
+    stored = np.dtype(run.dtype)
     stack = describe_stack(
         shots,
-        variables=stored_variables(variables, recipe, mask),
+        recipe,
+        variables=stored_variables(run.variables, recipe, mask),
         source=source,
         mask=mask,
-        recipe=recipe,
-        options=options,
-        setup=setup,
-        filters=filters,
         source_mask=source_mask,
         reader=reader,
-        warm_start=warm_start,
+        warm_start=run.warm_start,
     )
-    again = (PENDING, FAILED) if redo_failed else (PENDING,)
+    again = (PENDING, FAILED) if run.redo_failed else (PENDING,)
 
     def prepare(stage: str) -> None:
         if on_progress is not None:
@@ -142,7 +123,7 @@ def run_stack(
         ensure_compiled(lambda news: prepare(f"compiling, {news.message}"), should_stop)
     with clear_up_when_terminated(), locked(path):
         remove_unfinished(path)
-        store = StackStore(path) if path.exists() and not overwrite else None
+        store = StackStore(path) if path.exists() and not run.overwrite else None
         arrived = False
         if store is not None:
             stack = resume(store, stack, stored)
@@ -152,23 +133,16 @@ def run_stack(
                 _Run(stack, store, (), on_progress, should_stop).report("nothing to do")
                 return read_stack(path)
         # Before the store is created: a scheduler that does not respond must leave nothing behind.
-        with engine_for(scheduler, workers, should_stop) as engine:
+        with engine_for(scheduler, run.workers, should_stop) as engine:
             if store is None:
                 if stack.chooses_sites:
                     prepare("how many sites the first shots need")
                 stack = choose_sites(stack, should_stop)
-                store = create_store(path, contents_of(stack, stored), overwrite=overwrite)
+                store = create_store(path, contents_of(stack, stored), overwrite=run.overwrite)
             elif arrived:
                 store = append_shots(store, stack, stored)
             _Run(stack, store, again, on_progress, should_stop).run_on(engine)
     return read_stack(path)
-
-
-def stored_type(dtype: str) -> np.dtype[Any]:
-    """Return the type of stored images, checked."""
-    if dtype not in ("float32", "float64"):
-        raise InputError(f"dtype is {dtype!r}: expected 'float32' or 'float64'")
-    return np.dtype(dtype)
 
 
 def stored_variables(

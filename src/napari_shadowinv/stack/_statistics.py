@@ -42,8 +42,8 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
 
     Examples
     --------
-    >>> from napari_shadowinv import InversionOptions, invert_stack
-    >>> stack = invert_stack(np.ones((3, 20, 20)), options=InversionOptions(n_sites=50))
+    >>> from napari_shadowinv import InversionOptions, Recipe, invert_stack
+    >>> stack = invert_stack(np.ones((3, 20, 20)), Recipe(options=InversionOptions(n_sites=50)))
     >>> statistics = stack_statistics(stack)
     >>> float(statistics.displacement_peak.max())
     0.0

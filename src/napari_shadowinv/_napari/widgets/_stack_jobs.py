@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,7 @@ from napari_shadowinv._napari.widgets._results import Origins, result_frame
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io.formats import NEW_SHOTS
+from napari_shadowinv.options import RunOptions, WatchOptions
 from napari_shadowinv.preprocessing import Recipe
 
 if TYPE_CHECKING:
@@ -47,10 +47,8 @@ class StackJob:
     source: ArrayLike | None = None  # measured; for all shots, or one for each
     mask: BoolArray | None = None
     source_mask: BoolArray | None = None
+    run_options: RunOptions = field(default_factory=RunOptions)
     scheduler: str = "threads"
-    workers: int | None = None
-    overwrite: bool = False
-    redo_failed: bool = False
     status: RunStatus = field(default_factory=_empty_status)  # the window reads it at any time
 
     def run(
@@ -75,9 +73,18 @@ class StackJob:
             on_progress(Progress("shots", step, status.total, status.text))
 
         on_progress(Progress("prepare", 0, None, "shots and source"))
-        names = [attribute.name for attribute in fields(self) if attribute.name != "status"]
-        arguments = {name: getattr(self, name) for name in names}
-        run_stack(**arguments, on_progress=update, should_stop=should_stop)
+        run_stack(
+            self.shots,
+            self.out,
+            self.recipe,
+            source=self.source,
+            mask=self.mask,
+            source_mask=self.source_mask,
+            run=self.run_options,
+            scheduler=self.scheduler,
+            on_progress=update,
+            should_stop=should_stop,
+        )
         return self.status
 
 
@@ -217,7 +224,7 @@ class FolderEdit(QtWidgets.QWidget):
             "<qt>Each new file in this folder is inverted as soon as it is complete, until you "
             "press Cancel.</qt>"
         )
-        self.pattern = QtWidgets.QLineEdit(NEW_SHOTS)
+        self.pattern = QtWidgets.QLineEdit(WatchOptions().pattern)
         self.pattern.setToolTip("Pattern of the shots' file names, such as *.tif.")
         self.pattern.setMinimumWidth(60)
         column(self, labelled("", self.folder), labelled("Names", self.pattern))
@@ -235,7 +242,7 @@ class FolderEdit(QtWidgets.QWidget):
 class WatchJob(StackJob):
     """A folder to watch, as `shots`: the arguments of `stack.watch_stack`, and the status."""
 
-    pattern: str = NEW_SHOTS
+    watch_options: WatchOptions = field(default_factory=WatchOptions)
     waiting: int = 0  # files that have arrived
     note: str = ""
 
@@ -264,13 +271,11 @@ class WatchJob(StackJob):
         watch_stack(
             self.shots,
             self.out,
-            pattern=self.pattern,
-            recipe=self.recipe,
+            self.recipe,
             source=self.source,
             mask=self.mask,
             source_mask=self.source_mask,
-            overwrite=self.overwrite,
-            redo_failed=self.redo_failed,
+            watch=self.watch_options,
             on_progress=update,
             should_stop=should_stop,
         )

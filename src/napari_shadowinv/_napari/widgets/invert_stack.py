@@ -45,6 +45,7 @@ from napari_shadowinv._napari.widgets._tables import ShotTable
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.store import STORE_SUFFIX
+from napari_shadowinv.options import RunOptions, WatchOptions
 
 if TYPE_CHECKING:
     import napari
@@ -313,10 +314,8 @@ class InvertStack(InversionInputs, ToolPanel):
             source=self._source(layer),
             mask=mask,
             source_mask=self.hidden_from_source(layer),
+            run_options=RunOptions(workers=workers, **self._store_choices()),
             scheduler=scheduler,
-            workers=workers,
-            overwrite=self.overwrite.isChecked(),
-            redo_failed=self.redo_failed.isChecked(),
         )
         return StackRequest(
             job,
@@ -333,16 +332,22 @@ class InvertStack(InversionInputs, ToolPanel):
         job = WatchJob(
             shots=self.shots.folder.path,
             out=self.store.store,
-            pattern=self.shots.folder.pattern.text().strip(),
             recipe=recipe,
             source=self._source(None),
             mask=mask,
             source_mask=self.hidden_from_source(None),
-            overwrite=self.overwrite.isChecked(),
-            redo_failed=self.redo_failed.isChecked(),
+            watch_options=WatchOptions(
+                pattern=self.shots.folder.pattern.text().strip(), **self._store_choices()
+            ),
         )
         origins = self.origins(None, self.shots.name)
         return WatchRequest(job, None, self.companions(None), {}, origins)
+
+    def _store_choices(self) -> dict[str, bool]:
+        return {
+            "overwrite": self.overwrite.isChecked(),
+            "redo_failed": self.redo_failed.isChecked(),
+        }
 
     def _source(self, layer: Any) -> ArrayLike | None:
         # A stack of sources has one for each shot.

@@ -1,0 +1,129 @@
+"""Choices of a run over many shots, as models: `RunOptions`, `WatchOptions`."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import ConfigDict, Field, field_validator
+
+from napari_shadowinv._system.validation import CheckedModel
+
+__all__ = ["RunOptions", "WatchOptions"]
+
+
+class _StoreOptions(CheckedModel):
+    """Choices of a store, and of a run that resumes it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    variables: tuple[str, ...] | None = Field(
+        default=None,
+        title="Variables",
+        description="Variables to store; on the command line, separated by commas. Default: "
+        "potential, displacement and caustic, at a million pixels 13 MB per shot before "
+        "compression; of a fit, potential, displacement and its error bars.",
+        json_schema_extra={"metavar": "NAMES"},
+    )
+    dtype: Literal["float32", "float64"] = Field(
+        default="float32",
+        title="Stored type",
+        description="Type of stored images; sites, weights and scalars keep 64 bits.",
+    )
+    overwrite: bool = Field(
+        default=False, title="Overwrite", description="Discard the content of the store."
+    )
+    redo_failed: bool = Field(
+        default=False, title="Retry failed shots", description="Resume, and retry failed shots."
+    )
+
+    @field_validator("variables", mode="before")
+    @classmethod
+    def _split(cls, value: Any) -> Any:
+        if not isinstance(value, str):
+            return value if value is None else tuple(value)
+        return tuple(name.strip() for name in value.split(",") if name.strip())
+
+
+class RunOptions(_StoreOptions):
+    """Choices of a run over many shots.
+
+    Raises
+    ------
+    InputError
+        If a value is out of range or a name is unknown.
+
+    Examples
+    --------
+    >>> RunOptions(variables="potential, weights").variables
+    ('potential', 'weights')
+    """
+
+    warm_start: int = Field(
+        default=1,
+        ge=1,
+        title="Warm start",
+        description="Size of groups in which each shot is initialised from the previous one, for "
+        "similar shots with a common source.",
+        json_schema_extra={"metavar": "N"},
+    )
+    workers: int | None = Field(
+        default=None,
+        ge=1,
+        title="Workers",
+        description="Shots that are processed at once on this machine. Default: one per core.",
+        json_schema_extra={"metavar": "N"},
+    )
+
+
+class WatchOptions(_StoreOptions):
+    """Choices of a watched folder.
+
+    Raises
+    ------
+    InputError
+        If a value is out of range or a name is unknown.
+    """
+
+    pattern: str = Field(
+        default="*.tif",
+        title="Names",
+        description="File name pattern of the shots, in quotes on the command line; names that "
+        "begin with a dot are ignored.",
+    )
+    warm_start: bool = Field(
+        default=True,
+        title="Warm start",
+        description="Initialise each shot from the last but one, because two are inverted "
+        "simultaneously, unless that one failed or did not converge. Fits, and shots with "
+        "estimated sources, always start from zero.",
+    )
+    skip_existing: bool = Field(
+        default=False,
+        title="Skip existing files",
+        description="Skip files that are in the folder at the start.",
+    )
+    settle: float = Field(
+        default=1.0,
+        gt=0,
+        title="Settling time (s)",
+        description="Seconds without a change after which a file is complete, where the system "
+        "does not report that it was closed (network file systems, macOS, Windows).",
+    )
+    polling: bool = Field(
+        default=False,
+        title="Polling",
+        description="Poll the folder once a second instead of relying on file-system events.",
+    )
+    idle: float | None = Field(
+        default=None,
+        gt=0,
+        title="Idle time (s)",
+        description="Stop after this many seconds without a new file.",
+    )
+    max_shots: int | None = Field(
+        default=None,
+        ge=1,
+        title="Maximum number of shots",
+        description="Stop after N shots, done or failed.",
+        json_schema_extra={"metavar": "N"},
+    )
