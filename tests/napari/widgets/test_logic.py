@@ -32,6 +32,7 @@ from napari_shadowinv._napari.widgets.line_profile import (
 )
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.inversion import Inversion, compilation, invert
+from napari_shadowinv.options import RunOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.pipeline import Cache, run
@@ -360,7 +361,7 @@ def test_a_megapixel_ends_at_the_look_that_asks(job: Any, tmp_path: Path) -> Non
 
 def test_a_shot_is_looked_at_before_the_books_count_it(shot: Array, tmp_path: Path) -> None:
     stack, out = np.stack([shot, shot]), tmp_path / "a.shadowinv.zarr"
-    job = StackJob(stack, out, Recipe(options=FEW), workers=1)
+    job = StackJob(stack, out, Recipe(options=FEW), run_options=RunOptions(workers=1))
     counted: list[tuple[int | None, int]] = []
     job.run(lambda _: None, lambda: False, lambda index: counted.append((index, job.status.ended)))
     assert counted == [(0, 0), (1, 1)]
