@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, exit_unless_reliable, split_names
-from napari_shadowinv.cautions import Caution
-from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, exit_unless_reliable, shot_reader
+from napari_shadowinv.cli._batch import (
+    EXIT_FAILED_SHOTS,
+    exit_unless_reliable,
+    shot_reader,
+)
 from napari_shadowinv.cli._terminal import (
     cancel_exit_code,
     is_interrupted,
