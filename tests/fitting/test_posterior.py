@@ -227,7 +227,7 @@ def test_open_beams_are_those_that_several_energies_cannot_exclude() -> None:
 
 def test_open_beams_have_the_joint_posterior_and_move_the_fields() -> None:
     """Their covariance is the inverse Schur complement of a dense Hessian with a free beam."""
-    scene = replace(weak_scene((12, 16), (30.0, 100.0)), beam_modes=0, free_gains=False)
+    scene = replace(weak_scene((12, 16), (30.0, 100.0)), beam_modes=0, free_brightness=False)
     scene = replace(scene, free_frames=np.zeros(6, bool), weights=np.full((2, 12, 16), 1e4))
     unknowns = scene.nothing()
     y, x = np.indices(scene.rays.shape)
