@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from napari_shadowinv import Fit, FitOptions, fit, synthetic_image
+from napari_shadowinv.fitting import additive
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.preprocessing import STEPS, Radiograph
 from napari_shadowinv.preprocessing.steps import Step, choices_of
 
@@ -47,6 +50,33 @@ def test_the_column_reads_a_result_and_words_it(names):
     inversion = SimpleNamespace(displacement=np.full((2, 4, 4), 3.0))
     assert column.text({column.key: column.value(inversion)}) == "4.24"
     assert column.heading == "rms_displacement (px)"
+
+
+def test_the_unknown_is_fitted_with_the_field(names, monkeypatch):
+    truth = gaussian_blob((48, 48), 30.0, 7.0).displacement
+    backgrounds = [0.08, -0.05]
+    images = np.stack([synthetic_image(truth), synthetic_image(0.6 * truth)])
+    images += np.array(backgrounds)[:, None, None]
+    images += 0.02 * np.random.default_rng(0).normal(size=images.shape)
+    known = {"strengths": [1, 0.6], "noise": 0.02, "source": np.ones((48, 48))}
+    monkeypatch.setattr(additive, "ADDITIVE", (names["Background"],))
+    options_class = type("Options", (names["FitOptions"], FitOptions), {})
+    result = fit(images, options=options_class(background=0.1), **known)
+    error = np.abs(result.fields[0].displacement - truth).max()
+    plain = fit(images, options=options_class(samples=0), **known)
+    assert plain.report.added == {}
+    assert error < 0.1 * np.abs(plain.fields[0].displacement - truth).max()
+    rows = np.array(result.report.added["background"])
+    assert rows.shape == (2, 1, 2)
+    for (value, deviation), background in zip(rows[:, 0], backgrounds, strict=True):
+        assert 1e-4 < deviation < 0.01
+        assert abs(value - background) < 4 * deviation
+    facts = {fact.key: fact.text for fact in result.facts()}
+    assert f"background {rows[0, 0, 0]:.3g} ± " in facts["image_1"]
+    # The option is then one of FitOptions itself.
+    monkeypatch.setattr("napari_shadowinv.fitting.result.FitOptions", options_class)
+    again = Fit.from_dataset(result.to_dataset())
+    assert again.report.added == result.report.added
 
 
 @pytest.mark.parametrize("kind", ["u1", ">u2"])

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.additive import AdditiveBlock
 from napari_shadowinv.fitting.forward import Scene, blurred
 from napari_shadowinv.fitting.rays import KNOT, at_rest
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
+from napari_shadowinv.options import FitOptions
 
 SIZE, PAD = (32, 40), 8
 KERNEL = np.array([[0.0, 0.1, 0.0], [0.2, 0.4, 0.1], [0.0, 0.15, 0.05]])
@@ -19,6 +21,22 @@ KERNEL = np.array([[0.0, 0.1, 0.0], [0.2, 0.4, 0.1], [0.0, 0.15, 0.05]])
 def waves(shape: tuple[int, int], phase: float) -> FloatArray:
     y, x = np.indices(shape)
     return np.asarray(np.cos(y / 5 + phase) * np.sin(x / 7 - phase))
+
+
+class Stripes(AdditiveBlock):
+    """A constant and a stripe."""
+
+    title = "stripes"
+
+    @classmethod
+    def from_options(cls, options: FitOptions) -> Stripes:
+        return cls()
+
+    def spreads(self) -> FloatArray:
+        return np.array([0.1, 0.3])
+
+    def patterns(self, size: tuple[int, int]) -> FloatArray:
+        return np.stack([np.ones(size), waves(size, 0.3)])
 
 
 @pytest.fixture
@@ -50,6 +68,7 @@ def scene() -> Scene:
         blur=0.7,
         spacing=1 / 3,
         threads=1,
+        added=(Stripes(),),
     )
 
 
@@ -63,6 +82,7 @@ def some(scene: Scene) -> Unknowns:
     unknowns.beam[0, 1], unknowns.beam[2, 1] = 0.1, -0.05
     unknowns.brightness[:] = 0.1, -0.2
     unknowns.frames[1] = [0.4, 1.01, -0.01, -0.3, 0.02, 0.98]
+    unknowns.added[0][:] = [[0.1, 0.05], [-0.05, 0.02]]
     return unknowns
 
 
@@ -81,7 +101,7 @@ def only(part: str, change: Unknowns) -> Unknowns:
     return change if part == "all" else change.zeros()._replace(**{part: getattr(change, part)})
 
 
-@pytest.mark.parametrize("part", ["potentials", "beam", "brightness", "frames", "all"])
+@pytest.mark.parametrize("part", ["potentials", "beam", "brightness", "frames", "added", "all"])
 def test_the_gradient_is_that_of_the_value(scene: Scene, part: str) -> None:
     unknowns = some(scene)
     counts = scene.ray_counts(unknowns)

@@ -33,7 +33,7 @@ from napari_shadowinv.fitting.descent import coarser, finer
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import Measured, measured
 from napari_shadowinv.fitting.pattern import Pattern, find_pattern
-from napari_shadowinv.fitting.posterior import Posterior
+from napari_shadowinv.fitting.posterior import Posterior, Sample
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.search import (
     HELD,
@@ -210,8 +210,9 @@ def fit(
         evidence = float("nan")
         if options.evidence:
             evidence = _log_evidence(scene, best, fields, options, on_step)
+        amplification = noise_amplification(pattern.correlation)
         if errors is not None:
-            errors *= noise_amplification(pattern.correlation)
+            errors *= amplification
     found_by = FitReport(
         objective=value,
         iterations=taken,
@@ -221,6 +222,7 @@ def fit(
         log_evidence=evidence,
         pattern=pattern.largest,
         noise_correlation=pattern.correlation,
+        added=_added_light(data, fine, unknowns, samples, amplification),
     )
     return _result(
         data,
@@ -371,6 +373,26 @@ def _basins(scene: Scene, best: Found, others: Sequence[Found], on_step: Any) ->
         Basin(end.start, end.value, float(each), best.distance(end), end.displacement)
         for end, each in zip(ends, chi2, strict=True)
     )
+
+
+def _added_light(
+    given: Measured,
+    scene: Scene,
+    unknowns: Unknowns,
+    samples: Sequence[Sample],
+    amplification: float,
+) -> dict[str, list[list[list[float]]]]:
+    """Coefficients of light that adds to each image, in its unit, with standard deviations."""
+    units = (given.units * np.exp(unknowns.brightness))[:, None]
+    light = {}
+    for number, block in enumerate(scene.added):
+        values = units * unknowns.added[number]
+        changes = [sample.change.added[number] for sample in samples]
+        spreads = np.full_like(values, np.nan)
+        if changes:
+            spreads = units * amplification * np.sqrt(np.mean(np.square(changes), axis=0))
+        light[block.title] = np.stack([values, spreads], axis=-1).tolist()
+    return light
 
 
 def _log_evidence(

@@ -57,13 +57,15 @@ class Preconditioner:
         self._log_ratio -= 0.5 * float(np.log(of_prior).sum())
         pixels = scene.weights.sum(axis=(1, 2))
         used = prior.beam_weights > 0
-        self._beam = np.where(used, 1 / np.sqrt(prior.beam_weights + pixels.sum() / 4), 0.0)
-        self._brightness = np.where(scene.free_brightness, 1 / np.sqrt(pixels + 1), 0.0)
+        beam = np.where(used, 1 / np.sqrt(prior.beam_weights + pixels.sum() / 4), 0.0)
+        brightness = np.where(scene.free_brightness, 1 / np.sqrt(pixels + 1), 0.0)
         # Images have contrasts of some tenths over some pixels; stretching moves the edge by more.
         arm = max(scene.rays.size) / 4
         moved = 0.02 * pixels[:, None] * np.array([1, arm, arm, 1, arm, arm]) ** 2
-        self._frames = np.where(scene.free_frames, 1 / np.sqrt(moved + prior.frame_weights), 0.0)
-        self._frames[0] = 0
+        frames = np.where(scene.free_frames, 1 / np.sqrt(moved + prior.frame_weights), 0.0)
+        frames[0] = 0
+        added = [block.scales(scene.weights) for block in scene.added]
+        self._diagonals = [beam, brightness, frames, *added]
 
     def damped(self, unknowns: Unknowns) -> Unknowns:
         """Return unknowns without the finest waves, which knots further apart leave behind."""
@@ -73,28 +75,19 @@ class Preconditioner:
     def times(self, scaled: Unknowns) -> Unknowns:
         """Return S times scaled unknowns: their change."""
         waves = np.einsum("yxnm,nyx->myx", self._potentials, scaled.potentials)
-        return Unknowns(
-            idctn(waves, axes=(1, 2), norm="ortho"),
-            self._beam * scaled.beam,
-            self._brightness * scaled.brightness,
-            self._frames * scaled.frames,
-        )
+        products = map(np.multiply, self._diagonals, scaled.blocks[1:])
+        return Unknowns.from_blocks([idctn(waves, axes=(1, 2), norm="ortho"), *products])
 
     def turned(self, slope: Unknowns) -> Unknowns:
         """Return Sᵀ times derivatives: those with respect to scaled unknowns."""
         waves = dctn(slope.potentials, axes=(1, 2), norm="ortho")
-        return Unknowns(
-            np.einsum("yxnm,myx->nyx", self._potentials, waves),
-            self._beam * slope.beam,
-            self._brightness * slope.brightness,
-            self._frames * slope.frames,
-        )
+        potentials = np.einsum("yxnm,myx->nyx", self._potentials, waves)
+        products = map(np.multiply, self._diagonals, slope.blocks[1:])
+        return Unknowns.from_blocks([potentials, *products])
 
     def log_size(self) -> float:
         """Return log |det S| plus about half the log-determinant of the prior."""
-        scales = np.concatenate(
-            [part.ravel() for part in (self._beam, self._brightness, self._frames)]
-        )
+        scales = np.concatenate([part.ravel() for part in self._diagonals])
         return -self._log_ratio + float(np.log(scales[scales > 0]).sum())
 
 

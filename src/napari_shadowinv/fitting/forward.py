@@ -18,6 +18,7 @@ from scipy.signal import oaconvolve
 from scipy.sparse import csc_array, csr_array
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
+from napari_shadowinv.fitting.additive import AdditiveBlock
 from napari_shadowinv.fitting.priors import Prior
 from napari_shadowinv.fitting.rays import RayModel, at_rest
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
@@ -59,6 +60,8 @@ class Scene:
         Side of a pixel in recorded pixels.
     threads : int or None
         Number of threads. Default: all cores. It does not affect the result.
+    added : tuple of AdditiveBlock
+        Unknown light that adds to each image.
     """
 
     images: FloatArray
@@ -80,6 +83,7 @@ class Scene:
     spacing: float = 0.25
     bin: int = 1
     threads: int | None = None
+    added: tuple[AdditiveBlock, ...] = ()
 
     def only(self, numbers: Sequence[int]) -> Scene:
         """Return some of the images, in this order; fields stay in the same unit."""
@@ -114,6 +118,7 @@ class Scene:
             fiducials=self.fiducials,
             bin=self.bin,
             shift_spread=self.shift_spread,
+            added=self.added,
         )
 
     def nothing(self) -> Unknowns:
@@ -124,6 +129,7 @@ class Scene:
             np.zeros((self.beam_modes, self.beam_modes)),
             np.zeros(count),
             np.tile(at_rest(), (count, 1)),
+            tuple(np.zeros((count, len(block.spreads()))) for block in self.added),
         )
 
     def potentials(self, unknowns: Unknowns) -> FloatArray:
@@ -136,8 +142,8 @@ class Scene:
 
     def model(self, unknowns: Unknowns, counts: list[IntArray]) -> FloatArray:
         """Return the images that the unknowns make, shape (L, H, W)."""
-        bare = (self._bare(*shot) for shot in self._shots(unknowns, counts))
-        return np.stack([np.exp(log) * f for log, f in zip(unknowns.brightness, bare, strict=True)])
+        lit = (self._lit(unknowns, shot) for shot in self._shots(unknowns, counts))
+        return np.stack([np.exp(log) * f for log, f in zip(unknowns.brightness, lit, strict=True)])
 
     def beam(self, unknowns: Unknowns) -> FloatArray:
         """Return the beam of each image within it, without brightness, shape (L, H, W)."""
@@ -158,7 +164,7 @@ class Scene:
         of_shape = np.zeros(self.beams.shape[1:])
         for shot in self._shots(unknowns, counts):
             k, root = shot[0], np.sqrt(self.weights[shot[0]])
-            model = np.exp(unknowns.brightness[k]) * self._bare(*shot)
+            model = np.exp(unknowns.brightness[k]) * self._lit(unknowns, shot)
             residual = blurred(root * (model - self.images[k]), self.blur)
             value += float(np.einsum("yx,yx", residual, residual)) / 2
             pull = root * blurred(residual, self.blur)
@@ -206,7 +212,7 @@ class Scene:
             columns = math.prod(self.rays.shape)
             for jacobian in jacobians:
                 jacobian.resize(jacobian.shape[0], columns)
-        return Linear(self, unknowns, jacobians, [self._bare(*shot) for shot in shots])
+        return Linear(self, unknowns, jacobians, [self._lit(unknowns, shot) for shot in shots])
 
     def _shots(self, unknowns: Unknowns, counts: list[IntArray]) -> Iterator[_Shot]:
         shape = self._beam_shape(unknowns)
@@ -216,8 +222,21 @@ class Scene:
     def _bare(
         self, k: int, psi: FloatArray, counts: IntArray, beam: FloatArray, frame: FloatArray
     ) -> FloatArray:
-        """An image without its brightness."""
+        """The light of an image's rays, without its brightness."""
         return self._spread(k, self.rays.image(psi, counts, beam, frame))
+
+    def _lit(self, unknowns: Unknowns, shot: _Shot) -> FloatArray:
+        """An image without its brightness: the light of its rays, and what adds to it."""
+        return self._with_added(unknowns, shot[0], self._bare(*shot))
+
+    def _with_added(self, unknowns: Unknowns, k: int, image: FloatArray) -> FloatArray:
+        for block, coefficients in zip(self.added, unknowns.added, strict=True):
+            image = image + block.image(coefficients[k], self.rays.size)
+        return image
+
+    def _add_light_pulls(self, slope: Unknowns, k: int, pull: FloatArray) -> None:
+        for block, derivatives in zip(self.added, slope.added, strict=True):
+            derivatives[k] += block.pull(pull)
 
     def _add_pulls(
         self,
@@ -228,7 +247,9 @@ class Scene:
         pull: FloatArray,
     ) -> None:
         k, psi, counts, beam, frame = shot
-        back = self._spread_back(k, np.exp(unknowns.brightness[k]) * pull)
+        scaled = np.exp(unknowns.brightness[k]) * pull
+        self._add_light_pulls(slope, k, scaled)
+        back = self._spread_back(k, scaled)
         pulls = self.rays.gradient(
             psi,
             counts,
@@ -328,6 +349,7 @@ class Linear:
                 columns = np.concatenate([columns, of_beam.ravel(), change.frames[k]])
             landed = (jacobian @ columns).reshape(scene.rays.seen)
             bare = scene._spread(k, landed) + change.brightness[k] * self.bare[k]
+            bare = scene._with_added(change, k, bare)
             np.multiply(self._roots[k], bare, out=changes[k])
         return changes
 
@@ -339,6 +361,7 @@ class Linear:
         for k, transposed in enumerate(self._transposed):
             pull = self._roots[k] * residuals[k]
             slope.brightness[k] = np.einsum("yx,yx", pull, self.bare[k])
+            scene._add_light_pulls(slope, k, pull)
             columns = transposed @ scene._spread_back(k, pull).ravel()
             of_potential, of_instrument = np.split(columns, [math.prod(scene.rays.shape)])
             psi = of_potential.reshape(scene.rays.shape)

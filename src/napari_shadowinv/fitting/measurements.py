@@ -19,6 +19,7 @@ from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import check_instance
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting.additive import additive_blocks
 from napari_shadowinv.fitting.blur import checked_point_spread
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.unknowns import Fiducials
@@ -149,6 +150,7 @@ def measured(
         shift_spread=options.align_spread,
         fiducials=_checked_fiducials(fiducials, (height, width)),
         threads=options.threads,
+        added=additive_blocks(options),
     )
     spread = np.linalg.norm(matrix, axis=1)
     single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())

@@ -17,6 +17,7 @@ from scipy.fft import dctn, idctn
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.fitting._ray_kernels import spline_tables
+from napari_shadowinv.fitting.additive import AdditiveBlock
 from napari_shadowinv.fitting.rays import KNOT, RayModel, at_rest
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
 
@@ -52,6 +53,8 @@ class Prior:
         Side of a pixel in recorded pixels.
     shift_spread : float
         Standard deviation of an image's shift, px of the recorded image.
+    added : tuple of AdditiveBlock
+        Unknown light that adds to each image.
     """
 
     rays: RayModel
@@ -64,12 +67,14 @@ class Prior:
     fiducials: Fiducials | None
     bin: int
     shift_spread: float = 5.0
+    added: tuple[AdditiveBlock, ...] = ()
 
     def value_and_slope(self, unknowns: Unknowns) -> tuple[float, Unknowns]:
         """Return the sum of all terms, and its derivatives."""
         about_rest = unknowns._replace(frames=unknowns.frames - at_rest())
         slope = self.times(about_rest)
-        value = sum(float(np.sum(a * b)) for a, b in zip(slope, about_rest, strict=True)) / 2
+        pairs = zip(slope.blocks, about_rest.blocks, strict=True)
+        value = sum(float(np.sum(a * b)) for a, b in pairs) / 2
         if self.fiducials is None:
             return value, slope
         weights = 1 / self.fiducials.errors[:, None] ** 2
@@ -90,12 +95,8 @@ class Prior:
         if self.fiducials is not None:
             weights = 1 / self.fiducials.errors[:, None] ** 2
             self._add_there(slope, weights * self._displacements_there(change.potentials))
-        return Unknowns(
-            slope,
-            self.beam_weights * change.beam,
-            _BRIGHTNESS_WEIGHT * change.brightness,
-            self.frame_weights * change.frames,
-        )
+        products = map(np.multiply, self._weights, change.blocks[1:])
+        return Unknowns.from_blocks([slope, *products])
 
     def drawn(self, like: Unknowns, rng: np.random.Generator) -> Unknowns:
         """Return a random slope whose covariance is the terms' Hessian."""
@@ -112,12 +113,11 @@ class Prior:
         if self.fiducials is not None:
             errors = self.fiducials.errors[:, None]
             self._add_there(potentials, rng.normal(size=(len(errors), 2)) / errors)
-        return Unknowns(
-            potentials,
-            np.sqrt(self.beam_weights) * rng.normal(size=like.beam.shape),
-            np.sqrt(_BRIGHTNESS_WEIGHT) * rng.normal(size=like.brightness.shape),
-            np.sqrt(self.frame_weights) * rng.normal(size=like.frames.shape),
-        )
+        slopes = [
+            np.sqrt(weights) * rng.normal(size=block.shape)
+            for weights, block in zip(self._weights, like.blocks[1:], strict=True)
+        ]
+        return Unknowns.from_blocks([potentials, *slopes])
 
     def root_of_smoothness(self, field: int, values: FloatArray) -> FloatArray:
         """Return values per cosine times the root of the roughness penalty."""
@@ -147,6 +147,12 @@ class Prior:
         # A fifth of the coefficients or so lies in the pad.
         tied = self.tie * (0.2 * squares + lowest)
         return np.asarray(self._rough_weights + KNOT**2 * tied)
+
+    @cached_property
+    def _weights(self) -> list[FloatArray]:
+        """1 / s² of the values of each block but the potentials."""
+        added = (block.prior_weights() for block in self.added)
+        return [self.beam_weights, np.array(_BRIGHTNESS_WEIGHT), self.frame_weights, *added]
 
     @cached_property
     def beam_weights(self) -> FloatArray:

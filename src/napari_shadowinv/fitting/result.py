@@ -169,6 +169,9 @@ class FitReport:
     noise_correlation : float
         Standard deviation in px of the Gaussian that has blurred the noise; 0 for white noise. The
         error bars take it into account.
+    added : dict of str to list
+        Unknown light that adds to each image, by its title: for each image and each coefficient
+        the value and its standard deviation, in the image's unit.
     """
 
     objective: float
@@ -180,6 +183,7 @@ class FitReport:
     pattern: float = float("nan")
     noise_correlation: float = 0.0
     beam: BeamError | None = None
+    added: dict[str, list[list[list[float]]]] = dataclasses.field(default_factory=dict)
 
     @property
     def total(self) -> float:
@@ -360,6 +364,9 @@ class Fit:
             if k and self.options.align != "none":
                 dy, dx = self.frames[k][[0, 3]]
                 parts.append(f"shifted by y {dy:+.3g}, x {dx:+.3g} px")
+            for title, rows in self.report.added.items():
+                light = ", ".join(f"{value:.3g} ± {error:.2g}" for value, error in rows[k])
+                parts.append(f"{title} {light}")
             text = ", ".join(parts)
             yield Fact(f"image_{k + 1}", f"Image {k + 1}", text, short=f"χ² {chi2:.3g}")
 
