@@ -25,6 +25,7 @@ from napari_shadowinv.physics.setup import (
     SETUPS,
     SPECIES,
     BeamSetup,
+    Deflector,
     MainField,
     OpticalSetup,
     ProtonSetup,
@@ -357,7 +358,8 @@ class NeutralSetup(BeamSetup):
 
     title: ClassVar = "neutral atoms"
     beam: ClassVar = "atoms"
-    deflectors: ClassVar = ("force",)
+    beam_field: ClassVar = "energy"
+    deflectors: ClassVar = (Deflector("F", "force", "force (F)"),)
     si_fields: ClassVar = (
         *BeamSetup.si_fields,
         SIField("path_integrated_force", "N m", "Path-integrated force", is_vector=True),

@@ -13,7 +13,7 @@ from napari_shadowinv._napari.kinds import KINDS, layer_name
 from napari_shadowinv._napari.layer_metadata import KEY, Result, metadata_for, role_of
 from napari_shadowinv._napari.layers import FullLayerData, dataset_layers, symmetric_limits
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting import FIELDS
+from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import intensity_limits
 
 if TYPE_CHECKING:
@@ -123,7 +123,9 @@ def _field_layers(
 
     facts = {**facts, "displacement": variables["displacement"][1]}
     dataset = xr.Dataset(variables)
-    return dataset_layers(dataset, setup, frame, name, facts, deflector=FIELDS[field.name])
+    return dataset_layers(
+        dataset, setup, frame, name, facts, deflector=deflector_titles()[field.name]
+    )
 
 
 def _set_part(layer_data: Sequence[FullLayerData], part: str) -> list[FullLayerData]:

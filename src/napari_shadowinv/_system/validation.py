@@ -120,7 +120,8 @@ def _locate(
         else:  # the tag of a union
             tagged = [
                 model
-                for model in models
+                for base in models
+                for model in (base, *base.__subclasses__())
                 for field in model.model_fields.values()
                 if get_origin(field.annotation) is Literal and field.default == part
             ]

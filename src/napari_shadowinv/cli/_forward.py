@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cli._summary import setup_text
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv._typing import AnyArray, FloatArray
-    from napari_shadowinv.physics.setup import Deflector, Setup
+    from napari_shadowinv.physics.setup import Setup
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def predict_image(
     if recorded_with is None or target is None or recorded_with == target:
         return synthetic_image(displacement, source), ""
     # Names of two words have a hyphen on the command line.
-    name = cast("Deflector | None", deflector and deflector.replace("-", " "))
+    name = deflector and deflector.replace("-", " ")
     name = name or default_deflector(recorded_with, target)
     image = project(
         displacement, recorded_with, target, deflector=name, dispersion=dispersion, source=source

@@ -132,7 +132,7 @@ def windows_table(windows: FitWindows) -> Table:
     """Build a table of the fit of each window, and the peaks of its fields."""
     import numpy as np
 
-    from napari_shadowinv.fitting import FIELDS
+    from napari_shadowinv.physics.setup import deflector_titles
     from napari_shadowinv.physics.units import shown_fields
 
     fields = windows.fits[0].fields
@@ -149,7 +149,7 @@ def windows_table(windows: FitWindows) -> Table:
     used = np.stack([fit.used for fit in windows.fits])[:, None, None]
     unmasked = np.where(used, windows.displacement, np.nan)
     peaks = [
-        shown_fields(list(unmasked[:, m]), windows.setup, FIELDS[field.name])
+        shown_fields(list(unmasked[:, m]), windows.setup, deflector_titles()[field.name])
         for m, field in enumerate(fields)
     ]
     energies, times = windows.energies, windows.times_of_flight

@@ -2,13 +2,12 @@ from ._fit import compare, fit
 from ._leave_one_out import leave_one_out
 from .agreement import LeaveOneOut
 from .blur import point_spread
-from .measurements import FIELDS, FitOptions
+from .measurements import FitOptions
 from .result import Basin, Fit, FitReport, FittedField
 from .verdict import Verdict
 from .windows import FitWindows
 
 __all__ = [
-    "FIELDS",
     "Basin",
     "Fit",
     "FitOptions",

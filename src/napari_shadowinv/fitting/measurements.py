@@ -23,12 +23,11 @@ from napari_shadowinv.fitting.additive import additive_blocks
 from napari_shadowinv.fitting.blur import checked_point_spread
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.unknowns import Fiducials
-from napari_shadowinv.options import FIELDS, KINDS_OF_NOISE, MAX_STRENGTH, FitOptions, KindOfNoise
+from napari_shadowinv.options import KINDS_OF_NOISE, MAX_STRENGTH, FitOptions, KindOfNoise
 from napari_shadowinv.physics.projection import transferred_displacement
-from napari_shadowinv.physics.setup import BeamSetup, Setup
+from napari_shadowinv.physics.setup import BeamSetup, Setup, deflector_titles
 
 __all__ = [
-    "FIELDS",
     "FitOptions",
     "Measured",
     "estimated_noise",
@@ -182,7 +181,7 @@ def strengths_of(
     setups : sequence of Setup
         One for each image, with pixels of the same size at the object.
     fields : sequence of str
-        Of `FIELDS`.
+        Keys of `deflector_titles`.
     count : int
         Number of images.
     names : sequence of str, optional
@@ -193,9 +192,10 @@ def strengths_of(
     InputError
         If a field is unknown or does not bend the beam, or setups do not fit the images.
     """
-    unknown = [field for field in fields if field not in FIELDS]
+    titles = deflector_titles()
+    unknown = [field for field in fields if field not in titles]
     if unknown or not fields or len(set(fields)) < len(fields):
-        raise InputError(f"fields are {list(fields)}: expected some of {', '.join(FIELDS)}")
+        raise InputError(f"fields are {list(fields)}: expected some of {', '.join(titles)}")
     if setups is None:
         if count > 1:
             raise InputError(
@@ -221,7 +221,7 @@ def strengths_of(
     return np.array(
         [
             [
-                transferred_displacement(block, first, setup, deflector=FIELDS[field])[0, 0, 0]  # type: ignore[arg-type]
+                transferred_displacement(block, first, setup, deflector=titles[field])[0, 0, 0]
                 for field in fields
             ]
             for setup in setups

@@ -32,9 +32,9 @@ from napari_shadowinv.inversion.variables import (
     belongs,
     dataset_from_field,
 )
-from napari_shadowinv.options import FIELDS, FitOptions
+from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.labels import FLUX_DENSITY, PIXEL, label, numbers_of
-from napari_shadowinv.physics.setup import Setup, setup_from_dict
+from napari_shadowinv.physics.setup import Setup, deflector_titles, setup_from_dict
 from napari_shadowinv.physics.units import PeakError, ShownField, peak_facts, shown_fields
 from napari_shadowinv.provenance import ImageOrigin, Provenance
 
@@ -371,7 +371,7 @@ class Fit:
             yield Fact(f"image_{k + 1}", f"Image {k + 1}", text, short=f"χ² {chi2:.3g}")
 
     def _field_fact(self, field: FittedField) -> Fact:
-        setup, deflector = self.setup, FIELDS[field.name]
+        setup, deflector = self.setup, deflector_titles()[field.name]
         (pixels,) = shown_fields([field.displacement], None, mask=self.used)
         error = self.peak_error(field, pixels)
         peaks = peak_facts(field.displacement, setup, deflector, mask=self.used, error=error)

@@ -61,8 +61,6 @@ UNCERTAINTY = (_VECTORS, PIXEL, "Standard deviation of the displacement")
 BEAM_UNCERTAINTY = (_VECTORS, "px", "Standard deviation of the displacement by the beam")
 """Another variable of a fit."""
 
-_ASSUMES = {"path_integrated_b": "B", "path_integrated_e": "E"}
-
 
 def dataset_from_field(
     displacement: FloatArray,
@@ -122,7 +120,10 @@ def fit_labels(
 
 def belongs(variable: object, field: str) -> bool:
     """Return whether a variable makes sense for a field: ∫E dz of a magnetic one does not."""
-    return _ASSUMES.get(str(variable), field) == field
+    from napari_shadowinv.physics.setup import SETUPS
+
+    fields = (part for kind in SETUPS.values() for part in kind.si_fields)
+    return all(part.deflector in ("", field) for part in fields if part.name == variable)
 
 
 def setup_from_dataset(dataset: xarray.Dataset) -> Setup | None:

@@ -6,11 +6,9 @@ window, and is saved with each result: there is no second list of defaults.
 - options of an inversion and of a fit: `InversionOptions`, `FitOptions`
 - unknowns of a fit and knowledge about its images: `FitChoices`
 - choices of a run over many shots, and of a watched folder: `RunOptions`, `WatchOptions`
-- causes of a deflection, by name: `FIELDS`
 """
 
 from napari_shadowinv.options.fitting import (
-    FIELDS,
     KINDS_OF_NOISE,
     MAX_STRENGTH,
     FitChoices,
@@ -22,7 +20,6 @@ from napari_shadowinv.options.inversion import MAX_DEFAULT_SITES, InversionOptio
 from napari_shadowinv.options.run import RunOptions, WatchOptions
 
 __all__ = [
-    "FIELDS",
     "KINDS_OF_NOISE",
     "MAX_DEFAULT_SITES",
     "MAX_STRENGTH",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import (
@@ -14,9 +15,9 @@ from pydantic import (
 
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv.options._beam import BeamScale, BeamVariation
+from napari_shadowinv.physics.setup import deflector_titles
 
 __all__ = [
-    "FIELDS",
     "KINDS_OF_NOISE",
     "MAX_STRENGTH",
     "FitChoices",
@@ -25,17 +26,13 @@ __all__ = [
     "Noise",
 ]
 
-FIELDS = {
-    "B": "magnetic field",
-    "E": "electric field",
-    "plasma": "plasma",
-    "phase": "refractive index",
-}
-"""Causes of a deflection, by the names that a fit takes."""
-
-
 MAX_STRENGTH = 1e4
 """Largest ratio of an image's displacement to the first one's."""
+
+
+def _any_of(names: Iterable[str]) -> str:
+    *most, last = names
+    return f"{', '.join(most)} or {last}"
 
 
 class FitOptions(CheckedModel):
@@ -209,8 +206,8 @@ class FitChoices(CheckedModel):
         default=None,
         title="Fields",
         description=(
-            "Cause of the deflection: B, E, plasma or phase. Two of them, separated by a comma, "
-            "need images at two energies. Default: B, or phase for light."
+            f"Cause of the deflection: {_any_of(deflector_titles())}. Two of them, separated by a "
+            "comma, need images at two energies. Default: B, or phase for light."
         ),
         json_schema_extra={"metavar": "NAMES"},
     )
@@ -273,9 +270,9 @@ class FitChoices(CheckedModel):
     @field_validator("fields")
     @classmethod
     def _check_names(cls, names: tuple[str, ...] | None) -> tuple[str, ...] | None:
-        unique = set(names or ())
-        if names is not None and (not unique or unique - FIELDS.keys() or len(unique) < len(names)):
-            raise ValueError(f"expected one or more of {', '.join(FIELDS)}, each once")
+        unique, keys = set(names or ()), deflector_titles()
+        if names is not None and (not unique or unique - keys.keys() or len(unique) < len(names)):
+            raise ValueError(f"expected one or more of {', '.join(keys)}, each once")
         return names
 
     @model_validator(mode="after")

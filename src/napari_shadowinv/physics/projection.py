@@ -2,7 +2,7 @@
 
 - the displacement in another experiment: `transferred_displacement`
 - the image there, from a displacement: `project`; from a potential in SI: `project_potential`
-- the cause of the deflection, which both experiments have in common: `Deflector`
+- the cause of the deflection, which both experiments have in common: `deflector_titles`
 
 A deflection angle, and with it the potential in m, belongs to a beam. The object is described by a
 line integral, which is the same for all beams:
@@ -24,7 +24,7 @@ their images. The object is thin: rays of every direction pass straight through 
 from __future__ import annotations
 
 import math
-from typing import TypedDict, Unpack, get_args
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,10 +34,9 @@ from napari_shadowinv._system.arrays import PIXELS, VECTOR, plain_array
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.setup import Deflector, Setup
+from napari_shadowinv.physics.setup import Setup, deflector_titles
 
 __all__ = [
-    "Deflector",
     "default_deflector",
     "project",
     "project_potential",
@@ -57,7 +56,7 @@ def project(
     recorded_with: Setup,
     setup: Setup,
     *,
-    deflector: Deflector | None = None,
+    deflector: str | None = None,
     dispersion: float = 1.0,
     source: ArrayLike | None = None,
     shape: tuple[int, int] | None = None,
@@ -102,7 +101,7 @@ def project(
 
 
 class _Keywords(TypedDict, total=False):
-    deflector: Deflector | None
+    deflector: str | None
     dispersion: float
     source: ArrayLike | None
     shape: tuple[int, int] | None
@@ -133,7 +132,7 @@ def transferred_displacement(
     recorded_with: Setup,
     setup: Setup,
     *,
-    deflector: Deflector | None = None,
+    deflector: str | None = None,
     dispersion: float = 1.0,
     shape: tuple[int, int] | None = None,
 ) -> FloatArray:
@@ -189,7 +188,7 @@ def transferred_displacement(
     return factor * _resampled(field, size, ratio)
 
 
-def default_deflector(recorded_with: Setup, setup: Setup) -> Deflector:
+def default_deflector(recorded_with: Setup, setup: Setup) -> str:
     """Return the default cause of the deflection.
 
     It is a magnetic field for particles, and a refractive index for light of the same wavelength,
@@ -201,25 +200,24 @@ def default_deflector(recorded_with: Setup, setup: Setup) -> Deflector:
 
 
 def _angle_ratio(
-    recorded_with: Setup, setup: Setup, deflector: Deflector | None, dispersion: float
+    recorded_with: Setup, setup: Setup, deflector: str | None, dispersion: float
 ) -> float:
     """Deflection angle in the new experiment over that in the old one."""
     if not (math.isfinite(dispersion) and dispersion != 0):
         raise InputError(f"dispersion is {dispersion:g}: it must be a finite number, not 0")
-    if deflector is not None and deflector not in get_args(Deflector):
-        raise InputError(
-            f"deflector is {deflector!r}: it must be one of {', '.join(get_args(Deflector))}"
-        )
+    if deflector is not None and deflector not in deflector_titles().values():
+        titles = ", ".join(deflector_titles().values())
+        raise InputError(f"deflector is {deflector!r}: it must be one of {titles}")
     usual = deflector or default_deflector(recorded_with, setup)
     if dispersion != 1 and usual != "refractive index":
         raise InputError(
             f"dispersion is {dispersion:g}, but it does not apply to a {usual}: leave it out"
         )
     _require_same_kind(recorded_with, setup)
-    if usual not in setup.deflectors:
+    if usual not in setup.deflector_titles():
         raise InputError(
             f"deflector is {usual!r}, but the beam is {setup.beam}: expected "
-            f"{' or '.join(map(repr, setup.deflectors))}"
+            f"{' or '.join(map(repr, setup.deflector_titles()))}"
         )
     return setup.angle_ratio(recorded_with, usual) * dispersion
 

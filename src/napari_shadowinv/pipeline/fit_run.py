@@ -22,9 +22,9 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, compare, fit, point_spread
 from napari_shadowinv.inversion.budget import ASSUMED_VARIATION
 from napari_shadowinv.io.files import sha256, text_of
-from napari_shadowinv.options import FIELDS, FitChoices, FitOptions, KindOfNoise
+from napari_shadowinv.options import FitChoices, FitOptions, KindOfNoise
 from napari_shadowinv.physics.projection import default_deflector
-from napari_shadowinv.physics.setup import Setup, setup_warnings
+from napari_shadowinv.physics.setup import Setup, deflector_titles, setup_warnings
 from napari_shadowinv.pipeline.inversion_run import Inputs, Shot, collect_inputs, radiograph_of
 from napari_shadowinv.pipeline.shot_table import fiducials_from
 from napari_shadowinv.preprocessing import (
@@ -425,11 +425,13 @@ def usual_fields(setups: Sequence[Setup] | None) -> tuple[str, ...]:
     """Return the field that usually deflects such beams."""
     if not setups:
         return ("B",)
-    names = {deflector: name for name, deflector in FIELDS.items()}
+    names = {title: key for key, title in deflector_titles().items()}
     try:
         (usual,) = {names[default_deflector(setups[0], setup)] for setup in setups}
     except InputError as error:
-        raise InputError(f"{error}; name it with --fields, of {', '.join(FIELDS)}") from error
+        raise InputError(
+            f"{error}; name it with --fields, of {', '.join(names.values())}"
+        ) from error
     return (usual,)
 
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.fitting import Fit, fit
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.options import FIELDS, FitChoices, FitOptions
+from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.pipeline.fit_run import usual_fields
 from napari_shadowinv.provenance import Provenance
 
 __all__ = ["refinement_choices", "run_refinement"]
@@ -50,7 +51,7 @@ def run_refinement(
     result = fit(
         inversion.image,
         setups=None if setup is None else [setup],
-        fields=choices.fields or ("B",),
+        fields=choices.fields or usual_fields(None if setup is None else [setup]),
         source=inversion.source,
         noise=choices.noise,
         psf=choices.psf or 0.0,
@@ -75,8 +76,7 @@ def _options(inversion: Inversion, options: FitOptions) -> FitOptions:
 
 def refinement_choices(inversion: Inversion, setup: Setup | None, psf: float = 0.0) -> FitChoices:
     """Return the choices that follow from an inversion: field, boundary and seed."""
-    bends = (FIELDS["B"],) if setup is None else setup.deflectors
-    (field, *_) = (key for key, deflector in FIELDS.items() if deflector in bends)
+    field = "B" if setup is None else setup.deflectors[0].key
     boundary = "free" if inversion.options.boundary == "free" else "fading"
     options = FitOptions(boundary=boundary, seed=inversion.options.seed)
     return FitChoices(fields=(field,), psf=psf, options=options)

@@ -10,8 +10,9 @@ import numpy as np
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Fact, Level
-from napari_shadowinv.fitting import FIELDS, Fit, FittedField
+from napari_shadowinv.fitting import Fit, FittedField
 from napari_shadowinv.physics.forward import jacobian_determinant
+from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import ShownField, intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._drawing import (
@@ -97,7 +98,7 @@ def _kinds(fit: Fit) -> tuple[str, ...]:
 def _field_in_units(fit: Fit, field: FittedField) -> tuple[ShownField, ShownField | None]:
     """Return a field and its standard deviation, each in a handy unit."""
     setup = fit.setups[0] if fit.setups else None
-    deflector = FIELDS[field.name]
+    deflector = deflector_titles()[field.name]
     (in_units,) = shown_fields([field.displacement], setup, deflector, mask=fit.used)
     if field.uncertainty is None:
         return in_units, None

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from napari_shadowinv.fitting import FIELDS, FitWindows, LeaveOneOut, Verdict
+from napari_shadowinv.fitting import FitWindows, LeaveOneOut, Verdict
+from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._drawing import (
@@ -116,7 +117,9 @@ def windows_figure(windows: FitWindows, *, title: str | None = None) -> Figure:
         figure, panels = _panels.new_page(grid, _panels.image_scale(shape, windows.setup), heading)
         for m, field in enumerate(windows.fits[0].fields):
             block = panels[m * rows * columns : (m + 1) * rows * columns]
-            in_units = shown_fields(list(displacement[:, m]), windows.setup, FIELDS[field.name])
+            in_units = shown_fields(
+                list(displacement[:, m]), windows.setup, deflector_titles()[field.name]
+            )
             names = [f"{field.name}: " * (fields > 1) + _name(windows, w) for w in range(count)]
             draw_side_by_side(
                 block[: count + 1], dict(zip(names, in_units, strict=True)), common=True

@@ -25,8 +25,14 @@ from napari_shadowinv._napari.widgets._results import Origins
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.options import FIELDS, InversionOptions
-from napari_shadowinv.physics.setup import SETUPS, Setup, geometry_text, setup_warnings
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.setup import (
+    SETUPS,
+    Setup,
+    deflector_titles,
+    geometry_text,
+    setup_warnings,
+)
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
 
 _NONE = "none"
@@ -532,12 +538,6 @@ class InversionInputs:
         )
 
 
-_FIELD_TITLES = {
-    "B": "magnetic field (B)",
-    "E": "electric field (E)",
-    "plasma": "plasma (phase ∝ λ²)",
-    "phase": "refractive index (phase)",
-}
 BOTH = " and "
 NOISES = {
     "": "estimated from each image",
@@ -582,10 +582,10 @@ def fields_of(kind: str) -> dict[str, str]:
     """Return the fields that can deflect in a kind of setup, titles by key."""
     if kind not in SETUPS:
         return {"B": "one field, in pixels"}
-    keys = [key for key, deflector in FIELDS.items() if deflector in SETUPS[kind].deflectors]
-    choices = {key: _FIELD_TITLES[key] for key in keys}
+    choices = {deflector.key: deflector.label for deflector in SETUPS[kind].deflectors}
+    keys = list(choices)
     return choices | ({BOTH.join(keys): BOTH.join(keys)} if len(keys) > 1 else {})
 
 
 def field_key(fields: Sequence[str]) -> str:
-    return BOTH.join(key for key in FIELDS if key in fields)
+    return BOTH.join(key for key in deflector_titles() if key in fields)

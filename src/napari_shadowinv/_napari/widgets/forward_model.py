@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar, get_args
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,14 +28,14 @@ from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.physics.setup import SETUPS, Deflector
+from napari_shadowinv.physics.setup import SETUPS, deflector_titles
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.inversion_run import plane_of
 
 if TYPE_CHECKING:
     import napari
     from napari_shadowinv.physics.phantoms import Phantom
-    from napari_shadowinv.physics.setup import Deflector, Setup
+    from napari_shadowinv.physics.setup import Setup
 
 
 class PhantomRecipe(CheckedModel):
@@ -221,7 +221,7 @@ class ForwardJob(Job):
     to_px2: float = 1.0  # conversion factor of the potential to px²
     setup: Setup | None = None
     field_setup: Setup | None = None  # of the field's measurement
-    deflector: Deflector | None = None
+    deflector: str | None = None
     source: ArrayLike | None = None  # None for a uniform beam
     caustic_jacobian: float = InversionOptions.model_fields["caustic_jacobian"].default
     name: str = ""  # of the image
@@ -392,7 +392,7 @@ class ForwardModel(ToolPanel):
         self.interpretation = forms.wrapping_label()
         self.deflector = SteadyComboBox()
         self.deflector.addItem("default for the beam", None)
-        for name in get_args(Deflector):
+        for name in deflector_titles().values():
             self.deflector.addItem(name, name)
         self.deflector.setToolTip(
             "<qt>Field that deflects the beam. Used only to predict the object's image in another "

@@ -1,7 +1,8 @@
 """The experiment's geometry and probe, and the fields that follow from a displacement.
 
 - describe an experiment: `ProtonSetup`, `OpticalSetup`; any of them: `Setup`, by kind `SETUPS`
-- how a kind of setup is described: `BeamSetup`, `SIField`, `MainField`, `Deflector`
+- how a kind of setup is described: `BeamSetup`, `SIField`, `MainField`, `Deflector`,
+  `BeamQuantity`; of all kinds: `deflector_titles`, `beam_quantities`
 - get it back from a file's content: `setup_from_dict`; with larger pixels: `binned_setup`
 - convert pixels to SI and back: methods of `BeamSetup`; path-integrated fields: of `ProtonSetup`;
   line integrals of the refractive index or the density: of `OpticalSetup`
@@ -26,19 +27,22 @@ proportional to it (∫ln η dz, ∫n dz) are relative to the place where the po
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import BeforeValidator, SerializeAsAny, ValidationError
+from pydantic_core import PydanticKnownError
 
 from napari_shadowinv._system.validation import nearest, validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup._beam import (
+    BeamQuantity,
     BeamSetup,
+    Deflector,
     MainField,
     SIField,
     displacement_from_potential,
 )
-from napari_shadowinv.physics.setup._optical import LightDeflector, OpticalSetup
+from napari_shadowinv.physics.setup._optical import OpticalSetup
 from napari_shadowinv.physics.setup._plausibility import (
     deflection_warnings,
     field_of_view_text,
@@ -49,7 +53,6 @@ from napari_shadowinv.physics.setup._proton import (
     SPECIES,
     FieldUnit,
     Particle,
-    ParticleDeflector,
     ProtonSetup,
     Species,
 )
@@ -57,6 +60,7 @@ from napari_shadowinv.physics.setup._proton import (
 __all__ = [
     "SETUPS",
     "SPECIES",
+    "BeamQuantity",
     "BeamSetup",
     "Deflector",
     "FieldUnit",
@@ -67,8 +71,10 @@ __all__ = [
     "SIField",
     "Setup",
     "Species",
+    "beam_quantities",
     "binned_setup",
     "deflection_warnings",
+    "deflector_titles",
     "displacement_from_potential",
     "field_of_view_text",
     "geometry_text",
@@ -76,19 +82,47 @@ __all__ = [
     "setup_warnings",
 ]
 
-# A further kind of setup is added here, and nowhere else.
-Setup = Annotated[ProtonSetup | OpticalSetup, Field(discriminator="kind")]
-Deflector = Literal[ParticleDeflector, LightDeflector]
-
-SETUPS: dict[str, type[Setup]] = {
-    model.model_fields["kind"].default: model for model in get_args(get_args(Setup)[0])
+SETUPS: dict[str, type[BeamSetup]] = {
+    model.model_fields["kind"].default: model for model in (ProtonSetup, OpticalSetup)
 }
-"""The kinds of setup by name."""
+"""The kinds of setup by name. A further kind is added here, and nowhere else."""
 
-_EXPECTED = (
-    "it must be 'proton' (any charged particles, named by 'species': "
-    f"{', '.join(SPECIES)}) or 'optical'"
-)
+
+def _as_kind(value: Any) -> Any:
+    """Turn a mapping into the setup of its kind; pydantic reports its errors as of a union."""
+    if not isinstance(value, Mapping):
+        return value
+    kind = value.get("kind")
+    if kind is None:
+        raise PydanticKnownError("union_tag_not_found", {"discriminator": "'kind'"})
+    if not isinstance(kind, str) or kind not in SETUPS:
+        tags = ", ".join(map(repr, SETUPS))
+        context = {"discriminator": "'kind'", "tag": str(kind), "expected_tags": tags}
+        raise PydanticKnownError("union_tag_invalid", context)
+    try:
+        return SETUPS[kind].model_validate(value)
+    except ValidationError as error:
+        details: list[Any] = [
+            {**detail, "loc": (kind, *detail["loc"])} for detail in error.errors(include_url=False)
+        ]
+        raise ValidationError.from_exception_data(kind, details) from None
+
+
+Setup = Annotated[SerializeAsAny[BeamSetup], BeforeValidator(_as_kind)]
+"""Setup of any kind in `SETUPS`, as the field of a model."""
+
+
+def deflector_titles() -> dict[str, str]:
+    """Return the titles of all causes of a deflection, by the keys that a fit takes."""
+    return {
+        deflector.key: deflector.title for kind in SETUPS.values() for deflector in kind.deflectors
+    }
+
+
+def beam_quantities() -> dict[str, BeamQuantity]:
+    """Return the quantities that differ between beams, by name, for all kinds of setup."""
+    quantities = (kind.beam_quantity() for kind in SETUPS.values())
+    return {quantity.name: quantity for quantity in quantities}
 
 
 def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> Setup:
@@ -97,8 +131,8 @@ def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> Setup:
     Parameters
     ----------
     mapping : mapping of str to object
-        The fields, with ``kind`` "proton" (and a ``species``, for electrons or other ions) or
-        "optical".
+        The fields, with a ``kind`` of `SETUPS`, such as "proton" (and a ``species``, for
+        electrons or other ions) or "optical".
     where : str, optional
         Where the mapping comes from; an error's message begins with it.
 
@@ -119,9 +153,11 @@ def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> Setup:
         )
     kind = mapping.get("kind")
     if kind is None:
-        raise InputError(f"{where}: 'kind' is missing, {_EXPECTED}")
+        raise InputError(f"{where}: 'kind' is missing, {_expected_kind()}")
     if not isinstance(kind, str) or kind not in SETUPS:
-        raise InputError(f"{where}: 'kind' is {kind!r}, {_EXPECTED}{_suggest_kind(str(kind))}")
+        raise InputError(
+            f"{where}: 'kind' is {kind!r}, {_expected_kind()}{_suggest_kind(str(kind))}"
+        )
     return validated(SETUPS[kind], mapping, where)
 
 
@@ -132,6 +168,14 @@ def binned_setup(setup: Setup, factor: int) -> Setup:
         if values.get(name) is not None:
             values[name] *= factor
     return type(setup)(**values)
+
+
+def _expected_kind() -> str:
+    other_kinds = [repr(kind) for kind in SETUPS if kind != "proton"]
+    return (
+        "it must be 'proton' (any charged particles, named by 'species': "
+        f"{', '.join(SPECIES)}) or {' or '.join(other_kinds)}"
+    )
 
 
 def _suggest_kind(kind: str) -> str:

@@ -22,7 +22,11 @@ from pydantic import (
 from napari_shadowinv._system.arrays import checked_plane, plain_array, unmasked
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.physics.setup._quantities import number_in_unit, unit_in_title
+from napari_shadowinv.physics.setup._quantities import (
+    number_in_unit,
+    takes_prefixes,
+    unit_in_title,
+)
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,8 @@ class SIField:
     """A field in SI units: a variable of a dataset, made by a method of the setup.
 
     A vector is made of the displacement in px, a plane of the normalised potential in px².
-    The method has the name of the variable by default.
+    The method has the name of the variable by default. `deflector` is the key of the only cause of
+    deflection with which the field makes sense, empty for any.
     """
 
     name: str
@@ -38,6 +43,7 @@ class SIField:
     long_name: str
     is_vector: bool = False
     method: str = ""
+    deflector: str = ""
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,37 @@ class MainField:
     arrows: str = ""
 
 
+@dataclass(frozen=True)
+class Deflector:
+    """Cause of a deflection.
+
+    `key` names it in a fit, `title` in words, in projections and in files, `label` in forms.
+    """
+
+    key: str
+    title: str
+    label: str
+
+
+@dataclass(frozen=True)
+class BeamQuantity:
+    """Quantity that differs between the beams of several images of one object, such as the energy.
+
+    `name` is the field of the setup, the column of tables and the coordinate of datasets; `noun`
+    is for sentences.
+    """
+
+    name: str
+    noun: str
+    unit: str
+    long_name: str
+    description: str
+
+    def text(self, value: float) -> str:
+        """Return a value with its unit, such as "14.7 MeV" or "810 nm"."""
+        return length_text(value) if self.unit == "m" else f"{value:.4g} {self.unit}"
+
+
 def positive_field(title: str, description: str, default: Any = ..., *, most: float) -> Any:
     """Return the field of a positive number up to a limit."""
     return Field(
@@ -70,15 +107,6 @@ def positive_field(title: str, description: str, default: Any = ..., *, most: fl
 # Beyond any experiment, and far from the numbers that products in double precision cannot hold.
 _MAX_DISTANCE_M, _MAX_PIXEL_M = 1e9, 1e6
 _MIN_LENGTH_M = 1e-15
-_LENGTHS = {
-    "source_object_distance",
-    "object_image_distance",
-    "pixel_size",
-    "detector_pixel_size",
-    "wavelength",
-}
-# Fields of any kind of setup that take a unit; pydantic allows no validator for "*" with `kind`.
-_QUANTITIES = sorted({*_LENGTHS, "energy"})
 
 
 class BeamSetup(CheckedModel):
@@ -98,7 +126,8 @@ class BeamSetup(CheckedModel):
     main_field: ClassVar = MainField("deflection_angle", "Deflection angle", "|α|", ("αy", "αx"))
     # What is shown instead where it is known that something else deflects.
     other_fields: ClassVar[dict[str, MainField]] = {}
-    deflectors: ClassVar[tuple[str, ...]]  # causes of a deflection; see `angle_ratio`
+    beam_field: ClassVar[str]  # name of the field with the `BeamQuantity`
+    deflectors: ClassVar[tuple[Deflector, ...]]  # see `angle_ratio`
     in_pradformat: ClassVar[bool] = False  # whether that format can describe the beam
     # Whether a small source magnifies the object onto a film or plate, as it does with particles.
     projects: ClassVar[bool] = False
@@ -130,12 +159,12 @@ class BeamSetup(CheckedModel):
         most=_MAX_PIXEL_M,
     )
 
-    @field_validator(*_QUANTITIES, mode="before", check_fields=False)
+    @field_validator("*", mode="before")
     @classmethod
     def _read_unit(cls, value: Any, info: ValidationInfo) -> Any:
         """Turn a text such as "14.7 MeV" into the number in the field's unit."""
         unit = unit_in_title(cls.model_fields[info.field_name or ""].title)
-        if not isinstance(value, str):
+        if not isinstance(value, str) or not takes_prefixes(unit):
             return value
         try:
             return float(value)
@@ -155,8 +184,9 @@ class BeamSetup(CheckedModel):
 
     @model_validator(mode="after")
     def _lengths_in_range(self) -> BeamSetup:
-        lengths = {name: getattr(self, name) for name in self.model_fields_set & _LENGTHS}
-        for name, length in lengths.items():
+        for name in self.model_fields_set:
+            is_length = unit_in_title(type(self).model_fields[name].title) == "m"
+            length = getattr(self, name) if is_length else None
             if length is not None and length < _MIN_LENGTH_M:
                 raise ValueError(
                     f"'{name}' is {length:g} m, expected at least {_MIN_LENGTH_M:g} m: check its "
@@ -235,6 +265,31 @@ class BeamSetup(CheckedModel):
     def probe_doubts(self) -> Iterator[str]:
         """Yield a sentence for everything about the probe itself that is unusual."""
         yield from ()
+
+    @classmethod
+    def beam_quantity(cls) -> BeamQuantity:
+        """Describe the quantity that differs between images of one object."""
+        field = cls.model_fields[cls.beam_field]
+        title = (field.title or cls.beam_field).partition(" (")[0]
+        noun = title.split()[-1].lower()
+        return BeamQuantity(
+            name=cls.beam_field,
+            noun=noun,
+            unit=unit_in_title(field.title),
+            long_name=f"{noun.capitalize()} of the {cls.beam}",
+            description=field.description or "",
+        )
+
+    @property
+    def beam_value(self) -> float:
+        """Value of the quantity that differs between images of one object."""
+        value: float = getattr(self, self.beam_field)
+        return value
+
+    @classmethod
+    def deflector_titles(cls) -> tuple[str, ...]:
+        """Return the titles of the causes of a deflection."""
+        return tuple(deflector.title for deflector in cls.deflectors)
 
     @classmethod
     def own_fields(cls) -> set[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any, ClassVar, Literal, Self, get_args
+from typing import Any, ClassVar, Literal, Self
 
 from numpy.typing import ArrayLike
 from pydantic import Field
@@ -14,6 +14,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup._beam import (
     BeamSetup,
+    Deflector,
     SIField,
     length_text,
     positive_field,
@@ -21,8 +22,6 @@ from napari_shadowinv.physics.setup._beam import (
 )
 
 _USUAL_WAVELENGTHS_M = (10e-9, 20e-6)
-
-LightDeflector = Literal["plasma", "refractive index"]
 
 
 class OpticalSetup(BeamSetup):
@@ -40,7 +39,11 @@ class OpticalSetup(BeamSetup):
 
     title: ClassVar = "light"
     beam: ClassVar = "light"
-    deflectors: ClassVar = get_args(LightDeflector)
+    beam_field: ClassVar = "wavelength"
+    deflectors: ClassVar = (
+        Deflector("plasma", "plasma", "plasma (phase ∝ λ²)"),
+        Deflector("phase", "refractive index", "refractive index (phase)"),
+    )
     si_fields: ClassVar = (
         *BeamSetup.si_fields,
         SIField(
@@ -84,12 +87,11 @@ class OpticalSetup(BeamSetup):
         """Return the probe of the paper's plasma wave; see `phantoms.wakefield_setup`."""
         return cls(wavelength=810e-9, object_image_distance=20e-6, pixel_size=0.25e-6)
 
-    def default_deflector(self, recorded_with: Any) -> LightDeflector:
+    def default_deflector(self, recorded_with: Any) -> str:
         if recorded_with.wavelength != self.wavelength:
             raise InputError(
-                f"the wavelengths differ ({recorded_with.wavelength:g} and "
-                f"{self.wavelength:g} m) but "
-                "no deflector was given: choose 'plasma' (angles scale with the wavelength "
+                f"the wavelengths differ ({recorded_with.wavelength:g} and {self.wavelength:g} m) "
+                "but no deflector was given: choose 'plasma' (angles scale with the wavelength "
                 "squared) or 'refractive index' (angles are unchanged, apart from dispersion)"
             )
         return "refractive index"

@@ -15,9 +15,14 @@ from scipy import constants
 from napari_shadowinv._system.arrays import VECTOR, plain_array
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.setup._beam import BeamSetup, MainField, SIField, positive_field
+from napari_shadowinv.physics.setup._beam import (
+    BeamSetup,
+    Deflector,
+    MainField,
+    SIField,
+    positive_field,
+)
 
-ParticleDeflector = Literal["magnetic field", "electric field"]
 Species = Literal["proton", "deuteron", "triton", "helion", "alpha", "electron"]
 FieldUnit = Literal["T m", "MG um"]
 
@@ -78,7 +83,11 @@ class ProtonSetup(BeamSetup):
 
     title: ClassVar = "particles (protons, …)"
     beam: ClassVar = "particles"
-    deflectors: ClassVar = get_args(ParticleDeflector)
+    beam_field: ClassVar = "energy"
+    deflectors: ClassVar = (
+        Deflector("B", "magnetic field", "magnetic field (B)"),
+        Deflector("E", "electric field", "electric field (E)"),
+    )
     in_pradformat: ClassVar = True
     projects: ClassVar = True
     si_fields: ClassVar = (
@@ -89,6 +98,7 @@ class ProtonSetup(BeamSetup):
                 unit,
                 f"Path-integrated {kind} field, assuming purely {kind} deflection",
                 is_vector=True,
+                deflector=symbol.upper(),
             )
             for symbol, unit, kind in (("b", "T m", "magnetic"), ("e", "V", "electric"))
         ),
@@ -156,7 +166,7 @@ class ProtonSetup(BeamSetup):
         lengths = {"source_object_distance": 1.3e-3, "object_image_distance": 2e-2}
         return cls(energy=14.7, pixel_size=1.5e-6, **lengths)
 
-    def default_deflector(self, recorded_with: Any) -> ParticleDeflector:
+    def default_deflector(self, recorded_with: Any) -> str:
         return "magnetic field"
 
     def angle_ratio(self, recorded_with: Any, deflector: str) -> float:
