@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +24,7 @@ from napari_shadowinv.io.public_images import BURNER_FILES, fetch_burner
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+from napari_shadowinv.physics.setup import SETUPS, BeamSetup, OpticalSetup, ProtonSetup
 
 # The same examples in each run: a failure is due to a change, not to chance.
 settings.register_profile("same each time", derandomize=True)
@@ -233,3 +235,19 @@ def burner() -> list[Path]:
         return fetch_burner(len(BURNER_FILES) - 1)
     except OSError as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture
+def xray_setup(monkeypatch: pytest.MonkeyPatch) -> type[BeamSetup]:
+    """The kind of setup of CONTRIBUTING.md, added to those of the package."""
+    text = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    (block,) = (
+        block
+        for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+        if "class XRaySetup" in block
+    )
+    names: dict[str, Any] = {"__name__": "contributing"}
+    exec(compile(block, "CONTRIBUTING.md", "exec", dont_inherit=True), names)
+    kind: type[BeamSetup] = names["XRaySetup"]
+    monkeypatch.setitem(SETUPS, "x-ray", kind)
+    return kind

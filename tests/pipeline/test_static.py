@@ -125,7 +125,7 @@ def test_strengths_take_the_place_of_energies() -> None:
     ]
     result = run_windows(Recipe(fit=FitChoices(options=HASTY)), shots[::-1][:3], 2)
     assert result.numbers == ((2, 1), (1, 0))
-    assert result.energies is None
+    assert result.beam_means is None
     dataset = result.to_dataset()
     assert not {"energy", "time_of_flight"} & set(dataset.coords)
     third, fourth, fifth = np.array(STRENGTHS[2:]) / STRENGTHS[2]

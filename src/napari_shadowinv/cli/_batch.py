@@ -231,11 +231,15 @@ def _recipe_rows(store: StackStore) -> Rows:
     return rows + [("step", step.described) for step in steps]
 
 
-def _energy_rows(store: StackStore) -> Rows:
-    """Return the energies of the finished shots, if they come from rows of a table."""
-    energies = sorted({report["energy"] for report in store.reports() if "energy" in report})
-    text = ", ".join(f"{energy:g}" for energy in energies)
-    return [("energies", f"{text} MeV")] if energies else []
+def _beam_rows(store: StackStore) -> Rows:
+    """Return energies or wavelengths of the finished shots, if they come from rows of a table."""
+    from napari_shadowinv.physics.setup import beam_quantities
+
+    rows: Rows = []
+    for name, quantity in beam_quantities().items():
+        values = sorted({report[name] for report in store.reports() if name in report})
+        rows += [(quantity.plural, quantity.text(*values, digits=6))] if values else []
+    return rows
 
 
 def _fit_rows(attributes: Mapping[str, Any]) -> Rows:
@@ -393,7 +397,7 @@ def store_rows(store: StackStore, *, trouble: bool = True) -> Rows:
         ("shots", _counts_text(store)),
         ("image", str(attributes["image_size"])),
         *_recipe_rows(store),
-        *_energy_rows(store),
+        *_beam_rows(store),
         ("stored", str(attributes["stored"])),
         *([] if store.field is None else _fit_rows(attributes)),
         ("options", options_text(json.loads(attributes["options"]))),

@@ -55,8 +55,8 @@ shadowinv fit next.csv --recipe recipe.toml
 file, energy, setup, source, brightness
 a.tif, 14.7, setup.toml, beam.tif, 1
 b.tif, 30, setup.toml, beam.tif, 1.2
-Columns: file, setup, energy, strength, brightness, psf, mask, source, noise; exclude (yes to
-skip the image); shot, for shadowinv batch.
+Columns: file, setup, energy (MeV) or wavelength (m), strength, brightness, psf, mask, source,
+noise; exclude (yes to skip the image); shot, for shadowinv batch.
 
 [bold]Verdict[/bold]
 Each result states whether its field can be trusted: "determined", "one of several",
@@ -162,7 +162,7 @@ def fit(
         write_recipe(save_recipe, chosen.model_copy(update={"setup": common}), overwrite=overwrite)
     if not quiet:
         for table in _static_result.check_tables(
-            static, result_fit, short, [row.energy for row in rows]
+            static, result_fit, short, [row.beam_text for row in rows]
         ):
             say(table)
         say(_fit_result.fit_table(result_fit, names, list(outputs)))

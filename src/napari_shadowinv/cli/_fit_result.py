@@ -59,11 +59,13 @@ def compare_fields(
 ) -> Fit:
     """Fit several choices of fields and print how likely each is; return the one to write."""
     from napari_shadowinv.pipeline import run_comparison
-    from napari_shadowinv.pipeline.fit_run import COMPARED
+    from napari_shadowinv.pipeline.fit_run import compared_fields
 
     names = set(recipe.fit.fields or ()) if recipe.fit else set()
-    if written is not None and names not in map(set, COMPARED):
-        choices = "; ".join(",".join(choice) for choice in COMPARED)
+    first = shots[0].setup
+    compared = compared_fields(None if first is None else [first])
+    if written is not None and names not in map(set, compared):
+        choices = "; ".join(",".join(choice) for choice in compared)
         raise InputError(
             f"received --fields {written} and --compare, which compares {choices}: write one of "
             "these, or leave out --fields to write the likeliest"

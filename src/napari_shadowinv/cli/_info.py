@@ -13,7 +13,7 @@ from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cli import _summary
 from napari_shadowinv.facts import ResultKind
-from napari_shadowinv.physics.setup import setup_warnings
+from napari_shadowinv.physics.setup import beam_quantities, setup_warnings
 
 if TYPE_CHECKING:
     import xarray
@@ -109,9 +109,10 @@ def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> _summary.Rows:
         rows.append(("source", "in the same file, below the image"))
     if shot.mask is not None:
         rows.append(("mask", f"in the same file, {(~shot.mask).sum()} pixels excluded"))
+    quantities = beam_quantities()
     for name, value in shot.metadata.get("geometry", {}).items():
         if isinstance(value, int | float):
-            unit = "MeV" if name == "energy" else "m"
+            unit = quantities[name].unit if name in quantities else "m"
             rows.append((f"{name.replace('_', ' ')} ({unit})", f"{value:g}"))
     rows.append(("setup", _summary.setup_text(shot.setup, shot, shot.shape)))
     rows += [("note", text) for text in shot.notes]

@@ -39,7 +39,7 @@ file, energy, brightness, mask, exclude
 film1.tif, 4.3, 1, mask1.png,
 film2.tif, 6.1, 1.2, mask2.png,
 film3.tif, 7.6, 0.8, , yes
-Columns: file, setup, energy, brightness, mask, source, exclude.
+Columns: file, setup, energy (MeV) or wavelength (m), brightness, mask, source, exclude.
 
 [bold]shots.csv[/bold] (one fit per shot; other columns as for shadowinv fit)
 shot, file, energy, setup

@@ -76,12 +76,12 @@ def check_figures(
 
 
 def check_tables(
-    checks: StaticChecks, fit: Fit, names: Sequence[str], energies: Sequence[float | None]
+    checks: StaticChecks, fit: Fit, names: Sequence[str], beams: Sequence[str]
 ) -> list[Table]:
-    """Return a table for each check; `energies` (MeV) are given in the rows."""
+    """Return a table for each check; `beams` are the energies or wavelengths of the rows."""
     tables = []
     if checks.left_out is not None:
-        tables.append(left_out_table(checks.left_out, fit, names, energies))
+        tables.append(left_out_table(checks.left_out, fit, names, beams))
     if checks.windows is not None:
         tables.append(windows_table(checks.windows))
     return tables
@@ -95,20 +95,25 @@ def exit_unless_static(checks: StaticChecks, out: Path) -> None:
 
 
 def left_out_table(
-    left_out: LeaveOneOut, fit: Fit, names: Sequence[str], energies: Sequence[float | None]
+    left_out: LeaveOneOut, fit: Fit, names: Sequence[str], beams: Sequence[str]
 ) -> Table:
     """Build a table of how well the other images predict each image.
 
-    Without setups, the energies (MeV) come from the rows.
+    Without setups, the texts of the beams come from the rows.
     """
-    headings = ["image", "energy", "χ² left out", "χ² alone", "up to", "r.m.s.", "verdict"]
+    from napari_shadowinv.physics.setup import beam_values
+
+    noun, quantity_and_values = "energy", beam_values(fit.setups)
+    if quantity_and_values is not None:
+        quantity, values = quantity_and_values
+        noun, beams = quantity.noun, [quantity.text(value) for value in values]
+    headings = ["image", noun, "χ² left out", "χ² alone", "up to", "r.m.s.", "verdict"]
     table = _table("Left out", headings, left_out.explanation)
-    energies = [getattr(setup, "energy", None) for setup in fit.setups] or energies
-    for k, (name, energy) in enumerate(zip(names, energies, strict=True)):
+    for k, (name, beam) in enumerate(zip(names, beams, strict=True)):
         explained = bool(left_out.explained[k])
         table.add_row(
             plain(name),
-            "" if energy is None else f"{energy:.4g} MeV",
+            beam,
             f"{left_out.chi2[k]:.3g}",
             f"{left_out.alone[k]:.3g}",
             f"{left_out.limit[k]:.3g}",
@@ -135,10 +140,10 @@ def windows_table(windows: FitWindows) -> Table:
     from napari_shadowinv.physics.setup import deflector_titles
     from napari_shadowinv.physics.units import shown_fields
 
-    fields = windows.fits[0].fields
+    fields, quantity = windows.fits[0].fields, windows.beam_quantity
     headings = [
         "images",
-        "mean energy",
+        f"mean {quantity.noun if quantity else 'energy'}",
         "time of flight",
         "χ²",
         *[f.name for f in fields],
@@ -152,11 +157,11 @@ def windows_table(windows: FitWindows) -> Table:
         shown_fields(list(unmasked[:, m]), windows.setup, deflector_titles()[field.name])
         for m, field in enumerate(fields)
     ]
-    energies, times = windows.energies, windows.times_of_flight
+    means, times = windows.beam_means, windows.times_of_flight
     for w, fit in enumerate(windows.fits):
         table.add_row(
             ", ".join(str(k + 1) for k in windows.numbers[w]),
-            "" if energies is None else f"{energies[w]:.4g} MeV",
+            "" if quantity is None or means is None else quantity.text(means[w]),
             "" if times is None else f"{times[w] * 1e12:.4g} ps",
             ", ".join(f"{value:.3g}" for value in fit.chi2),
             *[values[w].peak_text() for values in peaks],

@@ -11,7 +11,7 @@ import numpy as np
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.labels import label
-from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.physics.setup import Setup, beam_values
 
 if TYPE_CHECKING:
     import xarray
@@ -175,9 +175,11 @@ def explanation_of(
 
 
 def _called(wrong: AnyArray, setups: Sequence[Setup] | None, names: Sequence[str] | None) -> str:
-    energies = [getattr(setup, "energy", None) for setup in setups or ()]
-    if energies and None not in energies:
-        return f"at {_listed([f'{energies[k]:g}' for k in wrong])} MeV"
+    beams = beam_values(setups or ())
+    if beams is not None:
+        quantity, values = beams
+        text = quantity.text(*(values[k] for k in wrong), digits=6)
+        return f"at {' and '.join(text.rsplit(', ', 1))}"
     return _listed([names[k] if names else str(k + 1) for k in wrong])
 
 

@@ -12,7 +12,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.inversion.variables import UNCERTAINTY, belongs, dataset_from_field
 from napari_shadowinv.physics.labels import PIXEL, label
-from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.physics.setup import BeamQuantity, Setup, beam_values
 
 if TYPE_CHECKING:
     import xarray
@@ -54,21 +54,28 @@ class FitWindows:
         return np.array(displacements) / self.strengths[:, :, None, None, None]
 
     @property
-    def energies(self) -> FloatArray | None:
-        """Mean energy of each group in MeV, shape (W,); None if not known."""
-        energies = [[getattr(setup, "energy", None) for setup in fit.setups] for fit in self.fits]
-        if any(not group or None in group for group in energies):
+    def beam_quantity(self) -> BeamQuantity | None:
+        """Quantity that differs between the images' beams, such as the energy; None if unknown."""
+        beams = beam_values([setup for fit in self.fits for setup in fit.setups])
+        return None if beams is None else beams[0]
+
+    @property
+    def beam_means(self) -> FloatArray | None:
+        """Mean of the beams' quantity in each group, shape (W,); None if unknown."""
+        groups = [beam_values(fit.setups) for fit in self.fits]
+        if self.beam_quantity is None or None in groups:
             return None
-        return np.array([np.mean(np.array(group, dtype=float)) for group in energies])
+        return np.array([np.mean(group[1]) for group in groups if group is not None])
 
     @property
     def times_of_flight(self) -> FloatArray | None:
-        """Time in s from the source to the object at each mean energy; None if not known."""
-        if self.energies is None:
+        """Time in s from the source to the object at each mean energy; None if unknown."""
+        quantity, means = self.beam_quantity, self.beam_means
+        if quantity is None or means is None:
             return None
         setups = [
-            fit.setups[0].model_copy(update={"energy": float(energy)})
-            for fit, energy in zip(self.fits, self.energies, strict=True)
+            fit.setups[0].model_copy(update={quantity.name: float(mean)})
+            for fit, mean in zip(self.fits, means, strict=True)
         ]
         times = np.array([getattr(setup, "time_of_flight", np.inf) for setup in setups])
         return times if np.isfinite(times).all() else None
@@ -82,7 +89,8 @@ class FitWindows:
             Dimensions window, component, y and x, and member for the images of a group. Fields are
             those that displace the first of all images; variables of each end with its name, as in
             ``displacement_B``, unless there is only one field. Coordinates along the windows are
-            the mean energy and the time of flight, where they are known, and the mean strength.
+            the mean strength and, where they are known, the mean energy or wavelength and the time
+            of flight.
         """
         import xarray as xr
 
@@ -105,7 +113,7 @@ class FitWindows:
     def added_to(self, dataset: xarray.Dataset) -> xarray.Dataset:
         """Return the dataset of a fit with these, their names beginning with ``window_``."""
         windows = self.to_dataset()
-        names = {*windows.data_vars, "energy", "time_of_flight", "strength"} & {*windows.variables}
+        names = {*windows.data_vars, *self._coordinates()}
         renamed = windows.rename({name: f"{PREFIX}{name}" for name in names})
         return dataset.assign_coords(renamed.coords).assign(renamed.data_vars)
 
@@ -135,9 +143,11 @@ class FitWindows:
         ]
         coordinates: dict[str, tuple[Sequence[float] | FloatArray | None, str, str]] = {
             "strength": (means, "1", "Mean displacement relative to the first image"),
-            "energy": (self.energies, "MeV", "Mean energy"),
             "time_of_flight": (self.times_of_flight, "s", "Time of flight from source to object"),
         }
+        if (quantity := self.beam_quantity) is not None:
+            mean = f"Mean {quantity.noun}"
+            coordinates[quantity.name] = self.beam_means, quantity.unit, mean
         return {
             name: ("window", np.array(values), label(unit, text))
             for name, (values, unit, text) in coordinates.items()

@@ -37,7 +37,7 @@ _KEY_PART = r"""(?:[A-Za-z0-9_-]+|"[^"\n]*"|'[^'\n]*')"""
 _DEEP_KEY = re.compile(
     rf"(?<![A-Za-z0-9_.-]){_KEY_PART}(?:[ \t]*\.[ \t]*{_KEY_PART}){{{_DEEPEST_KEY}}}"
 )
-_COMPLETE = {"energy", "source_object_distance", "object_image_distance"}
+_DISTANCES = {"source_object_distance", "object_image_distance"}
 
 
 @as_file_errors
@@ -126,12 +126,16 @@ def _make_radiograph(
 
 
 def _complete_setup(path: Path, geometry: dict[str, Any]) -> Setup | None:
-    if not (geometry.keys() >= _COMPLETE and {"pixel_size", "detector_pixel_size"} & set(geometry)):
-        return None
-    from napari_shadowinv.physics.setup import setup_from_dict
+    from napari_shadowinv.physics.setup import SETUPS, setup_from_dict
 
-    # A geometry with an energy belongs to a beam of particles.
-    return setup_from_dict({"kind": "proton", **geometry}, str(path))
+    # A geometry with an energy belongs to a beam of particles, with a wavelength to light.
+    kinds = [kind for kind, model in SETUPS.items() if model.beam_field in geometry]
+    has_pixels = not {"pixel_size", "detector_pixel_size"}.isdisjoint(geometry)
+    if not kinds or not (geometry.keys() >= _DISTANCES and has_pixels):
+        return None
+    names = geometry.keys() & SETUPS[kinds[0]].model_fields.keys()
+    entries = {name: geometry[name] for name in names}
+    return setup_from_dict({"kind": kinds[0], **entries}, str(path))
 
 
 def read_radiograph(

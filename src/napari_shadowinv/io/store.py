@@ -86,7 +86,9 @@ def columns_of_store(attributes: Mapping[Any, Any]) -> tuple[Column, ...]:
     """Return the columns of a store, by its attributes."""
     if fitted_field(attributes) is not None:
         return columns_of(FITS)
-    return columns_of(ROWS if OWN_SETUPS in attributes else INVERSIONS)
+    if OWN_SETUPS not in attributes:
+        return columns_of(INVERSIONS)
+    return columns_of(ROWS, json.loads(attributes.get("setup", "{}")).get("kind", "proton"))
 
 
 def _read_document(path: Path) -> dict[str, Any]:

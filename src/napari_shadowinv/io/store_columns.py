@@ -112,15 +112,6 @@ COLUMNS: tuple[Column, ...] = (
         format=".1f",
     ),
     Column(
-        "energy",
-        "MeV",
-        "Energy of the particles",
-        unit="MeV",
-        stores=(ROWS,),
-        value=lambda inversion: getattr(inversion.setup, "energy", None),
-        format="g",
-    ),
-    Column(
         "verdict",
         "verdict",
         "Whether the field may be believed",
@@ -213,13 +204,32 @@ COLUMNS: tuple[Column, ...] = (
 )
 
 
-def columns_of(store: str) -> tuple[Column, ...]:
-    """Return the columns of a kind of stores."""
-    return tuple(column for column in COLUMNS if store in column.stores)
+def columns_of(store: str, setup_kind: str = "proton") -> tuple[Column, ...]:
+    """Return the columns of a kind of stores, with the energy or wavelength of a table's shots."""
+    first, *others = (column for column in COLUMNS if store in column.stores)
+    beam = (_beam_column(setup_kind),) if store == ROWS else ()
+    return (first, *beam, *others)
+
+
+def _beam_column(setup_kind: str) -> Column:
+    from napari_shadowinv.physics.setup import SETUPS
+
+    quantity = SETUPS.get(setup_kind, SETUPS["proton"]).beam_quantity()
+    return Column(
+        quantity.name,
+        quantity.noun if quantity.unit == "m" else quantity.unit,
+        quantity.long_name,
+        unit=quantity.unit,
+        stores=(ROWS,),
+        value=lambda inversion: inversion.setup and inversion.setup.beam_value,
+        format="g",
+    )
 
 
 def column_values(store: str, result: Any) -> dict[str, Any]:
     """Return the values of a result by the columns' keys, for the shot's report."""
-    columns = (column for column in columns_of(store) if column.value is not None)
+    setup = getattr(result, "setup", None)
+    available = columns_of(store) if setup is None else columns_of(store, setup.kind)
+    columns = (column for column in available if column.value is not None)
     values = {column.key: column.value(result) for column in columns if column.value}
     return {key: value for key, value in values.items() if value is not None}

@@ -39,7 +39,7 @@ from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError
 
 _LONGEST_LINE = 4_000_000  # a row of 100 000 pixels with all their digits has 2.5 MB
-_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "mev": 1.0, "kev": 1e-3, "ev": 1e-6}
+_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "nm": 1e-9, "mev": 1.0, "kev": 1e-3, "ev": 1e-6}
 _UNITS |= dict.fromkeys(("um", "µm", "μm", "micron", "microns"), 1e-6)
 _ENERGY_UNITS = {"mev", "kev", "ev"}
 
@@ -54,6 +54,7 @@ _NAMES = {
 _KEYS = {key: name for name, keys in _NAMES.items() for key in keys.split()}
 # Plain words in other programs' files, where without a unit they mean something else.
 _KEYS_WITH_UNIT = {"s2r", "s2d", "bin", "ep"}
+_PARTICLE_ENERGY = "energy"  # without a unit in MeV
 _LONGEST_ENTRY = 200  # longer comments are prose
 _ENTRY = re.compile(
     r"^[#%\s]*(?P<key>[^\W\d][\w\- ()\[\]]*?)\s*(?P<sign>[=:]\s*|\s)(?P<value>[-+.\d].*)$"
@@ -204,27 +205,34 @@ def _is_number(word: str) -> bool:
 
 
 def _parse_geometry(path: Path, number: int, line: str) -> dict[str, float]:
-    """Return the geometry that a comment states, in m and MeV: one entry or none."""
+    """Return the geometry that a comment states, in the setup's units: one entry or none."""
+    from napari_shadowinv.physics.setup import beam_quantities
+
     entry = _ENTRY.match(line) if len(line) <= _LONGEST_ENTRY else None
     if entry is None:
         return {}
     words = [word for word in re.split(r"[\W_]+", entry["key"].lower()) if word]
     unit = words.pop() if len(words) > 1 and words[-1] in _UNITS else ""
-    name = _KEYS.get("_".join(words))
+    key, quantities = "_".join(words), beam_quantities()
+    name = key if key in quantities else _KEYS.get(key)
     value = _VALUE.match(entry["value"])
     unit = (value["unit"].lower() if value else "") or unit
-    if name is None or ("_".join(words) in _KEYS_WITH_UNIT and not unit):
+    needs_unit = key in _KEYS_WITH_UNIT or key in quantities.keys() - {_PARTICLE_ENERGY}
+    if name is None or (needs_unit and not unit):
         return {}
-    unit = unit or ("mev" if name == "energy" else "m")
-    fits = unit in _UNITS and (unit in _ENERGY_UNITS) == (name == "energy")
+    expected = quantities[name].unit.lower() if name in quantities else "m"
+    unit = unit or expected
+    fits = {unit, expected} <= _UNITS.keys() and (unit in _ENERGY_UNITS) == (
+        expected in _ENERGY_UNITS
+    )
     if value is not None and fits and _is_number(value["number"]):
-        return {name: float(value["number"]) * _UNITS[unit]}
+        return {name: float(value["number"]) * (_UNITS[unit] / _UNITS[expected])}
     if entry["sign"].isspace():
         # Prose that happens to begin with a key and a number.
         return {}
     raise FileFormatError(
         f"{path}, line {number} has {entry['value'][:30]!r} for {name}: expected a number and "
-        f"a unit such as {'14.7 MeV' if name == 'energy' else '1.4 cm'}; correct it"
+        f"a unit such as {'14.7 MeV' if expected in _ENERGY_UNITS else '1.4 cm'}; correct it"
     )
 
 

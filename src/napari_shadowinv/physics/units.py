@@ -4,7 +4,7 @@
 - their strongest points in words: `peak_facts`
 - the grey limits of an image: `intensity_limits`
 - a number with its error: `with_error`, `PeakError`
-- the prefix for a number: `prefix_for`; the units that take one: `PREFIXED_UNITS`
+- the prefix for a number: `prefix_for`; whether a unit takes one: `takes_prefix`
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from napari_shadowinv.facts import Fact
 from napari_shadowinv.physics.setup import SETUPS, Setup
 
 __all__ = [
-    "PREFIXED_UNITS",
     "PeakError",
     "ShownField",
     "intensity_limits",
@@ -29,6 +28,7 @@ __all__ = [
     "prefix_for",
     "shown_fields",
     "shown_potential",
+    "takes_prefix",
     "with_error",
 ]
 
@@ -39,13 +39,12 @@ _SAMPLED_PIXELS = 100_000
 
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 
-# The prefix of a power, such as m⁻², would be raised to that power.
-PREFIXED_UNITS = {
-    field.unit
-    for kind in SETUPS.values()
-    for field in kind.si_fields
-    if field.unit.replace(" ", "").isalpha()
-}
+
+def takes_prefix(unit: str) -> bool:
+    """Return whether a unit of a field in SI units may have a prefix."""
+    # The prefix of a power, such as m⁻², would be raised to that power.
+    units = {field.unit for kind in SETUPS.values() for field in kind.si_fields}
+    return unit in units and unit.replace(" ", "").isalpha()
 
 
 def prefix_for(largest: float, allowed: Collection[int] = tuple(_PREFIXES)) -> tuple[float, str]:

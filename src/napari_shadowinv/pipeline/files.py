@@ -62,15 +62,21 @@ def setup_from(
         defaults = {}
     elif defaults and "kind" not in defaults:
         # A text image contains distances, and the energy of particles, but not their species.
-        kinds = [kind for kind, model in SETUPS.items() if entries.keys() & model.own_fields()]
-        kind = entries.get("kind", kinds[-1] if kinds else "proton")
-        strange = () if kind == "proton" else SETUPS["proton"].own_fields()
+        kind = entries.get("kind") or _kind_of(entries) or _kind_of(defaults) or "proton"
+        others = (model.own_fields() for name, model in SETUPS.items() if name != kind)
+        strange = set().union(*others)
         defaults = {name: defaults[name] for name in defaults if name not in strange}
         defaults["kind"] = kind
     pixel_sizes = {"pixel_size", "detector_pixel_size"}
     if pixel_sizes & entries.keys():
         defaults = {name: value for name, value in defaults.items() if name not in pixel_sizes}
     return setup_from_dict({**defaults, **entries}, str(path))
+
+
+def _kind_of(entries: Mapping[str, Any]) -> str:
+    """Return the first kind of setup that alone has one of the entries, empty without one."""
+    kinds = (kind for kind, model in SETUPS.items() if entries.keys() & model.own_fields())
+    return next(kinds, "")
 
 
 def _map_files(recipe: Recipe, move: Any) -> Recipe:

@@ -39,18 +39,15 @@ from napari_shadowinv.preprocessing.image_checks import image_warnings
 from napari_shadowinv.provenance import Origin, Provenance, index_masks
 
 __all__ = [
-    "COMPARED",
     "FitInputs",
     "FitShot",
     "check_fit",
     "collect_fit_inputs",
+    "compared_fields",
     "run_comparison",
     "run_fit",
     "usual_fields",
 ]
-
-COMPARED = (("B",), ("E",), ("B", "E"))
-"""The choices of fields that `run_comparison` compares."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,11 +285,11 @@ def run_comparison(
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> tuple[Fit, ...]:
-    """Fit B alone, E alone and both, otherwise as `run_fit`; the likeliest comes first."""
+    """Fit each of the `compared_fields`, otherwise as `run_fit`; the likeliest comes first."""
     inputs = collect_fit_inputs(recipe, shots, fiducials=fiducials, should_stop=should_stop)
     fits = compare(
         **inputs.keywords,
-        choices=COMPARED,
+        choices=compared_fields(inputs.setups),
         options=inputs.options,
         on_progress=on_progress,
         should_stop=should_stop,
@@ -419,6 +416,13 @@ def _with_estimate(
     doubts: list[Caution] = []
     source = estimated_source(positioned, shot, should_stop, doubts.append)
     return replace(shot, source=source, warnings=(*shot.warnings, *doubts))
+
+
+def compared_fields(setups: Sequence[Setup] | None) -> tuple[tuple[str, ...], ...]:
+    """Return the choices of fields to compare: each cause of a deflection alone, and all."""
+    keys = tuple(cause.key for cause in setups[0].deflectors) if setups else ("B", "E")
+    alone = tuple((key,) for key in keys)
+    return (*alone, keys) if len(keys) > 1 else alone
 
 
 def usual_fields(setups: Sequence[Setup] | None) -> tuple[str, ...]:

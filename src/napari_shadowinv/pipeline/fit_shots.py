@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.setup import Setup, setup_from_dict
+from napari_shadowinv.physics.setup import Setup, beam_quantities, setup_from_dict
 from napari_shadowinv.pipeline.files import read_part, setup_from
 from napari_shadowinv.pipeline.fit_run import FitShot
 from napari_shadowinv.pipeline.shot_table import ShotRow
@@ -21,7 +21,7 @@ def read_rows(
     channel: str | None = None,
     variable: str | None = None,
 ) -> tuple[FitShot, ...]:
-    """Read the images of rows; energies complete the setups of the rows or the recipe.
+    """Read the images of rows, whose energies or wavelengths complete the setups.
 
     Parameters
     ----------
@@ -53,10 +53,10 @@ def _read(row: ShotRow, recipe: Recipe, channel: str | None, variable: str | Non
 def row_setup(row: ShotRow, shot: Radiograph, recipe: Recipe) -> Setup | None:
     """Return the setup of an image from its row, the recipe, or its file, in this order.
 
-    An `InputError` is raised if the row has an energy, no strength, and there is no setup to
-    complete it. With a strength, an energy without a setup is a name of the image.
+    An `InputError` is raised if the row has an energy or a wavelength, no strength, and there is no
+    setup to complete it. With a strength, an energy without a setup is a name of the image.
     """
-    changes = {} if row.energy is None else {"energy": row.energy}
+    changes = row.beam
     if row.setup is not None:
         return setup_from(row.setup, shot.metadata.get("geometry"), changes)
     setup = recipe.setup or shot.setup
@@ -64,7 +64,9 @@ def row_setup(row: ShotRow, shot: Radiograph, recipe: Recipe) -> Setup | None:
         return setup_from_dict({**setup.model_dump(), **changes}, str(row.file))
     if not changes or row.strength is not None:
         return None
+    nouns = " and ".join(beam_quantities()[name].noun for name in changes)
+    article = "an" if nouns[0] in "aeiou" else "a"
     raise InputError(
-        f"{row.file} has an energy of {row.energy:g} MeV and no setup: give the rest of the "
+        f"{row.file} has {article} {nouns} of {row.beam_text} and no setup: give the rest of the "
         "geometry with --setup"
     )

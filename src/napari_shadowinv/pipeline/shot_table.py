@@ -15,7 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from napari_shadowinv._system.safety import check_regular, small_text
 from napari_shadowinv._system.validation import CheckedModel, nearest, validated
@@ -23,6 +23,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import replacing, text_of
 from napari_shadowinv.io.formats import SITES
 from napari_shadowinv.options import MAX_STRENGTH, Noise
+from napari_shadowinv.physics.setup import beam_quantities
 
 __all__ = [
     "ShotRow",
@@ -38,7 +39,7 @@ __all__ = [
 
 _EXPECTED_FORMAT = "a table as comma-separated values"
 _MAX_HEADER_BYTES = 100_000
-_CONFIG = ConfigDict(frozen=True, extra="forbid")
+_BeamValue = Annotated[float, Field(gt=0, le=1e5)] | None
 
 
 def _strength(value: Any) -> Any:
@@ -60,19 +61,18 @@ def _is_number(text: str) -> bool:
 
 
 class ShotRow(CheckedModel):
-    """One image and its description."""
+    """One image and its description.
 
-    model_config = _CONFIG
+    It also takes the quantity of its beam in place of the setup's, ``energy`` (MeV) of particles or
+    ``wavelength`` (m) of light: the names in `beam_quantities`. If only strengths are given, the
+    quantity is a label.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+    __pydantic_extra__: dict[str, _BeamValue]
     file: Path = Field(title="Image", description="Its file.")
     setup: Path | None = Field(
         default=None, title="Setup", description="TOML file with the experimental geometry."
-    )
-    energy: float | None = Field(
-        default=None,
-        gt=0,
-        le=1e5,
-        title="Energy",
-        description="Energy in MeV, in place of the setup's; a label if only strengths are given.",
     )
     strength: Annotated[tuple[float, ...], BeforeValidator(_strength)] | None = Field(
         default=None,
@@ -114,6 +114,32 @@ class ShotRow(CheckedModel):
         default=False, title="Exclude", description="true, yes or 1 to leave the image out."
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_columns(cls, values: Any) -> Any:
+        unknown = set(values) - set(cls.columns()) if isinstance(values, Mapping) else set()
+        if unknown:
+            name = min(map(str, unknown))
+            raise ValueError(f"unknown key '{name}', {_suggest(name, cls.columns())}")
+        return values
+
+    @classmethod
+    def columns(cls) -> list[str]:
+        """Return the columns of a table of shots."""
+        first = ["file", "setup", *beam_quantities()]
+        return [*first, *(name for name in cls.model_fields if name not in first)]
+
+    @property
+    def beam(self) -> dict[str, float]:
+        """Energy or wavelength of the row, by name; empty without it."""
+        entries: dict[str, float | None] = self.model_extra or {}
+        return {name: value for name, value in entries.items() if value is not None}
+
+    @property
+    def beam_text(self) -> str:
+        """Energy or wavelength of the row with its unit; empty without it."""
+        return ", ".join(beam_quantities()[name].text(value) for name, value in self.beam.items())
+
     @property
     def source_file(self) -> Path | None:
         """The file of its source, if there is one."""
@@ -138,7 +164,7 @@ _FIT_COLUMNS = ("strength", "psf", "noise")
 
 
 class _Fiducial(CheckedModel):
-    model_config = _CONFIG
+    model_config = ConfigDict(frozen=True, extra="forbid")
     y: float
     x: float
     dy: float
@@ -236,7 +262,7 @@ def write_table(path: Path, rows: Sequence[ShotRow]) -> None:
             cells["strength"] = " ".join(f"{value:.17g}" for value in row.strength)
         if row.exclude:
             cells["exclude"] = "yes"
-    columns = [name for name in ShotRow.model_fields if any(name in cells for cells in table_cells)]
+    columns = [name for name in ShotRow.columns() if any(name in cells for cells in table_cells)]
     with (
         replacing(path, overwrite=True) as draft,
         Path(draft).open("w", newline="", encoding="utf-8") as file,
@@ -307,6 +333,11 @@ def _delimiter(header: str) -> str:
     return ";" if ";" in header else ","
 
 
+def _suggest(name: str, columns: list[str]) -> str:
+    match = nearest(name.lower(), columns)
+    return f"did you mean '{match}'?" if match else f"known are {', '.join(columns)}"
+
+
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -336,14 +367,10 @@ def rows_of(path: Path, model: type[Model], shared: Mapping[str, Any] | None = N
 
 
 def _check_header(path: Path, header: list[str], model: type[BaseModel]) -> None:
-    columns = list(model.model_fields)
+    columns = ShotRow.columns() if issubclass(model, ShotRow) else list(model.model_fields)
     for name in header:
         if name not in columns:
-            suggestion = nearest(name.lower(), columns)
-            hint = (
-                f"did you mean '{suggestion}'?" if suggestion else f"known are {', '.join(columns)}"
-            )
-            raise InputError(f"{path} has a column '{name}': {hint}")
+            raise InputError(f"{path} has a column '{name}': {_suggest(name, columns)}")
     for column, following in pairwise(sorted(header)):
         if column == following:
             raise InputError(f"{path} has the column '{column}' twice: expected it once")

@@ -23,7 +23,7 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.physics.labels import display_unit
-from napari_shadowinv.physics.units import PREFIXED_UNITS, prefix_for
+from napari_shadowinv.physics.units import prefix_for, takes_prefix
 from napari_shadowinv.plotting._panels import STYLE, choose_grid, image_scale, new_page
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def stack_frames(
         raise InputError(f"limits are {low:g} and {high:g}: the second must be larger")
     unit = str(field.attrs.get("units", ""))
     factor, prefix = 1.0, ""
-    if unit in PREFIXED_UNITS:
+    if takes_prefix(unit):
         factor, prefix = prefix_for(max(abs(low), abs(high)))
     label = f"{field.attrs.get('long_name', variable)} ({prefix}{display_unit(unit)})"
     shape = field.sizes["y"], field.sizes["x"]

@@ -172,9 +172,9 @@ def _images(windows: FitWindows, window: int) -> str:
 
 
 def _name(windows: FitWindows, window: int) -> str:
-    """Energy and time of flight of a group, or its images."""
-    energies, times = windows.energies, windows.times_of_flight
-    if energies is None:
+    """Energy or wavelength and time of flight of a group, or its images."""
+    quantity, means, times = windows.beam_quantity, windows.beam_means, windows.times_of_flight
+    if quantity is None or means is None:
         return _images(windows, window).capitalize()
     time = "" if times is None else f", {times[window] * 1e12:.3g} ps"
-    return f"{energies[window]:.4g} MeV{time}"
+    return f"{quantity.text(means[window])}{time}"

@@ -8,14 +8,10 @@ import numpy as np
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.store import DONE
+from napari_shadowinv.physics.setup import SETUPS
 
 if TYPE_CHECKING:
     import xarray
-
-_AVERAGED = """
-    potential displacement potential_si deflection_angle path_integrated_b path_integrated_e
-    line_integrated_log_index line_integrated_density
-"""
 
 
 def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
@@ -50,7 +46,9 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
     """
     import xarray as xr
 
-    names = [name for name in _AVERAGED.split() if name in stack and "shot" in stack[name].dims]
+    in_si = [field.name for kind in SETUPS.values() for field in kind.si_fields]
+    fields = dict.fromkeys(["potential", "displacement", *in_si])
+    names = [name for name in fields if name in stack and "shot" in stack[name].dims]
     if not names:
         raise InputError(
             "the dataset has no fields of a series of shots: expected one from invert_stack, "

@@ -114,7 +114,7 @@ def test_a_table_is_shown_changed_and_inverted(
     in_si = np.hypot(*stack["path_integrated_b"].values[1])
     np.testing.assert_allclose(second / second.max(), in_si / in_si.max(), atol=1e-6)
     # The file is as it was.
-    assert table_rows(pack)[0].energy == 9
+    assert table_rows(pack)[0].beam == {"energy": 9}
 
 
 def test_a_changed_row_is_noticed_when_the_run_goes_on(
@@ -174,7 +174,7 @@ def test_the_rows_are_saved_as_they_are_shown(
     )
     tool.shots.table.save_button.click()
     rows = table_rows(folder / "new.csv")
-    assert [row.energy for row in rows] == [6.0, None, 30.0]
+    assert [row.beam.get("energy") for row in rows] == [6.0, None, 30.0]
     assert [row.brightness for row in rows] == [1.5, 0.8, None]
     assert [row.exclude for row in rows] == [False, False, True]
     assert [row.file.resolve() for row in rows] == [

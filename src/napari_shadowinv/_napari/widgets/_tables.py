@@ -21,18 +21,18 @@ from qtpy.QtWidgets import (
 )
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.widgets._editors import format_number, parse_number, unit_of_title
+from napari_shadowinv._napari.widgets._editors import format_number, parse_number
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, PathEdit, labelled, small_button
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, kind_of, stack_of
 from napari_shadowinv._napari.widgets._qt import column, notify_errors, side_by_side, while_alive
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import SITES
-from napari_shadowinv.physics.setup import SETUPS, Setup
+from napari_shadowinv.physics.setup import SETUPS, BeamQuantity, Setup, beam_quantities
 from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table
 
 _MAX_SHOWN_ROWS = 8
-_UNITS_IN_HEADING = ("MeV", "px")
+_PREFIXED_UNIT = "m"  # cells show it, with the prefix of each number
 _PROBLEM_COLOUR = QColor(PROBLEM_STYLE.removeprefix("color: ").removesuffix(";"))
 
 
@@ -49,7 +49,8 @@ class Column:
 
     @property
     def heading(self) -> str:
-        return f"{self.title} ({self.unit})" if self.unit in _UNITS_IN_HEADING else self.title
+        unit = "" if self.unit == _PREFIXED_UNIT else self.unit
+        return f"{self.title} ({unit})" if unit else self.title
 
 
 class NumberTable(QTableWidget):
@@ -114,7 +115,7 @@ class NumberTable(QTableWidget):
             item.setData(Qt.ItemDataRole.UserRole, value if is_number else None)
             if not is_number:
                 item.setText(value or "")
-            elif spec.unit and spec.unit not in _UNITS_IN_HEADING:
+            elif spec.unit == _PREFIXED_UNIT:
                 item.setText(format_number(value, spec.unit))
             else:
                 item.setText(f"{value:.6g}")
@@ -164,19 +165,20 @@ _IMAGE_COLUMNS = (
         0.0,
     ),
 )
-_BEAM_FIELDS = {"proton": "energy", "optical": "wavelength"}
 
 
 def beam_column(kind: str) -> Column:
     """Return the column for a kind of setup; without a setup, the relative displacement."""
-    if kind not in _BEAM_FIELDS:
+    if kind not in SETUPS:
         tip = "Displacement in this image relative to the first image, such as 0.6."
         return Column("strength", "Strength", "", tip, _BEAM_WIDTH_PX)
-    name = _BEAM_FIELDS[kind]
-    field = SETUPS[kind].model_fields[name]
-    title, unit = unit_of_title(field.title or name)
-    last_word = title.split()[-1].capitalize()
-    return Column(name, last_word, unit, str(field.description), _BEAM_WIDTH_PX)
+    quantity = SETUPS[kind].beam_quantity()
+    return _quantity_column(quantity, quantity.description)
+
+
+def _quantity_column(quantity: BeamQuantity, tip: str) -> Column:
+    title = quantity.noun.capitalize()
+    return Column(quantity.name, title, quantity.unit, tip, _BEAM_WIDTH_PX)
 
 
 @dataclass(frozen=True)
@@ -289,8 +291,8 @@ class ImageTable(QWidget):
         editable = Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsEditable
         for number, row in enumerate(self.rows):
             is_reference = row == self._reference
-            beam = value if is_reference and kind in _BEAM_FIELDS else self._beam_of(row)
-            if is_reference and kind not in _BEAM_FIELDS:
+            beam = value if is_reference and kind in SETUPS else self._beam_of(row)
+            if is_reference and kind not in SETUPS:
                 beam = 1.0
             self.table.write(number, _BEAM, beam)
             for cell, spec in enumerate(_IMAGE_COLUMNS, _BRIGHTNESS):
@@ -374,7 +376,6 @@ def _setup_summary(row: ImageRow) -> str:
 
 
 _SHOT_COLUMNS = (
-    Column("energy", "Energy", "MeV", "Energy of the particles; empty for the setup's energy.", 92),
     Column(
         "brightness",
         "Brightness",
@@ -391,7 +392,7 @@ _SHOT_COLUMNS = (
         90,
     ),
 )
-_MASK = len(_SHOT_COLUMNS)
+_MASK = 1 + len(_SHOT_COLUMNS)
 _FILE_FILTER = "tables (*.csv)"
 
 
@@ -412,11 +413,12 @@ class ShotTable(QWidget):
         self._loaded = ""
         self.file = _TableEdit("Table of the shots", "shots.csv")
         self.file.edit.setToolTip(
-            "<qt>A table (.csv) with a row for each shot and the columns file, energy, setup, "
-            "brightness, mask, source, exclude.</qt>"
+            "<qt>A table (.csv) with a row for each shot and the columns file, setup, energy "
+            "or wavelength, brightness, mask, source, exclude.</qt>"
         )
         self.save_button = small_button("Save…", "Save the rows as a table (.csv).", self._save)
-        self.table = NumberTable("Shot", _SHOT_COLUMNS)
+        self._kind = "proton"
+        self.table = NumberTable("Shot", self._columns)
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
         column(self, labelled("", side_by_side((self.file, 1), (self.save_button, 0))), self.table)
         self.file.changed.connect(self._load)
@@ -430,14 +432,32 @@ class ShotTable(QWidget):
         if not self._rows:
             raise InputError(
                 "no table is selected: choose a .csv file with a row for each shot, with the "
-                "columns file and energy"
+                "columns file and energy or wavelength"
             )
         return [self._row(number) for number in range(len(self._rows))]
+
+    def show_kind(self, kind: str) -> None:
+        """Show the column for the beams of a kind of setup, unless the table has another."""
+        if kind not in SETUPS or kind == self._kind:
+            return
+        try:
+            rows = [self._row(number) for number in range(len(self._rows))]
+        except InputError:
+            return  # entries stay for correction
+        self._kind, self._rows = kind, rows
+        self._fill()
+
+    @property
+    def _columns(self) -> tuple[Column, ...]:
+        names = [name for row in self._rows for name in row.beam]
+        quantity = beam_quantities()[[*names, SETUPS[self._kind].beam_field][0]]
+        tip = f"{quantity.long_name}; empty for the setup's {quantity.noun}."
+        return (_quantity_column(quantity, tip), *_SHOT_COLUMNS)
 
     def _row(self, number: int) -> ShotRow:
         row = self._rows[number]
         changes: dict[str, Any] = {"exclude": not self.table.is_checked(number)}
-        for cell, spec in enumerate(_SHOT_COLUMNS[:-1], 1):
+        for cell, spec in enumerate(self._columns[:-1], 1):
             changes[spec.name] = self.table.number(number, cell)
         mask = self.table.item(number, _MASK).text().strip()
         if not mask or row.mask is None or mask != row.mask.name:
@@ -465,12 +485,15 @@ class ShotTable(QWidget):
             self._fill()
 
     def _fill(self) -> None:
+        columns = self._columns
+        self.table.set_columns(columns)
         with QSignalBlocker(self.table):
             self.table.setRowCount(len(self._rows))
             for number, row in enumerate(self._rows):
+                values = {"brightness": row.brightness, **row.beam}
                 self.table.fill_row(number, row.file.name, _tip(row), checked=not row.exclude)
-                for cell, spec in enumerate(_SHOT_COLUMNS[:-1], 1):
-                    self.table.write(number, cell, getattr(row, spec.name))
+                for cell, spec in enumerate(columns[:-1], 1):
+                    self.table.write(number, cell, values.get(spec.name))
                 self.table.write(number, _MASK, "" if row.mask is None else row.mask.name)
         self.table.setVisible(bool(self._rows))
         self.save_button.setEnabled(bool(self._rows))

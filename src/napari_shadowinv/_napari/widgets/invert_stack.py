@@ -291,6 +291,7 @@ class InvertStack(InversionInputs, ToolPanel):
 
     def _connect(self) -> None:
         self.shots.changed.connect(self._on_layer)
+        self.setup.changed.connect(self._show_beams)
         for part in (*self.inputs, self.engine):
             part.changed.connect(self.keep)
         self.panel.runner.progressed.connect(self._on_progress)
@@ -467,6 +468,9 @@ class InvertStack(InversionInputs, ToolPanel):
         self.panel.status.setToolTip(str(request.job.out.absolute()))
 
     # Layers
+
+    def _show_beams(self) -> None:
+        self.shots.table.show_kind(self.setup.picker.kind)
 
     def _on_layer(self) -> None:
         layer = self.shots.layer

@@ -2,7 +2,8 @@
 
 - describe an experiment: `ProtonSetup`, `OpticalSetup`; any of them: `Setup`, by kind `SETUPS`
 - how a kind of setup is described: `BeamSetup`, `SIField`, `MainField`, `Deflector`,
-  `BeamQuantity`; of all kinds: `deflector_titles`, `beam_quantities`
+  `BeamQuantity`; of all kinds: `deflector_titles`, `beam_quantities`; of some setups:
+  `beam_values`
 - get it back from a file's content: `setup_from_dict`; with larger pixels: `binned_setup`
 - convert pixels to SI and back: methods of `BeamSetup`; path-integrated fields: of `ProtonSetup`;
   line integrals of the refractive index or the density: of `OpticalSetup`
@@ -26,7 +27,7 @@ proportional to it (∫ln η dz, ∫n dz) are relative to the place where the po
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, SerializeAsAny, ValidationError
@@ -72,6 +73,7 @@ __all__ = [
     "Setup",
     "Species",
     "beam_quantities",
+    "beam_values",
     "binned_setup",
     "deflection_warnings",
     "deflector_titles",
@@ -123,6 +125,16 @@ def beam_quantities() -> dict[str, BeamQuantity]:
     """Return the quantities that differ between beams, by name, for all kinds of setup."""
     quantities = (kind.beam_quantity() for kind in SETUPS.values())
     return {quantity.name: quantity for quantity in quantities}
+
+
+def beam_values(setups: Sequence[Setup]) -> tuple[BeamQuantity, tuple[float, ...]] | None:
+    """Return the quantity that differs between beams, and its values; None without setups.
+
+    Setups of several kinds have no such quantity.
+    """
+    if len({type(setup) for setup in setups}) != 1:
+        return None
+    return setups[0].beam_quantity(), tuple(setup.beam_value for setup in setups)
 
 
 def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> Setup:

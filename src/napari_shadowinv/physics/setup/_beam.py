@@ -87,9 +87,15 @@ class BeamQuantity:
     long_name: str
     description: str
 
-    def text(self, value: float) -> str:
-        """Return a value with its unit, such as "14.7 MeV" or "810 nm"."""
-        return length_text(value) if self.unit == "m" else f"{value:.4g} {self.unit}"
+    @property
+    def plural(self) -> str:
+        """Noun for several values, such as "energies"."""
+        return f"{self.noun[:-1]}ies" if self.noun.endswith("y") else f"{self.noun}s"
+
+    def text(self, *values: float, digits: int = 4) -> str:
+        """Return values with their unit, such as "14.7 MeV" or "532, 810 nm"."""
+        size, unit = length_unit(max(values)) if self.unit == "m" else (1.0, self.unit)
+        return f"{', '.join(f'{value / size:.{digits}g}' for value in values)} {unit}"
 
 
 def positive_field(title: str, description: str, default: Any = ..., *, most: float) -> Any:
