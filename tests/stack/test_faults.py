@@ -116,7 +116,7 @@ def read_text(path: Path) -> str:
 DRIVER = """
     import sys
     import numpy as np
-    from napari_shadowinv import InversionOptions, run_stack
+    from napari_shadowinv import InversionOptions, Recipe, run_stack
     from helpers.slow_reading import hang_once
 
     folder, out, address = sys.argv[1:]
@@ -124,7 +124,7 @@ DRIVER = """
         f"{folder}/shot_*.npy",
         out,
         source=np.load(f"{folder}/source.npy"),
-        options=InversionOptions(n_sites=100),
+        recipe=Recipe(options=InversionOptions(n_sites=100)),
         reader=hang_once,
         scheduler=address,
     )
