@@ -10,6 +10,8 @@ from napari_shadowinv._system.validation import CheckedModel
 
 __all__ = ["RunOptions", "WatchOptions"]
 
+_RARE: Any = {"panel": "Rarely used options of a run"}
+
 
 class _StoreOptions(CheckedModel):
     """Choices of a store, and of a run that resumes it."""
@@ -28,6 +30,7 @@ class _StoreOptions(CheckedModel):
         default="float32",
         title="Stored type",
         description="Type of stored images; sites, weights and scalars keep 64 bits.",
+        json_schema_extra=_RARE,
     )
     overwrite: bool = Field(
         default=False, title="Overwrite", description="Discard the content of the store."
@@ -108,11 +111,13 @@ class WatchOptions(_StoreOptions):
         title="Settling time (s)",
         description="Seconds without a change after which a file is complete, where the system "
         "does not report that it was closed (network file systems, macOS, Windows).",
+        json_schema_extra=_RARE,
     )
     polling: bool = Field(
         default=False,
         title="Polling",
         description="Poll the folder once a second instead of relying on file-system events.",
+        json_schema_extra=_RARE,
     )
     idle: float | None = Field(
         default=None,
