@@ -9,7 +9,7 @@ import pytest
 from helpers.command_line import flat, shadowinv
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.pipeline import read_pack
-from napari_shadowinv.pipeline.new_pack import NewPack, draft_pack, write_new_pack
+from napari_shadowinv.pipeline.film_files import NewPack, draft_pack, write_new_pack
 
 TABLE = "Dose,Red,Green,Blue\n1,30000,31000,29000\n10,20000,24000,26000\n100,8000,12000,20000\n"
 

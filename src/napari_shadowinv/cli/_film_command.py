@@ -126,7 +126,7 @@ def film(
 
 def _write_new(folder: Path, pack: Path | None, overwrite: bool) -> None:
     """Write a pack file for a folder of scans, and list the entries to complete."""
-    from napari_shadowinv.pipeline.new_pack import draft_pack, missing_entries, write_new_pack
+    from napari_shadowinv.pipeline.film_files import draft_pack, missing_entries, write_new_pack
 
     if pack is not None:
         raise InputError(

@@ -2,27 +2,45 @@
 
 - read the description of a pack: `read_pack`
 - write its layers as images with a table: `write_layers`
+
+A first description of a film pack from a folder of scans.
+
+- the layers in the order of the scans' names, and the calibrations of the folder: `draft_pack`
+- the entries still to be added: `missing_entries`
+- the same as a file: `write_new_pack`
 """
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.film import Pack, PackLayer
+from napari_shadowinv.film import Calibration, Pack, PackLayer
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read_toml, replacing, write
-from napari_shadowinv.io.formats import PRADFORMAT, SITES, TIFF
+from napari_shadowinv.io.formats import PRADFORMAT, SCAN_SUFFIXES, SITES, TIFF
 from napari_shadowinv.io.pradformat import write_radiograph
 from napari_shadowinv.pipeline.shot_table import rows_of
 
-__all__ = ["LAYERS_TABLE", "read_pack", "write_layers"]
+__all__ = [
+    "LAYERS_TABLE",
+    "PACK_FILE",
+    "NewPack",
+    "draft_pack",
+    "missing_entries",
+    "read_pack",
+    "write_layers",
+    "write_new_pack",
+]
+
 
 LAYERS_TABLE = f"layers{SITES.suffix}"
 _COLUMNS = ("file", "mask", "setup", "energy", "strength", "exclude")
@@ -157,3 +175,153 @@ def _map_files(pack: Pack, move: Callable[[Path], Path]) -> Pack:
     return Pack.model_validate(
         {**dict(with_moved(pack, "scan", "corners", "fiducials")), **changes}
     )
+
+
+PACK_FILE = "pack.toml"
+_UNEXPOSED_NAME = re.compile("unexposed|blank|background", re.IGNORECASE)
+
+
+class NewPack(BaseModel):
+    """Facts about a pack that its scans do not show."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    film: Literal["HDV2", "EBT3", "MDV3"] = Field(
+        default="HDV2",
+        title="Film type",
+        description="Type of films whose file name does not contain another one.",
+    )
+    seen_from: Literal["source", "detector"] | None = Field(
+        default=None,
+        title="Films seen from",
+        description="Side from which the upright films are seen; decides the sign of B.",
+    )
+    source_object_distance: float | None = Field(
+        default=None,
+        gt=0,
+        title="Source to object (m)",
+        description="Without distances, results are in px.",
+    )
+    object_image_distance: float | None = Field(
+        default=None, gt=0, title="Object to first film (m)", description="Along the beam."
+    )
+
+
+def draft_pack(
+    folder: Path,
+    facts: NewPack | None = None,
+    layers: Sequence[Mapping[str, Any]] | None = None,
+) -> dict[str, Any]:
+    """Return the entries of a pack file for the scans of a folder, or for `layers` of them.
+
+    Without layers, each scan is one, in the order of the names (film_2 before film_10), without
+    filters. A scan that is named after a film type, or with "unexposed" or "blank", shows
+    unexposed film. A table (.csv) that can be read as a calibration belongs to the type in its
+    name, or to all types.
+
+    Raises
+    ------
+    FileFormatError
+        If the folder cannot be read.
+    InputError
+        If it has no scans, or only one of two distances is given.
+    """
+    facts = facts or NewPack()
+    folder = Path(folder)
+    try:
+        files = sorted((path for path in folder.iterdir() if path.is_file()), key=_natural_key)
+    except OSError as error:
+        raise FileFormatError(
+            f"{folder} cannot be read as a folder ({error.strerror}): choose the folder of the "
+            "scans"
+        ) from None
+    types = NewPack.model_fields["film"].annotation.__args__  # type: ignore[union-attr]
+    scans = [path for path in files if path.suffix.lower() in SCAN_SUFFIXES]
+    unexposed = [p for p in scans if p.stem in types or _UNEXPOSED_NAME.search(p.stem)]
+    scans = [path for path in scans if path not in unexposed]
+    if not scans:
+        raise InputError(f"{folder} has no scans of films: expected images in colour, such as TIFF")
+    tables = [path for path in files if path.suffix.lower() in SITES.suffixes]
+    calibrations = [path for path in tables if _is_calibration(path)]
+    layer_entries = layers or [
+        {"film": _film_type_of(path, types) or facts.film, "filters": [], "file": path.name}
+        for path in scans
+    ]
+    films: dict[str, dict[str, str]] = {}
+    for kind in sorted({str(layer["film"]) for layer in layer_entries}):
+        parts = {"calibration": calibrations, "unexposed": unexposed}
+        films[kind] = {
+            part: path.name
+            for part, candidates in parts.items()
+            if (path := _file_for_type(kind, candidates, types)) is not None
+        }
+    entries: dict[str, Any] = {}
+    if facts.seen_from is not None:
+        entries["seen_from"] = facts.seen_from
+    distances = {
+        name: getattr(facts, name) for name in ("source_object_distance", "object_image_distance")
+    }
+    if None not in distances.values():
+        entries["setup"] = distances
+    elif any(value is not None for value in distances.values()):
+        raise InputError("only one of two distances is given: give both, or none")
+    return {**entries, "films": {kind: parts for kind, parts in films.items() if parts}} | {
+        "layers": [dict(layer) for layer in layer_entries]
+    }
+
+
+def missing_entries(entries: Mapping[str, Any]) -> list[str]:
+    """Return the missing and recommended entries of a pack, one clause for each."""
+    missing = []
+    if not any(layer["filters"] for layer in entries["layers"]):
+        missing.append("filters: those in front of each film, such as 13 um Al; 25 um Fe")
+    for kind in sorted({layer["film"] for layer in entries["layers"]}):
+        if "calibration" not in entries["films"].get(kind, {}):
+            missing.append(f"calibration of {kind}: a table (.csv) of doses and pixels")
+    if "seen_from" not in entries:
+        missing.append("seen_from: source or detector, which decides the sign of B")
+    if "setup" not in entries:
+        missing.append("setup: distances, without which results are in px")
+    return missing
+
+
+def write_new_pack(folder: Path, entries: Mapping[str, Any], *, overwrite: bool = False) -> Path:
+    """Write the entries of a pack to ``pack.toml`` of a folder, and return its path.
+
+    Raises
+    ------
+    FileFormatError
+        If the file exists, unless `overwrite`, or cannot be written.
+    InputError
+        If the entries do not describe a pack; the message names the reason.
+    """
+    import tomli_w
+
+    path = Path(folder) / PACK_FILE
+    validated(Pack, dict(entries), str(path))
+    with replacing(path, overwrite) as unfinished:
+        Path(unfinished).write_text(tomli_w.dumps(dict(entries)), encoding="utf-8")
+    return path
+
+
+def _natural_key(path: Path) -> list[tuple[int, str]]:
+    """Sort key that takes digits as numbers."""
+    parts = re.findall(r"\d+|\D+", path.name.lower())
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+
+def _film_type_of(path: Path, types: tuple[str, ...]) -> str | None:
+    return next((kind for kind in types if kind.lower() in path.stem.lower()), None)
+
+
+def _file_for_type(kind: str, candidates: list[Path], types: tuple[str, ...]) -> Path | None:
+    """Return a file named after a type of film, or else one named after none."""
+    matching = [path for path in candidates if _film_type_of(path, types) == kind]
+    return next(iter(matching or [p for p in candidates if _film_type_of(p, types) is None]), None)
+
+
+def _is_calibration(path: Path) -> bool:
+    try:
+        Calibration.from_csv(path)
+    except (FileFormatError, InputError):
+        return False
+    return True

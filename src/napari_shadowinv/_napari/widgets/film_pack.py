@@ -49,7 +49,7 @@ from napari_shadowinv.io import write
 from napari_shadowinv.io.formats import RESULT
 from napari_shadowinv.io.images import Scan, read_scan
 from napari_shadowinv.pipeline import read_pack, write_layers
-from napari_shadowinv.pipeline.new_pack import (
+from napari_shadowinv.pipeline.film_files import (
     PACK_FILE,
     NewPack,
     draft_pack,
