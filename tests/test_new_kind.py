@@ -29,8 +29,7 @@ from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import FitShot, read_recipe, run_fit, write_recipe
 from napari_shadowinv.pipeline.files import setup_from
-from napari_shadowinv.pipeline.fit_run import compared_fields
-from napari_shadowinv.pipeline.refinement import refinement_choices, run_refinement
+from napari_shadowinv.pipeline.fit_run import compared_fields, refinement_choices, run_refinement
 from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table
 from napari_shadowinv.pipeline.static_checks import run_windows
 from napari_shadowinv.preprocessing import Recipe

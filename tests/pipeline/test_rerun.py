@@ -29,8 +29,8 @@ from napari_shadowinv.pipeline import (
     run_refinement,
     write_layers,
 )
+from napari_shadowinv.pipeline.fit_run import refinement_choices
 from napari_shadowinv.pipeline.fit_shots import read_rows
-from napari_shadowinv.pipeline.refinement import refinement_choices
 from napari_shadowinv.pipeline.rerun import provenance_of
 from napari_shadowinv.pipeline.shot_table import shot_rows
 from napari_shadowinv.pipeline.static_checks import run_checks

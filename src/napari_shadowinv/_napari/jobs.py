@@ -31,8 +31,8 @@ from napari_shadowinv.fitting import Fit, FitOptions
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline import Cache, FitShot, run_fit, run_refinement
+from napari_shadowinv.pipeline.fit_run import refinement_choices
 from napari_shadowinv.pipeline.inversion_run import run
-from napari_shadowinv.pipeline.refinement import refinement_choices
 from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 if TYPE_CHECKING:

@@ -30,9 +30,8 @@ from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.results import result_from_dataset
 from napari_shadowinv.pipeline._film import run_film
 from napari_shadowinv.pipeline.files import read_part
-from napari_shadowinv.pipeline.fit_run import FitShot, run_fit
+from napari_shadowinv.pipeline.fit_run import FitShot, run_fit, run_refinement
 from napari_shadowinv.pipeline.inversion_run import Shot, picture_mask, radiograph_of, run
-from napari_shadowinv.pipeline.refinement import run_refinement
 from napari_shadowinv.pipeline.static_checks import StaticChecks, run_checks
 from napari_shadowinv.preprocessing import MeasuredSource, Radiograph, Recipe
 from napari_shadowinv.provenance import MaskOrigin, Origin, Provenance
