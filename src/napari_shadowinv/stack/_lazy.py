@@ -17,8 +17,8 @@ from napari_shadowinv.io.store import with_places
 from napari_shadowinv.io.store_columns import INVERSIONS, column_values, columns_of
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack import _plan
+from napari_shadowinv.stack._plan import choose_sites
 from napari_shadowinv.stack._shots import Stack
-from napari_shadowinv.stack._site_count import choose_sites
 from napari_shadowinv.stack._sources import Reader, Shot, read_shot
 from napari_shadowinv.stack._worker import Beam, Work
 

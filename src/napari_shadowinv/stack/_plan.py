@@ -1,4 +1,7 @@
-"""Description of a stack before any shot is inverted: `describe_stack` returns a `Stack`."""
+"""Description of a stack before any shot is inverted: `describe_stack` returns a `Stack`.
+
+Number of sites of a stack from the accuracy: `choose_sites`.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,10 +23,12 @@ from napari_shadowinv._system.arrays import (
     unpack_array,
     unpack_mask,
 )
+from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import check_instance
-from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.normalise import bytes_per_pixel, checked_source
+from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.inversion import Inversion, count_sites
+from napari_shadowinv.inversion.normalise import bytes_per_pixel, checked_source, number_of_sites
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.store import FORMAT
@@ -56,6 +61,49 @@ from napari_shadowinv.stack._worker import Beam, shared_plan, threads_here
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
+
+
+MAX_TRIED_SHOTS = 10  # at the beginning of a stack
+_DECIDING_SHOTS = 3
+
+
+def choose_sites(stack: Stack, should_stop: ShouldStop | None = None) -> Stack:
+    """Return the stack with the number of sites that its first shots need.
+
+    All shots that share a beam then share the sites. Shots that cannot be inverted are skipped; if
+    all of them are, the number is the default without an accuracy.
+    """
+    if not stack.chooses_sites:
+        return stack
+    return with_enough_sites(stack, needed_shares(stack, should_stop))
+
+
+def needed_shares(stack: Stack, should_stop: ShouldStop | None = None) -> list[float]:
+    """Return the share of the default number of sites that each of the first shots needs."""
+    assert stack.beam is not None
+    options = stack.recipe.options
+    most = count_sites(stack.beam.image, options, mask=stack.beam.mask)
+    work, needed = stack.work(()), []
+    for shot in stack.shots.items[:MAX_TRIED_SHOTS]:
+        try:
+            content, _ = shot.load()
+            inversion = work.invert(content, stack.beam, workers=1, should_stop=should_stop)
+        except InversionCancelled:
+            raise
+        except Exception:  # the error is reported when it is its turn
+            continue
+        needed.append(cast("Inversion", inversion).report.n_sites / most)
+        if len(needed) == _DECIDING_SHOTS:
+            break
+    return needed
+
+
+def with_enough_sites(stack: Stack, shares: list[float]) -> Stack:
+    """Return the stack with enough sites for each of these shares."""
+    # A margin has its own sites, which are not counted here.
+    most = number_of_sites(stack.shape, stack.recipe.options)
+    return stack.with_sites(max(4, round(max(shares, default=1.0) * most)))
+
 
 # Variables that are stored of an inversion, and of a fit, by default.
 STORED = ("potential", "displacement", "caustic")

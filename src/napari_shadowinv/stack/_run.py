@@ -29,10 +29,9 @@ from napari_shadowinv.io.store_writing import (
 from napari_shadowinv.options import RunOptions
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._engines import Engine, WorkerDiedError, engine_for, is_local
-from napari_shadowinv.stack._plan import STORED, describe_stack
+from napari_shadowinv.stack._plan import STORED, choose_sites, describe_stack
 from napari_shadowinv.stack._resume import append_shots, contents_of, reopen_damaged, resume
 from napari_shadowinv.stack._shots import Stack
-from napari_shadowinv.stack._site_count import choose_sites
 from napari_shadowinv.stack._sources import Reader, read_shot
 from napari_shadowinv.stack._status import OnStatus, RunStatus
 from napari_shadowinv.stack._worker import ShotOutcome, TaskContext, run_shots

@@ -26,9 +26,9 @@ from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.io.store_writing import GrowingStore, create_store
 from napari_shadowinv.stack._discovery import Shots
 from napari_shadowinv.stack._folder_events import Arrivals
+from napari_shadowinv.stack._plan import MAX_TRIED_SHOTS, needed_shares, with_enough_sites
 from napari_shadowinv.stack._resume import NUMBERED_AS_ARRIVED, contents_of, match_store
 from napari_shadowinv.stack._shots import FitStack, Stack
-from napari_shadowinv.stack._site_count import MAX_TRIED_SHOTS, needed_shares, with_enough_sites
 from napari_shadowinv.stack._sources import FileShot, Reader, Shot, stamp
 from napari_shadowinv.stack._status import WATCHING, OnStatus, RunStatus
 from napari_shadowinv.stack._worker import Attempt, ShotOutcome, failure_text, try_shot, write_shot
