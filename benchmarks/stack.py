@@ -33,7 +33,7 @@ from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import Cache
 from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import ShotOutcome, read_shot
-from napari_shadowinv.stack._local import local_client
+from napari_shadowinv.stack._engines import local_client
 
 BURNER = Path(__file__).resolve().parents[2] / "shared" / "data" / "burner" / "data"
 

@@ -17,8 +17,7 @@ import pytest
 from distributed import Client, Security
 from distributed.comm import connect
 
-from napari_shadowinv.stack._engines import EngineError, engine_for
-from napari_shadowinv.stack._local import local_client
+from napari_shadowinv.stack._engines import EngineError, engine_for, local_client
 
 ROUNDS = 200
 
