@@ -32,7 +32,7 @@ from napari_shadowinv import (
 from napari_shadowinv._system.locking import locked
 from napari_shadowinv.cli import _watch
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
-from napari_shadowinv.stack import RunStatus, _folder_events, _watch_loop
+from napari_shadowinv.stack import RunStatus, _folder_events, watch
 
 IMAGES, SOURCE = make_shots(6)
 SETTLE = 0.1
@@ -99,7 +99,7 @@ def folder(tmp_path: Path, compiled: None) -> Path:
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """End at once when asked to."""
-    monkeypatch.setattr(_watch_loop, "_POLL_S", 0.02)
+    monkeypatch.setattr(watch, "_POLL_S", 0.02)
     monkeypatch.setattr(_folder_events, "_FOLDER_CHECK_S", 0.1)
 
 

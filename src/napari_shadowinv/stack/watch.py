@@ -1,35 +1,386 @@
-"""Watch a folder and invert each shot into a store as soon as it arrives: `watch_stack`."""
+"""Watch a folder and invert each shot into a store as soon as it arrives: `watch_stack`.
+
+The loop over files that arrive in a watched folder: `Watch`.
+
+- the description of the stack from its first files: `StackMaker`
+"""
 
 from __future__ import annotations
 
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.locking import locked
-from napari_shadowinv._system.machine import clear_up_when_terminated
+from napari_shadowinv._system.machine import clear_up_when_terminated, defer_interrupts
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
-from napari_shadowinv.io.store import check_store_path
-from napari_shadowinv.io.store_writing import remove_unfinished
+from napari_shadowinv.io.files import sha256, text_of
+from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_store_path
+from napari_shadowinv.io.store_writing import GrowingStore, create_store, remove_unfinished
 from napari_shadowinv.options import WatchOptions
+from napari_shadowinv.stack._discovery import Shots
 from napari_shadowinv.stack._folder_events import Arrivals, checked_folder, observing
-from napari_shadowinv.stack._plan import describe_stack
+from napari_shadowinv.stack._plan import (
+    MAX_TRIED_SHOTS,
+    describe_stack,
+    needed_shares,
+    with_enough_sites,
+)
+from napari_shadowinv.stack._resume import NUMBERED_AS_ARRIVED, contents_of, match_store
 from napari_shadowinv.stack._run import stored_variables
-from napari_shadowinv.stack._sources import Reader, read_shot
-from napari_shadowinv.stack._status import OnStatus
-from napari_shadowinv.stack._watch_loop import StackMaker, Watch
+from napari_shadowinv.stack._shots import FitStack, Stack
+from napari_shadowinv.stack._sources import FileShot, Reader, Shot, read_shot, stamp
+from napari_shadowinv.stack._status import WATCHING, OnStatus, RunStatus
+from napari_shadowinv.stack._worker import Attempt, ShotOutcome, failure_text, try_shot, write_shot
 
 if TYPE_CHECKING:
     import xarray
 
+    from napari_shadowinv.fitting import Fit
+    from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.preprocessing import Recipe
+
+
+# Simultaneous shots. The number is fixed, because each starts from the last one in its lane, and
+# results must not depend on the machine.
+_LANES = 2
+_CLOCK_RESOLUTION_S = 2.0  # of file times, on any file system
+_POLL_S = 0.25  # between two looks at `should_stop` while nothing arrives
+
+
+def _is_unchanged(shot: FileShot, report: dict[str, Any], stamp_now: dict[str, int]) -> bool:
+    """Return whether a file still agrees with its report."""
+    # Within the resolution of file times it may have changed at the same time.
+    if time.time() - stamp_now["mtime_ns"] / 1e9 < _CLOCK_RESOLUTION_S and "sha256" in report:
+        return bool(sha256(shot.path) == report["sha256"])
+    return shot.unchanged(report)
+
+
+class _ShapeUnknownError(Exception):
+    """The shape is unknown until a shot has arrived."""
+
+
+class _NoShot(Shot):
+    """Placeholder before any shot has arrived."""
+
+    def shape(self) -> tuple[int, ...]:
+        raise _ShapeUnknownError
+
+
+@dataclass(frozen=True)
+class StackMaker:
+    """Describes the stack of a folder's shots."""
+
+    describe: Callable[[Shots], Stack]
+    folder: Path
+    reader: Reader
+    chained: bool  # whether each shot starts from an earlier one
+
+    def shot(self, name: str) -> FileShot:
+        return FileShot(self.folder / name, self.reader)
+
+    def before_any(self) -> Stack | None:
+        """Return the stack before a shot has arrived; None if its shape is unknown."""
+        try:
+            return self._describe([_NoShot()], [""])
+        except _ShapeUnknownError:
+            return None
+
+    def of(self, names: Sequence[str]) -> Stack:
+        """Return the stack of some shots, the first of which can be read."""
+        return self._describe([self.shot(name) for name in names], names)
+
+    def _describe(self, items: Sequence[Shot], names: Sequence[str]) -> Stack:
+        stack = self.describe(Shots(items, tuple(map(text_of, names)), (0, 0)))
+        # Shots start from each other only on the same sites.
+        chained = self.chained and stack.beam is not None and not isinstance(stack, FitStack)
+        return replace(stack, as_arrived=True, chained=chained)
+
+
+@dataclass(frozen=True, eq=False)
+class _RunningShot:
+    """A shot in work, with its attempt."""
+
+    name: str
+    shot: FileShot
+    stamp_before: dict[str, int]  # of its file, before it was read
+    lane: int
+    attempt: Future[Attempt]
+
+
+class Watch:
+    """The loop: inverts two files simultaneously, and writes them in the order of arrival.
+
+    Shots alternate between two lanes; each starts from the last result in its lane.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        dtype: np.dtype[Any],
+        stacks: StackMaker,
+        arrivals: Arrivals,
+        on_progress: OnStatus | None,
+        should_stop: ShouldStop | None,
+    ) -> None:
+        self._path, self._dtype, self._stacks = path, dtype, stacks
+        self._arrivals, self._on_progress, self._should_stop = arrivals, on_progress, should_stop
+        self.store: GrowingStore | None = None
+        # Failures before the first good shot, which creates the store or proves that it fits.
+        self._early: dict[str, dict[str, Any]] = {}
+        self._doubtful: set[str] = set()
+        self._failures: dict[str, str] = {}
+        self._overwrite = False
+        self._stack: Stack | None = None
+        self._work: Any = None  # once the number of sites is known
+        self._pool = ThreadPoolExecutor(_LANES)
+        self._abandoned = Event()
+        self._running: deque[_RunningShot] = deque()
+        self._lanes: list[Inversion | Fit | None] = [None] * _LANES
+        self._redo: set[str] = set()
+        self._begun = self._ended = 0
+        self._last = self._busy_since = time.monotonic()
+        self._busy_s = 0.0
+
+    def report(self, **news: Any) -> None:
+        """Report the numbers of shots, and some news."""
+        if self._on_progress is None:
+            return
+        early, store = len(self._early), self.store
+        status = RunStatus(
+            total=early + (0 if store is None else len(store)),
+            done=0 if store is None else store.count(DONE),
+            failed=early + (0 if store is None else store.count(FAILED)),
+            doubtful=len(self._doubtful),
+            waiting=self._arrivals.waiting + len(self._running),
+            ended=self._ended,
+            seconds=self._busy_s + (time.monotonic() - self._busy_since if self._running else 0.0),
+            engine=WATCHING,
+            failures=tuple(self._failures.items()),
+        )
+        self._on_progress(replace(status, **news))
+
+    def open(self, *, overwrite: bool, redo_failed: bool) -> None:
+        """Open or check the store before any shot arrives, as far as possible."""
+        self._overwrite = overwrite
+        self._stack = self._stacks.before_any()
+        if overwrite or not self._path.exists():
+            return
+        store = StackStore(self._path)
+        again = (PENDING, FAILED) if redo_failed else (PENDING,)
+        self._redo = {store.names[i] for i in np.flatnonzero(np.isin(store.statuses(), again))}
+        for name, report in zip(store.names, store.reports(), strict=True):
+            self._note_report(name, report)
+        self.store = GrowingStore(store, NUMBERED_AS_ARRIVED)
+        if self._stack is not None:
+            self._use_stack(match_store(store, self._stack, self._dtype))
+
+    def run(self, idle: float | None = None, most: int | None = None) -> None:
+        """Invert existing and arriving files until the watch ends."""
+        for name in sorted(self._redo):
+            self._arrivals.put_back(name)
+        self.report()
+        try:
+            while not self._is_over(idle, most):
+                self._advance(most)
+        except InversionCancelled:
+            pass
+        finally:
+            self._abandoned.set()
+            self._pool.shutdown(cancel_futures=True)
+            self.report()
+
+    def _is_over(self, idle: float | None, most: int | None) -> bool:
+        if most is not None and self._ended >= most:
+            return True
+        if self._should_stop is not None and self._should_stop():
+            return True
+        quiet = time.monotonic() - max(self._arrivals.last_event, self._last)
+        is_quiet = self._arrivals.is_quiet and not self._running
+        return idle is not None and quiet > idle and is_quiet
+
+    def _is_stopped(self) -> bool:
+        requested = self._should_stop is not None and self._should_stop()
+        return requested or self._abandoned.is_set()
+
+    def _advance(self, most: int | None) -> None:
+        """Write the oldest shot once it is done, or start the next one."""
+        begun = len(self._running)
+        is_full = begun == _LANES or (most is not None and self._ended + begun == most)
+        if begun and (is_full or self._running[0].attempt.done()):
+            self._finish()
+            return
+        arrived = self._arrivals.next_name(_POLL_S)
+        if arrived is not None:
+            self._begin(arrived)
+
+    def _begin(self, name: str) -> None:
+        while any(name == running.name for running in self._running):
+            self._finish()  # it may have changed since it was read
+        shot = self._stacks.shot(name)
+        try:
+            stamp_now = stamp(shot.path)
+            report = self._previous_report(text_of(name))
+            if report is not None and _is_unchanged(shot, report, stamp_now):
+                if not self._arrivals.waiting:
+                    self.report()
+                return
+        except OSError:
+            self._arrivals.check()
+            return  # removed before its turn
+        lane = self._begun % _LANES
+        self._begun += 1
+        attempt = self._submit(name, shot, lane)
+        attempt.add_done_callback(lambda _: self._arrivals.wake())
+        self._busy_since = self._busy_since if self._running else time.monotonic()
+        self._running.append(_RunningShot(name, shot, stamp_now, lane, attempt))
+        self.report()
+
+    def _finish(self) -> None:
+        """Wait for the oldest attempt, and write its outcome."""
+        running = self._running[0]
+        attempt, stamp_before = running.attempt.result(), running.stamp_before
+        self._running.popleft()
+        if not self._running:
+            self._busy_s += time.monotonic() - self._busy_since
+        stamp_after = {**stamp_before, **attempt.origin}
+        with suppress(OSError):
+            stamp_after = stamp(running.shot.path) if attempt.failure else stamp_after
+        if not stamp_before.items() <= stamp_after.items():
+            self._arrivals.put_back(running.name)  # it was written to while it was read
+            return
+        if attempt.failure:
+            self._arrivals.check()
+        name = text_of(running.name)
+        again = self._previous_report(name) is not None
+        with defer_interrupts():
+            outcome = self._write(name, replace(attempt, origin={**stamp_before, **attempt.origin}))
+        self._redo.discard(name)
+        self._lanes[running.lane] = self._start_for_next(attempt)
+        self._ended += 1
+        self._last = time.monotonic()
+        self._note_report(name, {"reason": outcome.reason, "warnings": outcome.warnings})
+        self.report(name=name, outcome=outcome, result=attempt.result, again=again)
+
+    def _note_report(self, name: str, report: Mapping[str, Any]) -> None:
+        """Note whether a shot has failed or is doubtful, instead of its earlier report."""
+        self._failures.pop(name, None)
+        self._doubtful.discard(name)
+        if reason := report.get("reason"):
+            self._failures[name] = reason
+        elif report.get("warnings"):
+            self._doubtful.add(name)
+
+    def _previous_report(self, name: str) -> dict[str, Any] | None:
+        """Return the report of a shot that has ended before; None if it has not."""
+        store = self.store
+        index = None if store is None else store.number(name)
+        if store is None or index is None or name in self._early:
+            return self._early.get(name)
+        pending = name in self._redo or store.status(index) == PENDING
+        return None if pending else store.report(index)
+
+    def _submit(self, name: str, shot: FileShot, lane: int) -> Future[Attempt]:
+        failed = self._prepare(name, shot) if self._work is None else None
+        if failed is not None:
+            done: Future[Attempt] = Future()
+            done.set_result(failed)
+            return done
+        stack = self._stack
+        assert stack is not None
+        source, start = stack.source_of(0), self._lanes[lane]
+        # Alone, it has all the cores.
+        workers = _LANES if self._running or self._arrivals.waiting else 1
+        return self._pool.submit(
+            try_shot, self._work, shot, stack.beam, source, start, workers, self._is_stopped
+        )
+
+    def _prepare(self, name: str, shot: FileShot) -> Attempt | None:
+        """Describe the stack by its first shot; return a failed attempt if that is impossible."""
+        began = time.perf_counter()
+        names = [name, *self._arrivals.peek(MAX_TRIED_SHOTS - 1)]
+        stack = self._stack
+        if stack is None:
+            try:
+                shot.shape()
+            except Exception as error:
+                return Attempt(began, time.perf_counter() - began, {}, failure=failure_text(error))
+            store = self.store
+            if store is not None:
+                # Earlier shots are a better reference for the size of the images.
+                existing = (
+                    earlier for earlier in store.done() if self._stacks.shot(earlier).path.exists()
+                )
+                names = [*islice(existing, MAX_TRIED_SHOTS), *names]
+            stack = self._stacks.of(names)
+            if store is not None:
+                self._use_stack(match_store(StackStore(self._path), stack, self._dtype))
+                return None
+        if stack.chooses_sites:
+            self.report(stage="how many sites the first shots need")
+            shots = self._stacks.of(names).shots
+            shares = needed_shares(replace(stack, shots=shots), self._should_stop)
+            if not shares:
+                # It fails the same way, and a later shot decides.
+                return try_shot(stack.work(()), shot, stack.beam, None, None, 1, self._should_stop)
+            stack = with_enough_sites(stack, shares)
+        self._use_stack(stack)
+        return None
+
+    def _use_stack(self, stack: Stack) -> None:
+        self._stack = stack
+        per_shot = tuple(name for name in stack.variables if not stack.is_shared(name))
+        self._work = stack.work(per_shot)
+
+    def _write(self, name: str, attempt: Attempt) -> ShotOutcome:
+        early = self._early
+        if attempt.result is None and (self._work is None or self.store is None):
+            early[name] = {**attempt.origin, "reason": attempt.failure, "seconds": attempt.seconds}
+            return ShotOutcome(len(early) - 1, FAILED, attempt.seconds, attempt.failure)
+        store = self.store or self._create_store([*early, name])
+        for early_name in list(early):
+            index = store.number(early_name)
+            report = early.pop(early_name)
+            if early_name != name:
+                store.fail(store.append(early_name) if index is None else index, report)
+        number = store.number(name)
+        index = store.append(name) if number is None else number
+        if store.status(index) == DONE:
+            store.reopen(index)
+        return write_shot(store, self._work, index, attempt)
+
+    def _create_store(self, names: Sequence[str]) -> GrowingStore:
+        """Create the store with its first shots."""
+        assert self._stack is not None
+        first = tuple(dict.fromkeys(names))
+        shots = replace(self._stack.shots, items=[_NoShot()] * len(first), names=first)
+        stack = replace(self._stack, shots=shots)
+        created = create_store(
+            self._path, contents_of(stack, self._dtype), overwrite=self._overwrite
+        )
+        self._overwrite = False
+        self.store = GrowingStore(created, NUMBERED_AS_ARRIVED)
+        return self.store
+
+    def _start_for_next(self, attempt: Attempt) -> Inversion | Fit | None:
+        chained = self._stack is not None and self._stack.chained
+        good = attempt.result is not None and attempt.result.report.converged
+        return attempt.result if chained and good else None
 
 
 def watch_stack(
