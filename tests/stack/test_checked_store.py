@@ -19,8 +19,7 @@ from napari_shadowinv import InversionOptions, Recipe, run_stack
 from napari_shadowinv.cli import app
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.store import DAMAGED, DONE, StackStore, read_stack
-from napari_shadowinv.io.store_checksums import FIXED, SEAL
-from napari_shadowinv.io.store_files import CheckedStore
+from napari_shadowinv.io.store_checksums import FIXED, SEAL, CheckedStore
 
 OPTIONS = InversionOptions(n_sites=100)
 

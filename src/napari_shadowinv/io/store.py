@@ -225,7 +225,7 @@ def check_files(store: StackStore) -> None:
 def _open_readable(path: Path) -> dict[str, Any]:
     import zarr
 
-    from napari_shadowinv.io.store_files import CheckedStore
+    from napari_shadowinv.io.store_checksums import CheckedStore
 
     arrays: dict[str, Any] = dict(zarr.open_group(CheckedStore(path), mode="r").arrays())
     names = arrays["name"]
@@ -254,7 +254,7 @@ def open_dataset(path: Path) -> xarray.Dataset:
     """Open the arrays of a Zarr folder lazily; each file is checked before it is read."""
     import xarray as xr
 
-    from napari_shadowinv.io.store_files import CheckedStore, describes_arrays
+    from napari_shadowinv.io.store_checksums import CheckedStore, describes_arrays
 
     # No variable is a time, whatever its unit. While a store grows, only the folder's consolidated
     # metadata give all arrays the same length.
