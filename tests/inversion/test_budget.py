@@ -19,9 +19,8 @@ from napari_shadowinv import (
     synthetic_image,
 )
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.inversion.beam import beam_difference
 from napari_shadowinv.inversion.budget import Budget, ErrorEstimate
-from napari_shadowinv.inversion.noise import ImageNoise
+from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.pipeline import run

@@ -23,8 +23,7 @@ from scipy.spatial import KDTree
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.inversion.beam import beam_difference
-from napari_shadowinv.inversion.noise import ImageNoise
+from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.inversion.readout import LinearResponse
 from napari_shadowinv.options import InversionOptions
