@@ -4,11 +4,13 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from napari_shadowinv import InversionCancelled, invert
+from napari_shadowinv.geometry import flips
 from napari_shadowinv.inversion import compilation, machine_code
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.inversion.machine_code import is_compiled
@@ -205,3 +207,14 @@ class TestReadOnlyInstallation:
         cache_folder.chmod(0o770)
         assert printed(temporary) == ["False", "0", "None"]
         assert list(cache_folder.iterdir()) == []
+
+
+def test_machine_code_of_an_earlier_process_is_recognised(monkeypatch, tmp_path):
+    """By the file that numba writes for the triangulation's kernel, whatever its module's name."""
+    source = Path(flips.build.py_func.__code__.co_filename)
+    stats = SimpleNamespace(cache_path=str(tmp_path))
+    kernel = SimpleNamespace(signatures=[], stats=stats, py_func=flips.build.py_func)
+    monkeypatch.setattr(flips, "build", kernel)
+    assert not machine_code.is_compiled()
+    (tmp_path / f"{source.stem}.build-402.py311.nbi").touch()
+    assert machine_code.is_compiled()

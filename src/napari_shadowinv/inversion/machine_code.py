@@ -67,7 +67,8 @@ def is_compiled() -> bool:
     if build.signatures:  # type: ignore[attr-defined]
         return True
     folder = code_folder()
-    return folder is not None and any(folder.glob("_flips.build-*.nbi"))
+    module = Path(build.py_func.__code__.co_filename).stem  # type: ignore[attr-defined]
+    return folder is not None and any(folder.glob(f"{module}.build-*.nbi"))
 
 
 def code_folder() -> Path | None:
