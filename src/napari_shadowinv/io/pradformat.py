@@ -27,8 +27,8 @@ from napari_shadowinv.inversion.variables import (
     dataset_from_field,
     setup_from_dataset,
 )
-from napari_shadowinv.io.dataset import require
 from napari_shadowinv.io.hdf5 import hdf5_in_memory, held_arrays, load_dataset, member
+from napari_shadowinv.io.writing import require
 from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
