@@ -22,6 +22,7 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -32,9 +33,11 @@ from fit import Beam, Field, blobs, counted
 from napari_shadowinv import Fit, FitOptions, fit
 from napari_shadowinv.physics.phantoms import paper_setup
 
-NOISE = 0.05
+# A scientific camera: 1,000 photoelectrons a pixel, and 5 more of r.m.s. noise by reading.
+COUNTS, READ_NOISE = 1000.0, 5.0
+CONSTANT_NOISE = 0.05
 SILENT, SILENT_BARS = 0.05, 3.0
-RAYS = 20
+RAYS = 40
 
 FloatArray = NDArray[np.float64]
 Change = Callable[["Shots"], None]
@@ -54,7 +57,8 @@ class Shots:
     pedestal: float = 0.0
     shift: float = 0.0
     brighter: float = 0.0
-    quanta: float | None = None
+    quanta: float | None = COUNTS
+    read_noise: float = READ_NOISE
     keywords: dict[str, Any] = field(default_factory=dict)
 
     def strengths(self) -> FloatArray:
@@ -73,24 +77,52 @@ class Shots:
         shots = []
         for k, (strength, beam) in enumerate(zip(self.strengths(), beams, strict=True)):
             fields = [_moved(each, self.shift) for each in self.fields] if k else self.fields
-            shot = counted(fields, strength, beam, size, RAYS)
+            shot = _counted(tuple(fields), tuple(strength), beam, self.side)
             if self.blur:
                 shot = gaussian_filter(shot, self.blur, mode="nearest")
+            shot = shot * (1 + k * self.brighter)
             if self.quanta:
-                shots.append(rng.poisson(self.quanta * shot).astype(np.float64))
+                shots.append(self._recorded(shot, rng))
                 continue
-            noise = rng.normal(size=size)
-            if self.noise_blur:
-                noise = gaussian_filter(noise, self.noise_blur, mode="wrap")
-                noise /= noise.std()
-            shot = np.maximum(shot + self.pedestal, 0) ** self.gamma * (1 + k * self.brighter)
-            shots.append(shot / (1 + self.pedestal) ** self.gamma + NOISE * noise)
+            noise = CONSTANT_NOISE * _blurred_noise(rng.normal(size=size), self.noise_blur)
+            shots.append(self._response(shot) / self.beam_level + noise)
         return np.stack(shots)
+
+    def _recorded(self, shot: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Return an image as a camera records it: counts, noise of reading, dark level, gamma."""
+        assert self.quanta
+        counts = rng.poisson(self.quanta * shot) - self.quanta * shot
+        noise = _blurred_noise(counts + self.read_noise * rng.normal(size=shot.shape), self.noise_blur)
+        return self.quanta * self._response(shot + noise / self.quanta)
+
+    def _response(self, shot: FloatArray) -> FloatArray:
+        """Return the signal of a detector with a dark level and a gamma."""
+        return np.asarray(np.maximum(shot + self.pedestal, 0) ** self.gamma)
+
+    @property
+    def beam_level(self) -> float:
+        """The signal of the beam without the object, in units of a right detector's."""
+        return float((1 + self.pedestal) ** self.gamma)
 
     def displacement(self) -> FloatArray:
         """Return the displacement in the first image by the first field, px."""
         y, x = np.indices((self.side, self.side), dtype=np.float64)
         return np.stack(self.fields[0](y, x))
+
+
+@lru_cache(maxsize=64)
+def _counted(
+    fields: tuple[Field, ...], strength: tuple[float, ...], beam: Beam | None, side: int
+) -> FloatArray:
+    return counted(list(fields), np.array(strength), beam, (side, side), RAYS)
+
+
+def _blurred_noise(noise: FloatArray, width: float) -> FloatArray:
+    """Return noise of the same r.m.s. that a Gaussian has blurred."""
+    if not width:
+        return noise
+    blurred = gaussian_filter(noise, width, mode="wrap")
+    return blurred * (noise.std() / blurred.std())
 
 
 def _moved(displaced: Field, shift: float) -> Field:
@@ -113,12 +145,14 @@ def lumpy(side: int, rms: float, seed: int) -> Beam:
     return lambda y, x: 1 + rms * (height(y, x) - mean) / deviation
 
 
+@lru_cache
 def ring(side: int, folded: bool) -> list[Field]:
     """Return a Gaussian potential that spreads the beam; folded, at twice the first caustic."""
     sigma, middle = side / 9, (side - 1) / 2
     return [blobs([((4.0 if folded else 0.6) * sigma**2, sigma, sigma, 0, middle, middle)])]
 
 
+@lru_cache
 def ellipses(side: int, folded: bool) -> list[Field]:
     """Return two ellipses of opposite kind."""
     u = side / 100
@@ -244,15 +278,17 @@ CHANGES: dict[str, Change] = {
 }
 
 
-def cases(side: int) -> Iterator[tuple[str, Shots, bool]]:
+def cases(side: int, quanta: float | None) -> Iterator[tuple[str, Shots, bool]]:
     """Yield each case's name, its shots, and whether they are as assumed."""
     for change_name, change in CHANGES.items():
         for object_name, make in OBJECTS.items():
             for folded in (False, True):
                 for count, energies in ENERGIES.items():
-                    shots = Shots(side, energies, make(side, folded))
+                    shots = Shots(side, energies, make(side, folded), quanta=quanta)
                     shots.keywords["source"] = np.ones((side, side))
                     change(shots)
+                    if quanta and "source" in shots.keywords:
+                        shots.keywords["source"] *= quanta * shots.beam_level
                     kind = "folded " * folded + object_name
                     name = f"{change_name}, {kind}, {count} energies"
                     if change is not wires or (object_name == "ring" and not folded):
@@ -297,7 +333,7 @@ def right_case(number: int, side: int) -> tuple[str, Shots]:
         steepest = max(np.abs(np.gradient(along_y, axis=0)).max(),
                        np.abs(np.gradient(along_x, axis=1)).max())  # fmt: skip
         fields = [blobs([(each[0] * fold / steepest, *each[1:]) for each in parts])]
-    shots = Shots(side, energies, fields)
+    shots = Shots(side, energies, fields, read_noise=0.0)
     shots.quanta = (None, 30.0, 1000.0)[number % 3]
     if count > 1 and rng.random() < 0.2:
         shots.beams = [lumpy(side, 0.03, number)] * count
@@ -347,6 +383,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=[], help="parts of the rows' names")
     parser.add_argument("--limit", type=int, default=0, help="cases at most")
     parser.add_argument("--right", type=int, default=0, help="random objects that are as assumed")
+    parser.add_argument("--counts", type=float, default=COUNTS, help="a pixel; 0: constant noise")
     parser.add_argument("--first-seed", type=int, default=1000)
     arguments = parser.parse_args()
     if arguments.right:
@@ -355,7 +392,7 @@ def main() -> None:
     counts = {"": 0, "SILENT": 0, "FALSE ALARM": 0}
     print("| images | L2 error, % | bars, % | z | verdict | time, s | |")
     print("|---|---|---|---|---|---|---|")
-    for name, shots, is_right in cases(arguments.side):
+    for name, shots, is_right in cases(arguments.side, arguments.counts or None):
         if arguments.only and not all(part in name for part in arguments.only):
             continue
         for seed in range(arguments.seeds):
@@ -371,7 +408,7 @@ def fitted_row(name: str, shots: Shots, seed: int, is_right: bool) -> tuple[str,
     begun = time.perf_counter()
     setups = [paper_setup().model_copy(update={"energy": energy}) for energy in shots.energies]
     result = fit(
-        shots.images(seed), setups=setups, noise="poisson" if shots.quanta else NOISE,
+        shots.images(seed), setups=setups, noise="poisson" if shots.quanta else CONSTANT_NOISE,
         options=FitOptions(seed=seed), **shots.keywords,
     )  # fmt: skip
     seconds = time.perf_counter() - begun
