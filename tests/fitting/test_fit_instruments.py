@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from helpers.fit_images import bump, counted, distance, noisy, on_pixels, together
 from napari_shadowinv._system.progress import Progress
@@ -66,6 +67,25 @@ def test_a_blur_that_was_not_told_is_noticed() -> None:
         assert aware.verdict is Verdict.DETERMINED
         truth = on_pixels(ring, size)
         assert distance(aware.fields[0].displacement, truth) < 0.03
+
+
+@pytest.fixture(scope="module")
+def unfolded() -> list[FloatArray]:
+    """Two sharp images of a ring without bright lines."""
+    ring = bump(0.8, 8, (31.5, 31.5))
+    return [counted(lambda y, x, a=a: a * ring(y, x), (64, 64), rays=40) for a in STRENGTHS]
+
+
+def test_blur_that_a_smoother_field_imitates_is_noticed(unfolded: list[FloatArray]) -> None:
+    """No residual shows it: χ² and patterns are those of noise."""
+    flat = np.ones((64, 64))
+    for blur in (0.0, 3.0):
+        images = noisy([gaussian_filter(image, blur) for image in unfolded], NOISE)
+        result = fitted(images, source=flat)
+        assert result.chi2.max() < 1.1
+        assert result.report.pattern < 5
+        assert (result.verdict is Verdict.MISFIT) == (blur > 0)
+        assert ("give the point spread" in result.explanation) == (blur > 0)
 
 
 def test_one_folded_image_does_not_pass_for_an_answer() -> None:

@@ -6,9 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from typing import Any, Literal
-from zlib import crc32
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,7 +24,7 @@ from napari_shadowinv.fitting._error_bars import (
     shifts_by_beam,
 )
 from napari_shadowinv.fitting._masked import hidden_contrast
-from napari_shadowinv.fitting._rivals import name_cause, with_wider_spread
+from napari_shadowinv.fitting._rivals import gain_by_blur, log_evidence, name_cause
 from napari_shadowinv.fitting.beam_error import BeamError
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer
@@ -36,7 +34,6 @@ from napari_shadowinv.fitting.pattern import Pattern, find_pattern
 from napari_shadowinv.fitting.posterior import Posterior, Sample
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.search import (
-    HELD,
     MIDDLE,
     MIDDLE_SPACING,
     Found,
@@ -64,7 +61,7 @@ _SHARES_OF_TRANSPORT = (1.0, 1.4, 1.9, 2.4)  # past caustics, transport is too w
 _ROUNDED = 8.0  # px
 _TRANSPORT_SITES = 10_000
 _DECIDES = 10.0  # in log evidence
-_MIN_BLUR_SCORE = 4.0  # standard deviations, for which images are fitted with more blur
+_MIN_BLUR_SCORE = 4.0  # standard deviations
 _DARKEST = 1e-3  # of a beam's mean
 _MAX_RIVAL_CHI2 = 3.0  # a fit that ended further away is no start for a rival
 _SPACING_OF_SAMPLES = 1 / 3  # px
@@ -195,10 +192,10 @@ def fit(
         pattern = find_pattern(fine, unknowns, data.size)
         middle = replace(coarser(scene, MIDDLE), spacing=_SPACING_OF_SAMPLES)
         posterior = Posterior(middle, best.unknowns, rng, lambda: on_step("samples", value))
-        gain_by_blur = 0.0
-        # With several images the fit is repeated only if the residual asks for it.
-        if data.single or pattern.blur_score > _MIN_BLUR_SCORE:
-            gain_by_blur = best.value - with_wider_spread(scene, best, on_step).value
+        blur_gain = 0.0
+        if data.single or not pattern.is_certain:
+            suspected = data.single or pattern.blur_score > _MIN_BLUR_SCORE
+            blur_gain = gain_by_blur(scene, best, fields, options, on_step, suspected=suspected)
         if pattern.is_certain and pattern.chi2 < _MAX_RIVAL_CHI2:
             cause = name_cause(scene, best, fields, setups, on_step)
             pattern = replace(pattern, cause=cause)
@@ -209,7 +206,7 @@ def fit(
         by_beam = shifts_by_beam(data, scene, posterior, samples, options)
         evidence = float("nan")
         if options.evidence:
-            evidence = _log_evidence(scene, best, fields, options, on_step)
+            evidence = log_evidence(scene, best, fields, options, on_step)
         amplification = noise_amplification(pattern.correlation)
         if errors is not None:
             errors *= amplification
@@ -235,7 +232,7 @@ def fit(
         errors,
         by_beam,
         found_by,
-        gain_by_blur,
+        blur_gain,
         pattern,
     )
 
@@ -395,20 +392,6 @@ def _added_light(
     return light
 
 
-def _log_evidence(
-    scene: Scene, best: Found, names: Sequence[str], options: FitOptions, on_step: Any
-) -> float:
-    """Log evidence at the likeliest λ and κ, where it depends least on their accuracy."""
-    if options.smoothness is None:
-        scene = replace(scene, smoothness=scene.smoothness / HELD)
-    ended = settled(scene, best, on_step, "evidence", least_gain=0.1)
-    middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
-    chances = [np.random.default_rng([options.seed, crc32(name.encode())]) for name in names]
-    report = partial(on_step, "evidence", ended.value)
-    posterior = Posterior(middle, ended.unknowns, chances[0], report)
-    return posterior.log_evidence(chances)
-
-
 def _result(
     given: Measured,
     scene: Scene,
@@ -420,7 +403,7 @@ def _result(
     errors: FloatArray | None,
     by_beam: BeamShifts | None,
     report: FitReport,
-    gain_by_blur: float,
+    blur_gain: float,
     pattern: Pattern,
 ) -> Fit:
     height, width = given.size
@@ -472,7 +455,7 @@ def _result(
         jacobian=jacobian,
         uncertainty=uncertainty,
         ended=report.converged,
-        gain_by_blur=gain_by_blur,
+        gain_by_blur=blur_gain,
         pattern=pattern,
         beam=beam,
         displacement=displacements.sum(axis=0),
