@@ -88,6 +88,16 @@ def test_blur_that_a_smoother_field_imitates_is_noticed(unfolded: list[FloatArra
         assert ("give the point spread" in result.explanation) == (blur > 0)
 
 
+def test_a_dark_level_shows_in_the_noise_of_counts(unfolded: list[FloatArray]) -> None:
+    counts = np.random.default_rng(1).poisson(1000 * np.stack(unfolded)).astype(float)
+    for offset in (0.0, 120.0):
+        source = np.full((64, 64), 1000.0 + offset)
+        result = fitted(counts + offset, source=source, noise="poisson")
+        assert result.report.pattern < 5
+        assert (result.verdict is Verdict.UNCERTAIN) == (offset > 0)
+        assert ("dark level" in result.explanation) == (offset > 0)
+
+
 def test_one_folded_image_does_not_pass_for_an_answer() -> None:
     """The field is 20 % wrong, and explains the image to the noise."""
     size = (80, 80)

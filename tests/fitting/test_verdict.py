@@ -61,6 +61,16 @@ def test_noise_that_is_not_as_given_hides_what_does_not_fit(chi2: float, expecte
     assert ("noise is given too large: image 1: χ² 0.3" in why) == (chi2 < 0.4)
 
 
+@pytest.mark.parametrize(
+    ("share", "expected"), [(0.04, Verdict.DETERMINED), (0.1, Verdict.UNCERTAIN)]
+)
+def test_counts_with_too_little_noise_have_a_dark_level(share: float, expected: Verdict) -> None:
+    pattern = Pattern(np.array([-1.0, 1.0]), missing_counts=share)
+    verdict, why = judged(**GOOD | {"pattern": pattern})
+    assert verdict is expected
+    assert ("a dark level of about 10%" in why) == (share > 0.05)
+
+
 def test_images_that_are_explained_better_with_more_blur_do_not_fit() -> None:
     assert judged(**GOOD | {"gain_by_blur": 5.0})[0] is Verdict.DETERMINED
     verdict, why = judged(**GOOD | {"gain_by_blur": 30.0})

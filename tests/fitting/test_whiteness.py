@@ -10,6 +10,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.fitting.whiteness import (
     blur_score,
     correlation_length,
+    lack_of_noise,
     noise_amplification,
     pattern_strength,
 )
@@ -88,6 +89,24 @@ def test_noise_amplification_is_that_of_means_over_squares(width: float) -> None
     """The standard deviation of a mean over many pixels, against that of white noise."""
     means = [noise(seed, 128, width)[32:96, 32:96].mean() for seed in range(200)]
     assert np.std(means) * 64 == pytest.approx(noise_amplification(width), rel=0.2)
+
+
+@pytest.mark.parametrize("used", [everywhere(), holed()], ids=["all", "mask"])
+def test_lack_of_noise_is_that_of_the_variance(used: BoolArray) -> None:
+    stack, masks = np.stack([noise(1), noise(2)]), np.stack([used, used])
+    lack, deviation = lack_of_noise(stack, masks)
+    assert abs(lack) < 4 * deviation < 0.06
+    less, _ = lack_of_noise(np.sqrt(0.8) * stack, masks)
+    assert 1 - less == pytest.approx(0.8 * (1 - lack))
+    # Masked values do not count.
+    assert lack_of_noise(np.where(masks, stack, 1e6), masks) == (lack, deviation)
+
+
+def test_lack_of_noise_ignores_smooth_noise_that_a_fit_absorbs() -> None:
+    stack, used = np.stack([noise(1), noise(2)]), np.stack([everywhere()] * 2)
+    rough = stack - gaussian_filter(stack, (0, 4, 4))
+    lack, deviation = lack_of_noise(rough, used)
+    assert abs(lack - lack_of_noise(stack, used)[0]) < deviation
 
 
 def test_blur_score_finds_blur_and_ignores_noise() -> None:

@@ -189,7 +189,7 @@ def fit(
     with _timed("full size", seconds):
         fine, unknowns, value, taken, ended = refined(scene, best, options, on_step)
     with _timed("residual", seconds):
-        pattern = find_pattern(fine, unknowns, data.size)
+        pattern = find_pattern(fine, unknowns, data.size, is_counted=data.counted)
         middle = replace(coarser(scene, MIDDLE), spacing=_SPACING_OF_SAMPLES)
         posterior = Posterior(middle, best.unknowns, rng, lambda: on_step("samples", value))
         blur_gain = 0.0

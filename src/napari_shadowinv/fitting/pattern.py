@@ -9,7 +9,12 @@ import numpy as np
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.fitting.whiteness import blur_score, correlation_length, pattern_strength
+from napari_shadowinv.fitting.whiteness import (
+    blur_score,
+    correlation_length,
+    lack_of_noise,
+    pattern_strength,
+)
 
 __all__ = ["SUSPECT_PATTERN", "Pattern", "find_pattern"]
 
@@ -17,6 +22,8 @@ SUSPECT_PATTERN = 5.0
 """Standard deviations of a smoothed residual beyond which the model is wrong."""
 # Of fits with a right model it is -5 to 2, once 4.2: a deep fold at 30 counts a pixel. With a beam
 # that is 2 % off it is 31 and more, with absorption of 5 % 5.4 to 12.6.
+_MIN_COUNTS = 5.0  # a pixel
+_LACKING = 4.0  # standard deviations
 
 
 @dataclass(frozen=True)
@@ -33,6 +40,9 @@ class Pattern:
         The largest of all images.
     blur_score : float
         See `whiteness.blur_score`.
+    missing_counts : float
+        Share by which the noise is smaller than that of the counts, as a dark level of that share
+        makes it; 0 unless that is certain.
     cause : str
         The likeliest cause, as a clause; "" if none is likely or none was looked for.
     """
@@ -41,6 +51,7 @@ class Pattern:
     correlation: float = 0.0
     chi2: float = 1.0
     blur_score: float = 0.0
+    missing_counts: float = 0.0
     cause: str = ""
 
     @property
@@ -54,8 +65,13 @@ class Pattern:
         return self.largest > SUSPECT_PATTERN
 
 
-def find_pattern(scene: Scene, unknowns: Unknowns, size: tuple[int, int]) -> Pattern:
-    """Test the residuals of all images, the first `size` pixels of the scene, for structure."""
+def find_pattern(
+    scene: Scene, unknowns: Unknowns, size: tuple[int, int], *, is_counted: bool = False
+) -> Pattern:
+    """Test the residuals of all images, the first `size` pixels of the scene, for structure.
+
+    Of images that `is_counted` calls counts, the noise is tested, too.
+    """
     height, width = size
     counts = scene.ray_counts(unknowns)
     roots = np.sqrt(scene.weights[:, :height, :width])
@@ -67,9 +83,15 @@ def find_pattern(scene: Scene, unknowns: Unknowns, size: tuple[int, int]) -> Pat
         pattern_strength(residual, use, correlation)
         for residual, use in zip(residuals, used, strict=True)
     ]
+    missing = 0.0
+    if is_counted and not correlation:
+        # The weight of a pixel is one over the variance of its counts in units of the beam.
+        lack, deviation = lack_of_noise(residuals, roots * models > np.sqrt(_MIN_COUNTS))
+        missing = lack if lack > _LACKING * deviation else 0.0
     return Pattern(
         strengths=np.array(strengths),
         correlation=correlation,
         chi2=float(scene.chi2(unknowns, counts).max()),
         blur_score=blur_score(residuals, roots, models),
+        missing_counts=missing,
     )

@@ -153,6 +153,14 @@ def judged(
         # An object that the edge cuts leaves a pattern, too.
         verdict = Verdict.EDGE if at_edge else Verdict.MISFIT
         return verdict, "; ".join(filter(None, [at_edge, _pattern_text(pattern, names)]))
+    if pattern.missing_counts > _OPEN:
+        share = f"{pattern.missing_counts:.0%}"
+        return Verdict.UNCERTAIN, (
+            f"the noise is {share} smaller than that of as many counts: a dark level of about "
+            f"{share} seems to be left in the images, which makes the field too weak, by this "
+            "share or more; subtract it from images and source (step 'dark', --dark), or, if the "
+            "counts were averaged, scaled or smoothed, give their noise"
+        )
     rivals = [away for worse, away in others if worse < _AS_GOOD and away > _OTHER_FIELD]
     if rivals:
         return Verdict.SEVERAL, (

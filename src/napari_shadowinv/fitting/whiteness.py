@@ -1,5 +1,7 @@
 """Tests of a fit's residuals: `pattern_strength`, `correlation_length`, `blur_score`.
 
+The noise of counts: `lack_of_noise`.
+
 χ² hides structure: a beam that is 2 % wrong adds 0.1 to χ² at 5 % noise, spread over the whole
 image, and bends the field by tens of per cent. Smoothed, the same residual stands out of white
 noise by many standard deviations.
@@ -12,10 +14,17 @@ from scipy.ndimage import gaussian_filter, laplace
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 
-__all__ = ["blur_score", "correlation_length", "noise_amplification", "pattern_strength"]
+__all__ = [
+    "blur_score",
+    "correlation_length",
+    "lack_of_noise",
+    "noise_amplification",
+    "pattern_strength",
+]
 
 _WIDTHS_PX = (2.0, 4.0, 8.0)
 _SMALLEST_VARIANCE = 1e-12  # of the noise
+_DETAIL_PX, _MOSTLY_USED = 2.0, 0.9  # width of a Gaussian, and its share on used pixels
 _NEAR_PX, _FAR_PX = 1, 4  # distances of the pixels that are compared
 # White noise has a ratio of 1 ± 0.03 on 64 × 64 px; noise blurred by 0.4 px has 0.84.
 _MAX_VARIANCE_RATIO = 0.85
@@ -115,6 +124,30 @@ def blur_score(residuals: FloatArray, roots: FloatArray, made: FloatArray) -> fl
     change = roots * np.stack([laplace(image, mode="nearest") for image in made])
     size = float(np.sqrt((change**2).sum()))
     return float((residuals * change).sum()) / size if size > 0 else 0.0
+
+
+def lack_of_noise(residuals: FloatArray, used: BoolArray) -> tuple[float, float]:
+    """Return by how much the variance of white residuals is below 1, and its standard deviation.
+
+    Structure of more than a few pixels, of which a fit absorbs the noise, is left out.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (L, H, W)
+        Image minus model over the standard deviation of the noise.
+    used : ndarray of bool, shape (L, H, W)
+        The pixels to use.
+    """
+    inside = used.astype(np.float64)
+    near = np.maximum(gaussian_filter(inside, (0, _DETAIL_PX, _DETAIL_PX), mode="nearest"), 1e-9)
+    values = np.where(used, residuals, 0.0)
+    details = values - gaussian_filter(values, (0, _DETAIL_PX, _DETAIL_PX), mode="nearest") / near
+    # Shares of the variance that the Gaussian takes, and that it returns.
+    share = 1 / (2 * np.pi * _DETAIL_PX**2)
+    details = details[used & (near > _MOSTLY_USED)] / np.sqrt(1 - 2 * share + share / 2)
+    if not details.size:
+        return 0.0, np.inf
+    return 1 - float((details**2).mean()), float(np.sqrt(2 / details.size))
 
 
 def _amplification_after(width: float, correlation: float) -> float:
