@@ -92,7 +92,9 @@ class Shots:
         """Return an image as a camera records it: counts, noise of reading, dark level, gamma."""
         assert self.quanta
         counts = rng.poisson(self.quanta * shot) - self.quanta * shot
-        noise = _blurred_noise(counts + self.read_noise * rng.normal(size=shot.shape), self.noise_blur)
+        noise = _blurred_noise(
+            counts + self.read_noise * rng.normal(size=shot.shape), self.noise_blur
+        )
         return self.quanta * self._response(shot + noise / self.quanta)
 
     def _response(self, shot: FloatArray) -> FloatArray:
