@@ -157,9 +157,10 @@ def judged(
         share = f"{pattern.missing_counts:.0%}"
         return Verdict.UNCERTAIN, (
             f"the noise is {share} smaller than that of as many counts: a dark level of about "
-            f"{share} seems to be left in the images, which makes the field too weak, by this "
-            "share or more; subtract it from images and source (step 'dark', --dark), or, if the "
-            "counts were averaged, scaled or smoothed, give their noise"
+            f"{share} seems to be left in the images, or the detector's response is not linear, "
+            "and either weakens the field; subtract the dark level from images and source (step "
+            "'dark', --dark), linearise the images, or, if the counts were averaged, scaled or "
+            "smoothed, give their noise"
         )
     rivals = [away for worse, away in others if worse < _AS_GOOD and away > _OTHER_FIELD]
     if rivals:
