@@ -1,6 +1,6 @@
 """Fits of images that are not as assumed: the table of docs/trust.md.
 
-    python benchmarks/imperfections.py [--seeds 1] [--side 96] [--only "beam 2 %" …]
+    python benchmarks/imperfections.py [--seeds 1] [--side 96] [--only "beam 2 %" …] [--counts 0]
     python benchmarks/imperfections.py --right 200 [--first-seed 1000]
 
 Rays are counted one by one where an exact formula puts them (`counted` of `fit.py`); the package's
@@ -9,6 +9,12 @@ experiment that the fit is not told. The columns are the L2 error of the displac
 bars (r.m.s., by noise alone and with the beam), the strength of the residual's pattern, and the
 verdict. A row is SILENT if the verdict is "determined" while the field is off by more than 5 % and
 by more than three bars, and a FALSE ALARM if images that are as assumed are not called determined.
+
+The noise is that of a camera: 1,000 counts a pixel, and 5 more of noise by reading. `--counts 0`
+gives a constant noise of 5 %, which knows nothing of a dark level. On 64 px, 98 of the 170 fits
+were counted with the noise of a camera, and none was silent; not counted were beams that are off,
+absorption, the electric field, a shift of 1 px and noise correlated over 1 px. Of folded ellipses
+on 64 px the search fails even where nothing is wrong; on 96 px it does not.
 
 With `--right`, random objects are fitted as they are: sums of blobs and rings with a sharp rim,
 unfolded and folded, one to three energies, 30 and 1,000 counts a pixel or 5 % noise, given and
