@@ -65,7 +65,7 @@ def test_noise_that_is_not_as_given_hides_what_does_not_fit(chi2: float, expecte
     ("share", "expected"), [(0.04, Verdict.DETERMINED), (0.1, Verdict.UNCERTAIN)]
 )
 def test_counts_with_too_little_noise_have_a_dark_level(share: float, expected: Verdict) -> None:
-    pattern = Pattern(np.array([-1.0, 1.0]), missing_counts=share)
+    pattern = Pattern(np.array([-1.0, 1.0]), missing_counts=share, counts_deviation=0.005)
     verdict, why = judged(**GOOD | {"pattern": pattern})
     assert verdict is expected
     assert ("a dark level of about 10%" in why) == (share > 0.05)
@@ -73,6 +73,8 @@ def test_counts_with_too_little_noise_have_a_dark_level(share: float, expected: 
 
 def test_images_that_are_explained_better_with_more_blur_do_not_fit() -> None:
     assert judged(**GOOD | {"gain_by_blur": 5.0})[0] is Verdict.DETERMINED
+    noisy = {"gain_by_blur": 30.0, "uncertainty": 0.2}
+    assert judged(**GOOD | noisy)[0] is Verdict.UNCERTAIN
     verdict, why = judged(**GOOD | {"gain_by_blur": 30.0})
     assert verdict is Verdict.MISFIT
     assert "give the point spread" in why

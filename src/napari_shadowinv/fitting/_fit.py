@@ -192,6 +192,10 @@ def fit(
         pattern = find_pattern(fine, unknowns, data.size, is_counted=data.counted)
         middle = replace(coarser(scene, MIDDLE), spacing=_SPACING_OF_SAMPLES)
         posterior = Posterior(middle, best.unknowns, rng, lambda: on_step("samples", value))
+        if pattern.lacks_counts:
+            absorbed = posterior.count_determined(np.random.default_rng(options.seed))
+            share = pattern.missing_counts - absorbed / np.count_nonzero(scene.weights)
+            pattern = replace(pattern, missing_counts=share)
         blur_gain = 0.0
         if data.single or not pattern.is_certain:
             suspected = data.single or pattern.blur_score > _MIN_BLUR_SCORE

@@ -42,7 +42,9 @@ class Pattern:
         See `whiteness.blur_score`.
     missing_counts : float
         Share by which the noise is smaller than that of the counts, as a dark level of that share
-        makes it; 0 unless that is certain.
+        makes it.
+    counts_deviation : float
+        Standard deviation of `missing_counts`.
     cause : str
         The likeliest cause, as a clause; "" if none is likely or none was looked for.
     """
@@ -52,6 +54,7 @@ class Pattern:
     chi2: float = 1.0
     blur_score: float = 0.0
     missing_counts: float = 0.0
+    counts_deviation: float = np.inf
     cause: str = ""
 
     @property
@@ -63,6 +66,11 @@ class Pattern:
     def is_certain(self) -> bool:
         """Whether the pattern shows that the model is wrong."""
         return self.largest > SUSPECT_PATTERN
+
+    @property
+    def lacks_counts(self) -> bool:
+        """Whether the noise is certainly smaller than that of the counts."""
+        return self.missing_counts > _LACKING * self.counts_deviation
 
 
 def find_pattern(
@@ -83,15 +91,15 @@ def find_pattern(
         pattern_strength(residual, use, correlation)
         for residual, use in zip(residuals, used, strict=True)
     ]
-    missing = 0.0
+    missing, deviation = 0.0, np.inf
     if is_counted and not correlation:
         # The weight of a pixel is one over the variance of its counts in units of the beam.
-        lack, deviation = lack_of_noise(residuals, roots * models > np.sqrt(_MIN_COUNTS))
-        missing = lack if lack > _LACKING * deviation else 0.0
+        missing, deviation = lack_of_noise(residuals, roots * models > np.sqrt(_MIN_COUNTS))
     return Pattern(
         strengths=np.array(strengths),
         correlation=correlation,
         chi2=float(scene.chi2(unknowns, counts).max()),
         blur_score=blur_score(residuals, roots, models),
         missing_counts=missing,
+        counts_deviation=deviation,
     )

@@ -109,6 +109,11 @@ class Posterior:
         slope = slope.plus(self._scene.prior.drawn(self._unknowns, self._rng))
         return Sample(self._change(slope, tolerance), noise)
 
+    def count_determined(self, rng: np.random.Generator) -> float:
+        """Estimate how many numbers the data determine: so much of Σχ² the fit absorbs of noise."""
+        slope = self._linear.pulled(rng.normal(size=self._scene.images.shape))
+        return product(slope.flat(), self._change(slope, _ROUGHLY).flat())
+
     def moved_by_beams(self, variations: FloatArray) -> Unknowns:
         """Return the change of the unknowns if the beams differ from their sources.
 

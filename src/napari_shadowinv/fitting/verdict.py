@@ -131,7 +131,7 @@ def judged(
             "one image cannot tell the beam from the object: many pairs of them explain it; take "
             "another energy, or an image of the beam"
         )
-    if gain_by_blur > _BLURRED:
+    if gain_by_blur > _BLURRED and (single or not uncertainty > _OPEN):
         return Verdict.MISFIT, (
             "a wider point spread explains the image better: it is blurred by more than the "
             "given one, by source or detector; give the point spread (psf, or source size and "
@@ -153,7 +153,7 @@ def judged(
         # An object that the edge cuts leaves a pattern, too.
         verdict = Verdict.EDGE if at_edge else Verdict.MISFIT
         return verdict, "; ".join(filter(None, [at_edge, _pattern_text(pattern, names)]))
-    if pattern.missing_counts > _OPEN:
+    if pattern.lacks_counts and pattern.missing_counts > _OPEN:
         share = f"{pattern.missing_counts:.0%}"
         return Verdict.UNCERTAIN, (
             f"the noise is {share} smaller than that of as many counts: a dark level of about "
