@@ -189,7 +189,9 @@ def fit(
     with _timed("full size", seconds):
         fine, unknowns, value, taken, ended = refined(scene, best, options, on_step)
     with _timed("residual", seconds):
-        pattern = find_pattern(fine, unknowns, data.size, is_counted=data.counted)
+        # A fit of one image absorbs too much of its noise for the counts to be tested.
+        is_counted = data.counted and not data.single
+        pattern = find_pattern(fine, unknowns, data.size, is_counted=is_counted)
         middle = replace(coarser(scene, MIDDLE), spacing=_SPACING_OF_SAMPLES)
         posterior = Posterior(middle, best.unknowns, rng, lambda: on_step("samples", value))
         if pattern.lacks_counts:
