@@ -92,7 +92,7 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
             rms=float(np.sqrt((blob.displacement**2).sum(axis=0).mean())),
             discretisation=ErrorEstimate(0.01, 0.02),
             noise=ErrorEstimate(0.1, 0.05),
-            solver=ErrorEstimate(1e-5, 2e-5),
+            effects={"solver": ErrorEstimate(1e-5, 2e-5)},
             beam=ErrorEstimate(2.0, 1.0),
         ),
         "image_residual": image_residual(image, reprojection, np.ones(shape, dtype=bool)),

@@ -143,8 +143,8 @@ def test_the_solvers_part_is_the_change_by_a_better_solution(image):
         for tolerance in (0.02, 1e-9)
     )
     true = rms(loose.displacement - exact.displacement)
-    assert true / 3 < loose.errors.solver.rms < 3 * true
-    assert exact.errors.solver.rms < 1e-3 * true
+    assert true / 3 < loose.errors.effects["solver"].rms < 3 * true
+    assert exact.errors.effects["solver"].rms < 1e-3 * true
 
 
 def test_the_error_by_an_unmeasured_beam_is_that_by_other_beams(image):
@@ -177,7 +177,7 @@ def test_a_recorded_beam_has_a_sensitivity_and_no_error(image):
 
 def test_the_total_adds_all_errors_in_squares(image):
     errors = invert(image).errors
-    parts = np.array([errors.noise, errors.discretisation, errors.solver, errors.beam])
+    parts = np.array([errors.noise, errors.discretisation, errors.effects["solver"], errors.beam])
     np.testing.assert_allclose(errors.total, np.sqrt((parts**2).sum(axis=0)))
     assert errors.of_peak.cause == "beam assumed, 5 %"
     assert errors.of_peak.share == errors.total.at_peak / errors.peak

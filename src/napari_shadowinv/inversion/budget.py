@@ -2,6 +2,7 @@
 
 - the errors of a result: `Errors`, of which each is an `ErrorEstimate`
 - their computation from the solved levels, and the number of sites still needed: `Budget`
+- add a quantity: one entry of `FLUX_ERRORS`
 
 Between two levels, one with four times the sites of the other, the displacement changes by the
 error of the coarser one. Changes fall by nearly the same rate from level to level, and as each is
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -33,7 +34,7 @@ from napari_shadowinv.transport.objective import Solution
 from napari_shadowinv.transport.sites import RATIO, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
 
-__all__ = ["ASSUMED_VARIATION", "Budget", "ErrorEstimate", "Errors"]
+__all__ = ["ASSUMED_VARIATION", "FLUX_ERRORS", "Budget", "ErrorEstimate", "Errors"]
 
 _PLACES = 48  # along the longer side, where levels are compared
 _USUAL_RATE, _RATES = 0.35, (0.25, 0.7)  # of the change between levels to the one before
@@ -82,8 +83,8 @@ class Errors:
         Change by more sites; NaN if there was no coarser level to compare with.
     noise : ErrorEstimate
         Scatter by the noise of image and source.
-    solver : ErrorEstimate
-        Effect of the solver's remaining flux errors in the cells.
+    effects : dict of str to ErrorEstimate
+        Effects of errors of the flux in the cells, by their causes in `FLUX_ERRORS`.
     beam : ErrorEstimate or None
         Effect of a beam that differs from the source by `beam_variation`; None if the source was
         recorded, no variation was stated, and none was seen.
@@ -103,7 +104,7 @@ class Errors:
     rms: float
     discretisation: ErrorEstimate
     noise: ErrorEstimate
-    solver: ErrorEstimate
+    effects: dict[str, ErrorEstimate]
     beam: ErrorEstimate | None = None
     beam_sensitivity: ErrorEstimate | None = None
     beam_variation: float = ASSUMED_VARIATION
@@ -134,7 +135,7 @@ class Errors:
         noise = "noise"
         if self.noise_correlation:
             noise = f"noise, correlated over {self.noise_correlation:.2g} px"
-        parts = {noise: self.noise, "discretisation": self.discretisation, "solver": self.solver}
+        parts = {noise: self.noise, "discretisation": self.discretisation, **self.effects}
         if self.beam is not None:
             parts[_BEAM_TEXTS[self.beam_basis].format(100 * self.beam_variation)] = self.beam
         return {name: error for name, error in parts.items() if not math.isnan(error.rms)}
@@ -158,7 +159,8 @@ class Errors:
             for field in dataclasses.fields(self)
             if field.name in ("peak", "rms") or isinstance(getattr(self, field.name), ErrorEstimate)
         }
-        return dataclasses.replace(self, **lengths)
+        effects = {cause: _scale_error(error, factor) for cause, error in self.effects.items()}
+        return dataclasses.replace(self, effects=effects, **lengths)
 
     def rows(self, options: InversionOptions) -> list[tuple[str, str]]:
         """Describe the budget in words: names and texts."""
@@ -212,7 +214,8 @@ class Errors:
             name: ErrorEstimate(*value) if isinstance(value, list | tuple) else value
             for name, value in content.items()
         }
-        return cls(**values)
+        effects = {cause: ErrorEstimate(*value) for cause, value in content["effects"].items()}
+        return cls(**{**values, "effects": effects})
 
 
 class Budget:
@@ -300,7 +303,10 @@ class Budget:
             rms=float(np.sqrt(np.mean(length[mask] ** 2))),
             discretisation=discretisation,
             noise=estimate(*self._noisy_moves(response, solved[-1].level.spacing)),
-            solver=estimate(response.to(self._solver_gap(response, solved[-1]))),
+            effects={
+                cause: estimate(response.to(flux_error(response, solved[-1])))
+                for cause, flux_error in FLUX_ERRORS.items()
+            },
             beam=_scale_error(by_percent, times) if variation else None,
             beam_sensitivity=by_percent,
             beam_variation=variation,
@@ -396,17 +402,29 @@ class Budget:
             sample /= np.sqrt((mass * sample**2).sum() / mass.sum())
         return mass * samples
 
-    def _solver_gap(self, response: LinearResponse, solution: LevelSolution) -> FloatArray:
-        """Return the solver's remaining flux error in each cell."""
-        gap = solution.flux - solution.level.mass
-        # The nearest of the few sites is looked up by squares.
-        size = response.spacing
-        height, width = (int(side / size) + 1 for side in solution.level.shape)
-        middles = (np.indices((height, width)).reshape(2, -1).T + 0.5) * size - 0.5
-        nearest = KDTree(response.level.sites).query(middles)[1]
-        rows, columns = ((solution.level.sites + 0.5) / size).astype(np.int64).T
-        group = nearest[rows * width + columns]
-        return np.bincount(group, gap, len(response.flux)).astype(np.float64)[None]
+
+def _solver_gap(response: LinearResponse, solution: LevelSolution) -> FloatArray:
+    """Return the solver's remaining flux error in each cell."""
+    gap = solution.flux - solution.level.mass
+    # The nearest of the few sites is looked up by squares.
+    size = response.spacing
+    height, width = (int(side / size) + 1 for side in solution.level.shape)
+    middles = (np.indices((height, width)).reshape(2, -1).T + 0.5) * size - 0.5
+    nearest = KDTree(response.level.sites).query(middles)[1]
+    rows, columns = ((solution.level.sites + 0.5) / size).astype(np.int64).T
+    group = nearest[rows * width + columns]
+    return np.bincount(group, gap, len(response.flux)).astype(np.float64)[None]
+
+
+FLUX_ERRORS: dict[str, Callable[[LinearResponse, LevelSolution], FloatArray]] = {
+    "solver": _solver_gap
+}
+"""Causes of flux errors, with functions that return them in each cell of a response.
+
+A function takes the response, of n cells, and the solution of the finest level. It returns k
+independent samples of the error, shape (k, n), of which each sums to about 0: the total flux of the
+image is scaled to that of the source.
+"""
 
 
 def _scale_error(value: float | ErrorEstimate, factor: float) -> Any:
