@@ -21,7 +21,7 @@ from napari_shadowinv.cli import (
     _stack_commands,
     _watch_command,
 )
-from napari_shadowinv.cli._help import HELP_NAMES, HelpfulCommand, HelpfulGroup
+from napari_shadowinv.cli._flags import HELP_NAMES, HelpfulCommand, HelpfulGroup
 from napari_shadowinv.cli._terminal import EXIT_MISTAKE, notify_errors
 from napari_shadowinv.errors import InputError
 
