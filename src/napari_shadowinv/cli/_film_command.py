@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from napari_shadowinv.cli import _flags, _outputs
+from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._summary import fact_rows, two_columns, written_rows
 from napari_shadowinv.cli._terminal import is_interrupted, notify_errors, progress_bars, say
 from napari_shadowinv.errors import InputError
@@ -92,7 +92,7 @@ def film(
         raise InputError(
             "received no pack file: name one, or write one for a folder of scans with --new"
         )
-    result, figure = _outputs.result_and_figure(pack, out, figure)
+    result, figure = _inputs.result_and_figure(pack, out, figure)
     outputs: dict[Path, tuple[str, ...]] = {
         result: suffixes_for(ResultKind.FILM_DOSES),
         figure: FIGURE_SUFFIXES,
@@ -101,12 +101,12 @@ def film(
         outputs[corners] = SITES.suffixes
     if layers is not None and (table := layers / LAYERS_TABLE).exists():
         outputs[table] = SITES.suffixes
-    _outputs.check_outputs(outputs, overwrite)
+    _inputs.check_outputs(outputs, overwrite)
     content = read_pack(pack)
-    _outputs.protect(list(outputs), [pack, *content.files])
+    _inputs.protect(list(outputs), [pack, *content.files])
     doses = _run_pack(content, quiet)
     written = [result, figure]
-    _outputs.write_result(doses, [str(pack)], result, figure, overwrite)
+    _inputs.write_result(doses, [str(pack)], result, figure, overwrite)
     if layers is not None:
         written.append(write_layers(doses, layers, form=layers_format, overwrite=overwrite)[-1])
     if corners is not None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from napari_shadowinv.cli import _flags, _inputs, _outputs
+from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._terminal import (
     is_interrupted,
     notify_errors,
@@ -127,22 +127,22 @@ def fit(
     rows = shot_rows(images, {"setup": setup}, lists)
     first = rows[0].file
     target = Path(f"{first.stem}_fit{RESULT.suffix}") if out is None else out
-    result, figure = _outputs.result_and_figure(first, target, figure)
+    result, figure = _inputs.result_and_figure(first, target, figure)
     checks: dict[str, Any] = {"left_out": leave_one_out, "window": energy_window}
     _static_result.check_requests(len(rows), **checks, fiducials=fiducials, result=result)
     figures = [figure, *_static_result.static_figures(figure, **checks)]
     outputs = {result: suffixes_for(ResultKind.FIT), **dict.fromkeys(figures, FIGURE_SUFFIXES)}
     if save_recipe is not None:
         outputs[save_recipe] = (".toml",)
-    _outputs.check_outputs(outputs, overwrite)
+    _inputs.check_outputs(outputs, overwrite)
     row_files = [file for row in rows for file in row.files.values()]
-    _outputs.protect(list(outputs), [*images, fiducials, options, recipe, *row_files])
+    _inputs.protect(list(outputs), [*images, fiducials, options, recipe, *row_files])
     chosen = _inputs.fit_recipe_from(
         flags, recipe, options, source=source, brightness=brightness, mask=mask
     )
-    _outputs.protect_files_of(chosen, list(outputs))
+    _inputs.protect_files_of(chosen, list(outputs))
     shots = read_rows(rows, chosen, channel=channel, variable=variable)
-    _outputs.check_setup(result, shots[0].setup, chosen.fit.fields if chosen.fit else None)
+    _inputs.check_setup(result, shots[0].setup, chosen.fit.fields if chosen.fit else None)
     warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)
     names = [str(row.file) for row in rows]
     short = _static_result.short_names(names)
@@ -155,7 +155,7 @@ def fit(
     with nullcontext() if quiet else progress_bars() as show:
         callbacks: dict[str, Any] = {"on_progress": show, "should_stop": is_interrupted}
         static = run_checks(chosen, shots, result_fit, names=short, **checks, **callbacks)
-    _outputs.write_result(result_fit, names, result, figure, overwrite, static)
+    _inputs.write_result(result_fit, names, result, figure, overwrite, static)
     if save_recipe is not None:
         setups = {shot.setup for shot in shots}
         (common,) = setups if len(setups) == 1 else (None,)

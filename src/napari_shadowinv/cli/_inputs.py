@@ -1,17 +1,126 @@
-"""Inputs of a command: a recipe, options, the setup and images."""
+"""Inputs of a command: a recipe, options, the setup and images.
+
+Outputs of a command: names chosen and checked before the work, files written after it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from napari_shadowinv.errors import InputError
+from napari_shadowinv._system.safety import resolved_path
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.formats import PNG, PRADFORMAT, RESULT
 
 if TYPE_CHECKING:
+    from napari_shadowinv.io.results import AnyResult
     from napari_shadowinv.options import InversionOptions
     from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.pipeline.static_checks import StaticChecks
     from napari_shadowinv.preprocessing import Radiograph, Recipe
+
+
+def result_and_figure(image: Path, out: Path | None, report: Path | None) -> tuple[Path, Path]:
+    """Choose the names of result and figure; the figure never replaces the image."""
+    if not image.stem:
+        raise InputError(f"{image} is a folder: expected an image; give the name of a file")
+    result = Path(f"{image.stem}{RESULT.suffix}") if out is None else out
+    if report is not None:
+        return result, report
+    figure = result.with_suffix(PNG.suffix)
+    if resolved_path(figure) == resolved_path(image):
+        figure = result.with_name(f"{result.stem}_report{PNG.suffix}")
+    return result, figure
+
+
+def check_outputs(outputs: Mapping[Path, tuple[str, ...]], overwrite: bool) -> None:
+    """Refuse, before any work, files with a wrong ending or folder, or that exist."""
+    from napari_shadowinv.io import check_output
+
+    for path, suffixes in outputs.items():
+        check_output(path, overwrite, suffixes=suffixes)
+
+
+def protect(outputs: list[Path], inputs: list[Path | None]) -> None:
+    """Refuse to overwrite an input, even with --overwrite."""
+    sources = {resolved_path(file) for file in inputs if file is not None}
+    for path in outputs:
+        if resolved_path(path) in sources:
+            raise InputError(f"{path} is both read and written: choose another name for the output")
+    if len({resolved_path(path) for path in outputs}) < len(outputs):
+        raise InputError(f"{outputs[0]} would be written twice: choose two names")
+
+
+def protect_files_of(recipe: Recipe, outputs: list[Path]) -> None:
+    """Refuse to overwrite a file that a recipe names."""
+    source = getattr(recipe.source, "file", None)
+    protect(outputs, [recipe.mask, recipe.source_mask, source])
+
+
+def save_recipe(path: Path, recipe: Recipe, inputs: list[Path | None], overwrite: bool) -> None:
+    """Write a recipe, but not over an input."""
+    from napari_shadowinv.pipeline import write_recipe
+
+    check_outputs({path: (".toml",)}, overwrite)
+    protect([path], inputs)
+    protect_files_of(recipe, [path])
+    write_recipe(path, recipe, overwrite=overwrite)
+
+
+def protect_store(store: Path, output: Path) -> None:
+    """Refuse to write into a store that is read."""
+    if resolved_path(output).is_relative_to(resolved_path(store)):
+        raise InputError(
+            f"{output} is inside the store being read: choose another name for the output"
+        )
+
+
+def check_setup(result: Path, setup: Setup | None, fields: Sequence[str] | None = None) -> None:
+    """Refuse a setup, or fields, that the result's format cannot store."""
+    from napari_shadowinv.io.pradformat import check_pradformat_fields, check_pradformat_setup
+
+    if result.suffix.lower() in PRADFORMAT.suffixes:
+        check_pradformat_setup(setup)
+        check_pradformat_fields(fields or ())
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and its parents, unless they exist."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileFormatError(
+            f"{path} cannot be created as a folder ({error.strerror}): choose another name"
+        ) from None
+
+
+def write_result(
+    result: AnyResult,
+    names: Sequence[str],
+    out: Path,
+    figure: Path,
+    overwrite: bool,
+    checks: StaticChecks | None = None,
+) -> None:
+    """Write a result and its figures, all or none; the names of its files are the title."""
+    from napari_shadowinv.cli._static_result import check_figures
+    from napari_shadowinv.io import replacing, write
+    from napari_shadowinv.io.files import text_of
+    from napari_shadowinv.plotting import result_figure
+    from napari_shadowinv.plotting.figures import DOTS_PER_INCH
+
+    title = ", ".join(text_of(Path(name).name) for name in names)
+    dataset, figures = result.to_dataset(), {figure: result_figure(result, title=title)}
+    if checks is not None:
+        dataset = checks.add_to(dataset)
+        figures |= check_figures(checks, getattr(result, "setups", ()), figure, title)
+    with ExitStack() as stack:
+        for path, page in figures.items():
+            temporary = stack.enter_context(replacing(path, overwrite))
+            page.savefig(temporary, dpi=DOTS_PER_INCH)
+        write(out, dataset, overwrite=overwrite)
 
 
 def recipe_from(

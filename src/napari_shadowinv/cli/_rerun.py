@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from napari_shadowinv.cli import _outputs
+from napari_shadowinv.cli import _inputs
 from napari_shadowinv.cli._summary import fact_rows, headline_row, two_columns, written_rows
 from napari_shadowinv.cli._terminal import exit_unless_converged
 from napari_shadowinv.facts import ResultKind
@@ -24,10 +24,10 @@ def check_rerun(
     from napari_shadowinv.cli._static_result import static_figures
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, suffixes_for
 
-    _outputs.check_outputs({out: suffixes_for(inputs.kind)}, overwrite)
+    _inputs.check_outputs({out: suffixes_for(inputs.kind)}, overwrite)
     figures = static_figures(figure, left_out=inputs.has_left_out, window=inputs.window)
-    _outputs.check_outputs(dict.fromkeys(figures, FIGURE_SUFFIXES), overwrite)
-    _outputs.protect([out, figure, *figures], [result, *inputs.files])
+    _inputs.check_outputs(dict.fromkeys(figures, FIGURE_SUFFIXES), overwrite)
+    _inputs.protect([out, figure, *figures], [result, *inputs.files])
 
 
 def rerun_table(again: Rerun, names: Sequence[str], written: list[Path]) -> Table:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from napari_shadowinv.cli import _flags, _inputs, _outputs
+from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._terminal import (
     exit_unless_converged,
     invert_shot,
@@ -110,12 +110,12 @@ def invert(
     from napari_shadowinv.pipeline import write_recipe
     from napari_shadowinv.pipeline.files import read_part
 
-    result, figure = _outputs.result_and_figure(image, out, figure)
+    result, figure = _inputs.result_and_figure(image, out, figure)
     outputs = {result: suffixes_for(ResultKind.INVERSION), figure: FIGURE_SUFFIXES}
     if save_recipe is not None:
         outputs[save_recipe] = (".toml",)
-    _outputs.check_outputs(outputs, overwrite)
-    _outputs.protect(list(outputs), [image, recipe, setup, options])
+    _inputs.check_outputs(outputs, overwrite)
+    _inputs.protect(list(outputs), [image, recipe, setup, options])
     chosen = _inputs.recipe_from(
         flags,
         recipe,
@@ -126,12 +126,12 @@ def invert(
         mask=mask,
         source_mask=source_mask,
     )
-    _outputs.protect_files_of(chosen, list(outputs))
+    _inputs.protect_files_of(chosen, list(outputs))
     shot = read_part(image, channel, variable)
     chosen = chosen.model_copy(update={"setup": _inputs.setup_for(setup, shot, chosen)})
-    _outputs.check_setup(result, chosen.setup)
+    _inputs.check_setup(result, chosen.setup)
     inversion = invert_shot(chosen, shot, _inputs.source_from(chosen, image, channel), quiet)
-    _outputs.write_result(inversion, [str(image)], result, figure, overwrite)
+    _inputs.write_result(inversion, [str(image)], result, figure, overwrite)
     if save_recipe is not None:
         write_recipe(save_recipe, chosen, overwrite=overwrite)
     if not quiet:
@@ -176,16 +176,16 @@ def rerun(
     from napari_shadowinv.pipeline.rerun import collect_rerun
 
     target = out or Path(f"{result.stem}_again{result.suffix}")
-    again_out, figure = _outputs.result_and_figure(result, target, figure)
+    again_out, figure = _inputs.result_and_figure(result, target, figure)
     suffixes = suffixes_for(ResultKind.INVERSION)
-    _outputs.check_outputs({again_out: suffixes, figure: FIGURE_SUFFIXES}, overwrite)
+    _inputs.check_outputs({again_out: suffixes, figure: FIGURE_SUFFIXES}, overwrite)
     inputs = collect_rerun(result, image, source=source, other_folders=other_folders)
     _rerun.check_rerun(inputs, result, again_out, figure, overwrite)
     warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in inputs.shots)
     with nullcontext() if quiet else progress_bars() as show:
         again = inputs.run(show, is_interrupted)
     names = [str(file) for file in inputs.files[: len(inputs.shots)]] or [str(result)]
-    _outputs.write_result(again.content, names, again_out, figure, overwrite, again.checks)
+    _inputs.write_result(again.content, names, again_out, figure, overwrite, again.checks)
     if not quiet:
         say(_rerun.rerun_table(again, names, [again_out, figure]))
     _rerun.exit_unless_sound(again, again_out)
@@ -237,8 +237,8 @@ def forward(
     from napari_shadowinv.pipeline.files import setup_from
 
     path = Path(f"{field.stem}_image{TIFF.suffix}") if out is None else out
-    _outputs.check_outputs({path: tuple(IMAGE_WRITERS)}, overwrite)
-    _outputs.protect([path], [field, source, setup, recorded_with])
+    _inputs.check_outputs({path: tuple(IMAGE_WRITERS)}, overwrite)
+    _inputs.protect([path], [field, source, setup, recorded_with])
     if source_variable is not None and source is None:
         raise InputError("received --source-variable: it needs --source, the file that contains it")
     target = None if setup is None else setup_from(setup)
@@ -307,7 +307,7 @@ def demo(
     chosen = _inputs.options_from(
         {} if n_sites is None else {"n_sites": n_sites}, clip_negative=True
     )
-    _outputs.make_folder(out)
+    _inputs.make_folder(out)
     from napari_shadowinv.cli import _demo
     from napari_shadowinv.physics.phantoms import paper_setup
     from napari_shadowinv.preprocessing import Radiograph, Recipe

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from napari_shadowinv.cli import _flags, _outputs
+from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._inputs import recipe_for_shots
 from napari_shadowinv.cli._terminal import notify_errors, warn_of_setups
 from napari_shadowinv.options import WatchOptions
@@ -68,7 +68,7 @@ def watch(
         source_mask=source_mask,
     )
     if save_recipe is not None:
-        _outputs.save_recipe(save_recipe, chosen, [recipe, setup, options], watch_options.overwrite)
+        _inputs.save_recipe(save_recipe, chosen, [recipe, setup, options], watch_options.overwrite)
     if not quiet:
         warn_of_setups([(chosen.setup, None)])
     run_watch(folder, out, chosen, watch_options, channel=channel, variable=variable, quiet=quiet)
