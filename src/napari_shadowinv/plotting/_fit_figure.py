@@ -15,7 +15,11 @@ from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import ShownField, intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
-from napari_shadowinv.plotting._drawing import (
+from napari_shadowinv.plotting._panels import (
+    ALARM_COLOUR,
+    GOOD_COLOUR,
+    Grid,
+    Panel,
     draw_cuts,
     draw_differences,
     draw_field,
@@ -23,7 +27,6 @@ from napari_shadowinv.plotting._drawing import (
     draw_potential,
     outline_caustics,
 )
-from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, Grid, Panel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,12 +14,16 @@ from napari_shadowinv.fitting import FitWindows, LeaveOneOut, Verdict
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
-from napari_shadowinv.plotting._drawing import (
+from napari_shadowinv.plotting._panels import (
+    ALARM_COLOUR,
+    GOOD_COLOUR,
+    QUIET_COLOUR,
+    Grid,
+    Panel,
     draw_differences,
     draw_intensity,
     draw_side_by_side,
 )
-from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR, Grid, Panel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

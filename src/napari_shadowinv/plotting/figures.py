@@ -17,7 +17,13 @@ from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.physics.units import intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
-from napari_shadowinv.plotting._drawing import (
+from napari_shadowinv.plotting._film_figure import pack_figure
+from napari_shadowinv.plotting._fit_figure import fit_figure
+from napari_shadowinv.plotting._panels import (
+    ALARM_COLOUR,
+    GOOD_COLOUR,
+    QUIET_COLOUR,
+    Panel,
     draw_cuts,
     draw_differences,
     draw_field,
@@ -26,9 +32,6 @@ from napari_shadowinv.plotting._drawing import (
     draw_side_by_side,
     outline_caustics,
 )
-from napari_shadowinv.plotting._film_figure import pack_figure
-from napari_shadowinv.plotting._fit_figure import fit_figure
-from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR, Panel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
