@@ -16,8 +16,12 @@ import pytest
 from numpy.typing import NDArray
 
 from napari_shadowinv.inversion import Inversion, Report, invert
-from napari_shadowinv.inversion.edges import inner_sides, turned_back
-from napari_shadowinv.inversion.solution_checks import image_residual, mark_caustics
+from napari_shadowinv.inversion.solution_checks import (
+    image_residual,
+    inner_sides,
+    mark_caustics,
+    turned_back,
+)
 from napari_shadowinv.io import read
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics import phantoms
