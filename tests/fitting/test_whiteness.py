@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.fitting.whiteness import (
+from napari_shadowinv.fitting.pattern import (
     blur_score,
     correlation_length,
     lack_of_noise,

@@ -30,7 +30,7 @@ from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import Measured, measured
-from napari_shadowinv.fitting.pattern import Pattern, find_pattern
+from napari_shadowinv.fitting.pattern import Pattern, find_pattern, noise_amplification
 from napari_shadowinv.fitting.posterior import Posterior, Sample
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.search import (
@@ -45,7 +45,6 @@ from napari_shadowinv.fitting.search import (
 )
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.fitting.verdict import judged
-from napari_shadowinv.fitting.whiteness import noise_amplification
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import FitOptions, InversionOptions, KindOfNoise
 from napari_shadowinv.physics.forward import jacobian_determinant
