@@ -9,7 +9,7 @@ import pytest
 from scipy.fft import idctn
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.beam_error import draw_variations
+from napari_shadowinv.fitting._error_bars import draw_variations
 from napari_shadowinv.fitting.descent import descend
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.posterior import Posterior

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.beam_error import BeamError
+from napari_shadowinv.fitting._error_bars import BeamError
 from napari_shadowinv.fitting.pattern import Pattern
 from napari_shadowinv.fitting.verdict import Verdict, judged
 

@@ -18,6 +18,7 @@ from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting._error_bars import (
+    BeamError,
     BeamShifts,
     errors_by_noise,
     largest_share,
@@ -25,7 +26,6 @@ from napari_shadowinv.fitting._error_bars import (
 )
 from napari_shadowinv.fitting._masked import hidden_contrast
 from napari_shadowinv.fitting._rivals import gain_by_blur, log_evidence, name_cause
-from napari_shadowinv.fitting.beam_error import BeamError
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer
 from napari_shadowinv.fitting.forward import Scene

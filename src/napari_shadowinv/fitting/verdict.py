@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.fitting.beam_error import BeamError
+from napari_shadowinv.fitting._error_bars import BeamError
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
 from napari_shadowinv.inversion.solution_checks import TURNED_BACK, inner_sides, turned_back
 
