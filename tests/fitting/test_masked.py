@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from napari_shadowinv.fitting._masked import hidden_contrast
+from napari_shadowinv.fitting.verdict import hidden_contrast
 
 Y, X = np.indices((64, 64))
 RING = np.exp(-((np.hypot(Y - 32, X - 32) - 14) ** 2) / 2 / 2**2)[None]

@@ -24,7 +24,6 @@ from napari_shadowinv.fitting._error_bars import (
     largest_share,
     shifts_by_beam,
 )
-from napari_shadowinv.fitting._masked import hidden_contrast
 from napari_shadowinv.fitting._rivals import gain_by_blur, log_evidence, name_cause
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer
@@ -44,7 +43,7 @@ from napari_shadowinv.fitting.search import (
     with_likely_smoothness,
 )
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.fitting.verdict import judged
+from napari_shadowinv.fitting.verdict import hidden_contrast, judged
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import FitOptions, InversionOptions, KindOfNoise
 from napari_shadowinv.physics.forward import jacobian_determinant
