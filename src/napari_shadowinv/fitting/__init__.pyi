@@ -1,11 +1,10 @@
 from ._fit import compare, fit
 from ._leave_one_out import leave_one_out
-from .agreement import LeaveOneOut
 from .blur import point_spread
 from .measurements import FitOptions
 from .result import Basin, Fit, FitReport, FittedField
 from .verdict import Verdict
-from .windows import FitWindows
+from .windows import FitWindows, LeaveOneOut
 
 __all__ = [
     "Basin",

@@ -17,7 +17,6 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.fitting._fit import reweighted, starts
-from napari_shadowinv.fitting.agreement import LeaveOneOut, check_count, explanation_of
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer, settle
 from napari_shadowinv.fitting.forward import Scene
@@ -38,6 +37,7 @@ from napari_shadowinv.fitting.search import (
     with_likely_smoothness,
 )
 from napari_shadowinv.fitting.unknowns import Unknowns
+from napari_shadowinv.fitting.windows import LeaveOneOut, check_count, explanation_of
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.setup import Setup
 

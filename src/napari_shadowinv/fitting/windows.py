@@ -1,4 +1,7 @@
-"""Fits of neighbouring images one after another, a film of the field: `FitWindows`."""
+"""Fits of neighbouring images one after another, a film of the field: `FitWindows`.
+
+Whether one static field explains several images: the result `LeaveOneOut`.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.inversion.variables import UNCERTAINTY, belongs, dataset_from_field
 from napari_shadowinv.physics.labels import PIXEL, label
@@ -17,7 +21,178 @@ from napari_shadowinv.physics.setup import BeamQuantity, Setup, beam_values
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["PREFIX", "FitWindows"]
+__all__ = ["PREFIX", "FitWindows", "LeaveOneOut", "check_count", "explanation_of"]
+
+
+_PLANES = ("image", "y", "x")
+# Attribute: variable, dimensions, units, long name.
+_VARIABLES: dict[str, tuple[str, tuple[str, ...], str, str]] = {
+    "images": ("images", _PLANES, "flux/px²", "Image"),
+    "mask": ("mask", _PLANES, "1", "Pixels that were used"),
+    "predicted": ("left_out_prediction", _PLANES, "flux/px²", "Image as the others predict it"),
+    "residual": ("left_out_residual", _PLANES, "flux/px²", "Image minus prediction"),
+    "brightness": (
+        "left_out_brightness",
+        ("image",),
+        "1",
+        "Brightness relative to the expected one",
+    ),
+    "chi2": ("left_out_chi2", ("image",), "1", "Mean squared residual over the noise"),
+    "alone": ("left_out_alone", ("image",), "1", "The same with a field of the image's own"),
+    "limit": ("left_out_limit", ("image",), "1", "Largest χ² that one static field would give"),
+    "rms": ("left_out_rms", ("image",), "1", "R.m.s. residual over the image's mean"),
+}
+_SENTENCE = "left_out"
+_LARGE = 100.0
+_LEAST_IMAGES = 3
+
+
+@dataclass(frozen=True)
+class LeaveOneOut:
+    """Several images, each predicted from a fit of the others.
+
+    Attributes
+    ----------
+    images : ndarray, shape (L, H, W)
+        The data.
+    mask : ndarray of bool, shape (L, H, W)
+        The pixels that were used.
+    predicted, residual : ndarray, shape (L, H, W)
+        Prediction by the other images, and data minus prediction, 0 where masked.
+    brightness : ndarray, shape (L,)
+        How much brighter each image is than the source that was given; fitted to the prediction.
+    chi2 : ndarray, shape (L,)
+        Mean of (residual / σ)² over each image.
+    alone : ndarray, shape (L,)
+        The same if the image is fitted alone: due to noise, source, point spread.
+    limit : ndarray, shape (L,)
+        The largest χ² that one static field would give: 1.15 times the χ² of the noise, which
+        follows from `alone`, plus five times the variance of the prediction.
+    rms : ndarray, shape (L,)
+        R.m.s. residual, relative to the image's mean.
+    explanation : str
+        Which images one static field does not explain, in a sentence.
+    """
+
+    images: FloatArray
+    mask: BoolArray
+    predicted: FloatArray
+    residual: FloatArray
+    brightness: FloatArray
+    chi2: FloatArray
+    alone: FloatArray
+    limit: FloatArray
+    rms: FloatArray
+    explanation: str
+
+    @property
+    def explained(self) -> BoolArray:
+        """Whether the field of the others explains each image, shape (L,)."""
+        return np.asarray(self.chi2 <= self.limit)
+
+    def only(self, numbers: Sequence[int]) -> LeaveOneOut:
+        """Return some of the images, in this order."""
+        chosen = list(numbers)
+        arrays = {name: getattr(self, name)[chosen] for name in _VARIABLES}
+        return LeaveOneOut(**arrays, explanation=self.explanation)
+
+    def to_dataset(self) -> xarray.Dataset:
+        """Return everything as one labelled dataset, whose variables can join those of a fit."""
+        import xarray as xr
+
+        variables: dict[str, Any] = {
+            variable: (dims, getattr(self, name), label(units, text))
+            for name, (variable, dims, units, text) in _VARIABLES.items()
+        }
+        return xr.Dataset(variables, attrs={_SENTENCE: self.explanation})
+
+    @classmethod
+    def from_dataset(cls, dataset: xarray.Dataset) -> LeaveOneOut:
+        """Rebuild it from the dataset that has its variables.
+
+        Raises
+        ------
+        InputError
+            If one of them is missing.
+        """
+        missing = [variable for variable, *_ in _VARIABLES.values() if variable not in dataset]
+        if missing or _SENTENCE not in dataset.attrs:
+            raise InputError(
+                f"dataset has no {', '.join(missing) or _SENTENCE}: expected the result of "
+                "shadowinv fit --leave-one-out"
+            )
+        arrays: dict[str, AnyArray] = {
+            name: np.ascontiguousarray(dataset[variable].values)
+            for name, (variable, *_) in _VARIABLES.items()
+        }
+        return cls(**arrays, explanation=str(dataset.attrs[_SENTENCE]))
+
+
+def check_count(count: int) -> None:
+    """Reject with an `InputError` images that are too few for one of them to be left out."""
+    if count < _LEAST_IMAGES:
+        raise InputError(
+            f"received {count} image{'s' * (count != 1)}: leaving one out needs {_LEAST_IMAGES} or "
+            "more, so that two or more predict it"
+        )
+
+
+def explanation_of(
+    chi2: FloatArray,
+    limit: FloatArray,
+    setups: Sequence[Setup] | None,
+    names: Sequence[str] | None,
+) -> str:
+    """Say which images one static field does not explain, in a sentence.
+
+    Parameters
+    ----------
+    chi2, limit : ndarray, shape (L,)
+        χ² of the prediction of each image, and its upper limit.
+    setups : sequence of Setup or None
+        Their energies name the images.
+    names : sequence of str or None
+        Names of the images in messages. Default: their numbers.
+    """
+    wrong = np.flatnonzero(chi2 > limit)
+    if not len(wrong):
+        return (
+            f"one static field explains all {len(chi2)} images: each is predicted by the others "
+            f"(χ² {chi2.min():.2f} to {chi2.max():.2f})"
+        )
+    values = ", ".join(
+        f"{value:.1f}" if value < _LARGE else f"{value:.0f}" for value in chi2[wrong]
+    )
+    images = f"image{'s' * (len(wrong) > 1)} {_called(wrong, setups, names)}"
+    if len(wrong) < len(chi2) / 2:
+        verb = "are" if len(wrong) > 1 else "is"
+        disagreement = (
+            f"the {images} {verb} not explained by one static field with the others (χ² {values})"
+        )
+    else:
+        disagreement = (
+            f"no static field explains more than {max(len(chi2) - len(wrong), 1)} of "
+            f"{len(chi2)} images: the {images} differ (χ² {values})"
+        )
+    return (
+        f"{disagreement}: the object may have changed between images, or an energy, the source or "
+        "the point spread is wrong"
+    )
+
+
+def _called(wrong: AnyArray, setups: Sequence[Setup] | None, names: Sequence[str] | None) -> str:
+    beams = beam_values(setups or ())
+    if beams is not None:
+        quantity, values = beams
+        text = quantity.text(*(values[k] for k in wrong), digits=6)
+        return f"at {' and '.join(text.rsplit(', ', 1))}"
+    return _listed([names[k] if names else str(k + 1) for k in wrong])
+
+
+def _listed(texts: Sequence[str]) -> str:
+    *most, last = texts
+    return f"{', '.join(most)} and {last}" if most else last
+
 
 PREFIX = "window_"
 """What the variables begin with in the dataset of a fit."""

@@ -16,8 +16,8 @@ from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitWindows, LeaveOneOut, fit, leave_one_out
-from napari_shadowinv.fitting.agreement import check_count
 from napari_shadowinv.fitting.measurements import strengths_of
+from napari_shadowinv.fitting.windows import check_count
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline.fit_run import FitInputs, FitShot, collect_fit_inputs
 from napari_shadowinv.pipeline.inversion_run import Shot
