@@ -9,8 +9,14 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from napari_shadowinv._napari.frame import Frame
-from napari_shadowinv._napari.kinds import KINDS, layer_name
-from napari_shadowinv._napari.layer_metadata import KEY, Result, metadata_for, role_of
+from napari_shadowinv._napari.layer_metadata import (
+    KEY,
+    KINDS,
+    Result,
+    layer_name,
+    metadata_for,
+    role_of,
+)
 from napari_shadowinv._napari.layers import FullLayerData, dataset_layers, symmetric_limits
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.physics.setup import deflector_titles

@@ -13,12 +13,12 @@ import numpy as np
 
 from napari_shadowinv._napari.fit_layers import fit_layers
 from napari_shadowinv._napari.frame import Frame, frame_for, frame_of, matrix_of
-from napari_shadowinv._napari.kinds import main_layers
 from napari_shadowinv._napari.layer_metadata import (
     SHOT,
     SOURCE,
     Result,
     layer_key,
+    main_layers,
     metadata_of,
     role_of,
 )

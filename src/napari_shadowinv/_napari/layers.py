@@ -10,10 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._napari.frame import Frame, frame_for
-from napari_shadowinv._napari.kinds import KINDS, MASKED_ROLES, Kind, layer_name, main_layers
 from napari_shadowinv._napari.layer_metadata import (
     KEY,
+    KINDS,
+    MASKED_ROLES,
+    Kind,
     Result,
+    layer_name,
+    main_layers,
     metadata_for,
     role_of,
 )

@@ -19,8 +19,7 @@ import numpy as np
 
 from napari_shadowinv._napari.frame import Frame, frame_for
 from napari_shadowinv._napari.jobs import Job
-from napari_shadowinv._napari.kinds import Kind
-from napari_shadowinv._napari.layer_metadata import CAME_WITH, Result, metadata_for
+from napari_shadowinv._napari.layer_metadata import CAME_WITH, Kind, Result, metadata_for
 from napari_shadowinv._napari.layers import FullLayerData, Limits
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._system.progress import OnProgress, ShouldStop

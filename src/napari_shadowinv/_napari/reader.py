@@ -57,7 +57,7 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
     if not isinstance(path, str):
         return list(stack_layers([Path(item) for item in path]))
     if path.rstrip("/").endswith(STORE.suffix):
-        from napari_shadowinv._napari.kinds import main_layers
+        from napari_shadowinv._napari.layer_metadata import main_layers
         from napari_shadowinv._napari.stores import follow_once_added, store_layers
 
         layers = main_layers(store_layers(Path(path)))

@@ -16,8 +16,7 @@ from napari_shadowinv._napari.fit_layers import (
     start_name,
 )
 from napari_shadowinv._napari.jobs import Finished, FitJob
-from napari_shadowinv._napari.kinds import main_layers
-from napari_shadowinv._napari.layer_metadata import Result, result_of
+from napari_shadowinv._napari.layer_metadata import Result, main_layers, result_of
 from napari_shadowinv._napari.notifications import window_text
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import (

@@ -17,7 +17,7 @@ from qtpy import QtWidgets
 from qtpy.QtCore import QObject, QSize, Qt, Signal
 
 from napari_shadowinv._napari.jobs import Job
-from napari_shadowinv._napari.kinds import main_layers
+from napari_shadowinv._napari.layer_metadata import main_layers
 from napari_shadowinv._napari.notifications import USER_ERRORS, window_text
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, section, wrapping_label

@@ -13,8 +13,13 @@ from napari.utils.notifications import show_info
 from qtpy.QtWidgets import QFileDialog, QMenu, QPushButton, QSizePolicy
 
 from napari_shadowinv._napari.frame import Frame, frame_of
-from napari_shadowinv._napari.kinds import main_layers
-from napari_shadowinv._napari.layer_metadata import Result, metadata_of, result_of, source_of
+from napari_shadowinv._napari.layer_metadata import (
+    Result,
+    main_layers,
+    metadata_of,
+    result_of,
+    source_of,
+)
 from napari_shadowinv._napari.layer_state import layers_of_result
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.shots import radiograph_layers

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QCheckBox, QFileDialog, QHeaderView, QLabel, QLineEdit, QSpinBox
 
-from napari_shadowinv._napari.kinds import main_layers
-from napari_shadowinv._napari.layer_metadata import may_be_shot, role_of
+from napari_shadowinv._napari.layer_metadata import main_layers, may_be_shot, role_of
 from napari_shadowinv._napari.stores import follow_shots, shot_rows
 from napari_shadowinv._napari.widgets._forms import PathEdit, RowPicker, labelled
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
