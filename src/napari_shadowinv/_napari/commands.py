@@ -10,7 +10,7 @@ import numpy as np
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari import layers as results
-from napari_shadowinv._napari import notifications
+from napari_shadowinv._napari import viewer_sync
 from napari_shadowinv._napari.frame import Frame, frame_of
 from napari_shadowinv._napari.layer_metadata import main_layers
 from napari_shadowinv._napari.shots import radiograph_of, shot_layer
@@ -44,7 +44,7 @@ class _Selection:
         return self.shot.image
 
 
-@notifications.notify_errors(otherwise=list)
+@viewer_sync.notify_errors(otherwise=list)
 def invert_uniform(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
@@ -52,7 +52,7 @@ def invert_uniform(
     return _start(_select_image(layer, viewer), _invert, "Inverting", viewer)
 
 
-@notifications.notify_errors(otherwise=list)
+@viewer_sync.notify_errors(otherwise=list)
 def refine(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
@@ -63,14 +63,14 @@ def refine(
 
     name = name_of_result(layer)
     job = refinement(layer, layer, name, psf=0.0)
-    if viewer is None or not notifications.in_event_loop():
+    if viewer is None or not viewer_sync.in_event_loop():
         return list(job.work(lambda _: None, lambda: False).layer_data)
     _, tool = viewer.window.add_plugin_dock_widget("napari-shadowinv", "Invert shot")
     tool.refine_layer(layer)
     return []
 
 
-@notifications.notify_errors(otherwise=list)
+@viewer_sync.notify_errors(otherwise=list)
 def remove_hot_pixels(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
@@ -79,7 +79,7 @@ def remove_hot_pixels(
     return _start(selection, _repair, "Removing hot pixels from", viewer)
 
 
-@notifications.notify_errors(otherwise=list)
+@viewer_sync.notify_errors(otherwise=list)
 def high_pass(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
@@ -88,7 +88,7 @@ def high_pass(
     return _start(selection, _high_pass, "Filtering", viewer)
 
 
-@notifications.notify_errors(otherwise=list)
+@viewer_sync.notify_errors(otherwise=list)
 def estimate_source(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
@@ -131,7 +131,7 @@ Work = Callable[[_Selection, ShouldStop], list[results.FullLayerData]]
 
 def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> list[Any]:
     """Do the work now, or in a thread if there is a window."""
-    if viewer is None or not notifications.in_event_loop():
+    if viewer is None or not viewer_sync.in_event_loop():
         return list(work(selection, lambda: False))
     from napari.qt.threading import create_worker
     from napari.utils import cancelable_progress
@@ -143,8 +143,8 @@ def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> lis
         bar.close()
         if error is None:
             results.add_layers(viewer, layers)
-        elif isinstance(error, notifications.USER_ERRORS):
-            notifications.show_user_error(error)
+        elif isinstance(error, viewer_sync.USER_ERRORS):
+            viewer_sync.show_user_error(error)
         elif not isinstance(error, InversionCancelled):
             raise error
 

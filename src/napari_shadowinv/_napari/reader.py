@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from napari_shadowinv._napari.notifications import notify_errors, show_caution
+from napari_shadowinv._napari.viewer_sync import notify_errors, show_caution
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.formats import PRADFORMAT, RADIOGRAPH_SUFFIXES, RESULT, STORE

@@ -10,8 +10,8 @@ import numpy as np
 from napari_shadowinv import io
 from napari_shadowinv._napari.layer_metadata import CAME_WITH
 from napari_shadowinv._napari.layers import FullLayerData
-from napari_shadowinv._napari.notifications import notify_errors
 from napari_shadowinv._napari.shots import lazy_stack, radiograph_layers, shot_layer
+from napari_shadowinv._napari.viewer_sync import notify_errors
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.io import Radiograph
 from napari_shadowinv.io.public_images import fetch_burner

@@ -24,7 +24,7 @@ from napari_shadowinv._napari.layer_metadata import (
     role_of,
 )
 from napari_shadowinv._napari.layers import FullLayerData
-from napari_shadowinv._napari.notifications import show_caution
+from napari_shadowinv._napari.viewer_sync import show_caution
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order, sha256

@@ -1,14 +1,99 @@
-"""Synchronisation with a viewer: colour bar, placement of new images, label of the shown film."""
+"""Synchronisation with a viewer: colour bar, placement of new images, label of the shown film.
+
+Messages to napari's user: a sentence for a user's error instead of a traceback.
+"""
 
 from __future__ import annotations
 
+import functools
+import re
+import sys
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from napari_shadowinv._napari.frame import Frame, frame_of
 from napari_shadowinv._napari.layer_metadata import metadata_of, role_of
+from napari_shadowinv.errors import InputError
+
+USER_ERRORS = (InputError, OSError, MemoryError)
+"""Errors that a user can resolve; all others are bugs, whose traceback is needed."""
+
+ReturnValue = TypeVar("ReturnValue")
+
+# Hints for the command line or Python, and names of options elsewhere.
+_HINT = re.compile(r"\s*\([^()]*(?:--[a-z]|\b[a-z_]+=)[^()]*\)")
+_OPTION = re.compile(r"--([a-z][a-z-]*)|\b([a-z]+(?:_[a-z]+)+)\b")
+
+
+def window_text(text: str) -> str:
+    """Replace flags and keys of options by their labels in the forms, and remove hints on them."""
+
+    def label(match: re.Match[str]) -> str:
+        key = (match[1] or match[2]).replace("-", "_")
+        return f"'{_labels()[key]}'" if key in _labels() else match[0]
+
+    return _OPTION.sub(label, _HINT.sub("", text))
+
+
+@functools.cache
+def _labels() -> dict[str, str]:
+    from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
+
+    return {
+        name: str(field.title).partition(" (")[0]
+        for model in (FitChoices, FitOptions, InversionOptions)
+        for name, field in model.model_fields.items()
+        if field.title
+    }
+
+
+def in_event_loop() -> bool:
+    """Whether the call comes from a menu, a dialog or napari's console, not from a script."""
+    if "qtpy" not in sys.modules:
+        return False
+    from qtpy.QtCore import QThread
+
+    thread = QThread.currentThread()
+    return thread is not None and thread.loopLevel() > 0
+
+
+def notify_errors(
+    otherwise: Callable[[], ReturnValue],
+) -> Callable[..., Callable[..., ReturnValue]]:
+    """Show a user's error in a window as a notification, and return `otherwise()`."""
+
+    def decorate(function: Callable[..., ReturnValue]) -> Callable[..., ReturnValue]:
+        @functools.wraps(function)
+        def guarded(*args: Any, **kwargs: Any) -> ReturnValue:
+            try:
+                return function(*args, **kwargs)
+            except USER_ERRORS as error:
+                if not in_event_loop():
+                    raise
+                show_user_error(error)
+                return otherwise()
+
+        return guarded
+
+    return decorate
+
+
+def show_user_error(error: BaseException) -> None:
+    """Show a user's error as a notification."""
+    from napari.utils.notifications import show_error
+
+    text = window_text(str(error)) or "there is not enough memory for this"
+    show_error(text[:1].upper() + text[1:])
+
+
+def show_caution(text: str) -> None:
+    """Show a warning as a notification."""
+    from napari.utils.notifications import show_warning
+
+    show_warning(window_text(text))
+
 
 # Longer names would be cut off next to the colour bar of a narrow window.
 _NAME_SIZE_PT, _LINE_WIDTH_PT = 10, 460

@@ -17,7 +17,7 @@ from napari_shadowinv._napari.fit_layers import (
 )
 from napari_shadowinv._napari.jobs import Finished, FitJob
 from napari_shadowinv._napari.layer_metadata import Result, main_layers, result_of
-from napari_shadowinv._napari.notifications import window_text
+from napari_shadowinv._napari.viewer_sync import window_text
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import (
     PROBLEM_STYLE,

@@ -18,7 +18,7 @@ from qtpy.QtCore import QObject, QSize, Qt, Signal
 
 from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import main_layers
-from napari_shadowinv._napari.notifications import USER_ERRORS, window_text
+from napari_shadowinv._napari.viewer_sync import USER_ERRORS, window_text
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, section, wrapping_label
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers

@@ -12,7 +12,7 @@ from napari.utils.notifications import show_error
 from qtpy.QtCore import QObject, QSettings, Qt, QTimer
 from qtpy.QtWidgets import QDockWidget, QHBoxLayout, QMainWindow, QVBoxLayout, QWidget
 
-from napari_shadowinv._napari.notifications import USER_ERRORS, window_text
+from napari_shadowinv._napari.viewer_sync import USER_ERRORS, window_text
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 

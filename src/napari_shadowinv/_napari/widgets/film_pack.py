@@ -25,9 +25,8 @@ from napari_shadowinv._napari.layer_metadata import (
     role_of,
 )
 from napari_shadowinv._napari.layer_state import dataset_of_layers
-from napari_shadowinv._napari.notifications import window_text
 from napari_shadowinv._napari.packs import PackJob
-from napari_shadowinv._napari.viewer_sync import plane_in_view
+from napari_shadowinv._napari.viewer_sync import plane_in_view, window_text
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._forms import (
     ModelForm,

@@ -19,8 +19,8 @@ from napari_shadowinv._napari.layer_metadata import (
     metadata_of,
     result_of,
 )
-from napari_shadowinv._napari.notifications import show_caution
 from napari_shadowinv._napari.shots import radiograph_of
+from napari_shadowinv._napari.viewer_sync import show_caution
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._fitting import FitView, RefineSection
