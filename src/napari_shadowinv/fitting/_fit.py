@@ -196,10 +196,9 @@ def fit(
             absorbed = posterior.count_determined(np.random.default_rng(options.seed))
             share = pattern.missing_counts - absorbed / np.count_nonzero(scene.weights)
             pattern = replace(pattern, missing_counts=share)
-        blur_gain = 0.0
-        if data.single or not pattern.is_certain:
-            suspected = data.single or pattern.blur_score > _MIN_BLUR_SCORE
-            blur_gain = gain_by_blur(scene, best, fields, options, on_step, suspected=suspected)
+        # With several images the fit is repeated only if the residual asks for it.
+        suspected = data.single or pattern.blur_score > _MIN_BLUR_SCORE
+        blur_gain = gain_by_blur(scene, best, on_step) if suspected else 0.0
         if pattern.is_certain and pattern.chi2 < _MAX_RIVAL_CHI2:
             cause = name_cause(scene, best, fields, setups, on_step)
             pattern = replace(pattern, cause=cause)

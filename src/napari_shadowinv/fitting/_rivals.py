@@ -14,14 +14,13 @@ from zlib import crc32
 
 import numpy as np
 
-from napari_shadowinv.fitting.descent import coarser, smoothness_in_pixels
+from napari_shadowinv.fitting.descent import coarser
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import strengths_of
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.search import HELD, MIDDLE, MIDDLE_SPACING, Found, OnStep, settled
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions
-from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["gain_by_blur", "log_evidence", "name_cause"]
@@ -39,15 +38,6 @@ _BEAM_MODES, _FINE_BEAM_MODES = 8, 20
 _BEAM_SPREAD = 0.3
 _SHIFT = np.array([True, False, False] * 2)
 _STEPS = 12
-# Of right fits without folds, 3 px change the log evidence by -2151 to 6. Of images that are
-# blurred by 3 px it changes by -15 to 132 if the error bars are below 7 %. A prior that is not the
-# object's shifts it by up to 27.
-_EVIDENCE_ALLOWANCE = 20.0
-# By which the objective may grow, for each pixel, before λ and κ are adapted: 0.02 to 0.24 of right
-# fits, -0.006 to 0.005 of those that are blurred and noticed. More cannot be made good.
-_MAX_LOSS = 0.01
-# Beyond them bright lines reveal blur in the residual.
-_MAX_FOLDED = 0.005  # of the pixels
 _PEDESTALS = 0.09, 0.17  # of each image's mean: dark levels of 10 and 20 % of the beam
 
 
@@ -106,48 +96,9 @@ def name_cause(
     return f"{', or '.join(list(likely)[:2])} ({falls})"
 
 
-def gain_by_blur(
-    scene: Scene,
-    best: Found,
-    names: Sequence[str],
-    options: FitOptions,
-    on_step: OnStep,
-    *,
-    suspected: bool,
-) -> float:
-    """Return how much likelier a wider point spread makes the images, in units of a logarithm.
-
-    A smoother field imitates blur so well that χ² does not show it: a sharp model even follows the
-    noise better than the blurred one that is right. The evidence takes that freedom into account.
-    It is compared where no rays cross. Elsewhere bright lines show blur in the residual, and the
-    objective is compared if blur is `suspected`, as it is for one image.
-
-    Parameters
-    ----------
-    scene, best
-        The fit, in pixels of two.
-    names : sequence of str
-        The fields.
-    options : FitOptions
-        Its seed, and whether the smoothness was given.
-    on_step : callable
-        Receives the stage and the objective.
-    suspected : bool
-        Whether there is one image only, or the residual looks like blur.
-    """
-    if suspected:
-        wider = _wider(scene, _WIDER_PX)
-        return best.value - settled(wider, best, on_step, "point spread").value
-    if _share_folded(scene, best) > _MAX_FOLDED:
-        return 0.0
-    wider = _wider(scene, _MUCH_WIDER_PX)
-    end = settled(wider, best, on_step, "point spread")
-    if end.value - best.value > _MAX_LOSS * np.count_nonzero(scene.weights):
-        return 0.0
-    if options.smoothness is None:
-        wider, end = _with_likelier_smoothness(wider, end, options, on_step)
-    sharp = log_evidence(scene, best, names, options, on_step)
-    return log_evidence(wider, end, names, options, on_step) - sharp - _EVIDENCE_ALLOWANCE
+def gain_by_blur(scene: Scene, best: Found, on_step: OnStep) -> float:
+    """Return by how much a wider point spread lowers the objective; kernels stay."""
+    return best.value - settled(_wider(scene, _WIDER_PX), best, on_step, "point spread").value
 
 
 def log_evidence(
@@ -174,26 +125,6 @@ def log_evidence(
     report = partial(on_step, "evidence", ended.value)
     posterior = Posterior(middle, ended.unknowns, chances[0], report)
     return posterior.log_evidence(chances)
-
-
-def _with_likelier_smoothness(
-    scene: Scene, found: Found, options: FitOptions, on_step: OnStep
-) -> tuple[Scene, Found]:
-    """Return a scene with λ and κ nearer to its likeliest, and the unknowns that belong to them."""
-    middle = replace(
-        coarser(scene, MIDDLE), spacing=MIDDLE_SPACING, smoothness=scene.smoothness / HELD
-    )
-    rng = np.random.default_rng(options.seed)
-    report = partial(on_step, "point spread", found.value)
-    likely, _ = Posterior(middle, found.unknowns, rng, report).likely_smoothness()
-    scene = replace(scene, smoothness=HELD * likely / smoothness_in_pixels(MIDDLE))
-    return scene, found
-
-
-def _share_folded(scene: Scene, found: Found) -> float:
-    """The share of the pixels whose rays cross others, in the image where it is largest."""
-    moved = np.einsum("lm,mcyx->lcyx", scene.strengths, found.displacement) / found.bin
-    return max(float((jacobian_determinant(each) < 0).mean()) for each in moved)
 
 
 def _rivals(

@@ -177,7 +177,7 @@ def judged(
             "one image cannot tell the beam from the object: many pairs of them explain it; take "
             "another energy, or an image of the beam"
         )
-    if gain_by_blur > _BLURRED and (single or not uncertainty > _OPEN):
+    if gain_by_blur > _BLURRED:
         return Verdict.MISFIT, (
             "a wider point spread explains the image better: it is blurred by more than the "
             "given one, by source or detector; give the point spread (psf, or source size and "
