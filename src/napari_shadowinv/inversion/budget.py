@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -304,8 +304,8 @@ class Budget:
             discretisation=discretisation,
             noise=estimate(*self._noisy_moves(response, solved[-1].level.spacing)),
             effects={
-                cause: estimate(response.to(flux_error(response, solved[-1])))
-                for cause, flux_error in FLUX_ERRORS.items()
+                cause: estimate(response.to(samples))
+                for cause, samples in self._flux_errors(response, solved[-1])
             },
             beam=_scale_error(by_percent, times) if variation else None,
             beam_sensitivity=by_percent,
@@ -388,6 +388,14 @@ class Budget:
         moves, variance = self._by_noise[response]
         return moves, response.finer(variance, spacing, self._noise.grain)
 
+    def _flux_errors(
+        self, response: LinearResponse, solution: LevelSolution
+    ) -> Iterator[tuple[str, FloatArray]]:
+        for cause, flux_errors in FLUX_ERRORS.items():
+            samples = flux_errors(response, solution, self.options)
+            if samples is not None:
+                yield cause, samples
+
     def _beams(self, response: LinearResponse) -> FloatArray:
         """Return the flux that cells gain from beams that differ from the source by 1 (r.m.s.)."""
         rng = np.random.default_rng(self.options.seed)
@@ -403,7 +411,9 @@ class Budget:
         return mass * samples
 
 
-def _solver_gap(response: LinearResponse, solution: LevelSolution) -> FloatArray:
+def _solver_gap(
+    response: LinearResponse, solution: LevelSolution, options: InversionOptions
+) -> FloatArray:
     """Return the solver's remaining flux error in each cell."""
     gap = solution.flux - solution.level.mass
     # The nearest of the few sites is looked up by squares.
@@ -416,14 +426,14 @@ def _solver_gap(response: LinearResponse, solution: LevelSolution) -> FloatArray
     return np.bincount(group, gap, len(response.flux)).astype(np.float64)[None]
 
 
-FLUX_ERRORS: dict[str, Callable[[LinearResponse, LevelSolution], FloatArray]] = {
-    "solver": _solver_gap
-}
+FluxErrors = Callable[[LinearResponse, LevelSolution, InversionOptions], FloatArray | None]
+
+FLUX_ERRORS: dict[str, FluxErrors] = {"solver": _solver_gap}
 """Causes of flux errors, with functions that return them in each cell of a response.
 
-A function takes the response, of n cells, and the solution of the finest level. It returns k
-independent samples of the error, shape (k, n), of which each sums to about 0: the total flux of the
-image is scaled to that of the source.
+A function takes the response, of n cells, the solution of the finest level and the options. It
+returns k independent samples of the error, shape (k, n), or None if the options exclude it. Each
+sample sums to about 0: the total flux of the image is scaled to that of the source.
 """
 
 
