@@ -3,30 +3,57 @@
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import typer
+from typer.testing import CliRunner
 
-from napari_shadowinv import Fit, FitOptions, fit, synthetic_image
+from helpers.command_line import flat
+from napari_shadowinv import Fit, FitOptions, Inversion, cli, fit, invert, synthetic_image, write
+from napari_shadowinv.cli._terminal import EXIT_MISTAKE
 from napari_shadowinv.fitting import additive
+from napari_shadowinv.inversion.budget import FLUX_ERRORS
+from napari_shadowinv.io import store_columns
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.preprocessing import STEPS, Radiograph
 from napari_shadowinv.preprocessing.steps import Step, choices_of
 
 ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "napari_shadowinv"
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+
+
+# Their blocks change a table, or need a window.
+SEPARATE_SECTIONS = ("a quantity of the error budget", "a command", "a widget")
+
+
+def section(title: str) -> str:
+    """Return the text of an example."""
+    match = re.search(rf"^### {title}.*?(?=^##)", TEXT, re.DOTALL | re.MULTILINE)
+    assert match is not None
+    return match[0]
+
+
+def run_blocks(text: str) -> dict[str, Any]:
+    """Execute the Python of a text, and return its names."""
+    names: dict[str, Any] = {"__name__": "contributing"}
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(compile(block, "CONTRIBUTING.md", "exec", dont_inherit=True), names)
+    return names
 
 
 @pytest.fixture(scope="module")
 def names() -> dict[str, Any]:
-    names: dict[str, Any] = {"__name__": "contributing"}
-    for block in re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL):
-        exec(compile(block, "CONTRIBUTING.md", "exec", dont_inherit=True), names)
-    return names
+    text = TEXT
+    for title in SEPARATE_SECTIONS:
+        text = text.replace(section(title), "")
+    return run_blocks(text)
 
 
 def test_the_filter_is_a_step(names):
@@ -45,11 +72,46 @@ def test_the_option_is_one_field(names):
     assert names["InversionOptions"](ceiling=10.0).ceiling == 10.0
 
 
+def test_the_quantity_is_the_effect_of_a_nonlinear_detector(monkeypatch):
+    budget_table = dict(FLUX_ERRORS)
+    names = run_blocks(section("a quantity of the error budget"))
+    nonlinear_detector = FLUX_ERRORS.pop("nonlinear detector")
+    assert budget_table == FLUX_ERRORS
+    assert nonlinear_detector is names["nonlinear_detector"]
+    image = synthetic_image(gaussian_blob((64, 64), 20.0, 8.0).displacement)
+    options = InversionOptions(n_sites=1500)
+    plain = invert(image, source=np.ones(image.shape), options=options)
+    monkeypatch.setitem(FLUX_ERRORS, "nonlinear detector", nonlinear_detector)
+    inversion = invert(image, source=np.ones(image.shape), options=options)
+    np.testing.assert_array_equal(inversion.displacement, plain.displacement)
+
+    recorded = invert(image**1.05, source=np.ones(image.shape), options=options)
+    change = recorded.displacement - plain.displacement
+    rms = np.sqrt((change**2).sum(axis=0).mean())
+    error = inversion.errors.effects["nonlinear detector"]
+    assert error.rms == pytest.approx(rms, rel=0.2)
+    total = np.hypot(plain.errors.total, error)
+    np.testing.assert_allclose(inversion.errors.total, total)
+    assert inversion.errors.of_peak.cause == "nonlinear detector"
+    facts = {fact.key: fact.text for fact in inversion.facts}
+    assert "(nonlinear detector)" in facts["errors"]
+    restored = Inversion.from_dataset(inversion.to_dataset())
+    assert restored.errors == inversion.errors
+
+
 def test_the_column_reads_a_result_and_words_it(names):
     column = names["RMS_DISPLACEMENT"]
     inversion = SimpleNamespace(displacement=np.full((2, 4, 4), 3.0))
     assert column.text({column.key: column.value(inversion)}) == "4.24"
     assert column.heading == "rms_displacement (px)"
+
+
+def test_the_column_is_in_the_reports_of_inversions(names, monkeypatch, inversion, make_fit):
+    column = names["RMS_DISPLACEMENT"]
+    monkeypatch.setattr(store_columns, "COLUMNS", (*store_columns.COLUMNS, column))
+    values = store_columns.column_values(store_columns.INVERSIONS, inversion)
+    assert values[column.key] == pytest.approx(inversion.errors.rms)
+    assert column.key not in store_columns.column_values(store_columns.FITS, make_fit())
 
 
 def test_the_unknown_is_fitted_with_the_field(names, monkeypatch):
@@ -71,7 +133,7 @@ def test_the_unknown_is_fitted_with_the_field(names, monkeypatch):
     for (value, deviation), background in zip(rows[:, 0], backgrounds, strict=True):
         assert 1e-4 < deviation < 0.01
         assert abs(value - background) < 4 * deviation
-    facts = {fact.key: fact.text for fact in result.facts()}
+    facts = {fact.key: fact.text for fact in result.facts}
     assert f"background {rows[0, 0, 0]:.3g} ± " in facts["image_1"]
     # The option is then one of FitOptions itself.
     monkeypatch.setattr("napari_shadowinv.fitting.result.FitOptions", options_class)
@@ -99,11 +161,123 @@ def test_the_setup_converts_and_projects(names):
     assert harder.probe == "X-rays of 16 keV"
 
 
+@pytest.fixture
+def result_files(tmp_path, inversion, make_fit):
+    paths = [tmp_path / "inversion.shadowinv", tmp_path / "fit.shadowinv"]
+    for path, result in zip(paths, (inversion, make_fit()), strict=True):
+        write(path, result.to_dataset())
+    return paths
+
+
+@pytest.fixture
+def command():
+    """Run the command, on an app of its registration alone."""
+    text = section("a command")
+    app = typer.Typer()
+    module = SimpleNamespace(**run_blocks(text))
+    (registration,) = re.findall(r"^    (app\.command.*)$", text, re.MULTILINE)
+    exec(registration, {**vars(cli), "app": app, "_headlines": module})
+    runner = CliRunner(env={"COLUMNS": "500"})
+    return lambda *arguments: runner.invoke(app, [str(argument) for argument in arguments])
+
+
+def test_the_command_prints_each_result(command, result_files, inversion, make_fit):
+    answer = command(*result_files)
+    assert answer.exit_code == 0, answer.output
+    text = flat(answer.output)
+    assert "Headlines" in text
+    for path, result in zip(result_files, (inversion, make_fit()), strict=True):
+        assert f"{path.name} {result.headline.text}" in text
+
+
+def test_the_command_refuses_a_mistake_in_a_sentence_and_has_help(command, tmp_path):
+    answer = command(tmp_path / "absent.shadowinv")
+    assert answer.exit_code == EXIT_MISTAKE
+    assert "absent.shadowinv" in answer.output
+    assert "Traceback" not in answer.output
+    answer = command("--help")
+    assert "Print the peak and the warnings of each result in one line." in flat(answer.output)
+
+
+@pytest.fixture
+def area_map(qtbot, tmp_path):
+    """The widget in a viewer without a window, and the viewer."""
+    pytest.importorskip("napari")
+    from napari.components import ViewerModel
+    from qtpy.QtCore import QSettings
+
+    QSettings.setPath(QSettings.Format.IniFormat, QSettings.Scope.UserScope, str(tmp_path))
+    viewer = ViewerModel()
+    widget = run_blocks(section("a widget"))["AreaMap"](viewer)
+    qtbot.addWidget(widget)
+    return widget, viewer
+
+
+def test_the_widget_adds_the_layer_of_its_job(area_map, qtbot):
+    from napari_shadowinv._napari.layer_metadata import metadata_for
+
+    widget, viewer = area_map
+    y, x = np.indices((20, 30))
+    metadata = metadata_for("field", "px", displacement=np.stack([0.1 * y, 0.2 * x]))
+    viewer.add_image(np.ones((20, 30)), name="shot field", metadata=metadata, scale=(3, 3))
+    widget.panel.button.click()
+    qtbot.waitUntil(lambda: "shot field area" in viewer.layers, timeout=60_000)
+    layer = viewer.layers["shot field area"]
+    np.testing.assert_allclose(layer.data, 1.1 * 1.2)
+    np.testing.assert_array_equal(layer.scale, (3, 3))
+    widget.panel.button.click()
+    qtbot.waitUntil(lambda: not widget.panel.runner.running, timeout=60_000)
+    assert len(viewer.layers) == 2
+
+
+def test_the_widget_refuses_to_run_without_a_result(area_map):
+    widget, viewer = area_map
+    viewer.add_image(np.ones((20, 30)))
+    widget.panel.button.click()
+    assert "invert a shot first" in widget.panel.status.text()
+    assert not widget.panel.runner.running
+
+
+def test_the_widget_is_in_the_manifest():
+    npe2 = pytest.importorskip("npe2")
+    yaml = pytest.importorskip("yaml")
+    text = section("a widget")
+    (block,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    manifest = yaml.safe_load((PACKAGE / "napari.yaml").read_text(encoding="utf-8"))
+    for kind, entries in yaml.safe_load(block).items():
+        manifest["contributions"][kind] += entries
+    contributions = npe2.PluginManifest(**manifest).contributions
+    command = contributions.commands[-1]
+    assert contributions.widgets[-1].command == command.id
+    assert command.python_name.rpartition(":")[2] == "AreaMap"
+    assert "class AreaMap(" in text
+
+
 def test_the_rooms_are_those_of_the_source():
-    package = ROOT / "src" / "napari_shadowinv"
-    rooms = {path.parent.name for path in package.glob("*/__init__.py")}
-    listed = re.findall(r"^        ([_a-z]+)/ ", TEXT, re.MULTILINE)
+    rooms = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    listed = re.findall(r"^        ([_a-z]+)/ ", TEXT.split("    tests/ ")[0], re.MULTILINE)
     assert set(listed) == rooms
+    modules = {path.stem for path in PACKAGE.glob("*.py")}
+    lines = re.findall(r"^        ((?:[_a-z]+, )*[_a-z]+)  ", TEXT, re.MULTILINE)
+    assert {name for line in lines for name in line.split(", ")} == modules
+
+
+def test_each_reference_of_the_glossary_exists():
+    text = TEXT.partition("### Glossary")[2].partition("\n## ")[0]
+    references = re.findall(r"`([_a-z]+(?:\.\w+)+)`", text.replace("name.shadowinv.zarr", ""))
+    assert len(references) > 20
+    for reference in references:
+        room, _, name = reference.rpartition(".")
+        if (PACKAGE / f"{reference.replace('.', '/')}.py").exists():
+            continue
+        assert hasattr(import_module(f"napari_shadowinv.{room}"), name), reference
+
+
+def test_the_longest_module_is_as_long_as_stated():
+    limit = re.search(r"No module is longer than (\d+) lines", TEXT)
+    assert limit is not None
+    lengths = [len(path.read_text("utf-8").splitlines()) for path in PACKAGE.rglob("*.py")]
+    assert 500 < max(lengths) <= int(limit[1])
 
 
 def test_every_benchmark_is_listed_and_every_link_leads_somewhere():
