@@ -940,8 +940,8 @@ def test_a_source_of_another_file_is_not_taken_for_that_file(
     tool.source.layers.layer = beam
     tool.source.picker.set_kind("layer")
     first, second = inputs_of(tool).provenance.images
-    assert (first.image.file, first.source.file) == ("a.h5", "a.h5")
-    assert (second.image.file, second.source.file) == ("", "")
+    assert (first.file, first.source.file) == ("a.h5", "a.h5")
+    assert (second.file, second.source.file) == ("", "")
 
 
 def test_the_same_image_twice_is_told_by_the_names_of_its_layers(
