@@ -96,15 +96,24 @@ def tool_of(window: Any, title: str) -> Any:
     return tool
 
 
-def select(tool: Any, text: str) -> None:
-    """Choose an entry of the one list that offers it."""
+def select(tool: Any, text: str, label: str = "") -> None:
+    """Choose an entry of the one list that offers it, or of the list with this label."""
     (box,) = [
         box
         for box in tool.findChildren(QtWidgets.QComboBox)
-        if box.isVisibleTo(tool) and box.findText(text) >= 0
+        if box.isVisibleTo(tool)
+        and box.findText(text) >= 0
+        and (not label or label in labels_beside(box))
     ]
     box.setCurrentIndex(box.findText(text))
     box.activated.emit(box.currentIndex())
+
+
+def labels_beside(box: Any) -> set[str]:
+    """Texts of the labels in the same row."""
+    direct = Qt.FindChildOption.FindDirectChildrenOnly
+    labels = box.parentWidget().findChildren(QtWidgets.QLabel, options=direct)
+    return {label.text() for label in labels}
 
 
 def editor_of(tool: Any, title: str) -> Any:
@@ -349,8 +358,8 @@ def test_two_energies_are_clicked_to_their_end(
     source, noise = re.findall(
         r"Set \*\*Source\*\* to \*(.*?)\* and \*\*Noise\*\* to \*(.*?)\*", text
     )[0]
-    select(tool, source)
-    select(tool, noise)
+    select(tool, source, label="Source")
+    select(tool, noise, label="Noise")
     press(tool, "Run")
     wait_for_layers(tool, qtbot)
     assert "Verdict: determined" in tool.view.verdict.text()
