@@ -121,3 +121,22 @@ def test_pages_use_no_idiom(idiom):
         if re.search(idiom, line)
     ]
     assert not wrong, f"write {IDIOMS[idiom]}"
+
+
+def prose_lines(text: str) -> Iterator[str]:
+    """The lines of a page outside code, tables and headings, without inline code and numbers of lists."""
+    in_code = False
+    for line in text.splitlines():
+        if re.match(r"\s*(```|~~~)", line):
+            in_code = not in_code
+        elif not in_code and not re.match(r"\s*[|#>]| {4}|<", line):
+            yield re.sub(r"`[^`]*`", "code", re.sub(r"^\s*\d+\. ", "", line))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_page_has_one_sentence_a_line(page: Path) -> None:
+    """So that a change of a sentence changes one line."""
+    abbreviations = r"(?<!\b[A-Z])(?<!al)(?<!Eq)(?<!Eqs)(?<!Fig)(?<!e\.g)(?<!i\.e)(?<!r\.m\.s)"
+    two_sentences = re.compile(rf"[a-z0-9)\"*]{abbreviations}\.\*{{0,2}} +[A-Z][a-z]")
+    lines = prose_lines(page.read_text(encoding="utf-8"))
+    assert [line for line in lines if two_sentences.search(re.sub(r"\([^()]*\)", "", line))] == []
