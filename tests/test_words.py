@@ -124,7 +124,7 @@ def test_pages_use_no_idiom(idiom):
 
 
 def prose_lines(text: str) -> Iterator[str]:
-    """The lines of a page outside code, tables and headings, without inline code and numbers of lists."""
+    """The lines of a page outside code, tables and headings, without numbers of lists."""
     in_code = False
     for line in text.splitlines():
         if re.match(r"\s*(```|~~~)", line):
