@@ -92,7 +92,7 @@ def test_a_wrong_layer_is_one_sentence(viewer: ViewerModel, command: Any) -> Non
 def test_what_shows_no_inversion_is_not_refined(viewer: ViewerModel, shot: np.ndarray) -> None:
     with pytest.raises(InputError, match="no layer is selected: select a layer of an inversion"):
         commands.refine(None)
-    with pytest.raises(InputError, match="'shot' shows no inversion: select a layer of an"):
+    with pytest.raises(InputError, match="'shot' shows no result: select a layer of an inversion"):
         commands.refine(add_shot(viewer, shot))
 
 
