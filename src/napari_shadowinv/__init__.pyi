@@ -6,13 +6,14 @@ from .fitting import Fit, FitOptions, fit
 from .inversion import Inversion, Report, invert, plan_sites
 from .inversion.error_bars import Uncertainty, uncertainty
 from .io import Radiograph, read, write
-from .options import InversionOptions, RunOptions, WatchOptions
+from .options import InversionOptions
 from .physics.forward import synthetic_image
 from .physics.poisson import poisson_invert
 from .physics.projection import project, project_potential
 from .physics.setup import OpticalSetup, ProtonSetup
 from .pipeline import run
 from .pipeline.rerun import Rerun, rerun
+from .pipeline.run_options import RunOptions, WatchOptions
 from .preprocessing import Recipe
 from .stack import invert_stack, run_stack, stack_statistics, watch_stack
 

@@ -38,7 +38,7 @@ from napari_shadowinv.io.store import (
 )
 
 if TYPE_CHECKING:
-    from napari_shadowinv.options import RunOptions
+    from napari_shadowinv.pipeline.run_options import RunOptions
     from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.stack import RunStatus
 

@@ -10,7 +10,7 @@ import typer
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._inputs import recipe_for_shots
 from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups
-from napari_shadowinv.options import RunOptions
+from napari_shadowinv.pipeline.run_options import RunOptions
 
 # Help of options, where it is longer than a line.
 HELP = {

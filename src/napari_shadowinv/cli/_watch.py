@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.options import WatchOptions
+    from napari_shadowinv.pipeline.run_options import WatchOptions
     from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.stack import RunStatus
 

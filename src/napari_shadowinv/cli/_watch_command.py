@@ -10,7 +10,7 @@ import typer
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._inputs import recipe_for_shots
 from napari_shadowinv.cli._terminal import notify_errors, warn_of_setups
-from napari_shadowinv.options import WatchOptions
+from napari_shadowinv.pipeline.run_options import WatchOptions
 
 _FIT_HELP = (
     "Fit the forward model to each shot instead of inverting it, with the recipe's section [fit]."

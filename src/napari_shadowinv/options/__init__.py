@@ -1,11 +1,10 @@
-"""Choices of an inversion, of a fit and of a run, as validated models.
+"""Choices of an inversion and of a fit, as validated models.
 
 Each model is the keyword of a function, a part of a recipe, the flags of a command and a form in a
 window, and is saved with each result: there is no second list of defaults.
 
 - options of an inversion and of a fit: `InversionOptions`, `FitOptions`
 - unknowns of a fit and knowledge about its images: `FitChoices`
-- choices of a run over many shots, and of a watched folder: `RunOptions`, `WatchOptions`
 """
 
 from napari_shadowinv.options.fitting import (
@@ -17,7 +16,6 @@ from napari_shadowinv.options.fitting import (
     Noise,
 )
 from napari_shadowinv.options.inversion import MAX_DEFAULT_SITES, InversionOptions
-from napari_shadowinv.options.run import RunOptions, WatchOptions
 
 __all__ = [
     "KINDS_OF_NOISE",
@@ -28,6 +26,4 @@ __all__ = [
     "InversionOptions",
     "KindOfNoise",
     "Noise",
-    "RunOptions",
-    "WatchOptions",
 ]

@@ -26,7 +26,7 @@ from napari_shadowinv.io.store_writing import (
     remove_unfinished,
     summarise,
 )
-from napari_shadowinv.options import RunOptions
+from napari_shadowinv.pipeline.run_options import RunOptions
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._engines import Engine, WorkerDiedError, engine_for, is_local
 from napari_shadowinv.stack._plan import STORED, choose_sites, describe_stack

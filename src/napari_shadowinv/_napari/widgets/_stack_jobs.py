@@ -23,7 +23,7 @@ from napari_shadowinv._napari.widgets._results import Origins, result_frame
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.options import RunOptions, WatchOptions
+from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 from napari_shadowinv.preprocessing import Recipe
 
 if TYPE_CHECKING:

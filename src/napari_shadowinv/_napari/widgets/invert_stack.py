@@ -44,7 +44,7 @@ from napari_shadowinv._napari.widgets._tables import ShotTable
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.store import STORE_SUFFIX
-from napari_shadowinv.options import RunOptions, WatchOptions
+from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 
 if TYPE_CHECKING:
     import napari

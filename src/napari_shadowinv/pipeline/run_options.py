@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import ConfigDict, Field, field_validator
 
 from napari_shadowinv._system.validation import CheckedModel
+from napari_shadowinv.io.formats import TIFF
 
 __all__ = ["RunOptions", "WatchOptions"]
 
@@ -88,7 +89,7 @@ class WatchOptions(_StoreOptions):
     """
 
     pattern: str = Field(
-        default="*.tif",
+        default=f"*{TIFF.suffix}",
         title="Names",
         description="File name pattern of the shots, in quotes on the command line; names that "
         "begin with a dot are ignored.",
