@@ -18,6 +18,7 @@ SOURCES = sorted((ROOT / "src").rglob("*.py"))
 FILES = [*SOURCES, *sorted((ROOT / "tests").rglob("*.py"))]
 TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+WRITTEN_PAGES = [page for page in PAGES if page.parent.name != "reference"]  # others are generated
 
 VAGUE_WORDS = """
 one own other others found known told given kept made left whole rest asked held seen here there
@@ -133,7 +134,7 @@ def prose_lines(text: str) -> Iterator[str]:
             yield re.sub(r"`[^`]*`", "code", re.sub(r"^\s*\d+\. ", "", line))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", WRITTEN_PAGES, ids=lambda page: page.stem)
 def test_a_page_has_one_sentence_a_line(page: Path) -> None:
     """So that a change of a sentence changes one line."""
     abbreviations = r"(?<!\b[A-Z])(?<!al)(?<!Eq)(?<!Eqs)(?<!Fig)(?<!e\.g)(?<!i\.e)(?<!r\.m\.s)"

@@ -339,6 +339,8 @@ NAMED_IN = {
     "physics/phantoms/_scenes.py": "a magnetic field deflects particles only",
     "physics/phantoms/_wakefield.py": "a plasma wave is probed by light",
     "cli/_demo.py": "the demonstration is a magnetic field",
+    "film/pack.py": "stopping in film is that of protons",
+    "film_doses.py": "stopping in film is that of protons",
 }
 
 
