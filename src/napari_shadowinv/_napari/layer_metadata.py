@@ -1,6 +1,6 @@
 """Metadata of this plugin's layers: a plain dict under `KEY`.
 
-Kinds of layers of a result, their names, and the kinds shown by default.
+It names the kind of each layer of a result; some kinds are shown by default.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Synchronisation with a viewer: colour bar, placement of new images, label of the shown film.
+"""Synchronisation with a viewer, and messages to its user.
 
-Messages to napari's user: a sentence for a user's error instead of a traceback.
+Colour bar, placement of new images, label of the shown film; a sentence instead of a traceback for
+a user's error.
 """
 
 from __future__ import annotations

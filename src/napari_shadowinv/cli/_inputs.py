@@ -1,6 +1,7 @@
-"""Inputs of a command: a recipe, options, the setup and images.
+"""Inputs and outputs of a command.
 
-Outputs of a command: names chosen and checked before the work, files written after it.
+Inputs are a recipe, options, the setup and images. Names of outputs are chosen and checked before
+the work, and their files are written after it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Error bars of a fit, drawn around its best unknowns: `errors_by_noise`, `shifts_by_beam`.
+"""Error bars of a fit, drawn around its best unknowns.
 
-The error that an unmeasured or inexact beam adds to a fit: `BeamError`, `draw_variations`.
+- by the noise: `errors_by_noise`
+- by an unmeasured or inexact beam: `shifts_by_beam`, `BeamError`, `draw_variations`
 """
 
 from __future__ import annotations

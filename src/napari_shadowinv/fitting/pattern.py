@@ -1,8 +1,7 @@
 """Structure in the residuals of a fit: `Pattern`, `find_pattern`.
 
-Tests of a fit's residuals: `pattern_strength`, `correlation_length`, `blur_score`.
-
-The noise of counts: `lack_of_noise`.
+- tests of the residuals: `pattern_strength`, `correlation_length`, `blur_score`
+- the noise of counts: `lack_of_noise`
 
 χ² hides structure: a beam that is 2 % wrong adds 0.1 to χ² at 5 % noise, spread over the whole
 image, and bends the field by tens of per cent. Smoothed, the same residual stands out of white

@@ -2,9 +2,7 @@
 
 χ² alone does not show whether a field is right: one image, or several that the object displaces
 alike, can be explained perfectly by a wrong field. The test is whether other fields explain them
-as well.
-
-Masks that hide the structure that determines a field: `hidden_contrast`.
+as well. `hidden_contrast` finds masks that hide the structure that determines a field.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Fits of neighbouring images one after another, a film of the field: `FitWindows`.
+"""Results that show whether the object changed between images.
 
-Whether one static field explains several images: the result `LeaveOneOut`.
+- fits of neighbouring images one after another, a movie of the field: `FitWindows`
+- whether one static field explains several images: `LeaveOneOut`
 """
 
 from __future__ import annotations

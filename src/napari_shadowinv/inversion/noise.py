@@ -1,4 +1,7 @@
-"""Noise of an image, from differences between neighbouring pixels: `ImageNoise`.
+"""Noise of an image, and the difference of its beam from the source.
+
+- the noise, from differences between neighbouring pixels: `ImageNoise`
+- the beam of a shot against its source, where there is no object: `beam_difference`
 
 Structures from the beam's path are smooth over a few pixels, noise is not: in
 (a - b - c + d) / 2 over four neighbours a smooth image cancels, and white noise keeps its
@@ -6,8 +9,6 @@ variance. A filter, a scintillator or an image plate correlates the noise of nei
 then such a difference over k pixels grows with k until the pixels are independent, in all parts
 of the image alike. The variances V(k) = V(∞) (1 - ρ(k))² give the correlation ρ along one axis,
 and from it how much more noise there is in the mean of many pixels than in white noise.
-
-The beam of a shot against its source, where there is no object: `beam_difference`.
 
 A reference of another exposure, or a beam that is less flat than assumed, differs from the beam of
 the shot on large scales. An object has finer structure. The frame along the image's edge is divided

@@ -3,6 +3,7 @@
 - the difference of re-projection and image: `image_residual`
 - whether more sites would reduce it: `is_coarse`
 - the cautions about a solution: `find_cautions`
+- signs that a field continues beyond the edge of its image: `inner_sides`, `turned_back`
 
 Each sign was chosen to be absent in images whose field is known to be right and to appear where it
 is wrong; `docs/trust.md` lists them with advice. The limits, and the measurements on either side of
@@ -41,8 +42,6 @@ them (200 × 200 px and the reference images):
   that the edge cuts in half has 0.87 to 1 of its peak along the edge, real plumes up to 0.72; a
   jet is as strong at the edge as elsewhere, but nothing crosses the edge. A dipole's field, and an
   object cut off by less than half, are indistinguishable from a plume.
-
-Signs that a field continues beyond the edge of its image: `inner_sides`, `turned_back`.
 """
 
 from __future__ import annotations

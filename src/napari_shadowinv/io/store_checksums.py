@@ -10,9 +10,7 @@ chunks that belong to no shot.
 
 Stores without a seal, of an earlier version or copied by another program, are not checked.
 
-Files of a Zarr store, each checked before it is opened: `CheckedStore`.
-
-Zarr itself would wait for ever for a pipe behind a link, and ask for as much memory as the first
+`CheckedStore` checks each file of a Zarr store before it is opened: Zarr itself would wait for ever for a pipe behind a link, and ask for as much memory as the first
 bytes of a chunk name, damaged or not.
 """
 

@@ -1,6 +1,6 @@
 """Write a result or an image, whole or not at all: `write`.
 
-A result's dataset as one NetCDF4 file, ``.shadowinv``, or its sites alone as a table.
+A result becomes one NetCDF4 file, ``.shadowinv``, or a table of its sites.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""From the scans of a film pack to doses and fluences on common pixels: `run_film`.
+"""From the scans of a film pack to doses and fluences on common pixels.
 
-The films of a pack as scanned, with corners, calibration and marks: `read_films`.
+- the films as scanned, with corners, calibration and marks: `read_films`
+- their doses and fluences: `run_film`
 """
 
 from __future__ import annotations

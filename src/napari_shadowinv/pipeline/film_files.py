@@ -2,12 +2,9 @@
 
 - read the description of a pack: `read_pack`
 - write its layers as images with a table: `write_layers`
-
-A first description of a film pack from a folder of scans.
-
-- the layers in the order of the scans' names, and the calibrations of the folder: `draft_pack`
-- the entries still to be added: `missing_entries`
-- the same as a file: `write_new_pack`
+- draft a description from a folder of scans, with the layers in the order of their names and the
+  calibrations of the folder: `draft_pack`; as a file: `write_new_pack`
+- list the entries still to be added: `missing_entries`
 """
 
 from __future__ import annotations

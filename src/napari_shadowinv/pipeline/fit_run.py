@@ -2,8 +2,7 @@
 
 - one image with its measurements: `FitShot`
 - the complete inputs of a fit: `collect_fit_inputs`
-
-An inversion refined by a fit that starts from its field: `run_refinement`.
+- an inversion refined by a fit that starts from its field: `run_refinement`
 """
 
 from __future__ import annotations

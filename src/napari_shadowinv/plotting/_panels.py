@@ -1,7 +1,4 @@
-"""A page of panels: their layout, and the drawing of each.
-
-Contents of a panel: an image, a field, a residual, cuts.
-"""
+"""A page of panels: their layout, and the drawing of each: an image, a field, a residual, cuts."""
 
 from __future__ import annotations
 

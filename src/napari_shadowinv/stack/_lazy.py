@@ -1,6 +1,6 @@
 """A stack as a lazy dataset: one dask task inverts one shot, on demand.
 
-Mean, spread and peaks across the shots of a stack.
+`stack_statistics` gives mean, spread and peaks across its shots.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Description of a stack before any shot is inverted: `describe_stack` returns a `Stack`.
 
-Number of sites of a stack from the accuracy: `choose_sites`.
+Its number of sites follows from the accuracy: `choose_sites`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Watch a folder and invert each shot into a store as soon as it arrives: `watch_stack`.
 
-The loop over files that arrive in a watched folder: `Watch`.
-
+- the loop over files that arrive: `Watch`
 - the description of the stack from its first files: `StackMaker`
 """
 
