@@ -2,8 +2,8 @@
 
 The flags of steps, source estimates and options follow from the models: `takes_recipe` adds them
 to a command, and `recipe_of` overrides a recipe with their values. `takes_fit` and
-`fit_recipe_of` do the same for a fit. Help shows examples first and the common flags on one screen, all of
-them with --help-all.
+`fit_recipe_of` do the same for a fit. Help shows examples first and the common flags on one
+screen, all of them with --help-all.
 """
 
 from __future__ import annotations

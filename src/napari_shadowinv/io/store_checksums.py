@@ -10,8 +10,9 @@ chunks that belong to no shot.
 
 Stores without a seal, of an earlier version or copied by another program, are not checked.
 
-`CheckedStore` checks each file of a Zarr store before it is opened: Zarr itself would wait for ever for a pipe behind a link, and ask for as much memory as the first
-bytes of a chunk name, damaged or not.
+`CheckedStore` checks each file of a Zarr store before it is opened: Zarr itself would wait for
+ever for a pipe behind a link, and ask for as much memory as the first bytes of a chunk name,
+damaged or not.
 """
 
 from __future__ import annotations

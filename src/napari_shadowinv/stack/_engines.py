@@ -1,7 +1,8 @@
 """Engines that invert shots: threads, processes or a cluster; see `engine_for`.
 
 Anyone who can connect to a dask scheduler or worker can make it run any code. So the worker
-processes that `local_client` starts accept only each other: connections are encrypted with a key that exists only for the run.
+processes that `local_client` starts accept only each other: connections are encrypted with a key
+that exists only for the run.
 """
 
 from __future__ import annotations
