@@ -27,7 +27,7 @@ from napari_shadowinv.preprocessing import STEPS, Step
 Kinds = dict[str, tuple[str, type[BaseModel] | None]]
 
 PROBLEM_STYLE = "color: #d9822b;"
-_LABEL_WIDTH_PX = 66
+_LABEL_WIDTH_PX = 80
 INDENT = 12
 TOML = "TOML (*.toml)"
 # Optional fields that exclude each other: checking one unchecks the other.
