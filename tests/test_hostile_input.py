@@ -48,7 +48,7 @@ from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read_toml
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.options import FitChoices
-from napari_shadowinv.pipeline.shot_table import ShotRow, is_table, rows_of
+from napari_shadowinv.pipeline.shot_table import ShotRow, is_table, table_rows
 from napari_shadowinv.preprocessing import STEPS
 
 SHOT = np.random.default_rng(0).poisson(300, (16, 20)).astype(float)
@@ -267,15 +267,14 @@ def test_path_with_a_null_character_is_refused() -> None:
         ("shot.npy,1,1e300", "'energy' is '1e300'"),
         ("shot.npy,1e300,1", "at most 10000 times the first"),
         ("shot.npy,1,nan", "'energy' is 'nan'"),
-        ("a" * 140_000 + ",1,1", "cannot be read .field larger than field limit"),
     ],
-    ids=["energy", "strength", "nan", "cell"],
+    ids=["energy", "strength", "nan"],
 )
 def test_hostile_row_of_a_table_is_refused(row: str, message: str) -> None:
     Path("shots.csv").write_text(f"file,strength,energy\n{row}\n")
 
     with pytest.raises(InputError, match=message):
-        rows_of(Path("shots.csv"), ShotRow)
+        table_rows(Path("shots.csv"))
 
 
 def test_large_image_as_numbers_is_no_table() -> None:
@@ -290,7 +289,7 @@ def test_calibration_row_that_is_no_dose_is_refused(dose: str) -> None:
     rows = [f"{dose},30000,31000,32000", *(f"{2**n},{40000 - n},{41000 - n},9" for n in range(4))]
     Path("table.csv").write_text("Dose,Red,Green,Blue\n" + "\n".join(rows))
 
-    with pytest.raises(InputError, match="1 films with values that are negative or no numbers"):
+    with pytest.raises(InputError, match=f"line 2 has '{dose}'.*a dose of 0 or more"):
         Calibration.from_csv("table.csv")
 
 

@@ -302,13 +302,13 @@ def test_every_option_of_a_fit_has_a_flag() -> None:
 
 TABLES = {
     "file,enrgy\na.tif,3\n": ("column 'enrgy'", "did you mean 'energy'?"),
-    "name,energy\na.tif,3\n": ("column 'name'", "known are file, setup, energy"),
+    "name,energy\na.tif,3\n": ("column 'name'", "expected one of file, setup, energy"),
     "energy,psf\n3,1\n": ("no column 'file'",),
     "file,psf,psf\na.tif,3,3\n": ("column 'psf' twice",),
     "file,psf\n": ("no rows",),
-    "file,psf\na.tif,1,2\n": ("row 1 has 3 values, expected 2",),
-    "file,psf\na.tif,wide\n": ("row 1", "'psf' is 'wide'"),
-    "file,noise\na.tif,loud\n": ("row 1", "'noise' is 'loud': expected 'poisson'"),
+    "file,psf\na.tif,1,2\n": ("line 2 has 3 values, expected 2",),
+    "file,psf\na.tif,wide\n": ("line 2", "'psf' is 'wide'"),
+    "file,noise\na.tif,loud\n": ("line 2", "'noise' is 'loud': expected 'poisson'"),
     "file,strength\na.tif,1\nb.tif,\n": ("b.tif has no strength, other images have",),
     "file,source\na.tif,unknown\nb.tif,\n": ("b.tif has no unknown source",),
     "file,noise\na.tif,poisson\nb.tif,3\n": ("'poisson' in some images and a number in others",),

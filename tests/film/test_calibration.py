@@ -110,15 +110,15 @@ def test_films_in_the_wrong_order_count_as_one(table: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "has the columns none: expected one with 'dose'"),
-        ("a,b\n1,2\n", "has the columns 'a', 'b'"),
+        ("", "has no column 'dose', but none"),
+        ("a,b\n1,2\n", "has no column 'dose', but a, b"),
         (HEADER + UNITS + "1,0.1,-1,40000,7,x,7,1,1\n", r"line 3 has '0.1', '40000', 'x', '1'"),
         (HEADER + UNITS + ROWS + "6,2000\n", r"line 8 has '2000', '', '', ''"),
     ],
 )
 def test_mistakes_in_the_table_are_named(table: Path, content: str, message: str) -> None:
     table.write_text(content)
-    with pytest.raises(FileFormatError, match=message):
+    with pytest.raises(InputError, match=message):
         Calibration.from_csv(table)
 
 

@@ -98,7 +98,7 @@ def test_a_pack_that_stops_all_is_refused() -> None:
 @pytest.mark.parametrize(
     ("layer", "message"),
     [
-        ({"film": "HD-V2"}, "layer 1 is a film of type 'HD-V2': did you mean 'HDV2'?"),
+        ({"film": "HD-V2"}, "has no entry under [films]: did you mean 'HDV2'?"),
         ({"film": "EBT3", "filters": [{"material": "Wood", "thickness": 1e-4}]}, "has 'Wood'"),
         ({"film": "EBT3", "filters": [{"material": "Al", "thickness": 25}]}, "less than or equal"),
     ],

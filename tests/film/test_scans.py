@@ -12,7 +12,7 @@ import tifffile
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.scans import find_films, read_corners, straightened, write_corners
 
 Array = NDArray[np.float64]
@@ -154,12 +154,13 @@ def test_corners_come_back_from_a_table(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("film,y1\nA,1", "has the columns film, y1: expected film, y1, x1"),
-        ("film,y1,x1,y2,x2,y3,x3,y4,x4\nA,1,2", "line 2 has A, 1, 2: expected a film and eight"),
+        ("film,y1\nA,1", "has no column 'x1', but film, y1"),
+        ("film,y1,x1,y2,x2,y3,x3,y4,x4\nA,1,2", "line 2: 'y2' is missing"),
+        ("film,y1,x1,y2,x2,y3,x3,y4,x4\nA,0,0,5,5,0,5,5,0", "line 2: corners .* do not go around"),
     ],
 )
 def test_other_tables_are_refused(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "corners.csv"
     path.write_text(text)
-    with pytest.raises(FileFormatError, match=message):
+    with pytest.raises(InputError, match=message):
         read_corners(path)

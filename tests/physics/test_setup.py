@@ -273,7 +273,7 @@ def test_every_field_has_a_description() -> None:
         ({"detector_pixel_size": 1e-5}, "either 'pixel_size' .* received both"),
         ({"pixel_size": None}, "either 'pixel_size' .* received neither"),
         ({"energi": 3}, "unknown key 'energi', did you mean 'energy'"),
-        ({"colour": 3}, "unknown key 'colour'; known keys are kind"),
+        ({"colour": 3}, "unknown key 'colour', expected one of kind"),
         ({"species": "proten"}, "'species' is 'proten': species must be 'proton'"),
         ({"energy": "high"}, "'energy' is 'high': expected a number in MeV"),
         ({"kind": "protons"}, "'kind' is 'protons', .* did you mean 'proton'"),

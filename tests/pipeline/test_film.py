@@ -19,7 +19,7 @@ from napari_shadowinv.film.scans import upright
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read, read_toml, write
 from napari_shadowinv.pipeline import read_pack, run_film, write_layers
-from napari_shadowinv.pipeline.shot_table import ShotRow, rows_of
+from napari_shadowinv.pipeline.shot_table import table_rows
 from simulated_pack import Truth, simulate
 
 SHAPE, COUNT = (120, 160), 4
@@ -129,7 +129,7 @@ def test_films_lie_on_each_other(truth: Truth, doses) -> None:
 
 def test_the_setups_know_energy_depth_and_pixel(truth: Truth, doses, tmp_path: Path) -> None:
     table = write_layers(doses, tmp_path / "layers")[-1]
-    rows = rows_of(table, ShotRow)
+    rows = table_rows(table)
     assert [row.file.name for row in rows] == [f"layer_{k:02d}.tif" for k in range(1, COUNT + 1)]
     for layer, row in enumerate(rows):
         setup = read_toml(row.setup)
@@ -147,7 +147,7 @@ def test_the_setups_know_energy_depth_and_pixel(truth: Truth, doses, tmp_path: P
 
 def test_layers_in_pradformat_hold_their_setups(truth: Truth, doses, tmp_path: Path) -> None:
     table = write_layers(doses, tmp_path / "layers", form="pradformat")[-1]
-    for layer, row in enumerate(rows_of(table, ShotRow)):
+    for layer, row in enumerate(table_rows(table)):
         layer_image = read(row.file)
         used = doses.usable[layer]
         np.testing.assert_array_equal(layer_image.image[used], doses.fluence[layer][used])
@@ -380,7 +380,7 @@ def test_fiducials_of_a_film_on_its_face(truth: Truth, changed, tmp_path: Path) 
     [
         ("9,left,1,1", "a mark on film 9: expected numbers of layers, from 1 to 4"),
         ("1,left,1,1", "the mark 'left' twice on film 1"),
-        ("1,new,1,one", "row 13: 'x' is 'one'"),
+        ("1,new,1,one", "line 14: 'x' is 'one'"),
     ],
 )
 def test_wrong_fiducials_are_refused(

@@ -284,7 +284,7 @@ def refused(folder: Path) -> Callable[..., None]:
 def test_fit_mistakes_give_one_sentence(refused: Callable[..., None]) -> None:
     refused("low*.tif", "--fit", "--tolerance", 1e-3, names=("--tolerance", "[fit.options]"))
     Path("shots.csv").write_text("file,psf\nlow0.tif,1\n")
-    refused("shots.csv", "--fit", names=("row 1 does not say which shot", "column 'shot'"))
+    refused("shots.csv", "--fit", names=("line 2 does not say which shot", "column 'shot'"))
     Path("shots.csv").write_text("shot,file\n1,low0.tif\n1,high0.tif\n2,low1.tif\n")
     single = shadowinv("fit", "shots.csv")
     assert single.exit_code == 2

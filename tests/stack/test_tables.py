@@ -266,7 +266,7 @@ def test_a_store_has_the_units_of_one_kind_of_beam(pack: Path, out: Path) -> Non
 MISTAKES: dict[str, tuple[str, Sequence[str], tuple[str, ...]]] = {
     "no column for the file": ("energy", ["5"], ("has no column 'file'",)),
     "an unknown column": ("file,enrgy", ["film0.npy,5"], ("did you mean 'energy'?",)),
-    "a strange value": ("file,exclude", ["film0.npy,maybe"], ("row 1", "'exclude' is 'maybe'")),
+    "a strange value": ("file,exclude", ["film0.npy,maybe"], ("line 2", "'exclude' is 'maybe'")),
     "nothing left": (
         "file,exclude",
         ["film0.npy,yes", "film1.npy,1"],
@@ -277,7 +277,7 @@ MISTAKES: dict[str, tuple[str, Sequence[str], tuple[str, ...]]] = {
         ["film0.npy,5", "film1.npy,14.7"],
         ("film0.npy has an energy of 5 MeV and no setup", "--setup"),
     ),
-    "an unknown source": ("file,source", ["film0.npy,unknown"], ("row 1", "only a fit can find")),
+    "an unknown source": ("file,source", ["film0.npy,unknown"], ("line 2", "only a fit can find")),
     "files that are missing": ("file", ["gone.npy", "lost.npy"], ("none of 2 shots can be read",)),
     "an image twice": ("file", ["film0.npy", "film0.npy"], ("film0.npy twice",)),
     "a setup that is missing": ("file,setup", ["film0.npy,no.toml"], ("no.toml",)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
@@ -84,16 +84,23 @@ def validated(
         raise InputError(f"{where}: {_error_sentence(model_class, error)}") from error
 
 
-def nearest(name: str, choices: list[str]) -> str | None:
+def nearest(name: str, choices: Collection[str]) -> str | None:
     """Return the choice that is spelled most like `name`, None if none is similar."""
-    matches = difflib.get_close_matches(name, choices, n=1, cutoff=0.6)
-    return matches[0] if matches else None
+    lower = {choice.lower(): choice for choice in choices}
+    matches = difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.6)
+    return lower[matches[0]] if matches else None
+
+
+def suggestion(name: str, choices: Collection[str]) -> str:
+    """Ask whether the nearest choice is meant, or list all of them."""
+    match = nearest(name, choices)
+    return f"did you mean '{match}'?" if match else f"expected one of {', '.join(choices)}"
 
 
 def _error_sentence(model_class: type[BaseModel], error: ValidationError) -> str:
     details = error.errors(include_url=False)
     intended = {
-        nearest(str(detail["loc"][-1]), list(_locate(model_class, detail["loc"])[0].model_fields))
+        nearest(str(detail["loc"][-1]), _locate(model_class, detail["loc"])[0].model_fields)
         for detail in details
         if detail["type"] == "extra_forbidden"
     }
@@ -141,16 +148,12 @@ def _error_clause(model_class: type[BaseModel], detail: dict[str, Any]) -> str:
     kind, context = detail["type"], detail.get("ctx", {})
     tag_key = context.get("discriminator", "").strip("'")
     if kind == "extra_forbidden":
-        keys = list(model.model_fields)
-        match = nearest(names[-1], keys)
-        hint = f", did you mean '{match}'?" if match else f"; known keys are {', '.join(keys)}"
-        return f"unknown key '{name}'{hint}"
+        return f"unknown key '{name}', {suggestion(names[-1], model.model_fields)}"
     if kind == "union_tag_not_found":
         return f"'{name}' has no '{tag_key}': give it, to say which"
     if kind.startswith("union_tag"):
         expected = [tag.strip("' ") for tag in context["expected_tags"].split(",")]
-        match = nearest(str(context["tag"]), expected)
-        hint = f"did you mean '{match}'?" if match else f"expected one of {', '.join(expected)}"
+        hint = suggestion(str(context["tag"]), expected)
         return f"'{name}.{tag_key}' is '{context['tag']}', {hint}"
     field = model.model_fields.get(names[-1]) if names else None
     title = _lower(field.title) if field is not None and field.title else "it"

@@ -22,7 +22,7 @@ from pydantic.fields import FieldInfo
 from typer import Argument, Option
 from typer.core import TyperCommand, TyperGroup
 
-from napari_shadowinv._system.validation import Model, nearest, validated
+from napari_shadowinv._system.validation import Model, suggestion, validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import IMAGE_TITLES
 from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
@@ -538,9 +538,7 @@ def _estimate(flags: Mapping[str, Any], base: Recipe) -> Any:
     if method is None:
         method = "" if base.estimate is None else base.estimate.name()
     elif method not in ESTIMATES:
-        guess = nearest(method, list(ESTIMATES))
-        hint = f"did you mean '{guess}'?" if guess else f"expected one of {', '.join(ESTIMATES)}"
-        raise InputError(f"--source-from is '{method}': {hint}")
+        raise InputError(f"--source-from is '{method}': {suggestion(method, ESTIMATES)}")
     for name in changes:
         methods = _estimates_with(name)
         if method not in methods:

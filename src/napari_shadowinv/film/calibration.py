@@ -19,7 +19,6 @@ Medical Physics 32, 2245 (2005).
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,9 +27,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.safety import as_file_errors, small_text
+from napari_shadowinv._system.tables import Table, read_table
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
-from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.errors import InputError
 
 __all__ = [
     "Calibration",
@@ -150,18 +149,13 @@ class Calibration:
         Raises
         ------
         FileFormatError
-            If the file is missing, has no such columns, or a row holds anything but numbers;
-            the message names the line.
+            If the file is missing, or is no table.
+        InputError
+            If it has no such columns, or a row holds anything but numbers; the message names the
+            line.
         """
-        table = _read_rows(path)
-        strange = ~(np.isfinite(table).all(axis=1) & (table[:, 0] >= 0))
-        if strange.any():
-            row = ", ".join(f"{value:g}" for value in table[strange][0])
-            raise InputError(
-                f"{path} has {int(strange.sum())} films with values that are negative or no "
-                f"numbers ({row}): expected doses of 0 or more; correct or delete the row"
-            )
-        used = table[(table[:, 0] >= dose_range[0]) & (table[:, 0] <= dose_range[1])]
+        films = _films_of(Path(path))
+        used = films[(films[:, 0] >= dose_range[0]) & (films[:, 0] <= dose_range[1])]
         if len(used) < 2:
             raise InputError(
                 f"{path} has {len(used)} films between {dose_range[0]:g} and {dose_range[1]:g} "
@@ -414,37 +408,36 @@ def combined_dose(
     return CombinedDose(np.exp(mean), np.where(outside, np.inf, error), outside)
 
 
-@as_file_errors
-def _read_rows(path: Path) -> FloatArray:
+def _films_of(path: Path) -> FloatArray:
     """Read dose and red, green and blue pixel of every film, then spreads if all are present."""
-    text = small_text(path, "a calibration table, comma-separated values", "utf-8-sig")
-    lines = list(csv.reader(text.splitlines()))
-    columns = _find_columns(path, [name.strip().lower() for name in lines[0]] if lines else [])
+    table = read_table(path)
+    columns = _find_columns(table)
     rows: list[list[float]] = []
-    for number, cells in enumerate(lines[1:], start=2):
-        picked = [cells[column] if column < len(cells) else "" for column in columns]
+    for line, cells in table.rows.items():
+        picked = [cells[column] for column in columns]
         try:
-            rows.append([float(cell) for cell in picked])
+            row = [float(cell) for cell in picked]
         except ValueError:
-            has_units = number == 2
-            if any(cell.strip() for cell in cells) and not has_units:
-                raise FileFormatError(
-                    f"{path}, line {number} has {', '.join(map(repr, picked))[:80]}: expected a "
-                    "dose and three pixels as numbers; correct it"
-                ) from None
+            if line == min(table.rows):  # it may contain units
+                continue
+            row = [np.nan]
+        if not np.isfinite(row).all() or row[0] < 0:
+            raise InputError(
+                f"{path}, line {line} has {', '.join(map(repr, picked))[:80]}: expected a dose of "
+                "0 or more and the pixels as numbers; correct or delete the row"
+            )
+        rows.append(row)
     return np.array(rows, dtype=np.float64).reshape(-1, len(columns))
 
 
-def _find_columns(path: Path, names: list[str]) -> list[int]:
-    matches = [[at for at, name in enumerate(names) if "dose" in name and "log" not in name]]
-    for colour in ("red", "green", "blue"):
-        matches.append([at for at, name in enumerate(names) if name.startswith(colour)])
-    if not all(matches):
-        raise FileFormatError(
-            f"{path} has the columns {', '.join(map(repr, names)) or 'none'}: expected one with "
-            "'dose', and columns whose names begin with 'red', 'green' and 'blue'"
-        )
-    columns = [candidates[0] for candidates in matches]
-    spread_columns = [at + 1 for at in columns[1:]]
-    has_spreads = all(at < len(names) and names[at].startswith("std") for at in spread_columns)
-    return columns + spread_columns if has_spreads else columns
+def _find_columns(table: Table) -> list[int]:
+    names = [next((name for name in table.header if "dose" in name and "log" not in name), "dose")]
+    for colour in _CHANNELS:
+        names.append(next((name for name in table.header if name.startswith(colour)), colour))
+    columns = [table.position_of(name) for name in names]
+    spreads = [position + 1 for position in columns[1:]]
+    has_spreads = all(
+        position < len(table.header) and table.header[position].startswith("std")
+        for position in spreads
+    )
+    return columns + spreads if has_spreads else columns

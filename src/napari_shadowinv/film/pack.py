@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
-from napari_shadowinv._system.validation import CheckedModel, nearest
+from napari_shadowinv._system.validation import CheckedModel, suggestion
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.stopping import Stopping
@@ -120,6 +120,11 @@ def _split_slabs(value: Any) -> Any:
     return [part for part in value.split(";") if part.strip()] if isinstance(value, str) else value
 
 
+def _from_digits(value: Any) -> Any:
+    """Convert the text of a cell to a number."""
+    return int(value) if isinstance(value, str) and value.isdecimal() else value
+
+
 Slabs = Annotated[tuple[Slab, ...], BeforeValidator(_split_slabs)]
 
 
@@ -167,7 +172,7 @@ class PackLayer(CheckedModel):
     file: Path | None = Field(
         default=None, title="Scan", description="Its file; otherwise it is one of the pack's scan."
     )
-    turned: Literal[0, 180] = Field(
+    turned: Annotated[Literal[0, 180], BeforeValidator(_from_digits)] = Field(
         default=0, title="Turned (°)", description="180 if it was scanned upside down."
     )
     mirrored: bool = Field(
@@ -368,6 +373,6 @@ class Pack(CheckedModel):
 
 def _check_known(name: str, choices: Mapping[str, Any], who: str, table: str) -> None:
     if name not in choices:
-        match = nearest(name, list(choices))
-        hint = f"did you mean '{match}'?" if match else f"known are {', '.join(choices)}"
-        raise ValueError(f"{who} '{name}': {hint} Others are described under [{table}]")
+        raise ValueError(
+            f"{who} '{name}', which has no entry under [{table}]: {suggestion(name, choices)}"
+        )

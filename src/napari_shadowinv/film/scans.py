@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from napari_shadowinv._system.safety import as_file_errors, small_text
+from napari_shadowinv._system.tables import read_rows
+from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
-from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.errors import InputError
 
 __all__ = ["find_films", "read_corners", "straightened", "write_corners"]
 
@@ -38,7 +39,23 @@ _STEP_PX = 0.5
 _MIN_OUTLIER_PX = 0.1  # a point of a side that is closer to its line is no outlier
 _Line = tuple[float, float]  # offset and slope
 
-_HEADER = ["film", "y1", "x1", "y2", "x2", "y3", "x3", "y4", "x4"]
+
+class _CornerRow(CheckedModel):
+    """Corners of a film, in px of its scan."""
+
+    film: str
+    y1: float
+    x1: float
+    y2: float
+    x2: float
+    y3: float
+    x3: float
+    y4: float
+    x4: float
+
+    @property
+    def places(self) -> FloatArray:
+        return np.array(list(self.model_dump(exclude={"film"}).values())).reshape(4, 2)
 
 
 def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[FloatArray]:
@@ -309,45 +326,29 @@ def _in_reading_order(films: Sequence[FloatArray]) -> list[FloatArray]:
     return [film for row in rows for film in sorted(row, key=lambda film: film[:, 1].mean())]
 
 
-@as_file_errors
-def _read_corner_table(path: Path) -> dict[str, FloatArray]:
-    text = small_text(path, "a table of corners, comma-separated values", "utf-8-sig")
-    lines = [line for line in csv.reader(text.splitlines()) if any(map(str.strip, line))]
-    names = [name.strip().lower() for name in lines[0]] if lines else []
-    if names != _HEADER:
-        raise FileFormatError(
-            f"{path} has the columns {', '.join(names) or 'none'}: expected {', '.join(_HEADER)}"
-        )
-    corners: dict[str, FloatArray] = {}
-    for number, cells in enumerate(lines[1:], 2):
-        try:
-            values = np.array([float(cell) for cell in cells[1:]]).reshape(4, 2)
-        except ValueError:
-            raise FileFormatError(
-                f"{path}, line {number} has {', '.join(cells)[:80]}: expected a film and eight "
-                "numbers"
-            ) from None
-        corners[cells[0].strip()] = checked_corners(values)
-    return corners
-
-
 def read_corners(path: str | Path) -> dict[str, FloatArray]:
     """Read a table of corners: film, y1, x1, … y4, x4.
 
     Raises
     ------
     FileFormatError
-        If the file is no such table.
+        If the file is no table.
     InputError
-        If corners do not go around a film.
+        If it has other columns, or corners do not go around a film.
     """
-    return _read_corner_table(path)
+    corners = {}
+    for line, row in read_rows(Path(path), _CornerRow).items():
+        try:
+            corners[row.film] = checked_corners(row.places)
+        except InputError as error:
+            raise InputError(f"{path}, line {line}: {error}") from None
+    return corners
 
 
 def write_corners(path: str | Path, films: dict[str, FloatArray]) -> None:
     """Write a table that `read_corners` reads."""
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
-        rows.writerow(_HEADER)
+        rows.writerow(_CornerRow.model_fields)
         for name, corners in films.items():
             rows.writerow([name, *(f"{value:.2f}" for value in np.ravel(corners))])

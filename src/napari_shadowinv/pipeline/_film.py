@@ -17,6 +17,7 @@ from pydantic import ConfigDict
 
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.tables import read_rows
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
@@ -46,7 +47,6 @@ from napari_shadowinv.fitting.measurements import estimated_noise
 from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.images import Scan, read_scan
-from napari_shadowinv.pipeline.shot_table import rows_of
 from napari_shadowinv.provenance import ImageOrigin, Provenance
 
 __all__ = [
@@ -113,7 +113,7 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
     shared = _find_on_shared_scan(
         pack, [k for k in used if pack.layers[k - 1].file is None], measured
     )
-    fiducials = _read_marks(pack)
+    fiducials = {} if pack.fiducials is None else read_fiducials(pack.fiducials, len(pack.layers))
     calibrations = {layer.film: _calibration(pack, layer.film) for layer in pack.layers}
 
     def film(number: int) -> Film:
@@ -161,19 +161,19 @@ def _check_rectangle(number: int, corners: FloatArray, pixel_size: float | None)
         )
 
 
-def _read_marks(pack: Pack) -> dict[int, list[_Fiducial]]:
-    """Read the marks through the pack, by the number of the film."""
+def read_fiducials(table: Path, n_layers: int) -> dict[int, list[_Fiducial]]:
+    """Read the marks through a pack, by the number of the film."""
     marks: dict[int, list[_Fiducial]] = {}
-    for row in [] if pack.fiducials is None else rows_of(pack.fiducials, _Fiducial):
-        if not 1 <= row.film <= len(pack.layers):
+    for line, row in read_rows(table, _Fiducial).items():
+        if not 1 <= row.film <= n_layers:
             raise InputError(
-                f"{pack.fiducials} has a mark on film {row.film}: expected numbers of layers, from "
-                f"1 to {len(pack.layers)}"
+                f"{table}, line {line} has a mark on film {row.film}: expected numbers of layers, "
+                f"from 1 to {n_layers}"
             )
         if any(row.name == mark.name for mark in marks.get(row.film, [])):
             raise InputError(
-                f"{pack.fiducials} has the mark '{row.name}' twice on film {row.film}: expected "
-                "another name for each"
+                f"{table}, line {line} has the mark '{row.name}' twice on film {row.film}: "
+                "expected another name for each"
             )
         marks.setdefault(row.film, []).append(row)
     return marks

@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from napari_shadowinv._system.tables import read_rows
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.film import Calibration, Pack, PackLayer
@@ -25,7 +26,6 @@ from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read_toml, replacing, write
 from napari_shadowinv.io.formats import PRADFORMAT, SCAN_SUFFIXES, SITES, TIFF
 from napari_shadowinv.io.pradformat import write_radiograph
-from napari_shadowinv.pipeline.shot_table import rows_of
 
 __all__ = [
     "LAYERS_TABLE",
@@ -62,8 +62,8 @@ def read_pack(path: Path) -> Pack:
     path = Path(path).absolute()
     entries = read_toml(path)
     if isinstance(entries.get("layers"), str):
-        rows = rows_of(path.parent / entries["layers"], PackLayer)
-        entries["layers"] = [row.model_dump() for row in rows]
+        rows = read_rows(path.parent / entries["layers"], PackLayer)
+        entries["layers"] = [row.model_dump() for row in rows.values()]
     if isinstance(entries.get("setup"), str):
         entries["setup"] = read_toml(path.parent / entries["setup"])
     return _map_files(validated(Pack, entries, str(path)), path.parent.joinpath)

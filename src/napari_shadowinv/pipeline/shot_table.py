@@ -11,14 +11,13 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
-from napari_shadowinv._system.safety import check_regular, small_text
-from napari_shadowinv._system.validation import CheckedModel, nearest, validated
+from napari_shadowinv._system.tables import has_column_names, is_number, read_rows
+from napari_shadowinv._system.validation import CheckedModel, suggestion, validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import replacing, text_of
 from napari_shadowinv.io.formats import SITES
@@ -30,34 +29,23 @@ __all__ = [
     "fiducials_from",
     "is_table",
     "rows_by_shot",
-    "rows_of",
     "rows_to_invert",
     "shot_rows",
     "table_rows",
     "write_table",
 ]
 
-_EXPECTED_FORMAT = "a table as comma-separated values"
-_MAX_HEADER_BYTES = 100_000
 _BeamValue = Annotated[float, Field(gt=0, le=1e5)] | None
 
 
 def _strength(value: Any) -> Any:
     parts = str(value).split()
-    if not parts or not all(map(_is_number, parts)):
+    if not parts or not all(map(is_number, parts)):
         raise ValueError("expected a number, or one for each field with spaces between them")
     strengths = tuple(map(float, parts))
     if not all(abs(strength) <= MAX_STRENGTH for strength in strengths):
         raise ValueError(f"expected a displacement of at most {MAX_STRENGTH:g} times the first")
     return strengths
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 class ShotRow(CheckedModel):
@@ -120,7 +108,7 @@ class ShotRow(CheckedModel):
         unknown = set(values) - set(cls.columns()) if isinstance(values, Mapping) else set()
         if unknown:
             name = min(map(str, unknown))
-            raise ValueError(f"unknown key '{name}', {_suggest(name, cls.columns())}")
+            raise ValueError(f"unknown key '{name}', {suggestion(name, cls.columns())}")
         return values
 
     @classmethod
@@ -159,7 +147,6 @@ class ShotRow(CheckedModel):
         return {**entries, **{name: text_of(path.name) for name, path in self.files.items()}}
 
 
-_FILE_COLUMNS = ("file", "setup", "mask", "source")
 _FIT_COLUMNS = ("strength", "psf", "noise")
 
 
@@ -220,10 +207,10 @@ def shot_rows(
 def rows_by_shot(table: Path, shared: Mapping[str, Any]) -> dict[str, tuple[ShotRow, ...]]:
     """Return the rows of a table with the images of many shots, by shot, in their order."""
     by_shot: dict[str, tuple[ShotRow, ...]] = {}
-    for number, row in _used_rows(table, shared).items():
+    for line, row in _used_rows(table, shared).items():
         if row.shot is None:
             raise InputError(
-                f"{table}, row {number} does not say which shot its image belongs to: give the "
+                f"{table}, line {line} does not say which shot its image belongs to: give the "
                 "column 'shot', the same for all images of one object"
             )
         by_shot[row.shot] = (*by_shot.get(row.shot, ()), row)
@@ -233,10 +220,11 @@ def rows_by_shot(table: Path, shared: Mapping[str, Any]) -> dict[str, tuple[Shot
 def rows_to_invert(table: Path | Sequence[ShotRow]) -> tuple[list[ShotRow], tuple[str, ...]]:
     """Return the rows to invert one by one, and the columns that only fits use."""
     rows = _used_rows(table, {})
+    place = f"{table}, line" if isinstance(table, Path) else "the table, row"
     for number, row in rows.items():
         if row.source == "unknown":
             raise InputError(
-                f"{_name_of(table)}, row {number} has the source 'unknown', which only a fit can "
+                f"{place} {number} has the source 'unknown', which only a fit can "
                 "find: name an image, or leave the cell empty"
             )
     used = list(rows.values())
@@ -246,7 +234,7 @@ def rows_to_invert(table: Path | Sequence[ShotRow]) -> tuple[list[ShotRow], tupl
 
 def table_rows(table: Path) -> list[ShotRow]:
     """Return all rows of a table of shots, including excluded ones."""
-    return rows_of(table, ShotRow)
+    return list(_read_shots(table).values())
 
 
 def write_table(path: Path, rows: Sequence[ShotRow]) -> None:
@@ -273,24 +261,21 @@ def write_table(path: Path, rows: Sequence[ShotRow]) -> None:
 
 
 def _used_rows(table: Path | Sequence[ShotRow], shared: Mapping[str, Any]) -> dict[int, ShotRow]:
-    """Return the rows that are not excluded, by number."""
-    rows = rows_of(table, ShotRow, shared) if isinstance(table, Path) else table
-    used = {number: row for number, row in enumerate(rows, 1) if not row.exclude}
+    """Return the rows that are not excluded, by their lines in a file or their numbers."""
+    rows = _read_shots(table, shared) if isinstance(table, Path) else dict(enumerate(table, 1))
+    used = {number: row for number, row in rows.items() if not row.exclude}
     if not used:
         raise InputError(
-            f"{_name_of(table)} excludes all of its {len(rows)} images: empty the column 'exclude' "
-            "in the rows to use"
+            f"{table if isinstance(table, Path) else 'the table'} excludes all of its {len(rows)} "
+            "images: empty the column 'exclude' in the rows to use"
         )
     return used
 
 
-def _name_of(table: Path | Sequence[ShotRow]) -> str:
-    return str(table) if isinstance(table, Path) else "the table"
-
-
 def fiducials_from(path: Path) -> list[tuple[float, ...]]:
     """Read known displacements from a table: rows of y, x, dy, dx and their σ, in px."""
-    return [(row.y, row.x, row.dy, row.dx, row.sigma) for row in rows_of(path, _Fiducial)]
+    rows = read_rows(path, _Fiducial).values()
+    return [(row.y, row.x, row.dy, row.dx, row.sigma) for row in rows]
 
 
 def _drop_none(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -299,84 +284,14 @@ def _drop_none(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def is_table(path: Path) -> bool:
     """Return whether a file is a table with column names, not an image as text."""
-    if path.suffix.lower() not in SITES.suffixes:
-        return False
-    check_regular(path, _EXPECTED_FORMAT)
-    with path.open("rb") as file:  # an image may be large
-        head = file.read(_MAX_HEADER_BYTES).decode("utf-8-sig", errors="replace")
-    lines = _content_lines(head)
-    return bool(lines) and not any(map(_is_number, _cells(path, lines[0])))
+    return path.suffix.lower() in SITES.suffixes and has_column_names(path)
 
 
-def _lines(path: Path) -> list[str]:
-    return _content_lines(small_text(path, _EXPECTED_FORMAT, "utf-8-sig"))
-
-
-def _content_lines(text: str) -> list[str]:
-    """Return the lines of a table that are neither empty nor comments."""
-    return [line for line in text.splitlines() if line.strip(" ,;\t") and line.strip()[0] != "#"]
-
-
-def _cells(path: Path, line: str, delimiter: str = "") -> list[str]:
-    delimiter = delimiter or _delimiter(line)
-    try:
-        (cells,) = csv.reader([line], delimiter=delimiter, skipinitialspace=True)
-    except csv.Error as error:
-        raise InputError(
-            f"{path} has a line that begins with {line[:30]!r} and cannot be read ({error}): "
-            "expected a table as comma-separated values; correct it"
-        ) from None
-    return [cell.strip() for cell in cells]
-
-
-def _delimiter(header: str) -> str:
-    return ";" if ";" in header else ","
-
-
-def _suggest(name: str, columns: list[str]) -> str:
-    match = nearest(name.lower(), columns)
-    return f"did you mean '{match}'?" if match else f"known are {', '.join(columns)}"
-
-
-Model = TypeVar("Model", bound=BaseModel)
-
-
-def rows_of(path: Path, model: type[Model], shared: Mapping[str, Any] | None = None) -> list[Model]:
-    """Return the rows of a table as models; file names are relative to its folder."""
-    lines = _lines(path)
-    header = _cells(path, lines[0]) if lines else []
-    _check_header(path, header, model)
-    if len(lines) < 2:
-        raise InputError(f"{path} has no rows below its first line: expected one for each image")
-    rows = []
-    for number, line in enumerate(lines[1:], 1):
-        cells = _cells(path, line, _delimiter(lines[0]))
-        if len(cells) > len(header):
-            raise InputError(
-                f"{path}, row {number} has {len(cells)} values, expected {len(header)}: "
-                f"{', '.join(header)}"
-            )
-        entries = {name: cell for name, cell in zip(header, cells, strict=False) if cell}
-        for name in entries.keys() & set(_FILE_COLUMNS):
-            if entries[name] != "unknown":
-                entries[name] = str(path.parent / entries[name])
-        rows.append(
-            validated(model, {**_drop_none(shared or {}), **entries}, f"{path}, row {number}")
-        )
-    return rows
-
-
-def _check_header(path: Path, header: list[str], model: type[BaseModel]) -> None:
-    columns = ShotRow.columns() if issubclass(model, ShotRow) else list(model.model_fields)
-    for name in header:
-        if name not in columns:
-            raise InputError(f"{path} has a column '{name}': {_suggest(name, columns)}")
-    for column, following in pairwise(sorted(header)):
-        if column == following:
-            raise InputError(f"{path} has the column '{column}' twice: expected it once")
-    needed = [name for name, field in model.model_fields.items() if field.is_required()]
-    missing = [name for name in needed if name not in header]
-    if missing:
-        raise InputError(
-            f"{path} has no column '{missing[0]}': its first line must name {', '.join(needed)}"
-        )
+def _read_shots(table: Path, shared: Mapping[str, Any] | None = None) -> dict[int, ShotRow]:
+    """Return all rows of a table by their lines; file names are relative to its folder."""
+    return read_rows(
+        table,
+        ShotRow,
+        columns=ShotRow.columns(),
+        shared=_drop_none(shared or {}),
+    )

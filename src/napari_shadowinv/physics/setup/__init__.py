@@ -192,7 +192,7 @@ def _expected_kind() -> str:
 
 def _suggest_kind(kind: str) -> str:
     """Suggest a kind or species for an unknown kind."""
-    match = nearest(kind.lower(), list(dict.fromkeys([*SETUPS, *SPECIES])))
+    match = nearest(kind, [*SETUPS, *SPECIES])
     if match is None or match in SETUPS:
         return f"; did you mean '{match}'?" if match else ""
     return f'; for this beam give kind = "proton" and species = "{match}"'

@@ -1,0 +1,189 @@
+"""Tables as comma-separated values, with the lines of their rows for messages.
+
+- the cells of a table: `read_table`; its rows as models: `read_rows`
+- whether a file begins with column names: `has_column_names`
+
+Semicolons and tabs separate cells, too. Empty lines and lines that begin with ``#`` are skipped.
+Capitals in column names do not matter.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar, get_args
+
+from pydantic import BaseModel
+
+from napari_shadowinv._system.safety import as_file_errors, check_regular, small_text
+from napari_shadowinv._system.validation import suggestion, validated
+from napari_shadowinv.errors import FileFormatError, InputError
+
+_MAX_HEADER_BYTES = 100_000
+_SEPARATORS = ";\t,"
+_EXPECTED = "a table as comma-separated values"
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class Table(NamedTuple):
+    """Cells of a table.
+
+    Attributes
+    ----------
+    path : Path
+    header : list of str
+        Column names in lower case.
+    rows : dict of int to list of str
+        Cells of each row, as many as there are columns, by its line in the file.
+    """
+
+    path: Path
+    header: list[str]
+    rows: dict[int, list[str]]
+
+    def position_of(self, column: str) -> int:
+        """Return the position of a column that occurs once, or raise an `InputError`."""
+        if column not in self.header:
+            raise InputError(
+                f"{self.path} has no column '{column}', but {', '.join(self.header) or 'none'}: "
+                "the first line must name the columns"
+            )
+        if self.header.count(column) > 1:
+            raise InputError(f"{self.path} has the column '{column}' twice: expected it once")
+        return self.header.index(column)
+
+
+@as_file_errors
+def read_table(path: Path) -> Table:
+    """Read the column names and rows of a table.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read as a table.
+    InputError
+        If it has no rows, or one with more cells than there are columns; the message names the
+        line.
+    """
+    records = _records(path, small_text(path, _EXPECTED, "utf-8-sig"))
+    _, names = next(records, (0, []))
+    header = [name.lower() for name in _without_empty_end(names)]
+    rows = {}
+    for line, cells in records:
+        if len(_without_empty_end(cells)) > len(header):
+            raise InputError(
+                f"{path}, line {line} has {len(cells)} values, expected {len(header)}: "
+                f"{', '.join(header)}"
+            )
+        rows[line] = [*cells, *[""] * len(header)][: len(header)]
+    if header and not rows:
+        raise InputError(f"{path} has no rows below its column names: expected at least one")
+    return Table(path, header, rows)
+
+
+def read_rows(
+    path: Path,
+    model: type[Model],
+    *,
+    columns: Collection[str] = (),
+    shared: Mapping[str, Any] | None = None,
+) -> dict[int, Model]:
+    """Return the rows of a table as models, by their lines in the file.
+
+    Parameters
+    ----------
+    path : Path
+    model : type
+        Model of a row. Empty cells stand for its defaults, file names are relative to the folder
+        of the table.
+    columns : collection of str, optional
+        Names of the columns. Default: the model's fields.
+    shared : mapping, optional
+        Values of all rows where cells are empty.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read as a table.
+    InputError
+        If a column is unknown, missing or given twice, or a row is invalid; the message names the
+        line.
+    """
+    table = read_table(path)
+    known = {name.lower(): name for name in columns or model.model_fields}
+    for name in table.header:
+        if name not in known:
+            raise InputError(f"{path} has a column '{name}': {suggestion(name, known.values())}")
+    required = [name.lower() for name, field in model.model_fields.items() if field.is_required()]
+    for name in (*required, *table.header):
+        table.position_of(name)
+    models = {}
+    for line, cells in table.rows.items():
+        entries = {
+            known[name]: cell for name, cell in zip(table.header, cells, strict=True) if cell
+        }
+        for name, field in model.model_fields.items():
+            if name in entries and _is_file_name(entries[name], field.annotation):
+                entries[name] = str(path.parent / entries[name])
+        models[line] = validated(model, {**(shared or {}), **entries}, f"{path}, line {line}")
+    return models
+
+
+def has_column_names(path: Path) -> bool:
+    """Return whether a file begins with column names, not with numbers."""
+    check_regular(path, _EXPECTED)
+    with path.open("rb") as file:  # it may be a large image
+        head = file.read(_MAX_HEADER_BYTES).decode("utf-8-sig", errors="replace")
+    _, names = next(_records(path, head), (0, []))
+    return bool(names) and not any(map(is_number, names))
+
+
+def is_number(text: str) -> bool:
+    """Return whether a text is a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _records(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the line and the cells of each row that is not empty."""
+    lines = ["\n" if _is_comment(line) else line for line in io.StringIO(text, newline=None)]
+    header = next((line for line in lines if line.strip(f" {_SEPARATORS}\n")), "")
+    separator = max(_SEPARATORS, key=header.count)
+    reader = csv.reader(lines, delimiter=separator, skipinitialspace=True, strict=True)
+    while True:
+        line = reader.line_num + 1
+        try:
+            cells = [cell.strip() for cell in next(reader)]
+        except StopIteration:
+            return
+        except csv.Error as error:
+            raise FileFormatError(
+                f"{path}, line {line} cannot be read ({error}): expected {_EXPECTED}, with quotes "
+                "in pairs; correct it"
+            ) from None
+        if any(cells):
+            yield line, cells
+
+
+def _is_comment(line: str) -> bool:
+    # A lone # is the name of a column of numbers.
+    text = line.lstrip()
+    return text.startswith("#") and text[1:2] not in {*_SEPARATORS}
+
+
+def _is_file_name(cell: str, annotation: Any) -> bool:
+    """Return whether a field takes a path, and the cell is none of its keywords."""
+    types = get_args(annotation) or (annotation,)
+    keywords = [word for literal in types for word in get_args(literal)]
+    return Path in types and cell not in keywords
+
+
+def _without_empty_end(cells: list[str]) -> list[str]:
+    count = max((k for k, cell in enumerate(cells, 1) if cell), default=0)
+    return cells[:count]
