@@ -460,7 +460,7 @@ def test_film_that_is_too_dark_is_reported(truth: Truth, changed) -> None:
         ('file = "film_02.tif"', 'file = "lost.tif"', "lost.tif does not exist"),
         ('file = "film_02.tif"', 'file = "film_01.tif"', "same content as the scan of film 1"),
         ('file = "film_02.tif"', "", "layer 2 has no file: give it, or a 'scan' of all films"),
-        ('film = "HDV2"', 'film = "HD-V2"', "of type 'HD-V2': did you mean 'HDV2'?"),
+        ('film = "HDV2"', 'film = "HD-V2"', "under [films]: did you mean 'HDV2'?"),
         ('"13 um Al"', '"13 Al"', "expected thickness, unit (um or mm) and material"),
         ('calibration = "HDV2.csv"\n', "", "films of type 'HDV2' have no calibration"),
         ('kind = "proton"', 'kind = "optical"', "setup is not one of protons"),
