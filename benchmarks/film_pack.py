@@ -37,7 +37,7 @@ from scipy import ndimage
 
 import simulated_pack
 from napari_shadowinv import FitOptions, Recipe
-from napari_shadowinv.film import moved_corners, straightened, write_corners
+from napari_shadowinv.film import move_corners, straighten_film, write_corners
 from napari_shadowinv.film.scans import upright
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.options import FitChoices
@@ -138,7 +138,7 @@ class Images:
             for both in zip(doses.usable, doses.fluence.astype(float), strict=True)
         ]
         pose = doses.shifts[0], float(doses.turns[0])
-        _, middle, _ = upright(moved_corners(doses.corners[0], *pose, 1.0))
+        _, middle, _ = upright(move_corners(doses.corners[0], *pose, 1.0))
         place = truth.placements[0]
         offset = np.array(place.axes) @ (middle - np.array(place.middle)) + np.array(place.slip)
         return cls(planes, list(doses.usable), list(doses.setups), offset)
@@ -284,9 +284,9 @@ def print_real(pack: Path, first: int, last: int) -> None:
         corners, shift = doses.corners[number - 1], doses.shifts[number - 1]
         turn, film = float(doses.turns[number - 1]), described.layers[number - 1].film
         pixels = tifffile.imread(described.layers[number - 1].file)
-        laid = moved_corners(corners, shift, turn, 1.0)
+        laid = move_corners(corners, shift, turn, 1.0)
         slits = [
-            slit_of(straightened(pixels, where, shape=shape).mean(axis=-1))
+            slit_of(straighten_film(pixels, where, shape=shape).mean(axis=-1))
             for where in (corners, laid)
         ]
         cells = ["–" if slit is None else f"{slit[0]:.0f}, {slit[1]:.1f}" for slit in slits]

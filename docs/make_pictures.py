@@ -59,8 +59,8 @@ def toroid_picture() -> None:
 
 def burner_picture(folder: Path) -> None:
     """A real shadowgram with its real reference beam."""
-    shot = read(folder / SHOT).binned(2)
-    reference = read(folder / "Image_00000.bmp").binned(2)
+    shot = read(folder / SHOT).bin_pixels(2)
+    reference = read(folder / "Image_00000.bmp").bin_pixels(2)
     inversion = invert(shot.image, source=reference.image)
     figure = report_figure(inversion, title="Plume of an alcohol burner")
     save_small(figure, HERE / "burner.png", 1300)

@@ -209,8 +209,8 @@ def source_pictures() -> None:
 
 def burner_sources_picture(folder: Path) -> None:
     """How far each estimate is from the beam that was really there."""
-    shot = read(folder / SHOT).binned(2).image
-    reference = read(folder / "Image_00000.bmp").binned(2).image
+    shot = read(folder / SHOT).bin_pixels(2).image
+    reference = read(folder / "Image_00000.bmp").bin_pixels(2).image
     shot, reference = shot / shot.mean(), reference / reference.mean()
     y, x = np.mgrid[: shot.shape[0], : shot.shape[1]]
     mask = ~((x > 115) & (x < 530) & (y < 200)) & ~((x > 190) & (x < 440))
@@ -347,8 +347,8 @@ def hot_pixels_picture() -> None:
 
 def burner_filters_picture(folder: Path) -> None:
     """The paper's filtering of a shadowgram, of its potential, and of both."""
-    shot = read(folder / SHOT).binned(4).image
-    reference = read(folder / "Image_00000.bmp").binned(4).image
+    shot = read(folder / SHOT).bin_pixels(4).image
+    reference = read(folder / "Image_00000.bmp").bin_pixels(4).image
     flat = remove_background(shot, 4)
     raw = invert(shot).potential
     potentials = {

@@ -141,7 +141,7 @@ def toroid_window() -> None:
 def stack_window(folder: Path) -> None:
     """A run over real shadowgrams without a reference: the widget, and a shot's field."""
     viewer = new_window("alcohol burner", height=840)
-    shots = [read_radiograph(path, channel="mean").binned(4).image for path in frames(folder)]
+    shots = [read_radiograph(path, channel="mean").bin_pixels(4).image for path in frames(folder)]
     viewer.add_image(np.stack(shots), name="burner", axis_labels=("shot", "y", "x"))
     widget = open_widget(viewer, "Invert stack")
     widget.source.picker.set_kind("polynomial")

@@ -27,9 +27,9 @@ options.out.mkdir(parents=True, exist_ok=True)
 
 # %% The frames and the undisturbed beam, with 2×2 pixels summed
 factor = 8 if options.small else 2
-reference = read(options.folder / "Image_00000.bmp").binned(factor).image
+reference = read(options.folder / "Image_00000.bmp").bin_pixels(factor).image
 files = sorted(options.folder.glob("Image_2*.bmp"))
-frames = [read(file).binned(factor).image for file in files]
+frames = [read(file).bin_pixels(factor).image for file in files]
 times = [datetime.strptime(file.stem[6:], "%Y%m%d%H%M%S%f") for file in files]
 seconds = [(time - times[0]).total_seconds() for time in times]
 

@@ -57,7 +57,7 @@ for layer, (energy, top, left) in LAYERS.items():
     scan = tifffile.imread(options.folder / f"RCF_18{layer}.tif")
     scan = scan[top : top + HEIGHT, left : left + WIDTH]
     found = dose(scan, calibration, background=unexposed)
-    doses[layer] = Radiograph(found.dose).binned(factor).image / factor**2
+    doses[layer] = Radiograph(found.dose).bin_pixels(factor).image / factor**2
     outside[layer] = float(found.outside.mean())
     print(
         f"{layer}, {energy} MeV: {doses[layer].min():.1f} to {doses[layer].max():.0f} Gy, "

@@ -63,7 +63,7 @@ def test_the_filter_is_a_step(names):
     assert "median" not in STEPS
     image = np.ones((20, 20))
     image[9, 9] = 50.0
-    np.testing.assert_array_equal(step.applied(Radiograph(image)).image, 1.0)
+    np.testing.assert_array_equal(step.apply(Radiograph(image)).image, 1.0)
 
 
 def test_the_option_is_one_field(names):

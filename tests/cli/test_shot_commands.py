@@ -694,7 +694,7 @@ def test_sources_are_estimated_as_the_library_does(folder: Path) -> None:
         assert provenance.recipe.estimate is not None
         assert provenance.recipe.estimate.name() == name
         text = " ".join(result.stdout.split())
-        assert f"source {provenance.recipe.estimate.described}" in text
+        assert f"source {provenance.recipe.estimate.summary}" in text
 
 
 def test_filters_match_the_library(folder: Path) -> None:

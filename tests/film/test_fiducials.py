@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.film import moved_corners, poses_by_fiducials
+from napari_shadowinv.film import move_corners, poses_by_fiducials
 
 THROUGH = {"a": (-40.0, -60.0), "b": (-35.0, 70.0), "c": (45.0, 10.0)}
 SHIFTS = np.array([(1.0, -2.0), (-3.0, 0.5), (2.0, 1.5)])
@@ -44,7 +44,7 @@ def test_shifts_and_turns_are_those_of_the_marks() -> None:
     for (marks, corners), shift, turn, scale in zip(
         films, poses.shifts, poses.turns, scales, strict=True
     ):
-        moved = moved_corners(corners, shift, turn, scale)
+        moved = move_corners(corners, shift, turn, scale)
         middle, right = moved.mean(axis=0), moved[1] - moved[0]
         right /= np.hypot(*right)
         axes = np.array([[right[1], -right[0]], right])

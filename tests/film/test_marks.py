@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.film import Calibration, find_films, straightened
+from napari_shadowinv.film import Calibration, find_films, straighten_film
 from napari_shadowinv.film.marks import burnt_edges, usable_pixels
 
 SHAPE = (200, 320)
@@ -65,9 +65,9 @@ def test_the_writing_on_real_films_is_found(shared_data: Path, letter: str) -> N
     folder = shared_data / "rcf"
     kind, table = ("HDV2", "HDV2_3") if letter < "M" else ("EBT3", "EBT3_2")
     blank = tifffile.imread(folder / f"{kind}.tif")
-    unexposed = straightened(blank, find_films(blank)[0])[60:-60, 60:-60].reshape(-1, 3)
+    unexposed = straighten_film(blank, find_films(blank)[0])[60:-60, 60:-60].reshape(-1, 3)
     scan = tifffile.imread(folder / f"RCF_18{letter}.tif")
-    film = straightened(scan, find_films(scan)[0])
+    film = straighten_film(scan, find_films(scan)[0])
     usable = usable_pixels(
         film,
         Calibration.from_csv(folder / f"{table}_calibration.csv"),
@@ -113,7 +113,7 @@ def test_burnt_edges_are_not_seen_in_a_beam() -> None:
 def test_burnt_edges_of_real_films_are_masked(shared_data: Path, letter: str) -> None:
     folder = shared_data / "rcf"
     scan = tifffile.imread(folder / f"RCF_18{letter}.tif")
-    red = straightened(scan, find_films(scan)[0], shape=(296, 590))[..., 0]
+    red = straighten_film(scan, find_films(scan)[0], shape=(296, 590))[..., 0]
     calibration = Calibration.from_csv(folder / "EBT3_2_calibration.csv")
     densities, doses = calibration.curve("red")
     dose = np.exp(np.interp(np.log10(calibration.background[0] / red), densities, np.log(doses)))

@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.film import check_orientation, moved_corners, register, straightened
+from napari_shadowinv.film import check_orientation, move_corners, register, straighten_film
 
 SHAPE = (150, 210)
 RNG = np.random.default_rng(3)
@@ -86,14 +86,14 @@ def test_moved_corners_cut_the_film_where_it_shows_the_same() -> None:
     shift, turn = (2.4, -1.7), 0.02
     scan = np.pad(film(shift, turn), 40, mode="edge")
     corners = np.array([(39.5, 39.5), (39.5, 249.5), (189.5, 249.5), (189.5, 39.5)])
-    cut = straightened(scan, moved_corners(corners, shift, turn, 1.0), shape=SHAPE)
+    cut = straighten_film(scan, move_corners(corners, shift, turn, 1.0), shape=SHAPE)
     inner = np.s_[20:-20, 20:-20]
     np.testing.assert_allclose(cut[inner], film((0, 0))[inner], atol=0.02)
 
 
 def test_moved_corners_measure_shifts_in_pixels_of_the_scale() -> None:
     corners = np.array([(0, 0), (0, 200), (150, 200), (150, 0)], dtype=float)
-    moved = moved_corners(corners, (2.0, -1.0), 0.0, 3.0)
+    moved = move_corners(corners, (2.0, -1.0), 0.0, 3.0)
     np.testing.assert_allclose(moved - corners, np.tile([6.0, -3.0], (4, 1)))
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.film.scans import find_films, read_corners, straightened, write_corners
+from napari_shadowinv.film.scans import find_films, read_corners, straighten_film, write_corners
 
 Array = NDArray[np.float64]
 
@@ -83,7 +83,7 @@ def test_many_films_come_in_the_order_of_reading() -> None:
 
 def test_a_film_turned_upright_is_as_it_was() -> None:
     corners = laid((140.0, 200.0), (120.0, 230.0), 2.5)
-    film = straightened(scanned([corners]), corners)
+    film = straighten_film(scanned([corners]), corners)
     assert film.shape == (120, 230, 3)
     grey = film[..., 0] / (20_000 + 10_000 * (np.arange(230) + 0.5) / 230)
     assert abs(grey[3:-3, 3:-3] - 1).max() < 0.06
@@ -119,7 +119,7 @@ def test_real_films_lie_where_they_were_found_by_hand(shared_data: Path) -> None
         height = np.hypot(*(film[3] - film[0]))
         assert height == pytest.approx(296, abs=3)
         if letter not in "ABCDEFJ":  # torn along the slit, or it is too faint
-            slits.append(slit_of(straightened(scan, film, shape=(296, 590)).mean(axis=-1)))
+            slits.append(slit_of(straighten_film(scan, film, shape=(296, 590)).mean(axis=-1)))
     assert np.abs(away).max() < 10
     assert np.sqrt(np.mean(np.square(away))) < 3.5
     # What is cut into all films alike lies at the same place of each.
@@ -136,9 +136,9 @@ def test_a_scan_without_films_is_refused() -> None:
 def test_corners_in_another_order_are_refused() -> None:
     corners = laid((140.0, 200.0), (120.0, 230.0), 0)
     with pytest.raises(InputError, match="in the direction of reading"):
-        straightened(np.ones((300, 420)), corners[::-1])
+        straighten_film(np.ones((300, 420)), corners[::-1])
     with pytest.raises(InputError, match=r"corners have shape \(3, 2\)"):
-        straightened(np.ones((300, 420)), corners[:3])
+        straighten_film(np.ones((300, 420)), corners[:3])
 
 
 def test_corners_come_back_from_a_table(tmp_path: Path) -> None:

@@ -481,7 +481,7 @@ def test_the_donut_is_retrieved(shared_data):
 
 
 def test_a_real_plume_with_its_real_reference_is_explained(burner):
-    reference, shot = (read(burner[number]).binned(2) for number in (0, 3))
+    reference, shot = (read(burner[number]).bin_pixels(2) for number in (0, 3))
     options = InversionOptions(n_sites=shot.image.size)
     inversion = invert(shot.image, source=reference.image, options=options)
     assert inversion.report.converged

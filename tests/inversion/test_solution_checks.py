@@ -359,8 +359,10 @@ def test_other_reference_images_get_no_doubts(shared_data: Path):
 
 @pytest.mark.parametrize("number", [0, 4, 5])
 def test_a_real_plume_gets_no_doubts(burner: list[Path], number: int):
-    reference = read(burner[0]).binned(4).image
-    assert invert(read(burner[1 + number]).binned(4).image, source=reference).report.warnings == ()
+    reference = read(burner[0]).bin_pixels(4).image
+    assert (
+        invert(read(burner[1 + number]).bin_pixels(4).image, source=reference).report.warnings == ()
+    )
 
 
 @pytest.mark.parametrize(

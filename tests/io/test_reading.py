@@ -258,7 +258,7 @@ def test_bins_sum_counts_and_widen_pixels(proton_setup: Any) -> None:
     mask = np.ones((6, 9), bool)
     mask[0, 0] = False
     shot = Radiograph(RAMP.astype(float), setup=proton_setup, mask=mask, source=np.ones((6, 9)))
-    binned = shot.binned(2)
+    binned = shot.bin_pixels(2)
     assert binned.image.shape == (3, 4)
     assert binned.image.sum() == RAMP[:6, :8].sum()
     assert binned.image[1, 2] == RAMP[2:4, 4:6].sum()
@@ -270,7 +270,7 @@ def test_bins_sum_counts_and_widen_pixels(proton_setup: Any) -> None:
     assert binned.setup.object_pixel_size == 2 * proton_setup.object_pixel_size
     assert binned.notes == ("binned 2 × 2, 0 rows and 1 columns cut off",)
     with pytest.raises(InputError, match="from 1 to 3"):
-        shot.binned(4)
+        shot.bin_pixels(4)
 
 
 def test_import_is_light() -> None:

@@ -67,14 +67,14 @@ def test_magnification_of_the_paper() -> None:
 
 
 def test_collimated_beam_does_not_magnify(optical: OpticalSetup) -> None:
-    assert optical.collimated
+    assert optical.is_collimated
     assert optical.magnification == 1
     assert optical.object_pixel_size == 5e-6
 
 
 def test_magnification_tends_to_one_as_the_source_recedes(proton: ProtonSetup) -> None:
     far = proton.model_copy(update={"source_object_distance": 1e9})
-    assert not far.collimated
+    assert not far.is_collimated
     assert far.magnification == pytest.approx(1, abs=1e-10)
 
 

@@ -14,7 +14,7 @@ import tifffile
 from scipy import ndimage
 
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
-from napari_shadowinv.film import Pack, moved_corners, read_corners, write_corners
+from napari_shadowinv.film import Pack, move_corners, read_corners, write_corners
 from napari_shadowinv.film.scans import upright
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read, read_toml, write
@@ -59,7 +59,7 @@ def laid(truth: Truth, doses, layer: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions and middle of the upright film on its scan, after its shift and turn."""
     scale = truth.scene.magnifications[layer] / truth.scene.magnifications[0]
     pose = doses.shifts[layer], float(doses.turns[layer])
-    return upright(moved_corners(doses.corners[layer], *pose, scale))[:2]
+    return upright(move_corners(doses.corners[layer], *pose, scale))[:2]
 
 
 def on_films(truth: Truth, doses, plane: Callable[[int], np.ndarray], layer: int) -> np.ndarray:

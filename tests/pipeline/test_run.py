@@ -113,14 +113,14 @@ def test_source_and_masks_go_through_the_same_steps(image: FloatArray) -> None:
         return turned.all(axis=(1, 3)) if array.dtype == bool else turned.sum(axis=(1, 3))
 
     usable = by_hand(mask)
-    small = LowPassFilter(width=1).filtered(by_hand(image), usable)
+    small = LowPassFilter(width=1).filter_image(by_hand(image), usable)
     recipe = Recipe(steps=steps, source=PolynomialEstimate(degree=1), options=OPTIONS)
     source = polynomial_source(small, degree=1, mask=usable & by_hand(bare))
     inversion = run(recipe, image, mask=mask, source_mask=bare)
     # Sums of a turned array are rounded in another order.
     expected = invert(small, source=source, mask=usable, options=OPTIONS)
     assert_same(inversion, expected, rtol=1e-9)
-    measured = LowPassFilter(width=1).filtered(by_hand(1.1 * image + 9), usable)
+    measured = LowPassFilter(width=1).filter_image(by_hand(1.1 * image + 9), usable)
     inversion = run(Recipe(steps=steps, options=OPTIONS), image, source=1.1 * image + 9, mask=mask)
     expected = invert(small, source=measured, mask=usable, options=OPTIONS)
     assert_same(inversion, expected, rtol=1e-9)

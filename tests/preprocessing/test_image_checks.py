@@ -217,7 +217,7 @@ def test_dark_is_a_number_or_a_file_in_every_notation():
 )
 def test_dark_says_why_it_cannot_be_subtracted(level, message):
     with pytest.raises(InputError, match=message):
-        Dark(level=level).applied(Radiograph(np.full((8, 8), 400.0)))
+        Dark(level=level).apply(Radiograph(np.full((8, 8), 400.0)))
 
 
 def test_dark_frame_of_another_size_is_refused(tmp_path):

@@ -13,7 +13,7 @@ from napari_shadowinv.preprocessing import (
     PolynomialEstimate,
     Radiograph,
     Recipe,
-    estimated_source,
+    estimate_source,
 )
 
 SHAPE = (120, 160)
@@ -88,7 +88,7 @@ def test_a_source_dark_behind_the_source_mask_is_reported() -> None:
         cautions: list[Caution] = []
         estimate = PolynomialEstimate(degree=1)
         shot = Radiograph(image, mask=DEAD, source_mask=x < 100)
-        estimated_source(estimate, shot, on_caution=cautions.append)
+        estimate_source(estimate, shot, on_caution=cautions.append)
         assert len(cautions) == count
         # Nor where nothing of it is inverted.
-        estimated_source(estimate, Radiograph(image, mask=x < 100))
+        estimate_source(estimate, Radiograph(image, mask=x < 100))

@@ -37,11 +37,11 @@ def test_defaults_are_those_of_the_function(recipe: Any, function: Any) -> None:
 def test_a_choice_describes_its_values(recipe: Any) -> None:
     choice = recipe()
     assert pickle.loads(pickle.dumps(choice)) == choice
-    assert choice.described.startswith(recipe.title)
+    assert choice.summary.startswith(recipe.title)
     for name, value in choice.values().items():
         if isinstance(value, (int, float)):
             changed_choice = choice.model_copy(update={name: value + 1})
-            assert changed_choice.described != choice.described
+            assert changed_choice.summary != choice.summary
 
 
 @pytest.mark.parametrize("junk", [np.nan, -1e6, 1e6])
@@ -51,9 +51,9 @@ def test_filters_do_not_see_masked_pixels(recipe: Any, junk: float) -> None:
     image = 100 + rng.normal(size=(40, 50))
     usable = np.ones(image.shape, bool)
     usable[20:24, 30:37] = False
-    expected = recipe().filtered(image, usable)
+    expected = recipe().filter_image(image, usable)
     spoilt = np.where(usable, image, junk)
-    np.testing.assert_array_equal(recipe().filtered(spoilt, usable)[usable], expected[usable])
+    np.testing.assert_array_equal(recipe().filter_image(spoilt, usable)[usable], expected[usable])
 
 
 NEAR = paper_setup().model_copy(update={"pixel_size": 6.5e-6})
@@ -61,33 +61,33 @@ NEAR = paper_setup().model_copy(update={"pixel_size": 6.5e-6})
 
 def test_an_isotropic_estimate_is_the_function_in_its_experiment() -> None:
     image = 1 + np.random.default_rng(0).random((30, 40))
-    estimate = preprocessing.IsotropicEstimate().placed(NEAR, image.shape)
+    estimate = preprocessing.IsotropicEstimate().adapt_to(NEAR, image.shape)
     expected = preprocessing.isotropic_source(image, NEAR)
     np.testing.assert_array_equal(estimate.source(image, None), expected)
     assert pickle.loads(pickle.dumps(estimate)) == estimate
     # Another experiment is another estimate, also for what keeps the last one.
     nearer_setup = NEAR.model_copy(update={"source_object_distance": 2.6e-3})
-    assert preprocessing.IsotropicEstimate().placed(nearer_setup, image.shape) != estimate
+    assert preprocessing.IsotropicEstimate().adapt_to(nearer_setup, image.shape) != estimate
     # Of a part, with the axis in the middle of the whole.
     shifted = np.array([[1.0, 0, 10], [0, 1, 4], [0, 0, 1]])
     part = (
         preprocessing.IsotropicEstimate()
-        .placed(NEAR, image.shape, shifted)
+        .adapt_to(NEAR, image.shape, shifted)
         .source(expected[10:22, 4:25], None)
     )
     np.testing.assert_allclose(part, expected[10:22, 4:25], rtol=1e-12)
     # With pixels merged.
-    chosen = preprocessing.IsotropicEstimate(centre_y=3, centre_x=21).placed(NEAR, image.shape)
+    chosen = preprocessing.IsotropicEstimate(centre_y=3, centre_x=21).adapt_to(NEAR, image.shape)
     blocks = chosen.source(image, None).reshape(15, 2, 20, 2).mean(axis=(1, 3))
-    np.testing.assert_allclose(chosen.coarser(2).source(blocks, None), blocks, rtol=1e-9)
+    np.testing.assert_allclose(chosen.coarsen(2).source(blocks, None), blocks, rtol=1e-9)
 
 
 def test_an_isotropic_estimate_needs_the_setup_of_a_point_source() -> None:
     isotropic = preprocessing.IsotropicEstimate()
     with pytest.raises(InputError, match="'isotropic' without a setup"):
-        isotropic.placed(None, (4, 4))
+        isotropic.adapt_to(None, (4, 4))
     with pytest.raises(InputError, match="'isotropic' without a setup"):
         isotropic.source(np.ones((4, 4)), None)
     collimated = NEAR.model_copy(update={"source_object_distance": np.inf})
     with pytest.raises(InputError, match="collimated beam"):
-        isotropic.placed(collimated, (4, 4))
+        isotropic.adapt_to(collimated, (4, 4))

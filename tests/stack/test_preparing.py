@@ -59,7 +59,9 @@ def usable() -> np.ndarray:
 def alone(image, usable, bare):
     """One shot as a stack does it, by the functions themselves."""
     # Far from the object the masked corner hides nothing that counts.
-    clean = LowPassFilter(width=0.8).filtered(HotPixelFilter().filtered(image, usable), usable)
+    clean = LowPassFilter(width=0.8).filter_image(
+        HotPixelFilter().filter_image(image, usable), usable
+    )
     source = polynomial_source(clean, degree=1, mask=usable & bare)
     return invert(clean, source=source, mask=usable, options=OPTIONS)
 

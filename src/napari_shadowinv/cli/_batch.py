@@ -228,7 +228,7 @@ def _recipe_rows(store: StackStore) -> Rows:
     files = list(dict.fromkeys(source.file for source in sources if source and source.file))
     rows = [("source", _list_text(files) or source or str(store.attributes["source_image"]))]
     steps = () if provenance is None else provenance.recipe.steps
-    return rows + [("step", step.described) for step in steps]
+    return rows + [("step", step.summary) for step in steps]
 
 
 def _beam_rows(store: StackStore) -> Rows:

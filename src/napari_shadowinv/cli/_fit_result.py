@@ -133,7 +133,7 @@ def fit_file_rows(dataset: xarray.Dataset) -> Rows:
 
 def _provenance_rows(provenance: Provenance) -> Rows:
     """Return the steps before a fit, its choices, and the checksums of its files."""
-    steps = [("step", step.described) for step in provenance.recipe.steps]
+    steps = [("step", step.summary) for step in provenance.recipe.steps]
     fit = provenance.recipe.fit
     choices = {} if fit is None else fit.model_dump(exclude_none=True, exclude={"options"})
     rows = [*steps, ("fit", options_text(choices))]

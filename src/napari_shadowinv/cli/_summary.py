@@ -66,7 +66,7 @@ def provenance_rows(provenance: Provenance | None) -> Rows:
     if source is not None:
         origin = source.file or "an array"
     else:
-        origin = "uniform" if estimate is None else estimate.described
+        origin = "uniform" if estimate is None else estimate.summary
     rows = [*[("prepared", note) for note in image.notes], ("source", origin)]
     for name, index in (("mask", image.mask), ("source mask", image.source_mask)):
         if (mask := provenance.mask_of(index)) is not None:

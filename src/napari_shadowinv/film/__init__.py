@@ -1,10 +1,10 @@
 """Films, CR-39 and image plates: from their scans to doses, counts and luminescence.
 
-- films on a scan: `find_films`, `straightened`, `read_corners`, `write_corners`
+- films on a scan: `find_films`, `straighten_film`, `read_corners`, `write_corners`
 - pixels without marks and burns: `usable_pixels`, `burnt_edges`
 - doses: `Calibration`, `dose`, `combined_dose`, `net_optical_density`
 - packs, and the response of each film to protons of each energy: `Pack`, `Response`
-- alignment of the films of a pack: `register`, `poses_by_fiducials`, `moved_corners`,
+- alignment of the films of a pack: `register`, `poses_by_fiducials`, `move_corners`,
   `check_orientation`
 - fluences at each energy from the doses of all films: `unfold`
 - CR-39: `Tracks`, `TrackImage`
@@ -30,8 +30,8 @@ from napari_shadowinv.film.image_plates import (
 )
 from napari_shadowinv.film.marks import burnt_edges, usable_pixels
 from napari_shadowinv.film.pack import FilmType, Material, Pack, PackLayer, Slab
-from napari_shadowinv.film.registration import Poses, check_orientation, moved_corners, register
-from napari_shadowinv.film.scans import find_films, read_corners, straightened, write_corners
+from napari_shadowinv.film.registration import Poses, check_orientation, move_corners, register
+from napari_shadowinv.film.scans import find_films, read_corners, straighten_film, write_corners
 from napari_shadowinv.film.stopping import Stopping
 from napari_shadowinv.film.tracks import TrackImage, Tracks
 from napari_shadowinv.film.unfolding import Spectra, unfold
@@ -61,12 +61,12 @@ __all__ = [
     "find_films",
     "fuji_luminescence",
     "ge_luminescence",
-    "moved_corners",
+    "move_corners",
     "net_optical_density",
     "poses_by_fiducials",
     "read_corners",
     "register",
-    "straightened",
+    "straighten_film",
     "unexposed_pixel",
     "unfold",
     "usable_pixels",

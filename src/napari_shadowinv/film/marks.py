@@ -92,8 +92,8 @@ def usable_pixels(
     samples = excess[first::_SAMPLE_STEP_PX, first::_SAMPLE_STEP_PX]
     usual = ndimage.median_filter(samples, _BACKGROUND_SAMPLES, mode="nearest")
     scatter = ndimage.median_filter(np.abs(samples - usual), _SCATTER_SAMPLES, mode="nearest")
-    least = np.maximum(_resampled(_MIN_SCATTERS * _NORMAL_MAD * scatter, excess), _MIN_DENSITY)
-    marked = np.abs(excess - _resampled(usual, excess)) > least
+    least = np.maximum(_resample(_MIN_SCATTERS * _NORMAL_MAD * scatter, excess), _MIN_DENSITY)
+    marked = np.abs(excess - _resample(usual, excess)) > least
     labels, count = ndimage.label(marked)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     marked &= sizes[labels] >= _MIN_MARK_PX
@@ -162,7 +162,7 @@ def _expected_blue(calibration: Calibration, unexposed: FloatArray, red: FloatAr
     return np.asarray(np.interp(red, np.maximum.accumulate(table[:, 0]), table[:, 2]))
 
 
-def _resampled(samples: FloatArray, image: FloatArray) -> FloatArray:
+def _resample(samples: FloatArray, image: FloatArray) -> FloatArray:
     """Interpolate samples to the pixels of an image."""
     places = np.mgrid[: image.shape[0], : image.shape[1]] / _SAMPLE_STEP_PX - 0.5
     return np.asarray(ndimage.map_coordinates(samples, places, order=1, mode="nearest"))

@@ -1,4 +1,4 @@
-"""Films of one pack laid on each other: `register`, `moved_corners`, `check_orientation`.
+"""Films of one pack laid on each other: `register`, `move_corners`, `check_orientation`.
 
 Films are cut and stacked by hand, so their edges determine their places within some pixels only.
 The fine structure of the beam, which several films share, determines them within one.
@@ -19,7 +19,7 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.scans import upright
 
-__all__ = ["EDGES", "Poses", "check_orientation", "moved_corners", "register"]
+__all__ = ["EDGES", "Poses", "check_orientation", "move_corners", "register"]
 
 EDGES = 3.0  # px: what they tell of a film's place
 _FINE, _COARSE = 2.0, 12.0  # px: structure between these sizes is compared
@@ -156,11 +156,11 @@ def register(
     for first in range(len(films)):
         report("register", first, len(films))
         for second in range(first + 1, min(first + 1 + _NEXT, len(films))):
-            pair = _compared(first, second, films)
+            pair = _compare(first, second, films)
             if pair is not None:
                 compared.append(pair)
     pairs = _credible(compared, edges, alike, values.shape[1:])
-    poses = _settled(pairs, edges)
+    poses = _fit_poses(pairs, edges)
     errors = poses.errors.copy()
     for k in np.flatnonzero(~poses.by_images):
         # Edges are as far off as those of films of the same kind that can be compared.
@@ -177,7 +177,7 @@ def register(
     )
 
 
-def moved_corners(corners: ArrayLike, shift: ArrayLike, turn: float, scale: float) -> FloatArray:
+def move_corners(corners: ArrayLike, shift: ArrayLike, turn: float, scale: float) -> FloatArray:
     """Return corners of a film, moved and turned by its pose, which is in px of `scale`."""
     places = np.asarray(corners, np.float64)
     axes, middle, _ = upright(places)
@@ -201,11 +201,9 @@ def check_orientation(images: ArrayLike, usable: ArrayLike, names: Sequence[str]
     flips = [(False, False)]  # of the rows and columns, so that films lie as the first
     clues = {}
     for number in range(1, len(planes)):
-        before, film = (_flipped(planes[k], flips[-1]) for k in (number - 1, number))
+        before, film = (_flip(planes[k], flips[-1]) for k in (number - 1, number))
         as_is = _greatest_correlation(before, film)
-        turned = {
-            flip: _greatest_correlation(before, _flipped(film, flip)) for flip in _WAYS_AROUND
-        }
+        turned = {flip: _greatest_correlation(before, _flip(film, flip)) for flip in _WAYS_AROUND}
         best = max(turned, key=lambda flip: turned[flip])
         if turned[best] > _BEST and 1 - turned[best] < _BETTER * (1 - as_is):
             clues[number] = f"correlation {as_is:.3f}, turned over {turned[best]:.3f}"
@@ -235,7 +233,7 @@ def check_orientation(images: ArrayLike, usable: ArrayLike, names: Sequence[str]
     )
 
 
-def _flipped(
+def _flip(
     planes: tuple[FloatArray, FloatArray], flip: tuple[bool, bool]
 ) -> tuple[FloatArray, FloatArray]:
     turn = np.s_[:: -1 if flip[0] else 1, :: -1 if flip[1] else 1]
@@ -321,7 +319,7 @@ def _texture(image: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArr
     return fine[few], np.where(counts, fine - coarse, 0.0)[few], counts[few]
 
 
-def _compared(first: int, second: int, films: list[_Film]) -> _Pair | None:
+def _compare(first: int, second: int, films: list[_Film]) -> _Pair | None:
     """Pose of the second film against the first, or None if they do not show the same."""
     reference, reference_mask = films[first].texture, films[first].counts
     texture, mask = _with_dose_of(films[second], films[first])
@@ -332,9 +330,7 @@ def _compared(first: int, second: int, films: list[_Film]) -> _Pair | None:
     slope_y, slope_x = (np.gradient(texture, axis=axis) for axis in (0, 1))
     y, x = _from_middle(reference.shape)
     for _ in range(_STEPS):
-        moved, both, along_y, along_x = _moved(
-            pose, texture, reference_mask, mask, slope_y, slope_x
-        )
+        moved, both, along_y, along_x = _move(pose, texture, reference_mask, mask, slope_y, slope_x)
         c, s = np.cos(pose[2]), np.sin(pose[2])
         turning = along_y * (-s * y - c * x) + along_x * (c * y - s * x)
         slopes = np.stack([along_y[both], along_x[both], turning[both]], axis=1)
@@ -351,7 +347,7 @@ def _compared(first: int, second: int, films: list[_Film]) -> _Pair | None:
             return None
         if np.abs(step[:2]).max() < _CLOSE:
             break
-    moved, both, along_y, along_x = _moved(pose, texture, reference_mask, mask, slope_y, slope_x)
+    moved, both, along_y, along_x = _move(pose, texture, reference_mask, mask, slope_y, slope_x)
     error = _disagreement(reference, moved, both, along_y, along_x)
     if error is None:
         return None
@@ -367,7 +363,7 @@ def _from_middle(shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
     return y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2
 
 
-def _moved(
+def _move(
     pose: FloatArray,
     image: FloatArray,
     reference_mask: BoolArray,
@@ -434,7 +430,7 @@ def _disagreement(
     return float(np.sqrt(np.average(away, weights=weights) / alike))
 
 
-def _settled(pairs: list[_Pair], edges: FloatArray) -> Poses:
+def _fit_poses(pairs: list[_Pair], edges: FloatArray) -> Poses:
     """The poses that comparisons and edges together make likeliest."""
     count = len(edges)
     normal, sides = np.diag(1 / np.square(edges)), np.zeros((count, 2))
@@ -469,12 +465,12 @@ def _large(image: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray
     """Large structure in few pixels, and how much of each of them is known."""
     height, width = (length // _LARGE * _LARGE for length in image.shape)
 
-    def summed(plane: FloatArray) -> FloatArray:
+    def sum_blocks(plane: FloatArray) -> FloatArray:
         part = plane[:height, :width]
         return np.asarray(part.reshape(height // _LARGE, _LARGE, -1, _LARGE).sum(axis=(1, 3)))
 
-    counts = summed(usable.astype(np.float64))
-    return summed(np.where(usable, image, 0.0)) / np.maximum(counts, 1.0), counts / _LARGE**2
+    counts = sum_blocks(usable.astype(np.float64))
+    return sum_blocks(np.where(usable, image, 0.0)) / np.maximum(counts, 1.0), counts / _LARGE**2
 
 
 def _greatest_correlation(

@@ -1,7 +1,7 @@
 """Films on the bed of a scanner.
 
 - their corners: `find_films`
-- one of them cut out and turned upright: `straightened`
+- one of them cut out and turned upright: `straighten_film`
 - corners from a table and to one: `read_corners`, `write_corners`
 
 Corners are in px of the scan, (y, x), from the film's top left in the direction of reading, shape
@@ -23,7 +23,7 @@ from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
-__all__ = ["find_films", "read_corners", "straightened", "write_corners"]
+__all__ = ["find_films", "read_corners", "straighten_film", "write_corners"]
 
 _DARKER = 0.75  # of the bed's brightness, in the film's darkest colour
 _BED = 99.0  # percentile of the brightness
@@ -99,7 +99,7 @@ def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[Floa
     return _in_reading_order(corners)
 
 
-def straightened(
+def straighten_film(
     scan: ArrayLike,
     corners: ArrayLike,
     *,

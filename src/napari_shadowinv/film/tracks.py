@@ -1,6 +1,6 @@
 """Etched tracks in CR-39, one by one, and the image that they make.
 
-- the tracks of a scan, and those within ranges of their properties: `Tracks`, `Tracks.selected`
+- the tracks of a scan, and those within ranges of their properties: `Tracks`, `Tracks.select`
 - the number of tracks in each bin: `Tracks.image`, `TrackImage`
 
 Etching widens the trail of a charged particle to a pit, whose diameter depends on the particle and
@@ -78,7 +78,7 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.y)
 
-    def selected(
+    def select(
         self,
         *,
         diameter: tuple[float | None, float | None] | None = None,
@@ -101,7 +101,7 @@ class Tracks:
         --------
         >>> place, width = np.array([0.1, 0.2]), np.array([3.0, 8.0])
         >>> tracks = Tracks(place, place, width, width, width, (1.0, 1.0))
-        >>> len(tracks.selected(diameter=(4, None)))
+        >>> len(tracks.select(diameter=(4, None)))
         1
         """
         ranges = {"diameter": diameter, "contrast": contrast, "eccentricity": eccentricity}

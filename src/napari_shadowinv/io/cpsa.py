@@ -82,7 +82,7 @@ def read_image(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[
     chosen = {} if variable is None else _parse_ranges(variable)
     tracks, warnings = _read_scan(path)
     bin_ = chosen.pop("bin", None)
-    counts, _, bin_ = tracks.selected(**chosen).image(bin_)
+    counts, _, bin_ = tracks.select(**chosen).image(bin_)
     if not chosen:
         text = (
             f"all {counts.sum()} tracks are counted, whatever their diameter, contrast and "

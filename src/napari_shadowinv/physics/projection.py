@@ -185,7 +185,7 @@ def transferred_displacement(
     factor *= float(recorded_with.deflection_angle(1.0) / setup.deflection_angle(1.0))
     if size == old and math.isclose(ratio, 1, rel_tol=_SIZE_TOLERANCE):
         return factor * field
-    return factor * _resampled(field, size, ratio)
+    return factor * _resample(field, size, ratio)
 
 
 def default_deflector(recorded_with: Setup, setup: Setup) -> str:
@@ -271,7 +271,7 @@ def _checked_shape(
     return int(shape[0]), int(shape[1])
 
 
-def _resampled(field: FloatArray, shape: tuple[int, int], ratio: float) -> FloatArray:
+def _resample(field: FloatArray, shape: tuple[int, int], ratio: float) -> FloatArray:
     """A field at the centres of other pixels, `ratio` times as wide, about the same middle."""
     for axis, count in enumerate(shape, start=1):
         old = np.arange(field.shape[axis]) - (field.shape[axis] - 1) / 2

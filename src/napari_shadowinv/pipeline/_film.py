@@ -31,11 +31,11 @@ from napari_shadowinv.film import (
     check_orientation,
     combined_dose,
     find_films,
-    moved_corners,
+    move_corners,
     poses_by_fiducials,
     read_corners,
     register,
-    straightened,
+    straighten_film,
     unexposed_pixel,
     unfold,
     usable_pixels,
@@ -134,7 +134,7 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
         is_mirrored = pack.is_mirrored(layer)
         lay = scan, layer.turned, is_mirrored
         marks = {
-            mark.name: _turned_places(np.array([mark.y, mark.x]), *lay)
+            mark.name: _turn_places(np.array([mark.y, mark.x]), *lay)
             for mark in fiducials.get(number, [])
         }
         scan, corners = to_scan_frame(scan, corners, layer.turned, is_mirrored)
@@ -271,7 +271,7 @@ def to_scan_frame(
     scan: Scan, corners: FloatArray, turned: int, mirrored: bool
 ) -> tuple[Scan, FloatArray]:
     """Turn and mirror scan and corners of a film to the right way round, or back."""
-    pixels, corners = scan.pixels, _turned_places(corners, scan, turned, mirrored)
+    pixels, corners = scan.pixels, _turn_places(corners, scan, turned, mirrored)
     if mirrored:
         pixels, corners = pixels[:, ::-1], corners[[1, 0, 3, 2]]
     if turned == 180:
@@ -279,7 +279,7 @@ def to_scan_frame(
     return scan._replace(pixels=pixels), corners
 
 
-def _turned_places(places: FloatArray, scan: Scan, turned: int, mirrored: bool) -> FloatArray:
+def _turn_places(places: FloatArray, scan: Scan, turned: int, mirrored: bool) -> FloatArray:
     """Turn and mirror places (y, x) on a scan."""
     last = np.array(scan.pixels.shape[:2]) - 1
     if mirrored:
@@ -355,7 +355,7 @@ def run_film(
     edges = in_parallel(doses_of, films)
     poses = _align_films(films, edges, pack, scales, report)
     aligned = [
-        replace(film, corners=moved_corners(film.corners, shift, turn, scales[film.number - 1]))
+        replace(film, corners=move_corners(film.corners, shift, turn, scales[film.number - 1]))
         for film, shift, turn in zip(films, poses.shifts, poses.turns, strict=True)
     ]
     if marked:
@@ -408,7 +408,7 @@ def _scale_about_axis(films: list[Film], pack: Pack, scales: FloatArray) -> list
     for film in films:
         scale = scales[film.number - 1]
         shift = (1 - scale) / scale * away
-        moved.append(replace(film, corners=moved_corners(film.corners, shift, 0.0, scale)))
+        moved.append(replace(film, corners=move_corners(film.corners, shift, 0.0, scale)))
     return moved
 
 
@@ -444,7 +444,7 @@ def _common_shape(films: list[Film], scales: FloatArray) -> tuple[int, int]:
 
 
 def _film_doses(film: Film, shape: tuple[int, int], scale: float, rim: int) -> _Doses:
-    values = straightened(film.scan.pixels, film.corners, shape=shape, scale=scale)
+    values = straighten_film(film.scan.pixels, film.corners, shape=shape, scale=scale)
     combined = combined_dose(values, film.calibration, background=film.background)
     usable = usable_pixels(values, film.calibration, background=film.background, rim=rim)
     usable &= ~burnt_edges(combined.dose)

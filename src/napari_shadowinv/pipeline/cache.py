@@ -124,7 +124,7 @@ def quick_source(
     sums = merged(np.where(usable, image, 0.0), (factor, factor))
     filled = share > 0
     coarse = np.where(filled, sums / np.where(filled, share, 1.0), 0.0)
-    coarser = estimate.coarser(factor)
+    coarser = estimate.coarsen(factor)
     beam = coarser.source(coarse, None if filled.all() else filled, should_stop, on_caution)
     middle = (factor - 1) / 2
     places = np.meshgrid(*((np.arange(n) - middle) / factor for n in image.shape), indexing="ij")

@@ -35,7 +35,7 @@ from napari_shadowinv.preprocessing import (
     Radiograph,
     Recipe,
     UniformEstimate,
-    estimated_source,
+    estimate_source,
 )
 from napari_shadowinv.preprocessing.image_checks import image_warnings
 from napari_shadowinv.provenance import Origin, Provenance, index_masks
@@ -425,7 +425,7 @@ def check_fit(recipe: Recipe) -> None:
     for step in recipe.steps:
         if step.name() not in FIT_STEPS:
             raise InputError(
-                f"the recipe has the step {step.described}, which changes what the forward model "
+                f"the recipe has the step {step.summary}, which changes what the forward model "
                 f"is fitted to: leave it out; expected some of {', '.join(FIT_STEPS)}"
             )
     if recipe.fit is not None and recipe.fit.beam == "unknown" and recipe.source is not None:
@@ -489,9 +489,9 @@ def _with_estimate(
     inputs: Inputs, shot: Radiograph, estimate: Estimate, should_stop: ShouldStop | None
 ) -> Radiograph:
     recorded = inputs.shot.shape
-    positioned = estimate.placed(shot.setup, recorded, inputs.recipe.matrix(recorded))
+    positioned = estimate.adapt_to(shot.setup, recorded, inputs.recipe.matrix(recorded))
     doubts: list[Caution] = []
-    source = estimated_source(positioned, shot, should_stop, doubts.append)
+    source = estimate_source(positioned, shot, should_stop, doubts.append)
     return replace(shot, source=source, warnings=(*shot.warnings, *doubts))
 
 

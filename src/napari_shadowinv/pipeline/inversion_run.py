@@ -40,7 +40,7 @@ from napari_shadowinv.preprocessing import (
     Radiograph,
     Recipe,
     UniformEstimate,
-    estimated_source,
+    estimate_source,
     uniform_warnings,
 )
 from napari_shadowinv.preprocessing.estimates import centre_within
@@ -246,10 +246,10 @@ def _source(
         usable = np.ones(shot.shape, bool) if shot.mask is None else shot.mask
         return checked_source(shot.source, usable)
     assert estimate is not None
-    estimate = estimate.placed(shot.setup, recorded, matrix)
+    estimate = estimate.adapt_to(shot.setup, recorded, matrix)
     report("source", 0, None, estimate.title)
     cached = partial(cache.source, estimate, most_pixels=PREVIEW_PIXELS if preview else None)
-    return estimated_source(estimate, shot, should_stop, doubts.append, by=cached)
+    return estimate_source(estimate, shot, should_stop, doubts.append, by=cached)
 
 
 def collect_inputs(

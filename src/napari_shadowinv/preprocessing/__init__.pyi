@@ -38,7 +38,7 @@ from .recipe import (
     MeasuredSource,
     Recipe,
     check_masks,
-    estimated_source,
+    estimate_source,
 )
 from .steps import Bin, Choice, Crop, Dark, Rotate, Step
 
@@ -73,7 +73,7 @@ __all__ = [
     "UniformEstimate",
     "butterworth",
     "check_masks",
-    "estimated_source",
+    "estimate_source",
     "fit_polynomial",
     "gaussian_source",
     "high_pass",

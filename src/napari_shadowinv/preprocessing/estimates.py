@@ -40,7 +40,7 @@ from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution, OnCaution, warn_of
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.setup import Setup, binned_setup
+from napari_shadowinv.physics.setup import Setup, bin_setup
 from napari_shadowinv.preprocessing import pixels
 from napari_shadowinv.preprocessing.filters import low_pass
 from napari_shadowinv.preprocessing.pixels import (
@@ -68,7 +68,7 @@ class Estimate(Choice):
     needs_mask: ClassVar[bool] = False  # does it nothing without a mask
     uses_mask: ClassVar[bool] = True  # does it anything with one
 
-    def placed(
+    def adapt_to(
         self, setup: Setup | None, shape: tuple[int, int], matrix: FloatArray | None = None
     ) -> Estimate:
         """Return the estimate for the images of an experiment; most do not depend on it.
@@ -106,7 +106,7 @@ class Estimate(Choice):
     ) -> FloatArray:
         return self.function(image, mask=mask, should_stop=should_stop, **self.values())
 
-    def coarser(self, factor: int) -> Estimate:
+    def coarsen(self, factor: int) -> Estimate:
         """Return the estimate for an image with pixels `factor` times as large."""
         lengths = {
             name: getattr(self, name) / factor
@@ -310,10 +310,10 @@ class TotalVariationEstimate(Estimate):
         description="Maximum iterations; an object of radius r px needs about r².",
     )
 
-    def coarser(self, factor: int) -> Estimate:
+    def coarsen(self, factor: int) -> Estimate:
         # A step reaches one pixel farther: fewer steps go as far in larger pixels.
         steps = max(1, self.iterations // factor**2)
-        return super().coarser(factor).model_copy(update={"iterations": steps})
+        return super().coarsen(factor).model_copy(update={"iterations": steps})
 
 
 class InterpolatedEstimate(Estimate):
@@ -548,7 +548,7 @@ class IsotropicEstimate(Estimate):
     # Not a parameter: the user gives the setup elsewhere.
     _setup: Any = PrivateAttr(default=None)
 
-    def placed(
+    def adapt_to(
         self, setup: Setup | None, shape: tuple[int, int], matrix: FloatArray | None = None
     ) -> Estimate:
         if setup is None:
@@ -556,11 +556,11 @@ class IsotropicEstimate(Estimate):
         point_distance(setup)  # refuses a collimated beam before any work
         return self._at(*centre_within(shape, matrix, self.centre_y, self.centre_x), setup)
 
-    def coarser(self, factor: int) -> Estimate:
+    def coarsen(self, factor: int) -> Estimate:
         if self._setup is None or self.centre_y is None or self.centre_x is None:
             return self
         y, x = ((c + 0.5) / factor - 0.5 for c in (self.centre_y, self.centre_x))
-        return self._at(y, x, binned_setup(self._setup, factor))
+        return self._at(y, x, bin_setup(self._setup, factor))
 
     def _source(self, image: FloatArray, mask: BoolArray | None, *_: Any) -> FloatArray:
         if self._setup is None:
@@ -613,7 +613,7 @@ def uniform_warnings(
     tuple of Caution
         Empty where the fluence of an isotropic point source varies by 1 % at most.
     """
-    if setup is None or setup.collimated:
+    if setup is None or setup.is_collimated:
         return ()
     distance = point_distance(setup)
     axis = [(side - 1) / 2 for side in shape] if centre is None else centre
@@ -681,7 +681,7 @@ def isotropic_source(
 
 def point_distance(setup: Setup) -> float:
     """Return the distance from the point source to the detector, in px of the detector."""
-    if setup.collimated:
+    if setup.is_collimated:
         raise InputError(
             "got the source 'isotropic' and a setup with a collimated beam "
             "(source_object_distance is inf): give the distance of the point source, or choose "

@@ -32,7 +32,7 @@ from pydantic import Field
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import pixels
-from napari_shadowinv.preprocessing.pixels import without_masked
+from napari_shadowinv.preprocessing.pixels import fill_masked_pixels
 from napari_shadowinv.preprocessing.steps import Step, degree_field, width_field
 
 if TYPE_CHECKING:
@@ -62,29 +62,29 @@ class Filter(Step):
     def moves_pixels(self) -> bool:
         return False
 
-    def filtered(
+    def filter_image(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
     ) -> FloatArray:
         """Apply the filter, so that masked pixels, even NaN, do not affect the others."""
         values = np.asarray(image, dtype=np.float64)
-        return self._filtered(without_masked(values, mask, should_stop), mask, should_stop)
+        return self._filter(fill_masked_pixels(values, mask, should_stop), mask, should_stop)
 
-    def _filtered(
+    def _filter(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
     ) -> FloatArray:
         return self.function(image, **self.values())
 
     def note(self, before: FloatArray, after: FloatArray, mask: BoolArray | None) -> str:
         """Return a note on the changes by the filter."""
-        return self.described
+        return self.summary
 
-    def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
-        image = self.filtered(shot.image, shot.mask, should_stop)
+    def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+        image = self.filter_image(shot.image, shot.mask, should_stop)
         source = shot.source
         if source is not None:
-            source = self.filtered(source, shot.mask, should_stop)
+            source = self.filter_image(source, shot.mask, should_stop)
         note = self.note(shot.image, image, shot.mask)
-        return replace(shot, image=image, source=source).noted(note)
+        return replace(shot, image=image, source=source).add_notes(note)
 
 
 def low_pass(image: ArrayLike, width: float) -> FloatArray:
@@ -112,7 +112,7 @@ def low_pass(image: ArrayLike, width: float) -> FloatArray:
     """
     values, _ = pixels.checked_pixels(image)
     width = pixels.checked_number("width", width, above=0, unit="px")
-    return _filtered(values, np.exp(-0.5 * (width * _wave_numbers(values.shape)) ** 2))
+    return _apply_gain(values, np.exp(-0.5 * (width * _wave_numbers(values.shape)) ** 2))
 
 
 class LowPassFilter(Filter):
@@ -224,7 +224,7 @@ def butterworth(
     gain = np.sqrt(scipy.special.expit(2 * order * (octaves if kind == "high" else -octaves)))
     if kind == "high" and keep_mean:
         gain[0, 0] = 1.0
-    return _filtered(values, gain)
+    return _apply_gain(values, gain)
 
 
 class ButterworthFilter(Filter):
@@ -338,7 +338,7 @@ class BackgroundFilter(Filter):
     def flattens(self) -> bool:
         return True
 
-    def _filtered(
+    def _filter(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
     ) -> FloatArray:
         return remove_background(
@@ -352,5 +352,5 @@ def _wave_numbers(shape: tuple[int, ...]) -> FloatArray:
     return np.asarray(np.hypot(k_y[:, None], k_x))
 
 
-def _filtered(values: FloatArray, gain: FloatArray) -> FloatArray:
+def _apply_gain(values: FloatArray, gain: FloatArray) -> FloatArray:
     return np.asarray(scipy.fft.idctn(gain * scipy.fft.dctn(values, norm="ortho"), norm="ortho"))

@@ -39,7 +39,7 @@ class HotPixelFilter(Filter):
         json_schema_extra={"slider": [2.0, 20.0]},
     )
 
-    def _filtered(
+    def _filter(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
     ) -> FloatArray:
         return remove_hot_pixels(image, threshold=self.threshold, should_stop=should_stop)[0]
@@ -138,14 +138,14 @@ def _neighbours(
     n = size * size - 1
     broken = n // 8
 
-    def ranked(rank: int, mode: Literal["mirror", "reflect"]) -> FloatArray:
+    def rank_filter(rank: int, mode: Literal["mirror", "reflect"]) -> FloatArray:
         report("hot pixels", 0)
         return np.asarray(scipy.ndimage.rank_filter(values, rank, footprint=footprint, mode=mode))
 
     # 'reflect' lets no neighbour of a corner pixel fill half of its neighbourhood; 'mirror'
     # does not make a pixel at the border its own peer.
-    median = (ranked(n // 2 - 1, "reflect") + ranked(n // 2, "reflect")) / 2
-    return median, ranked(n - 1 - broken, "mirror"), ranked(broken, "mirror")
+    median = (rank_filter(n // 2 - 1, "reflect") + rank_filter(n // 2, "reflect")) / 2
+    return median, rank_filter(n - 1 - broken, "mirror"), rank_filter(broken, "mirror")
 
 
 def _noise(difference: FloatArray, brightness: FloatArray) -> FloatArray:

@@ -4,7 +4,7 @@
 - one number or integer: `checked_number`, `checked_integer`
 - fit a polynomial: `fit_polynomial`
 - fill in, from the surroundings, the beam under an object: `interpolated_source`; masked pixels:
-  `without_masked`
+  `fill_masked_pixels`
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _COARSEST_SIDE = 32
 _TOLERANCE = 1e-6
 
 
-def without_masked(
+def fill_masked_pixels(
     image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
 ) -> FloatArray:
     """Return an image with masked pixels filled in, so that filters do not spread their values."""

@@ -61,11 +61,11 @@ class Radiograph:
         """Notes on the steps applied so far, for people."""
         return tuple(self.metadata.get("notes", ()))
 
-    def noted(self, *notes: str) -> Radiograph:
+    def add_notes(self, *notes: str) -> Radiograph:
         """Return the same with more notes."""
         return replace(self, metadata={**self.metadata, "notes": (*self.notes, *notes)})
 
-    def mapped(
+    def map_planes(
         self, values: Callable[[FloatArray], FloatArray], masks: Callable[[BoolArray], BoolArray]
     ) -> Radiograph:
         """Return the same with a function applied to image and source, another to the masks."""
@@ -78,7 +78,7 @@ class Radiograph:
             source_mask=None if self.source_mask is None else masks(self.source_mask),
         )
 
-    def binned(self, factor: int) -> Radiograph:
+    def bin_pixels(self, factor: int) -> Radiograph:
         """Sum blocks of `factor` × `factor` pixels; the setup's pixel grows with them.
 
         Rows and columns that fill no block are cut off at the end. A block can be used if all its
@@ -87,10 +87,10 @@ class Radiograph:
 
         Examples
         --------
-        >>> Radiograph(np.ones((5, 6))).binned(2).image
+        >>> Radiograph(np.ones((5, 6))).bin_pixels(2).image
         array([[4., 4., 4.], [4., 4., 4.]])
         """
-        from napari_shadowinv.physics.setup import binned_setup
+        from napari_shadowinv.physics.setup import bin_setup
 
         height, width = self.image.shape
         if min(height, width) < 2:
@@ -106,16 +106,16 @@ class Radiograph:
         if factor == 1:
             return self
         binned = replace(
-            self.mapped(
+            self.map_planes(
                 lambda plane: _blocks(plane, factor).sum(axis=(1, 3)),
                 lambda mask: np.asarray(_blocks(mask, factor).all(axis=(1, 3))),
             ),
-            setup=None if self.setup is None else binned_setup(self.setup, factor),
+            setup=None if self.setup is None else bin_setup(self.setup, factor),
             metadata={**self.metadata, "bin": factor * int(self.metadata.get("bin", 1))},
         )
         rows, columns = height % factor, width % factor
         cut = f", {rows} rows and {columns} columns cut off" if rows or columns else ""
-        return binned.noted(f"binned {factor} × {factor}{cut}")
+        return binned.add_notes(f"binned {factor} × {factor}{cut}")
 
 
 def _blocks(array: AnyArray, factor: int) -> AnyArray:

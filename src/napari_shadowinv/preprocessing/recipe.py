@@ -159,7 +159,7 @@ class Recipe(CheckedModel):
         """Return a shot after only the steps that move pixels, such as for its masks."""
         for step in self.steps:
             if step.moves_pixels:
-                shot = step.applied(shot)
+                shot = step.apply(shot)
         return shot
 
     def check(self, shot: Radiograph) -> None:
@@ -185,7 +185,7 @@ class Recipe(CheckedModel):
             for step in self.steps:
                 if step.flattens:
                     raise InputError(
-                        f"got a source and the filter {step.described}, which removes the beam "
+                        f"got a source and the filter {step.summary}, which removes the beam "
                         "from the image but not from the source: use only one of them"
                     )
         elif isinstance(self.source, MeasuredSource):
@@ -204,9 +204,9 @@ class Recipe(CheckedModel):
             )
 
     def prepare(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
-        """Return a shot, with its source and masks, after all steps; see `Step.applied`."""
+        """Return a shot, with its source and masks, after all steps; see `Step.apply`."""
         for step in self.steps:
-            shot = step.applied(shot, should_stop)
+            shot = step.apply(shot, should_stop)
         return shot
 
 
@@ -232,7 +232,7 @@ def check_masks(mask: BoolArray | None, bare: BoolArray | None) -> None:
         )
 
 
-def estimated_source(
+def estimate_source(
     estimate: Estimate,
     shot: Radiograph,
     should_stop: ShouldStop | None = None,

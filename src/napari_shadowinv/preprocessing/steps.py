@@ -55,7 +55,7 @@ class Choice(CheckedModel):
         return {name: getattr(self, name) for name in self.parameters()}
 
     @property
-    def described(self) -> str:
+    def summary(self) -> str:
         """Title and parameters, the same for the same choices."""
         values = (f"{name} {value}" for name, value in self.values().items())
         return ", ".join([self.title, *values])
@@ -117,7 +117,7 @@ class Step(Choice):
         """Whether it reduces pixel noise but keeps low-frequency noise."""
         return False
 
-    def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+    def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
         """Return the shot with the step applied to image, source, masks and setup.
 
         Raises an `InputError` if it does not apply to this image, and `InversionCancelled` if
@@ -186,7 +186,7 @@ class Dark(Step):
         """File of the image to subtract; None for a number."""
         return self.level if isinstance(self.level, Path) else None
 
-    def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+    def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
         dark: Any = self.level
         name = f"level {dark:g}" if self.frame_file is None else f"frame {self.frame_file.name}"
         if self.frame_file is not None:
@@ -205,7 +205,7 @@ class Dark(Step):
                 "units of the image"
             )
         source = None if shot.source is None else np.maximum(shot.source - dark, 0.0)
-        return replace(shot, image=image, source=source).noted(f"dark {name} subtracted")
+        return replace(shot, image=image, source=source).add_notes(f"dark {name} subtracted")
 
 
 def _turn(array: AnyArray, turns: int) -> Any:
@@ -241,27 +241,27 @@ class Rotate(Step):
     def smooths(self) -> bool:
         return self._turns is None
 
-    def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+    def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
         turns = self._turns
         if turns is None:
-            rotated = self._interpolated(shot)
+            rotated = self._interpolate(shot)
         else:
-            rotated = shot.mapped(partial(_turn, turns=turns), partial(_turn, turns=turns))
-        return rotated.noted(f"rotated by {self.angle:g}°")
+            rotated = shot.map_planes(partial(_turn, turns=turns), partial(_turn, turns=turns))
+        return rotated.add_notes(f"rotated by {self.angle:g}°")
 
-    def _interpolated(self, shot: Radiograph) -> Radiograph:
+    def _interpolate(self, shot: Radiograph) -> Radiograph:
         usable = np.isfinite(shot.image) if shot.mask is None else shot.mask
-        share = self._moved(usable.astype(np.float64))
+        share = self._move(usable.astype(np.float64))
         mask = share > _MIN_SHARE
 
         def values(image: FloatArray) -> FloatArray:
-            moved = self._moved(np.where(usable, image, 0.0))
+            moved = self._move(np.where(usable, image, 0.0))
             return np.where(mask, moved / np.maximum(share, _MIN_SHARE), 0.0)
 
-        rotated = shot.mapped(values, lambda bare: self._moved(bare.astype(float)) > 0.5)
+        rotated = shot.map_planes(values, lambda bare: self._move(bare.astype(float)) > 0.5)
         return replace(rotated, mask=mask)
 
-    def _moved(self, plane: FloatArray) -> FloatArray:
+    def _move(self, plane: FloatArray) -> FloatArray:
         from scipy.ndimage import affine_transform
 
         height, width = plane.shape
@@ -341,14 +341,14 @@ class Crop(Step):
             )
         return rows, columns
 
-    def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+    def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
         part = self.slices(shot.shape)
         rows, columns = part
 
         def cut(array: AnyArray) -> Any:
             return np.ascontiguousarray(array[part])
 
-        return shot.mapped(cut, cut).noted(
+        return shot.map_planes(cut, cut).add_notes(
             f"cropped to rows {rows.start}:{rows.stop}, columns {columns.start}:{columns.stop}"
         )
 
@@ -378,8 +378,8 @@ class Bin(Step):
         json_schema_extra={"metavar": "N"},
     )
 
-    def applied(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
-        return shot.binned(self.factor)
+    def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+        return shot.bin_pixels(self.factor)
 
     def shape_after(self, shape: tuple[int, int]) -> tuple[int, int]:
         height, width = shape

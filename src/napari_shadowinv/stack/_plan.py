@@ -237,7 +237,7 @@ def _describe_inputs(
     )
     inputs.recipe.check(inputs.shot)
     if inputs.recipe.estimate is not None:
-        inputs.recipe.estimate.placed(
+        inputs.recipe.estimate.adapt_to(
             inputs.recipe.setup, stack_shots.shape
         )  # refuses a wrong setup
     if isinstance(source, (str, Path)):

@@ -340,7 +340,7 @@ def test_shots_are_filtered_and_their_sources_guessed(
     tool.source.picker.form.editors["width"].set_value(6.0)
     tool.steps.add("low-pass")
     run(tool)
-    clean = LowPassFilter(width=1.0).filtered(stack[1], mask)
+    clean = LowPassFilter(width=1.0).filter_image(stack[1], mask)
     source = LowPassEstimate(width=6.0).source(np.where(mask, clean, 0), mask)
     expected = invert(clean, source=source, mask=mask, options=InversionOptions(**FEW))
     potential = np.asarray(read_stack(out)["potential"][1])

@@ -163,7 +163,9 @@ def test_a_step_does_the_same_to_image_and_source_as_alone(shot: Array) -> None:
     beam = 1 + np.random.default_rng(0).random(shot.shape)
     recipe = Recipe(steps=(LowPassFilter(width=1.5),), options=FEW)
     mine = run(recipe, image, source=beam, mask=usable)
-    smooth, source = (LowPassFilter(width=1.5).filtered(plane, usable) for plane in (image, beam))
+    smooth, source = (
+        LowPassFilter(width=1.5).filter_image(plane, usable) for plane in (image, beam)
+    )
     alone = invert(smooth, source=source, mask=usable, options=FEW)
     np.testing.assert_array_equal(mine.displacement, alone.displacement)
     assert np.isfinite(smooth).all()

@@ -407,7 +407,7 @@ class StepForm(QWidget):
         title = self.kind.title
         if self.form.isHidden():
             try:
-                title = self.form.model().described  # type: ignore[attr-defined]
+                title = self.form.model().summary  # type: ignore[attr-defined]
             except InputError:
                 self.form.setVisible(True)  # it shows the problem
         self.title.setText(title)

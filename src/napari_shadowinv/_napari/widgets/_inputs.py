@@ -283,7 +283,7 @@ class SourcePicker(forms.RowPicker):
             return "came with the shot" if self.is_supplied else "fitted"
         model = self.picker.model()
         assert isinstance(model, preprocessing.Estimate)
-        return f"estimate: {model.described}" if self.is_estimated else model.described
+        return f"estimate: {model.summary}" if self.is_estimated else model.summary
 
     @property
     def short_name(self) -> str:

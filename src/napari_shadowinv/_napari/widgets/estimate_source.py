@@ -18,7 +18,7 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.pipeline import Cache
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_PIXELS
-from napari_shadowinv.preprocessing import ESTIMATES, Estimate, Radiograph, estimated_source
+from napari_shadowinv.preprocessing import ESTIMATES, Estimate, Radiograph, estimate_source
 
 if TYPE_CHECKING:
     import napari
@@ -38,7 +38,7 @@ class SourceJob(Job):
         shot = load_radiograph(self.shot, "the image")
         max_pixels = PREVIEW_PIXELS if self.preview else None
         by = partial(Cache().source, self.estimate, most_pixels=max_pixels)
-        source = estimated_source(self.estimate, shot, should_stop, by=by)
+        source = estimate_source(self.estimate, shot, should_stop, by=by)
         report("source", 1, 1)
         return source
 
@@ -94,8 +94,8 @@ class EstimateSource(LivePanel):
         image = image_of(layer)
         mask = self.masks.usable(layer)
         model: Any = self.method.model()
-        estimate = model.placed(about.setup_of(layer), image.shape)
-        made_from = {"image": layer.name, "estimate": estimate.described}
+        estimate = model.adapt_to(about.setup_of(layer), image.shape)
+        made_from = {"image": layer.name, "estimate": estimate.summary}
         if mask is not None:
             made_from["source_mask"] = self.masks.summary(layer)
         return SourceJob(estimate, Radiograph(image, source_mask=mask), layer, made_from, preview)

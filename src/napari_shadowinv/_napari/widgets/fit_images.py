@@ -262,7 +262,7 @@ class FitImages(ToolPanel):
             "source_origin": self.source.summary,
             "mask_origin": self.masks.summary(first.layer),
             "setup_origin": self.setup.origin,
-            "steps": "; ".join(step.described for step in recipe.steps),
+            "steps": "; ".join(step.summary for step in recipe.steps),
         }
         input_rows = [
             ("Source", self.source.summary),

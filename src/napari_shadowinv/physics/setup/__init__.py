@@ -4,7 +4,7 @@
 - how a kind of setup is described: `BeamSetup`, `SIField`, `MainField`, `Deflector`,
   `BeamQuantity`; of all kinds: `deflector_titles`, `beam_quantities`; of some setups:
   `beam_values`
-- get it back from a file's content: `setup_from_dict`; with larger pixels: `binned_setup`
+- get it back from a file's content: `setup_from_dict`; with larger pixels: `bin_setup`
 - convert pixels to SI and back: methods of `BeamSetup`; path-integrated fields: of `ProtonSetup`;
   line integrals of the refractive index or the density: of `OpticalSetup`
 - whether its numbers are plausible: `setup_warnings`, `deflection_warnings`; for people to
@@ -74,7 +74,7 @@ __all__ = [
     "Species",
     "beam_quantities",
     "beam_values",
-    "binned_setup",
+    "bin_setup",
     "deflection_warnings",
     "deflector_titles",
     "displacement_from_potential",
@@ -156,7 +156,7 @@ def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> Setup:
     Examples
     --------
     >>> light = {"wavelength": 810e-9, "object_image_distance": 0.01, "pixel_size": 1e-6}
-    >>> setup_from_dict({"kind": "optical", **light}).collimated
+    >>> setup_from_dict({"kind": "optical", **light}).is_collimated
     True
     """
     if not isinstance(mapping, Mapping):
@@ -173,7 +173,7 @@ def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> Setup:
     return validated(SETUPS[kind], mapping, where)
 
 
-def binned_setup(setup: Setup, factor: int) -> Setup:
+def bin_setup(setup: Setup, factor: int) -> Setup:
     """Return the setup of an image whose pixels were summed in blocks of side `factor`."""
     values = setup.model_dump()
     for name in ("pixel_size", "detector_pixel_size"):

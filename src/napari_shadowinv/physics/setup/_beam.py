@@ -216,7 +216,7 @@ class BeamSetup(CheckedModel):
         return 1 + self.object_image_distance / self.source_object_distance
 
     @property
-    def collimated(self) -> bool:
+    def is_collimated(self) -> bool:
         """Whether the beam is parallel before the object."""
         return math.isinf(self.source_object_distance)
 
@@ -239,19 +239,19 @@ class BeamSetup(CheckedModel):
 
     def deflection_angle(self, displacement: ArrayLike) -> FloatArray:
         """Angle a = d p M / L in rad of rays displaced by d px (Eq. 3 of the paper)."""
-        return scaled(displacement, self._angle_per_pixel)
+        return scale_by(displacement, self._angle_per_pixel)
 
     def displacement(self, angle: ArrayLike) -> FloatArray:
         """Displacement d = a L / (p M) in px of rays deflected by a in rad."""
-        return scaled(angle, 1 / self._angle_per_pixel)
+        return scale_by(angle, 1 / self._angle_per_pixel)
 
     def potential(self, phi: ArrayLike) -> FloatArray:
         """Potential Φ = φ p² M / L in m, with a = -∇Φ, from φ in px² (Eq. 1 of the paper)."""
-        return scaled(phi, self.object_pixel_size * self._angle_per_pixel)
+        return scale_by(phi, self.object_pixel_size * self._angle_per_pixel)
 
     def normalized_potential(self, potential: ArrayLike) -> FloatArray:
         """Potential φ = Φ L / (p² M) in px², from Φ in m."""
-        return scaled(potential, 1 / (self.object_pixel_size * self._angle_per_pixel))
+        return scale_by(potential, 1 / (self.object_pixel_size * self._angle_per_pixel))
 
     def displacement_from_potential(self, potential: ArrayLike) -> FloatArray:
         """Displacement (px) of a potential in SI units (m); see the function of this name."""
@@ -337,7 +337,7 @@ def displacement_from_potential(potential: ArrayLike) -> FloatArray:
     return -np.stack([np.gradient(plane, axis=axis, edge_order=2) for axis in (0, 1)])
 
 
-def scaled(values: ArrayLike, factor: float) -> FloatArray:
+def scale_by(values: ArrayLike, factor: float) -> FloatArray:
     """Values times a factor, as float64."""
     product: FloatArray = np.asarray(unmasked(values, "values"), dtype=np.float64) * factor
     return product

@@ -18,7 +18,7 @@ from napari_shadowinv.physics.setup._beam import (
     SIField,
     length_text,
     positive_field,
-    scaled,
+    scale_by,
 )
 
 _USUAL_WAVELENGTHS_M = (10e-9, 20e-6)
@@ -142,7 +142,7 @@ class OpticalSetup(BeamSetup):
     ) -> FloatArray:
         """Potential φ in px² of a modulated plasma, from ∫Δn/n₀ dz in m and n₀ in m⁻³."""
         return self.normalized_potential_from_density(
-            scaled(modulation, _positive_density(density))
+            scale_by(modulation, _positive_density(density))
         )
 
 

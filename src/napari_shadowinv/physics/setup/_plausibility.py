@@ -48,7 +48,7 @@ def geometry_text(setup: BeamSetup, shape: tuple[int, int] | None = None) -> str
     pixel = f"pixel {length_text(setup.object_pixel_size)}"
     extent = pixel if shape is None else field_of_view_text(setup, shape)
     text = f"{extent} at the object, M = {setup.magnification:.3g}"
-    if setup.collimated:
+    if setup.is_collimated:
         return f"{text}, collimated, object to detector {length_text(setup.object_image_distance)}"
     total = setup.source_object_distance + setup.object_image_distance
     return f"{text}, source to detector {length_text(total)}"
@@ -146,7 +146,7 @@ def _distance_doubts(setup: BeamSetup, shape: tuple[int, int] | None) -> Iterato
     if (
         setup.projects
         and setup.magnification < _MIN_PARTICLE_MAGNIFICATION
-        and not setup.collimated
+        and not setup.is_collimated
     ):
         yield (
             f"the magnification is {setup.magnification:.3g}: the source is "
