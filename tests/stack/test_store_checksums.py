@@ -136,6 +136,57 @@ def test_swapped_reports_damage_both_shots(store):
     assert np.flatnonzero(read(store).status == DAMAGED).tolist() == [1, 4]
 
 
+def swap_shots(store: Path, first: int, second: int) -> None:
+    """Exchange all files that belong to two shots, and their names."""
+    for chunks in store.glob("*/c"):
+        if len(list(chunks.iterdir())) == 6:
+            swap(chunks / str(first), chunks / str(second))
+    names = zarr.open_group(store, mode="r+")["name"]
+    names[[first, second]] = names[[second, first]]
+
+
+def without_places(store: Path) -> None:
+    """Write the reports as an earlier version did."""
+    reports = zarr.open_group(store, mode="r+")["report"]
+    for index, text in enumerate(reports[:]):
+        report = json.loads(text)
+        del report["place"]
+        reports[index : index + 1] = np.array([json.dumps(report)], object)
+
+
+def test_swapped_shots_are_damaged_with_all_their_files(store):
+    swap_shots(store, 1, 4)
+    damage = StackStore(store).damage
+    problem = "its report was written for another shot"
+    assert damage.shots == {1: problem, 4: problem}
+    assert damage.files == ()
+    with pytest.raises(FileFormatError, match=problem):
+        read(store).potential[4].load()
+
+
+def test_shot_of_another_store_is_damaged(any_night, store, tmp_path):
+    other = tmp_path / "other.shadowinv.zarr"
+    any_night.run(other)
+    for name in ("report", "status", "potential", "displacement", "caustic"):
+        shutil.rmtree(store / name)
+        shutil.copytree(other / name, store / name)
+    assert list(StackStore(store).damage.shots) == list(range(6))
+
+
+def test_reports_without_places_are_read(store, finished):
+    without_places(store)
+    assert StackStore(store, every_byte=True).damage.shots == {}
+    np.testing.assert_array_equal(read(store).potential, read(finished).potential)
+
+
+def test_every_name_is_compared_with_its_report(store):
+    without_places(store)
+    names = zarr.open_group(store, mode="r+")["name"]
+    names[[2, 3]] = names[[3, 2]]
+    with pytest.raises(FileFormatError, match="name/c/0 does not belong to shots 0 to 5"):
+        read(store)
+
+
 def test_swapped_numbers_of_shots_are_refused(store):
     swap(store / "image_residual" / "c" / "0", store / "noise_error" / "c" / "0")
     with pytest.raises(FileFormatError, match="does not belong to shots 0 to 5"):

@@ -32,7 +32,6 @@ from napari_shadowinv.io.files import check_folder_of
 from napari_shadowinv.io.formats import STORE
 from napari_shadowinv.io.store_checksums import (
     FIXED,
-    LABELS,
     SEAL,
     Damage,
     Layout,
@@ -187,29 +186,32 @@ class StackStore:
         for name in self._layout.of_many_shots:
             length = self._arrays[name].chunks[0]
             for first in range(0, len(self.names), length):
-                index = self._first_ended(first, first + length, damage)
-                if index is None or any(f"{name}/c/{first // length} " in f for f in damage.files):
+                end = min(first + length, len(self.names))
+                sound = [index for index in range(first, end) if index in damage.noted]
+                key = f"{name}/c/{first // length}"
+                if not sound or any(problem.startswith(f"{key} ") for problem in damage.files):
                     continue
-                report = _parse_reports(self.path, [str(self._values("report", index))])[0]
-                value = self._values(name, index).item()
-                expected: list[Any] = [report.get(LABELS, {}).get(name, value)]
-                if column := columns.get(name):
-                    expected = [column.kind(column.of(report)), column.kind(column.fill)]
-                if json.dumps(value) not in map(json.dumps, expected):
-                    yield (
-                        f"{name}/c/{first // length} does not belong to shots {first} to "
-                        f"{min(first + length, len(self.names)) - 1}"
-                    )
-
-    def _first_ended(self, first: int, end: int, damage: Damage) -> int | None:
-        """Return the first shot of some whose report can be trusted, None without one."""
-        for index in range(first, min(end, len(self.names))):
-            if index not in damage.shots and self._values("status", index) != PENDING:
-                return index
-        return None
+                values = self._values(name, slice(first, end)).tolist()
+                column = columns.get(name)
+                # Numbers of one shot only: others may have been computed again since.
+                is_intact = all(
+                    _agrees(values[index - first], damage.noted[index], name, column)
+                    for index in (sound if column is None else sound[:1])
+                )
+                if not is_intact:
+                    yield f"{key} does not belong to shots {first} to {end - 1}"
 
     def _values(self, name: str, which: Any = ...) -> AnyArray:
         return _values(self.path, self._arrays[name], which)
+
+
+def _agrees(value: Any, noted: Mapping[str, Any], name: str, column: Column | None) -> bool:
+    """Return whether a value agrees with the shot's report; a column may not be filled yet."""
+    if column is None:
+        expected = [noted.get(name, value)]
+    else:
+        expected = [column.kind(column.of(noted)), column.kind(column.fill)]
+    return value in expected or json.dumps(value) in map(json.dumps, expected)  # NaN is not NaN
 
 
 def check_files(store: StackStore) -> None:

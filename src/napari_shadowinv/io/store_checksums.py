@@ -1,9 +1,9 @@
 """Checksums of a store, so that no damage to its files is read as data.
 
 Each chunk ends with its CRC-32C, which Zarr checks when it unpacks the chunk. Lost and exchanged
-chunks are noticed by checksums in other files: the report of a shot holds the shot's name and the
-checksums of its chunks, the folder's ``zarr.json`` holds its own SHA-256 and the checksums of
-chunks that belong to no shot.
+files are noticed by checksums in other files: the report of a shot holds the shot's place in the
+store, its name and the checksums of its chunks, the folder's ``zarr.json`` holds its own SHA-256
+and the checksums of chunks that belong to no shot.
 
 - note them: `seal`, `reseal`, `note_shot`
 - compare them: `check_seal`, `check_chunk`, `check_content`, `find_damage`
@@ -172,8 +172,11 @@ SEAL = "metadata_sha256"  # attribute: checksum of the folder's description
 FIXED = "chunk_checksums"  # attribute: checksums of chunks that belong to no shot (JSON)
 CHUNKS = "chunks"  # in a shot's report: checksums of its chunks, None of those that are not there
 LABELS = "labels"  # in a shot's report: its name and its other labels
+PLACE = "place"  # in a shot's report: the store's identifier and the shot's number in it
 _CODEC = "crc32c"
 _CRC_BYTES = 4
+Report = dict[str, Any]
+
 _READS = 3  # of a shot that another process may be writing again
 _RECORD = ("status", "report")  # arrays with an entry for each shot that are no fields
 
@@ -223,6 +226,7 @@ class Layout:
     """The arrays of a store with checksums, by how their chunks are noted."""
 
     root: Path
+    store_id: str
     arrays: Mapping[str, Mapping[str, Any]] = field(repr=False)
     fixed: Mapping[str, str]  # checksums of chunks that belong to no shot
 
@@ -231,8 +235,8 @@ class Layout:
         """Return the layout of a store, or None for a store without checksums."""
         if not is_sealed(document):
             return None
-        arrays = document["consolidated_metadata"]["metadata"]
-        return cls(root, arrays, json.loads(document["attributes"][FIXED]))
+        arrays, attributes = document["consolidated_metadata"]["metadata"], document["attributes"]
+        return cls(root, attributes["store_id"], arrays, json.loads(attributes[FIXED]))
 
     @cached_property
     def shots(self) -> int:
@@ -300,9 +304,9 @@ def has_checksums(array: Any) -> bool:
 
 
 def note_shot(
-    root: Path, arrays: Mapping[str, Any], index: int, labels: Mapping[str, Any]
+    root: Path, store_id: str, arrays: Mapping[str, Any], index: int, labels: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the checksums of a shot's written chunks and its labels, for its report."""
+    """Return a shot's place, labels and the checksums of its written chunks, for its report."""
     chunks: dict[str, str | None] = {}
     for name, array in arrays.items():
         if not is_along_shots(array) or name in _RECORD:
@@ -311,7 +315,7 @@ def note_shot(
             return {}
         if array.chunks[0] == 1:
             chunks[name] = stored_checksum(chunk_file(root, array, index))
-    return {CHUNKS: chunks, LABELS: dict(labels)}
+    return {CHUNKS: chunks, LABELS: dict(labels), PLACE: [store_id, index]}
 
 
 def read_labels(arrays: Mapping[str, Any], numbers: Collection[str], index: int) -> dict[str, Any]:
@@ -387,7 +391,7 @@ def check_chunk(layout: Layout, key: str, name: str, index: int) -> None:
     """
     problem = ""
     if name in layout.of_each_shot:
-        problem = _check_again(partial(_shot_problem, layout, index, (name,)))
+        problem, _ = _check_again(partial(_inspect_shot, layout, index, (name,)))
     elif name not in _RECORD:
         problem = _chunk_problem(layout, key, every_byte=False)
     if problem:
@@ -428,23 +432,29 @@ def _label(layout: Layout, index: int) -> str:
         return f"shot {index}"
 
 
-def _check_again(look: Callable[[], str]) -> str:
+def _check_again(inspect: Callable[[], tuple[str, Report]]) -> tuple[str, Report]:
     """Repeat a check that fails, because the shot may be being written at this moment."""
-    problem = look()
+    problem, report = inspect()
     for _ in range(_READS - 1):
         if problem:
-            problem = look()
-    return problem
+            problem, report = inspect()
+    return problem, report
 
 
-def _shot_problem(
+def _inspect_shot(
     layout: Layout, index: int, names: tuple[str, ...], every_byte: bool = False
-) -> str:
-    """Describe the damage to a shot that has ended; empty if there is none."""
+) -> tuple[str, Report]:
+    """Describe the damage to a shot that has ended, empty if there is none; return its report."""
     try:
         report = _read_report(layout.root, index)
     except (OSError, ValueError, TypeError, struct.error) as error:
-        return f"its report is damaged ({error})"
+        return f"its report is damaged ({error})", {}
+    return _shot_problem(layout, index, report, names, every_byte), report
+
+
+def _shot_problem(
+    layout: Layout, index: int, report: Report, names: tuple[str, ...], every_byte: bool
+) -> str:
     if CHUNKS not in report:
         try:
             status = _read_status(layout.root, index)
@@ -452,6 +462,9 @@ def _shot_problem(
             return f"its status is damaged ({error})"
         lacks = status == Status.DONE or (status == Status.FAILED and "reason" not in report)
         return "its report is missing" if lacks else ""
+    place = [layout.store_id, index]
+    if report.get(PLACE, place) != place:  # not in reports of earlier versions
+        return "its report was written for another shot"
     for name in names:
         file = layout.root / layout.key(name, index)
         expected = report[CHUNKS].get(name)
@@ -495,10 +508,13 @@ class Damage:
         Shots that have ended and cannot be trusted, with the reason.
     files : tuple of str
         Descriptions of damage to files that belong to no single shot.
+    noted : dict of int to dict
+        The report's values of each sound shot that has ended, by the arrays that repeat them.
     """
 
     shots: dict[int, str] = field(default_factory=dict)
     files: tuple[str, ...] = ()
+    noted: dict[int, dict[str, Any]] = field(default_factory=dict)
 
 
 def find_damage(layout: Layout, *, every_byte: bool = False) -> Damage:
@@ -516,15 +532,19 @@ def find_damage(layout: Layout, *, every_byte: bool = False) -> Damage:
     """
     names = layout.of_each_shot
     shots: dict[int, str] = {}
+    noted: dict[int, dict[str, Any]] = {}
     for index in range(layout.shots):
-        problem = _check_again(partial(_record_problem, layout, index, names, every_byte))
+        problem, report = _check_again(partial(_inspect_record, layout, index, names, every_byte))
         if problem:
             shots[index] = problem
+        elif report:
+            values = {**report, **report.get(LABELS, {})}
+            noted[index] = {k: values[k] for k in layout.of_many_shots if k in values}
     keys = [*layout.keys_of_many(), *layout.fixed]
     problems = [_chunk_problem(layout, key, every_byte) for key in keys]
     if every_byte:
         problems += [_description_problem(layout, name) for name in layout.arrays]
-    return Damage(shots, tuple(filter(None, problems)))
+    return Damage(shots, tuple(filter(None, problems)), noted)
 
 
 def _description_problem(layout: Layout, name: str) -> str:
@@ -547,10 +567,12 @@ def _as_comparable_text(description: Mapping[str, Any]) -> str:
     return json.dumps(filled, sort_keys=True)
 
 
-def _record_problem(layout: Layout, index: int, names: tuple[str, ...], every_byte: bool) -> str:
+def _inspect_record(
+    layout: Layout, index: int, names: tuple[str, ...], every_byte: bool
+) -> tuple[str, Report]:
     try:
         if _read_status(layout.root, index) not in (Status.DONE, Status.FAILED):
-            return ""
+            return "", {}
     except OSError as error:
-        return f"its status is damaged ({error})"
-    return _shot_problem(layout, index, names, every_byte)
+        return f"its status is damaged ({error})", {}
+    return _inspect_shot(layout, index, names, every_byte)

@@ -118,7 +118,8 @@ class ShotWriter:
                 else:
                     self._erase(group[name], index)
             labels = read_labels(group, [c.key for c in columns_of_store(attributes)], index)
-            text = json.dumps({**report, **note_shot(self.path, group, index, labels)})
+            note = note_shot(self.path, self.store_id, group, index, labels)
+            text = json.dumps({**report, **note})
             group["report"][index : index + 1] = np.array([text], dtype=object)
             group["status"][index : index + 1] = np.int8(status)
 
