@@ -106,6 +106,7 @@ def nearly_all_masked() -> FloatArray:
         ({"noise": 0}, "noise is not positive everywhere"),
         ({"noise": np.full(SIZE, np.nan)}, "noise is not positive everywhere"),
         ({"noise": []}, "noise is not positive everywhere"),
+        ({"noise": [0.1, 1e300]}, r"image 2: the noise is \S+e\+\d+ times the beam or more"),
         ({"noise": np.ones(3)}, r"noise has shape \(3,\): expected one number, one an image"),
         ({"noise": "poisson", "images": with_pixel(-1)}, "negative pixels, so they are no counts"),
         ({"psf": [1.0, 2.0, 3.0]}, "psf has 3 entries: expected one, or one for each of 2"),
@@ -144,6 +145,14 @@ def test_what_does_not_fit_is_refused_in_a_sentence(changes: Any, sentence: str)
     with pytest.raises(InputError, match=sentence) as refused:
         given(**changes)
     assert "\n" not in str(refused.value)
+
+
+def test_noise_may_hide_single_pixels() -> None:
+    noise = np.full(SIZE, 0.1)
+    noise[5, 6] = 1e100
+    weights = given(noise=noise).scene.weights
+    assert weights[0, 5, 6] < 1e-99
+    assert weights[0, 5, 7] > 0
 
 
 def test_one_image_and_an_unknown_source_are_taken_if_asked_for() -> None:

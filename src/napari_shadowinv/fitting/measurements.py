@@ -41,6 +41,7 @@ _SMALLEST_SIDE = 32
 _BYTES_PER_PIXEL, _BYTES_PER_PIXEL_AND_IMAGE = 2000, 600  # measured peak
 _NORMAL_MAD = 1.4826
 _LEAST_NOISE = 0.005  # of the beam: what the model itself is off by, about
+_LARGEST_NOISE = 1e6  # of the beam, of the least noisy pixel
 _LEAST_COUNTS = 1.0
 _SMOOTHED = 5  # px, over which images are averaged for the standard deviation of their noise
 _DARKEST = 1e-3  # of an image's mean
@@ -125,6 +126,7 @@ def measured(
     units = np.array([beam[use].mean() for beam, use in zip(beams, used, strict=True)])
     scaled = np.where(used, data / units[:, None, None], 0.0)
     deviations = _deviations(noise, data, used) / units[:, None, None]
+    _refuse_hopeless_noise(deviations, used, names)
     weights = np.where(used, 1 / np.maximum(deviations, _LEAST_NOISE) ** 2, 0.0)
 
     fill = [(0, 0), *((0, -side % _BLOCK) for side in (height, width))]
@@ -445,6 +447,16 @@ def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
             "the images"
         )
     return np.array(np.broadcast_to(sigma, data.shape))
+
+
+def _refuse_hopeless_noise(deviations: FloatArray, used: BoolArray, names: Sequence[str]) -> None:
+    """Refuse noise, relative to the beam, that hides any image; single pixels may have it."""
+    for name, plane, use in zip(names, deviations, used, strict=True):
+        if (least := float(plane[use].min())) > _LARGEST_NOISE:
+            raise InputError(
+                f"{name}: the noise is {least:.3g} times the beam or more: expected standard "
+                "deviations in the unit of the image"
+            )
 
 
 def _is(value: object, kind: str) -> bool:
