@@ -159,6 +159,29 @@ def test_register_finds_the_shift_of_a_reference(faint, shift):
     assert named(image[part], source[part]) == []
 
 
+@pytest.mark.parametrize("peak", [97.0, 194.0])
+def test_register_sees_a_faint_smooth_beam_above_the_noise(peak):
+    y, x = np.indices((200, 200)) / 200
+    smooth = 100 * np.exp(-((y - 0.45) ** 2 + (x - 0.55) ** 2) / 0.5)
+    clean = synthetic_image(toroid(smooth.shape, paper_setup(), peak, 30e-6).displacement, smooth)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        image, source = (rng.poisson(plane).astype(float) for plane in (clean, smooth))
+        assert "register" in named(image[5:], source[:-5])
+        assert "register" not in named(image, source)
+
+
+def test_register_is_silent_on_a_beam_that_merely_differs():
+    y, x = np.indices((200, 200)) / 200
+    smooth = 100 * np.exp(-((y - 0.45) ** 2 + (x - 0.55) ** 2) / 0.5)
+    for seed in range(1000, 1030):
+        rng = np.random.default_rng(seed)
+        change = gaussian_filter(rng.normal(size=smooth.shape), 35)
+        other = smooth * (1 + 0.01 * (change - change.mean()) / change.std())
+        image, source = (rng.poisson(plane).astype(float) for plane in (other, smooth))
+        assert "register" not in named(image, source)
+
+
 def test_negative_and_swapped_are_named(shot, faint):
     image, source = faint
     assert "negative" in named(image.max() - image, source)

@@ -54,7 +54,9 @@ _MIN_BLOCKS = 16
 _USABLE = 0.999  # share of a block's pixels
 _RING = 0.2  # of the side: there is rarely an object
 _MAX_SHIFT = 0.2  # of the side
-_MATCH = 0.5  # of the mismatch that may be left after a shift
+# Share of the mismatch that may be left after a shift, by the blur (blocks) of both: a beam that
+# merely differs, smooth as it is, may match somewhere by chance to a quarter.
+_MATCH = {0.0: 0.5, 2.0: 0.15}
 _ABOVE_NOISE = 1.2  # of the median mismatch, so that a shift is detectable
 _MIN_SIDES = 3  # of the image, with enough blocks
 _MIN_OVERLAP = 0.4  # of the ring
@@ -263,8 +265,17 @@ class ReferencePair:
         """
         if not self._has_border:
             return None
+        return next(filter(None, map(self._shift_after_blur, _MATCH)), None)
+
+    def _shift_after_blur(self, blur: float) -> tuple[float, float] | None:
+        """Return the shift seen after a blur (blocks), which lifts a smooth beam above noise."""
         shot, beam, _ = self._blocks
         ring, step = self._ring, _coarse_step(self.image.shape)
+        pair = ring[:, 1:] & ring[:, :-1]
+        noise = float(np.median(np.diff(shot - beam, axis=1)[pair] ** 2)) / 2
+        if blur:
+            shot, beam = (_blurred(plane, ring, blur) for plane in (shot, beam))
+            noise /= 4 * math.pi * blur**2
         mismatch = _mismatch(shot, beam, ring)
         reach = [max(2, round(_MAX_SHIFT * side)) for side in shot.shape]
         near = mismatch[np.ix_(*(np.arange(-side, side + 1) for side in reach))]
@@ -272,41 +283,11 @@ class ReferencePair:
         shift = np.array([int(place) - side for place, side in zip(best, reach, strict=True)])
         if (np.abs(shift) == reach).any():
             return None
-        if not shift.any() or not self._fits_after(shift[0], shift[1]):
+        if not shift.any() or not _fits_after(
+            shot, beam, ring, noise, (shift[0], shift[1]), _MATCH[blur]
+        ):
             return None
         return float(shift[0] * step), float(shift[1] * step)
-
-    def _fits_after(self, down: int, right: int) -> bool:
-        """Whether a shift by blocks makes most sides fit; an object displaces some of them."""
-        shot, beam, _ = self._blocks
-        height, width = shot.shape
-        rows = slice(max(down, 0), height + min(down, 0))
-        columns = slice(max(right, 0), width + min(right, 0))
-        behind = (
-            slice(rows.start - down, rows.stop - down),
-            slice(columns.start - right, columns.stop - right),
-        )
-        common = self._ring[rows, columns] & self._ring[behind]
-        moved = (shot[rows, columns] - beam[behind]) ** 2
-        unmoved = (shot - beam)[rows, columns] ** 2
-        pair = self._ring[:, 1:] & self._ring[:, :-1]
-        noise = float(np.median(np.diff(shot - beam, axis=1)[pair] ** 2)) / 2
-
-        def gain(part: BoolArray) -> float:
-            """Return the share of the mismatch that remains, apart from noise."""
-            before, after = (float(np.median(values[part])) for values in (unmoved, moved))
-            return (after - noise) / max(before - noise, 1e-300)
-
-        if common.sum() < _MIN_BLOCKS or np.median(unmoved[common]) < _ABOVE_NOISE * noise:
-            return False
-        if gain(common) > _MATCH:
-            return False
-        y, x = np.ogrid[rows, columns]
-        y_top, x_left = height * _RING, width * _RING
-        sides = (y < y_top, y >= height - y_top, x < x_left, x >= width - x_left)
-        parts = [common & side for side in sides]
-        better = [gain(part) < 1 for part in parts if part.sum() >= _MIN_BLOCKS]
-        return len(better) >= _MIN_SIDES and sum(better) >= len(better) - 1
 
     @cached_property
     def _blocks(self) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -385,3 +366,47 @@ def _mismatch(image: FloatArray, source: FloatArray, ring: BoolArray) -> FloatAr
     total = fft.irfft2(squares, shape)
     overlaps = count > _MIN_OVERLAP * weights.sum()
     return np.asarray(np.where(overlaps, total / np.where(overlaps, count, 1.0), np.inf))
+
+
+def _blurred(values: FloatArray, usable: BoolArray, blur: float) -> FloatArray:
+    """Return a Gaussian blur of the usable values."""
+    weights = ndimage.gaussian_filter(usable.astype(float), blur)
+    total = ndimage.gaussian_filter(np.where(usable, values, 0.0), blur)
+    return np.asarray(total / np.where(usable, weights, 1.0))
+
+
+def _fits_after(
+    shot: FloatArray,
+    beam: FloatArray,
+    ring: BoolArray,
+    noise: float,
+    shift: tuple[int, int],
+    match: float,
+) -> bool:
+    """Whether a shift by blocks makes most sides fit; an object displaces some of them."""
+    (height, width), (down, right) = shot.shape, shift
+    rows = slice(max(down, 0), height + min(down, 0))
+    columns = slice(max(right, 0), width + min(right, 0))
+    behind = (
+        slice(rows.start - down, rows.stop - down),
+        slice(columns.start - right, columns.stop - right),
+    )
+    common = ring[rows, columns] & ring[behind]
+    moved = (shot[rows, columns] - beam[behind]) ** 2
+    unmoved = (shot - beam)[rows, columns] ** 2
+
+    def gain(part: BoolArray) -> float:
+        """Return the share of the mismatch that remains, apart from noise."""
+        before, after = (float(np.median(values[part])) for values in (unmoved, moved))
+        return (after - noise) / max(before - noise, 1e-300)
+
+    if common.sum() < _MIN_BLOCKS or np.median(unmoved[common]) < _ABOVE_NOISE * noise:
+        return False
+    if gain(common) > match:
+        return False
+    y, x = np.ogrid[rows, columns]
+    y_top, x_left = height * _RING, width * _RING
+    sides = (y < y_top, y >= height - y_top, x < x_left, x >= width - x_left)
+    parts = [common & side for side in sides]
+    better = [gain(part) < 1 for part in parts if part.sum() >= _MIN_BLOCKS]
+    return len(better) >= _MIN_SIDES and sum(better) >= len(better) - 1
