@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from helpers.command_line import flat
 from napari_shadowinv import Fit, FitOptions, Inversion, cli, fit, invert, synthetic_image, write
 from napari_shadowinv.cli._terminal import EXIT_MISTAKE
-from napari_shadowinv.fitting import additive
+from napari_shadowinv.fitting import unknowns
 from napari_shadowinv.inversion.budget import FLUX_ERRORS
 from napari_shadowinv.io import store_columns
 from napari_shadowinv.options import InversionOptions
@@ -121,7 +121,7 @@ def test_the_unknown_is_fitted_with_the_field(names, monkeypatch):
     images += np.array(backgrounds)[:, None, None]
     images += 0.02 * np.random.default_rng(0).normal(size=images.shape)
     known = {"strengths": [1, 0.6], "noise": 0.02, "source": np.ones((48, 48))}
-    monkeypatch.setattr(additive, "ADDITIVE", (names["Background"],))
+    monkeypatch.setattr(unknowns, "ADDITIVE", (names["Background"],))
     options_class = type("Options", (names["FitOptions"], FitOptions), {})
     result = fit(images, options=options_class(background=0.1), **known)
     error = np.abs(result.fields[0].displacement - truth).max()

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.additive import AdditiveBlock
 from napari_shadowinv.fitting.forward import Scene, blurred
 from napari_shadowinv.fitting.rays import KNOT, at_rest
-from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
+from napari_shadowinv.fitting.unknowns import AdditiveBlock, Fiducials, Unknowns
 from napari_shadowinv.options import FitOptions
 
 SIZE, PAD = (32, 40), 8
@@ -167,7 +166,7 @@ def test_pushed_is_the_change_of_residuals(scene: Scene) -> None:
         scene.model(unknowns.plus(unknowns.like(s * change.flat())), counts) for s in (step, -step)
     )
     expected = np.sqrt(scene.weights) * (ahead - behind) / (2 * step)
-    pushed = scene.linear(unknowns, counts).pushed(change)
+    pushed = scene.linear(unknowns, counts).push(change)
     assert np.abs(pushed - expected).max() < 1e-4 * np.abs(expected).max()
 
 
@@ -178,8 +177,8 @@ def test_pulled_is_the_transpose_of_pushed(scene: Scene) -> None:
     change.frames[0] = 0
     change.beam[scene.prior.beam_weights == 0] = 0
     residuals = np.random.default_rng(4).normal(size=scene.images.shape)
-    pushed = scene.linear(unknowns, counts).pushed(change) * residuals
-    pulled = scene.linear(unknowns, counts).pulled(residuals)
+    pushed = scene.linear(unknowns, counts).push(change) * residuals
+    pulled = scene.linear(unknowns, counts).pull(residuals)
     assert abs(pushed.sum() - along(pulled, change)) < 1e-12 * np.abs(pushed).sum()
 
 

@@ -10,11 +10,11 @@ from scipy import constants
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting.blur import point_spread
 from napari_shadowinv.fitting.measurements import (
-    Measured,
+    FitData,
+    collect_data,
     estimated_noise,
-    measured,
+    point_spread,
     strengths_of,
 )
 from napari_shadowinv.options import FitOptions
@@ -27,7 +27,7 @@ def images(count: int = 2) -> FloatArray:
     return np.random.default_rng(0).normal(5, 0.1, (count, *SIZE))
 
 
-def given(**changes: Any) -> Measured:
+def given(**changes: Any) -> FitData:
     """Two images with strengths, and what a test changes about them."""
     usual: dict[str, Any] = {
         "images": images(),
@@ -43,7 +43,7 @@ def given(**changes: Any) -> Measured:
         "options": FitOptions(),
     }
     usual |= changes
-    return measured(usual.pop("images"), **usual)
+    return collect_data(usual.pop("images"), **usual)
 
 
 def protons(energy: float, **changes: Any) -> ProtonSetup:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.minimise import minimise, product, solve
+from napari_shadowinv.fitting.descent import minimise, product, solve
 
 
 def positive_definite(size: int, seed: int) -> FloatArray:

@@ -9,10 +9,9 @@ import pytest
 from scipy.fft import idctn
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting._error_bars import draw_variations
 from napari_shadowinv.fitting.descent import descend
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.posterior import Posterior
+from napari_shadowinv.fitting.posterior import Posterior, draw_variations
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import Unknowns
 
@@ -180,7 +179,7 @@ def test_moved_by_beams_is_the_response_of_the_best_field() -> None:
         scene.changed_by_beams(unknowns, counts, 0.01 * wave), residuals, atol=1e-9
     )
     matrix, free = dense_hessian(scene, unknowns)
-    slope = scene.linear(unknowns, counts).pulled(residuals).flat()[free]
+    slope = scene.linear(unknowns, counts).pull(residuals).flat()[free]
     expected = unknowns.flat() * 0
     expected[free] = np.linalg.pinv(matrix[np.ix_(free, free)], rcond=1e-10, hermitian=True) @ slope
     posterior = Posterior(scene, unknowns, np.random.default_rng(0))

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.priors import Prior
 from napari_shadowinv.fitting.rays import KNOT, RayModel, at_rest
-from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
+from napari_shadowinv.fitting.unknowns import Fiducials, Prior, Unknowns
 
 SIZE, PAD = (24, 32), 8
 DRAWS = 3000
@@ -94,7 +93,7 @@ def test_random_slopes_have_the_hessian_as_covariance(prior: Prior) -> None:
         ways[-1].potentials[field] = np.cos(x / 30)
     ways.append(like.zeros()._replace(beam=random(prior, 9).beam))
     ways.append(like.zeros()._replace(frames=random(prior, 9).frames))
-    samples = np.stack([prior.drawn(like, rng).flat() for _ in range(DRAWS)])
+    samples = np.stack([prior.draw(like, rng).flat() for _ in range(DRAWS)])
     table = samples @ np.stack([way.flat() for way in ways]).T
     variances = np.array([along(way, prior.times(way)) for way in ways])
     tolerance = 4 * np.sqrt(2 / DRAWS)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting._rivals import name_cause
 from napari_shadowinv.fitting.descent import coarser, finer
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.search import Found, settled
+from napari_shadowinv.fitting.pattern import name_cause
+from napari_shadowinv.fitting.search import Minimum, settle_minimum
 
 SIDE, PAD, NOISE = 64, 16, 0.05
 
@@ -21,7 +21,7 @@ def tell(stage: str, objective: float) -> None:
 
 
 @pytest.fixture(scope="module")
-def shifted() -> tuple[Scene, Found]:
+def shifted() -> tuple[Scene, Minimum]:
     """Two images of a blob, the second shifted by a pixel, and the best field."""
     scene = Scene(
         images=np.ones((2, SIDE, SIDE)),
@@ -42,8 +42,8 @@ def shifted() -> tuple[Scene, Found]:
     images[1] = np.roll(images[1], 1, axis=1)
     images += NOISE * np.random.default_rng(1).normal(size=images.shape)
     scene = replace(scene, images=images)
-    start = Found("truth", truth, np.inf, np.zeros((1, 2, SIDE // 2, SIDE // 2)))
-    return scene, settled(scene, start, tell)
+    start = Minimum("truth", truth, np.inf, np.zeros((1, 2, SIDE // 2, SIDE // 2)))
+    return scene, settle_minimum(scene, start, tell)
 
 
 def stripes(strength: float) -> FloatArray:
@@ -52,16 +52,16 @@ def stripes(strength: float) -> FloatArray:
     return np.stack([np.tile(waves, (SIDE, 1)), -np.tile(waves, (SIDE, 1))])
 
 
-def test_name_cause_finds_a_shift(shifted: tuple[Scene, Found]) -> None:
+def test_name_cause_finds_a_shift(shifted: tuple[Scene, Minimum]) -> None:
     cause = name_cause(*shifted, ["B"], None, tell)
     assert cause.startswith("the images are not in register")
     assert "something else" not in cause
 
 
-def test_name_cause_says_what_it_leaves_unexplained(shifted: tuple[Scene, Found]) -> None:
+def test_name_cause_says_what_it_leaves_unexplained(shifted: tuple[Scene, Minimum]) -> None:
     scene, best = shifted
     striped = replace(scene, images=scene.images + stripes(0.1))
-    found = settled(striped, best, tell)
+    found = settle_minimum(striped, best, tell)
     cause = name_cause(striped, found, ["B"], None, tell)
     assert "in register" in cause
     assert "something else is wrong, too" in cause

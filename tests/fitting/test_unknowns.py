@@ -33,7 +33,7 @@ def test_some_images_have_their_rows_of_each_block() -> None:
     for block, chosen in zip(unknowns.blocks[2:], second.blocks[2:], strict=True):
         np.testing.assert_array_equal(chosen, block[1:])
     doubled = second.plus(second)
-    merged = unknowns.with_those([1], doubled)
+    merged = unknowns.with_images([1], doubled)
     np.testing.assert_array_equal(merged.potentials, doubled.potentials)
     for block, new in zip(unknowns.blocks[2:], merged.blocks[2:], strict=True):
         np.testing.assert_array_equal(new, np.concatenate([block[:1], 2 * block[1:]]))

@@ -27,7 +27,7 @@ from napari_shadowinv import (
     uncertainty,
 )
 from napari_shadowinv._system.arrays import coordinate_spacing, order_by_value
-from napari_shadowinv.fitting.measurements import measured
+from napari_shadowinv.fitting.measurements import collect_data
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import FitShot
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
@@ -80,7 +80,7 @@ def _measured(images: Any, mask: Any = None, **keywords: Any) -> np.ndarray[Any,
     """Images and weights that a fit sees."""
     inputs = {"strengths": None, "setups": None, "source": None, "noise": None, "psf": 0.0}
     inputs |= {"brightness": "known", "fiducials": None, "fields": ("B",), "options": FitOptions()}
-    scene = measured(images, mask=mask, **(inputs | keywords)).scene
+    scene = collect_data(images, mask=mask, **(inputs | keywords)).scene
     return np.stack([scene.images, scene.weights])
 
 

@@ -1,7 +1,6 @@
 from ._fit import compare, fit
 from ._leave_one_out import leave_one_out
-from .blur import point_spread
-from .measurements import FitOptions
+from .measurements import FitOptions, point_spread
 from .result import Basin, Fit, FitReport, FittedField
 from .verdict import Verdict
 from .windows import FitWindows, LeaveOneOut

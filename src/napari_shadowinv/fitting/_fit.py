@@ -17,40 +17,47 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting._error_bars import (
+from napari_shadowinv.fitting.compilation import ensure_compiled
+from napari_shadowinv.fitting.descent import coarser, finer
+from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.measurements import FitData, collect_data
+from napari_shadowinv.fitting.pattern import (
+    Pattern,
+    find_pattern,
+    gain_by_blur,
+    log_evidence,
+    name_cause,
+    noise_amplification,
+)
+from napari_shadowinv.fitting.posterior import (
     BeamError,
     BeamShifts,
+    Posterior,
+    Sample,
     errors_by_noise,
     largest_share,
     shifts_by_beam,
 )
-from napari_shadowinv.fitting._rivals import gain_by_blur, log_evidence, name_cause
-from napari_shadowinv.fitting.compilation import ensure_compiled
-from napari_shadowinv.fitting.descent import coarser, finer
-from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.measurements import Measured, measured
-from napari_shadowinv.fitting.pattern import Pattern, find_pattern, noise_amplification
-from napari_shadowinv.fitting.posterior import Posterior, Sample
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.search import (
     MIDDLE,
     MIDDLE_SPACING,
-    Found,
+    Minimum,
     Start,
-    refined,
+    estimate_smoothness,
+    refine_minimum,
     search,
-    settled,
-    with_likely_smoothness,
+    settle_minimum,
 )
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.fitting.verdict import hidden_contrast, judged
+from napari_shadowinv.fitting.verdict import assess_verdict, hidden_contrast
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import FitOptions, InversionOptions, KindOfNoise
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["compare", "fit", "reweighted", "starts"]
+__all__ = ["collect_starts", "compare", "fit", "reweight_counts"]
 
 _FROM_FAR = ((4, 2.0), (4, 1.0), (2, 1.0))
 _FROM_NEAR = ((2, 4.0), (2, 2.0), (2, 1.0))
@@ -153,7 +160,7 @@ def fit(
     report = Reporter(on_progress, should_stop)
     seconds: dict[str, float] = {}
     rng = np.random.default_rng(options.seed)
-    data = measured(
+    data = collect_data(
         images,
         strengths=strengths,
         setups=setups,
@@ -168,7 +175,7 @@ def fit(
         names=names,
     )
     ensure_compiled(on_progress, should_stop)
-    scene = data.held(options.smoothness)
+    scene = data.scene_with(options.smoothness)
     steps = 0
 
     def on_step(stage: str, objective: float) -> None:
@@ -177,15 +184,15 @@ def fit(
         report("fit", steps, None, stage, objective)
 
     with _timed("starts", seconds):
-        minima = search(scene, starts(data, start, on_step, should_stop), on_step)
+        minima = search(scene, collect_starts(data, start, on_step, should_stop), on_step)
     with _timed("smoothness", seconds):
-        scene, best = with_likely_smoothness(scene, minima[0], rng, on_step)
+        scene, best = estimate_smoothness(scene, minima[0], rng, on_step)
         if data.counted:
-            scene = reweighted(data, scene, best)
-            best = settled(scene, best, on_step)
+            scene = reweight_counts(data, scene, best)
+            best = settle_minimum(scene, best, on_step)
         basins = _basins(scene, best, minima[1:], on_step)
     with _timed("full size", seconds):
-        fine, unknowns, value, taken, ended = refined(scene, best, options, on_step)
+        fine, unknowns, value, taken, ended = refine_minimum(scene, best, options, on_step)
     with _timed("residual", seconds):
         # A fit of one image absorbs too much of its noise for the counts to be tested.
         is_counted = data.counted and not data.single
@@ -290,35 +297,35 @@ def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
     seconds[stage] = time.perf_counter() - begun
 
 
-def starts(
-    given: Measured, start: ArrayLike | None, on_step: Any, should_stop: ShouldStop | None
+def collect_starts(
+    data: FitData, start: ArrayLike | None, on_step: Any, should_stop: ShouldStop | None
 ) -> list[Start]:
     """Return the starting points: no field, the `start` field, and inversions by transport."""
-    scene = given.scene
+    scene = data.scene
     candidates = []
     if start is not None:
         potential = as_numbers("start", plain_array(start, "start", unit=SQUARE_PIXELS))
-        if potential.shape != given.size or not np.isfinite(potential).all():
+        if potential.shape != data.size or not np.isfinite(potential).all():
             raise InputError(
                 f"start has shape {potential.shape}: expected a finite potential in px² of the "
-                f"images' shape {given.size}"
+                f"images' shape {data.size}"
             )
         candidates.append(Start("given", ((2, 1.0),), potential))
-    if not given.single:
+    if not data.single:
         candidates.append(Start("from far", _FROM_FAR))
     candidates.append(Start("from near", _FROM_NEAR))
-    if scene.beam_modes and not given.single:
+    if scene.beam_modes and not data.single:
         candidates.append(Start("from far, beam held", _FROM_FAR, beam_held=True))
     if scene.strengths.shape[1] > 1 or scene.beam_modes:
         return candidates
     sizes = np.abs(scene.strengths[:, 0])  # zero where the object does not deflect: a blank shot
     weakest = int(np.argmin(np.where(sizes > 0, sizes, np.inf)))
     on_step("transport", float("nan"))
-    transported = _transported(given, weakest, should_stop)
+    transported = _transport_potential(data, weakest, should_stop)
     if transported is None:
         return candidates
     potential = gaussian_filter(transported, _ROUNDED) / scene.strengths[weakest, 0]
-    if not given.single:
+    if not data.single:
         return [*candidates, Start("transport", ((2, 2.0), (2, 1.0)), potential)]
     return candidates + [
         Start(f"{share:g} × transport", _FROM_FIELD, share * potential)
@@ -326,10 +333,12 @@ def starts(
     ]
 
 
-def _transported(given: Measured, number: int, should_stop: ShouldStop | None) -> FloatArray | None:
+def _transport_potential(
+    data: FitData, number: int, should_stop: ShouldStop | None
+) -> FloatArray | None:
     """The potential that transport makes of an image; None if it makes none of it."""
-    height, width = given.size
-    scene = given.scene
+    height, width = data.size
+    scene = data.scene
     image = scene.images[number, :height, :width]
     used = scene.weights[number, :height, :width] > 0
     pad = scene.pad
@@ -348,23 +357,28 @@ def _transported(given: Measured, number: int, should_stop: ShouldStop | None) -
         return None
 
 
-def reweighted(given: Measured, scene: Scene, found: Found) -> Scene:
+def reweight_counts(data: FitData, scene: Scene, minimum: Minimum) -> Scene:
     """Return the weights of counts from the expected instead of the recorded counts."""
-    unknowns = finer(found.unknowns)
+    unknowns = finer(minimum.unknowns)
     expected = scene.model(unknowns, scene.ray_counts(unknowns))
-    units = given.units[:, None, None]
+    units = data.units[:, None, None]
     weights = units**2 / np.maximum(expected * units, 1.0)
     return replace(scene, weights=np.where(scene.weights > 0, weights, 0.0))
 
 
-def _basins(scene: Scene, best: Found, others: Sequence[Found], on_step: Any) -> tuple[Basin, ...]:
+def _basins(
+    scene: Scene, best: Minimum, others: Sequence[Minimum], on_step: Any
+) -> tuple[Basin, ...]:
     """The best answer and others, with the same λ and without blur.
 
     Smoother fields have decided which is best: the present λ favours what follows the
     noise.
     """
     middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
-    ends = [best, *(settled(scene, minimum, on_step, "other starts") for minimum in others[:2])]
+    ends = [
+        best,
+        *(settle_minimum(scene, minimum, on_step, "other starts") for minimum in others[:2]),
+    ]
     chi2 = [
         middle.chi2(minimum.unknowns, middle.ray_counts(minimum.unknowns)).mean()
         for minimum in ends
@@ -376,14 +390,14 @@ def _basins(scene: Scene, best: Found, others: Sequence[Found], on_step: Any) ->
 
 
 def _added_light(
-    given: Measured,
+    data: FitData,
     scene: Scene,
     unknowns: Unknowns,
     samples: Sequence[Sample],
     amplification: float,
 ) -> dict[str, list[list[list[float]]]]:
     """Coefficients of light that adds to each image, in its unit, with standard deviations."""
-    units = (given.units * np.exp(unknowns.brightness))[:, None]
+    units = (data.units * np.exp(unknowns.brightness))[:, None]
     light = {}
     for number, block in enumerate(scene.added):
         values = units * unknowns.added[number]
@@ -396,7 +410,7 @@ def _added_light(
 
 
 def _result(
-    given: Measured,
+    data: FitData,
     scene: Scene,
     unknowns: Unknowns,
     names: Sequence[str],
@@ -409,11 +423,11 @@ def _result(
     blur_gain: float,
     pattern: Pattern,
 ) -> Fit:
-    height, width = given.size
+    height, width = data.size
     counts = scene.ray_counts(unknowns)
-    units = given.units[:, None, None]
+    units = data.units[:, None, None]
     used = scene.weights[:, :height, :width] > 0
-    data = scene.images[:, :height, :width] * units
+    images = scene.images[:, :height, :width] * units
     model = scene.model(unknowns, counts)[:, :height, :width] * units
     brightness = np.exp(unknowns.brightness)
     beams = scene.beam(unknowns)[:, :height, :width] * units * brightness[:, None, None]
@@ -439,7 +453,7 @@ def _result(
             variation=by_beam.variation,
             share=largest_share(by_beam.errors, displacements),
             scale=options.beam_scale,
-            assumed=given.assumed,
+            assumed=data.assumed,
         )
     report = replace(report, uncertainty=uncertainty, beam=beam)
     jacobians = [
@@ -449,11 +463,11 @@ def _result(
     jacobian = max(jacobians, key=lambda each: int((each < 0).sum()))
     folded = float((jacobian < 0).mean())
     rivals = [(basin.objective / basins[0].objective - 1, basin.distance) for basin in basins[1:]]
-    verdict, explanation = judged(
+    verdict, explanation = assess_verdict(
         chi2=chi2,
-        names=_names(setups, len(data)),
+        names=_names(setups, len(images)),
         others=rivals,
-        single=given.single,
+        single=data.single,
         beam_unknown=scene.beam_modes > 0,
         jacobian=jacobian,
         uncertainty=uncertainty,
@@ -467,15 +481,15 @@ def _result(
         edge_is_free=options.boundary == "free",
     )
     return Fit(
-        images=data,
+        images=images,
         mask=used,
         strengths=scene.strengths,
         fields=tuple(fields),
         source=beams,
-        brightness=brightness * given.brightness,
+        brightness=brightness * data.brightness,
         frames=unknowns.frames,
         reprojection=model,
-        residual=np.where(used, data - model, 0.0),
+        residual=np.where(used, images - model, 0.0),
         chi2=chi2,
         basins=basins,
         folded=folded,

@@ -16,25 +16,24 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
-from napari_shadowinv.fitting._fit import reweighted, starts
+from napari_shadowinv.fitting._fit import collect_starts, reweight_counts
 from napari_shadowinv.fitting.compilation import ensure_compiled
-from napari_shadowinv.fitting.descent import coarser, finer, settle
+from napari_shadowinv.fitting.descent import coarser, finer, product, settle
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.measurements import Measured, measured
-from napari_shadowinv.fitting.minimise import product
+from napari_shadowinv.fitting.measurements import FitData, collect_data
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.rays import at_rest
 from napari_shadowinv.fitting.search import (
     COARSE_GAIN,
     FIRST_SMOOTHNESS,
-    HELD,
     MIDDLE,
     MIDDLE_SPACING,
-    Found,
-    refined,
+    SMOOTHNESS_RATIO,
+    Minimum,
+    estimate_smoothness,
+    refine_minimum,
     search,
-    settled,
-    with_likely_smoothness,
+    settle_minimum,
 )
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.fitting.windows import LeaveOneOut, check_count, explanation_of
@@ -103,7 +102,7 @@ def leave_one_out(
         "mask": None,
         "brightness": "known",
     }
-    data = measured(
+    data = collect_data(
         images,
         fields=fields,
         setups=setups,
@@ -123,10 +122,10 @@ def leave_one_out(
         report("leave one out", steps, None, stage, objective)
 
     work = _Work(data, options, on_step)
-    begun = work.begun(should_stop)
-    agreeing = work.agreeing(begun)
-    scene, common = work.with_likely_smoothness(agreeing, begun)
-    predictions = work.predictions(agreeing, scene, common)
+    first = work.search_all(should_stop)
+    agreeing = work.find_agreeing(first)
+    scene, common = work.estimate_smoothness(agreeing, first)
+    predictions = work.predict_all(agreeing, scene, common)
     return _result(data, predictions, setups, names)
 
 
@@ -154,7 +153,7 @@ class _SampledFit:
         linear = scene.linear(unknowns, scene.ray_counts(unknowns))
         no_change = unknowns.zeros()
         residuals = [
-            linear.pushed(no_change._replace(potentials=change.potentials, beam=change.beam))
+            linear.push(no_change._replace(potentials=change.potentials, beam=change.beam))
             for change in self.changes
         ]
         return float(np.mean(np.square(residuals)[:, scene.weights > 0]))
@@ -171,35 +170,37 @@ class _OwnFit:
 class _Work:
     """Context of all steps: images, options, and the callback for progress."""
 
-    def __init__(self, given: Measured, options: FitOptions, on_step: Any) -> None:
-        self._given, self._options, self._on_step = given, options, on_step
-        self._count = len(given.units)
+    def __init__(self, data: FitData, options: FitOptions, on_step: Any) -> None:
+        self._data, self._options, self._on_step = data, options, on_step
+        self._count = len(data.units)
 
-    def begun(self, should_stop: ShouldStop | None) -> Found:
+    def search_all(self, should_stop: ShouldStop | None) -> Minimum:
         """Where a search in all images ends, in pixels of two."""
-        scene = self._given.held(self._options.smoothness)
-        begun = starts(self._given, None, self._on_step, should_stop)
+        scene = self._data.scene_with(self._options.smoothness)
+        begun = collect_starts(self._data, None, self._on_step, should_stop)
         return search(scene, begun, self._on_step)[0]
 
-    def agreeing(self, begun: Found) -> list[int]:
+    def find_agreeing(self, begun: Minimum) -> list[int]:
         """The most images that one field explains, found in pixels of two."""
-        scene = self._given.held(self._options.smoothness)
+        scene = self._data.scene_with(self._options.smoothness)
         if self._options.smoothness is None:
-            usual = HELD * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1))
+            usual = SMOOTHNESS_RATIO * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1))
             scene = replace(scene, smoothness=usual)
-        alone = [self._settled(scene, begun, [k], f"image {k + 1} alone") for k in self._all]
+        alone = [self._settle_members(scene, begun, [k], f"image {k + 1} alone") for k in self._all]
         most: list[int] = []
         remaining = self._all
         while len(remaining) > len(most):
-            group = self._group(scene, begun, remaining, alone)
+            group = self._find_group(scene, begun, remaining, alone)
             most = max(most, group, key=len)
             remaining = [k for k in remaining if k not in group]
         return most
 
-    def _group(self, scene: Scene, begun: Found, left: list[int], alone: list[Found]) -> list[int]:
+    def _find_group(
+        self, scene: Scene, begun: Minimum, left: list[int], alone: list[Minimum]
+    ) -> list[int]:
         """Images that one field explains, after removing the worst one by one."""
         least = np.array([self._chi2_in_middle(scene, alone[k], [k])[0] for k in self._all])
-        together = self._settled(scene, begun, left, "all images")
+        together = self._settle_members(scene, begun, left, "all images")
         while len(left) > _LEAST_AGREEING:
             worse = self._chi2_in_middle(scene, together, left) / least[left]
             if worse.max() < _WORSE_IN_MIDDLE:
@@ -208,7 +209,7 @@ class _Work:
             for k in left:
                 members = [image for image in left if image != k]
                 # Unknowns of all images are kept, so that each can come back.
-                tried[k] = self._settled(scene, together, members, f"without image {k + 1}")
+                tried[k] = self._settle_members(scene, together, members, f"without image {k + 1}")
             out = min(left, key=lambda k: tried[k].value + alone[k].value)
             left = [k for k in left if k != out]
             together = tried[out]
@@ -218,46 +219,46 @@ class _Work:
     def _all(self) -> list[int]:
         return list(range(self._count))
 
-    def with_likely_smoothness(self, members: list[int], begun: Found) -> tuple[Scene, Found]:
+    def estimate_smoothness(self, members: list[int], begun: Minimum) -> tuple[Scene, Minimum]:
         """All images with the λ and κ of some, and weights of counts; the field of those."""
-        scene = self._given.held(self._options.smoothness)
+        scene = self._data.scene_with(self._options.smoothness)
         rng = np.random.default_rng(self._options.seed)
         first = replace(begun, unknowns=begun.unknowns.only(members))
-        part, best = with_likely_smoothness(scene.only(members), first, rng, self._on_step)
+        part, best = estimate_smoothness(scene.only(members), first, rng, self._on_step)
         scene = replace(scene, smoothness=part.smoothness)
-        common = replace(best, unknowns=begun.unknowns.with_those(members, best.unknowns))
-        if self._given.counted:
-            scene = reweighted(self._given, scene, common)
-            common = self._settled(scene, common, members, "all that agree")
+        common = replace(best, unknowns=begun.unknowns.with_images(members, best.unknowns))
+        if self._data.counted:
+            scene = reweight_counts(self._data, scene, common)
+            common = self._settle_members(scene, common, members, "all that agree")
         return scene, common
 
-    def predictions(self, agreeing: list[int], scene: Scene, common: Found) -> list[_Prediction]:
+    def predict_all(self, agreeing: list[int], scene: Scene, common: Minimum) -> list[_Prediction]:
         """Each image as all others predict it that agree.
 
         Larger pixels may set aside too many: images that the others predict are added again.
         """
-        own_fits = [self._own_fit(scene, k, common) for k in self._all]
+        own_fits = [self._fit_alone(scene, k, common) for k in self._all]
         predictions: dict[int, _Prediction] = {}
         while outside := [k for k in self._all if k not in agreeing]:
-            fit = self._sampled_fit(scene, common, agreeing)
+            fit = self._sample_fit(scene, common, agreeing)
             for k in outside:
-                predictions[k] = self._predicted(k, agreeing, scene, fit, own_fits[k])
+                predictions[k] = self._predict(k, agreeing, scene, fit, own_fits[k])
             back = [k for k in outside if predictions[k].chi2 <= predictions[k].limit]
             if not back:
                 break
             agreeing = sorted([*agreeing, *back])
         for k in agreeing:
             members = [image for image in agreeing if image != k]
-            fit = self._sampled_fit(scene, common, members)
-            predictions[k] = self._predicted(k, members, scene, fit, own_fits[k])
+            fit = self._sample_fit(scene, common, members)
+            predictions[k] = self._predict(k, members, scene, fit, own_fits[k])
         return [predictions[k] for k in self._all]
 
-    def _sampled_fit(self, scene: Scene, common: Found, members: list[int]) -> _SampledFit:
+    def _sample_fit(self, scene: Scene, common: Minimum, members: list[int]) -> _SampledFit:
         name = f"images {', '.join(str(k + 1) for k in members)}"
-        coarse = self._settled(scene, common, members, name, _LAST_GAIN)
+        coarse = self._settle_members(scene, common, members, name, _LAST_GAIN)
         part = scene.only(members)
         first = replace(coarse, unknowns=coarse.unknowns.only(members))
-        fine, unknowns, *_ = refined(part, first, self._options, self._on_step)
+        fine, unknowns, *_ = refine_minimum(part, first, self._options, self._on_step)
         # Folds are deeper in the image that is left out if it is displaced most.
         fine = replace(fine, spacing=_RAY_SPACING_RATIO * fine.spacing)
         unknowns, value, *_ = settle(
@@ -278,22 +279,22 @@ class _Work:
         changes = [posterior.draw_sample(_SAMPLE_TOLERANCE).change for _ in range(_SAMPLES)]
         if large:
             changes = [finer(change) for change in changes]
-        return _SampledFit(fine, finer(coarse.unknowns).with_those(members, unknowns), changes)
+        return _SampledFit(fine, finer(coarse.unknowns).with_images(members, unknowns), changes)
 
-    def _predicted(
+    def _predict(
         self, k: int, others: list[int], scene: Scene, fit: _SampledFit, own_fit: _OwnFit
     ) -> _Prediction:
         """One image, as others predict it."""
         scene = replace(scene, spacing=fit.scene.spacing)
         unknowns = fit.unknowns
         if scene.free_frames.any():
-            unknowns = _placed(scene, unknowns, others[0], k)
+            unknowns = _align_image(scene, unknowns, others[0], k)
         unknowns = unknowns.only([k])._replace(brightness=np.zeros(1))
         scene = scene.only([k])
         (rough,) = scene.model(unknowns, scene.ray_counts(unknowns))
         scene = replace(scene, spacing=_RAY_SPACING_RATIO * scene.spacing)
         (image,) = scene.model(unknowns, scene.ray_counts(unknowns))
-        brightness, weights = self._matched(k, image, scene)
+        brightness, weights = self._match_brightness(k, image, scene)
         chi2 = _chi2(brightness * image, scene.images[0], weights)
         variance = fit.variance_in(scene, unknowns)
         variance += _RAY_VARIANCE_RATIO * _chi2(brightness * image, brightness * rough, weights)
@@ -302,46 +303,46 @@ class _Work:
             brightness * image, brightness, chi2, own_fit.chi2, limit * own_fit.noise_chi2
         )
 
-    def _own_fit(self, scene: Scene, k: int, common: Found) -> _OwnFit:
-        fit = self._sampled_fit(scene, common, [k])
+    def _fit_alone(self, scene: Scene, k: int, common: Minimum) -> _OwnFit:
+        fit = self._sample_fit(scene, common, [k])
         unknowns = fit.unknowns.only([k])
         chi2 = float(fit.scene.chi2(unknowns, fit.scene.ray_counts(unknowns))[0])
         # A field of an image's own follows the noise by as much as it is left open.
         share = min(fit.variance_in(fit.scene, unknowns), _MAX_FITTED_SHARE)
         return _OwnFit(chi2, chi2 / (1 - share))
 
-    def _matched(self, k: int, made: FloatArray, one: Scene) -> tuple[float, FloatArray]:
+    def _match_brightness(self, k: int, made: FloatArray, one: Scene) -> tuple[float, FloatArray]:
         """Brightness with which a prediction is nearest to an image, and the pixels' weights."""
         (weights,), (data,) = one.weights, one.images
         brightness = _brightness(made, data, weights)
-        if self._given.counted:
-            unit = self._given.units[k]
+        if self._data.counted:
+            unit = self._data.units[k]
             expected = np.maximum(brightness * made * unit, 1.0)
             weights = np.where(weights > 0, unit**2 / expected, 0.0)
             brightness = _brightness(made, data, weights)
         return brightness, weights
 
-    def _settled(
+    def _settle_members(
         self,
         scene: Scene,
-        found: Found,
+        minimum: Minimum,
         members: list[int],
         name: str,
         least_gain: float = COARSE_GAIN,
-    ) -> Found:
+    ) -> Minimum:
         """Fit some of the images; brightness and frames of the others stay."""
-        first = replace(found, unknowns=found.unknowns.only(members))
-        end = settled(scene.only(members), first, self._on_step, name, least_gain)
-        return replace(end, unknowns=found.unknowns.with_those(members, end.unknowns))
+        first = replace(minimum, unknowns=minimum.unknowns.only(members))
+        end = settle_minimum(scene.only(members), first, self._on_step, name, least_gain)
+        return replace(end, unknowns=minimum.unknowns.with_images(members, end.unknowns))
 
     @staticmethod
-    def _chi2_in_middle(scene: Scene, found: Found, members: list[int]) -> FloatArray:
+    def _chi2_in_middle(scene: Scene, minimum: Minimum, members: list[int]) -> FloatArray:
         middle = replace(coarser(scene.only(members), MIDDLE), spacing=MIDDLE_SPACING)
-        unknowns = found.unknowns.only(members)
+        unknowns = minimum.unknowns.only(members)
         return middle.chi2(unknowns, middle.ray_counts(unknowns))
 
 
-def _placed(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknowns:
+def _align_image(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknowns:
     """Find where an image lies, and its brightness, beside one whose place is known."""
     pair = scene.only([first, k])
     weights = np.append(np.where(scene.free_frames, scene.prior.frame_weights, 0.0), 1.0)
@@ -349,7 +350,9 @@ def _placed(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknowns:
     for _ in range(_FRAME_STEPS):
         counts = pair.ray_counts(now)
         linear = pair.linear(now, counts)
-        columns = [linear.pushed(change)[1].ravel() for change in _moves(now, scene.free_frames)]
+        columns = [
+            linear.push(change)[1].ravel() for change in _unit_changes(now, scene.free_frames)
+        ]
         misfit = (pair.model(now, counts) - pair.images)[1] * np.sqrt(pair.weights[1])
         matrix = np.array([[product(a, b) for b in columns] for a in columns])
         slope = np.array([product(column, misfit.ravel()) for column in columns])
@@ -363,10 +366,10 @@ def _placed(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknowns:
                 now.frames[1, place] += change
             else:
                 now.brightness[1] += change
-    return unknowns.with_those([k], now.only([1]))
+    return unknowns.with_images([k], now.only([1]))
 
 
-def _moves(unknowns: Unknowns, free: BoolArray) -> list[Unknowns]:
+def _unit_changes(unknowns: Unknowns, free: BoolArray) -> list[Unknowns]:
     """A unit of each number of the second image's frame that is free, and of its brightness."""
     moves = []
     for place in np.flatnonzero(free):
@@ -387,29 +390,29 @@ def _chi2(made: FloatArray, data: FloatArray | float, weights: AnyArray) -> floa
 
 
 def _result(
-    given: Measured,
+    data: FitData,
     predictions: Sequence[_Prediction],
     setups: Sequence[Setup] | None,
     names: Sequence[str] | None,
 ) -> LeaveOneOut:
-    height, width = given.size
-    units = given.units[:, None, None]
-    used = given.scene.weights[:, :height, :width] > 0
-    data = given.scene.images[:, :height, :width] * units
+    height, width = data.size
+    units = data.units[:, None, None]
+    used = data.scene.weights[:, :height, :width] > 0
+    images = data.scene.images[:, :height, :width] * units
     models = np.stack([each.image for each in predictions])[:, :height, :width] * units
-    residual = np.where(used, data - models, 0.0)
-    level = np.where(used, data, 0.0).sum(axis=(1, 2)) / used.sum(axis=(1, 2))
+    residual = np.where(used, images - models, 0.0)
+    level = np.where(used, images, 0.0).sum(axis=(1, 2)) / used.sum(axis=(1, 2))
     squares = (residual**2).sum(axis=(1, 2)) / used.sum(axis=(1, 2))
     chi2, alone, limit = (
         np.array([getattr(each, name) for each in predictions])
         for name in ("chi2", "alone", "limit")
     )
     return LeaveOneOut(
-        images=data,
+        images=images,
         mask=used,
         predicted=models,
         residual=residual,
-        brightness=np.array([each.brightness for each in predictions]) * given.brightness,
+        brightness=np.array([each.brightness for each in predictions]) * data.brightness,
         chi2=chi2,
         alone=alone,
         limit=limit,

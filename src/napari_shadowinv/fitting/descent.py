@@ -1,7 +1,18 @@
-"""Steps towards the best unknowns: `descend`, `settle`; pixels: `coarser`, `finer`."""
+"""Steps towards the best unknowns.
+
+- by L-BFGS: `descend`; by Gauss and Newton, where it is near: `settle`
+- larger and smaller pixels: `coarser`, `finer`
+- minimisation and linear systems of flat arrays: `minimise`, `solve`
+
+References
+----------
+D. C. Liu and J. Nocedal, Math. Prog. 45, 503 (1989); M. R. Hestenes and E. Stiefel, J. Res. Natl.
+Bur. Stand. 49, 409 (1952).
+"""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -10,10 +21,8 @@ from scipy.fft import dctn, idctn
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.minimise import minimise, solve
-from napari_shadowinv.fitting.priors import POWERS
 from napari_shadowinv.fitting.rays import KNOT
-from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
+from napari_shadowinv.fitting.unknowns import POWERS, Fiducials, Unknowns
 
 __all__ = [
     "Preconditioner",
@@ -21,9 +30,164 @@ __all__ = [
     "coarser",
     "descend",
     "finer",
+    "minimise",
+    "product",
     "settle",
     "smoothness_in_pixels",
+    "solve",
 ]
+
+_PAIRS = 20  # of steps and changes of the gradient that are kept
+_DECREASE, _SLOPE = 1e-4, 0.9  # Wolfe's conditions
+_TRIALS = 12  # steps tried along a line
+
+Objective = Callable[[FloatArray], tuple[float, FloatArray]]
+
+
+def product(first: FloatArray, second: FloatArray) -> float:
+    """Scalar product without BLAS, whose idle threads spin and whose sums depend on them."""
+    return float(np.einsum("i,i", first, second))
+
+
+def minimise(
+    objective: Objective,
+    start: FloatArray,
+    *,
+    iterations: int,
+    least_gain: float,
+    after_step: Callable[[int, float], None] | None = None,
+) -> tuple[FloatArray, float, int]:
+    """Minimise by L-BFGS, starting with the identity as Hessian.
+
+    Parameters
+    ----------
+    objective : callable
+        Returns value and gradient.
+    start : ndarray, shape (n,)
+        Where to start; scaled so that the Hessian is about the identity.
+    iterations : int
+        Most steps.
+    least_gain : float
+        Ends once five steps lower the value by less.
+    after_step : callable, optional
+        Receives the number of steps and the value.
+
+    Returns
+    -------
+    point : ndarray
+    value : float
+    steps : int
+    """
+    point = start
+    value, gradient = objective(point)
+    values = [value]
+    pairs: deque[tuple[FloatArray, FloatArray, float]] = deque(maxlen=_PAIRS)
+    step = 1.0
+    for _ in range(iterations):
+        direction = -_times_inverse_hessian(gradient, pairs)
+        slope = product(direction, gradient)
+        if not slope < 0:
+            break
+        step_taken = _step_along(objective, point, direction, value, slope, step)
+        if step_taken is None:
+            if not pairs:
+                break
+            pairs.clear()
+            continue
+        share, value, after = step_taken
+        moved, turned = share * direction, after - gradient
+        if (curvature := product(moved, turned)) > 0:
+            pairs.append((moved, turned, curvature))
+        point, gradient, step = point + moved, after, 1.0
+        values.append(value)
+        if after_step is not None:
+            after_step(len(values) - 1, value)
+        if len(values) > 5 and values[-6] - value < least_gain:
+            break
+    return point, value, len(values) - 1
+
+
+def _times_inverse_hessian(
+    gradient: FloatArray, pairs: deque[tuple[FloatArray, FloatArray, float]]
+) -> FloatArray:
+    """The two loops over the pairs."""
+    result = gradient.copy()
+    shares = []
+    for moved, turned, curvature in reversed(pairs):
+        share = product(moved, result) / curvature
+        shares.append(share)
+        result -= share * turned
+    if pairs:
+        _, turned, curvature = pairs[-1]
+        result *= curvature / product(turned, turned)
+    for (moved, turned, curvature), share in zip(pairs, reversed(shares), strict=True):
+        result += (share - product(turned, result) / curvature) * moved
+    return result
+
+
+def _step_along(
+    objective: Objective,
+    point: FloatArray,
+    direction: FloatArray,
+    value: float,
+    slope: float,
+    step: float,
+) -> tuple[float, float, FloatArray] | None:
+    """A step that lowers the value enough and leaves less slope: bisection."""
+    shortest, longest = 0.0, np.inf
+    best = None
+    for _ in range(_TRIALS):
+        trial_value, gradient = objective(point + step * direction)
+        if not trial_value <= value + _DECREASE * step * slope:
+            longest = step
+        else:
+            best = step, trial_value, gradient
+            if product(gradient, direction) >= _SLOPE * slope:
+                return best
+            shortest = step
+        step = (shortest + longest) / 2 if np.isfinite(longest) else 2 * step
+    return best
+
+
+def solve(
+    times: Callable[[FloatArray], FloatArray],
+    right: FloatArray,
+    *,
+    tolerance: float,
+    iterations: int,
+    after_step: Callable[[int], None] | None = None,
+) -> FloatArray:
+    """Solve a positive definite system by conjugate gradients, from zero.
+
+    Parameters
+    ----------
+    times : callable
+        The matrix times a vector.
+    right : ndarray, shape (n,)
+        The right side.
+    tolerance : float
+        Length of the residual relative to the right side.
+    iterations : int
+        Most steps.
+    after_step : callable, optional
+        Receives the number of steps.
+    """
+    solution = np.zeros_like(right)
+    residual, direction = right.copy(), right.copy()
+    square = first = product(residual, residual)
+    for k in range(iterations):
+        if square <= tolerance**2 * first:
+            break
+        image = times(direction)
+        share = square / product(direction, image)
+        solution += share * direction
+        residual -= share * image
+        square, before = product(residual, residual), square
+        direction = residual + square / before * direction
+        if after_step is not None:
+            after_step(k + 1)
+    return solution
+
 
 _DESCENTS = 3  # with fixed numbers of rays each
 _FEW = 10  # steps, after which the numbers of rays still fit
@@ -67,7 +231,7 @@ class Preconditioner:
         added = [block.scales(scene.weights) for block in scene.added]
         self._diagonals = [beam, brightness, frames, *added]
 
-    def damped(self, unknowns: Unknowns) -> Unknowns:
+    def damp(self, unknowns: Unknowns) -> Unknowns:
         """Return unknowns without the finest waves, which knots further apart leave behind."""
         waves = dctn(unknowns.potentials, axes=(1, 2), norm="ortho") * self._kept
         return unknowns._replace(potentials=idctn(waves, axes=(1, 2), norm="ortho"))
@@ -78,7 +242,7 @@ class Preconditioner:
         products = map(np.multiply, self._diagonals, scaled.blocks[1:])
         return Unknowns.from_blocks([idctn(waves, axes=(1, 2), norm="ortho"), *products])
 
-    def turned(self, slope: Unknowns) -> Unknowns:
+    def transpose_times(self, slope: Unknowns) -> Unknowns:
         """Return Sᵀ times derivatives: those with respect to scaled unknowns."""
         waves = dctn(slope.potentials, axes=(1, 2), norm="ortho")
         potentials = np.einsum("yxnm,myx->nyx", self._potentials, waves)
@@ -120,14 +284,14 @@ def descend(
     steps : int
     """
     scales = Preconditioner(scene)
-    unknowns, steps, value = scales.damped(start), 0, np.inf
+    unknowns, steps, value = scales.damp(start), 0, np.inf
     for _ in range(_DESCENTS):
         counts, base = scene.ray_counts(unknowns), unknowns
 
         def objective(flat: FloatArray) -> tuple[float, FloatArray]:
             shifted = base.plus(scales.times(base.like(flat)))  # noqa: B023
             value, slope = scene.value_and_gradient(shifted, counts)  # noqa: B023
-            return value, scales.turned(slope).flat()
+            return value, scales.transpose_times(slope).flat()
 
         flat, value, taken = minimise(
             objective,
@@ -176,7 +340,7 @@ def settle(
         Whether steps were left.
     """
     scales = Preconditioner(scene)
-    now = scales.damped(start)
+    now = scales.damp(start)
     counts = scene.ray_counts(now)
     value, slope = scene.value_and_gradient(now, counts)
     # Jacobians of many pixels would fill the memory.
@@ -189,9 +353,9 @@ def settle(
             if after_step is not None:
                 after_step(value)  # noqa: B023
             change = scales.times(now.like(flat))  # noqa: B023
-            return scales.turned(linear.hessian_times(change)).flat()  # noqa: B023
+            return scales.transpose_times(linear.hessian_times(change)).flat()  # noqa: B023
 
-        down = -scales.turned(slope).flat()
+        down = -scales.transpose_times(slope).flat()
         step = solve(times, down, tolerance=_NEWTON, iterations=_MOST_SOLVING)
         change = scales.times(now.like(step))
         for share in _SHARES_OF_STEP:

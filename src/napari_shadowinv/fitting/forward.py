@@ -18,10 +18,8 @@ from scipy.signal import oaconvolve
 from scipy.sparse import csc_array, csr_array
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
-from napari_shadowinv.fitting.additive import AdditiveBlock
-from napari_shadowinv.fitting.priors import Prior
 from napari_shadowinv.fitting.rays import RayModel, at_rest
-from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
+from napari_shadowinv.fitting.unknowns import AdditiveBlock, Fiducials, Prior, Unknowns
 
 __all__ = ["Linear", "Scene", "blurred"]
 
@@ -332,10 +330,10 @@ class Linear:
     def hessian_times(self, change: Unknowns) -> Unknowns:
         """Return the Gauss-Newton Hessian times a change of the unknowns."""
         free = self.scene._only_free(change)
-        pulled = self.pulled(self.pushed(free))
+        pulled = self.pull(self.push(free))
         return self.scene._only_free(self.scene.prior.times(free)).plus(pulled)
 
-    def pushed(self, change: Unknowns) -> FloatArray:
+    def push(self, change: Unknowns) -> FloatArray:
         """Return the change of all residuals (f - I) / σ, to first order, shape (L, H, W)."""
         scene = self.scene
         potentials = scene.potentials(change)
@@ -353,8 +351,8 @@ class Linear:
             np.multiply(self._roots[k], bare, out=changes[k])
         return changes
 
-    def pulled(self, residuals: FloatArray) -> Unknowns:
-        """Return the transpose of `pushed` times residuals."""
+    def pull(self, residuals: FloatArray) -> Unknowns:
+        """Return the transpose of `push` times residuals."""
         scene = self.scene
         slope = self.unknowns.zeros()
         of_shape = np.zeros(scene.beams.shape[1:])

@@ -1,7 +1,8 @@
-"""The inputs of a fit, checked and in common units: `measured`.
+"""The inputs of a fit, checked and in common units: `collect_data`.
 
 - standard deviation of an image's noise: `estimated_noise`
 - displacement by each field in each image, from the setups: `strengths_of`
+- width of the point spread in px, from the beam's source and the detector: `point_spread`
 """
 
 from __future__ import annotations
@@ -19,19 +20,19 @@ from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import check_instance
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting.additive import additive_blocks
-from napari_shadowinv.fitting.blur import checked_point_spread
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.unknowns import Fiducials
+from napari_shadowinv.fitting.unknowns import Fiducials, additive_blocks
 from napari_shadowinv.options import KINDS_OF_NOISE, MAX_STRENGTH, FitOptions, KindOfNoise
 from napari_shadowinv.physics.projection import transferred_displacement
 from napari_shadowinv.physics.setup import BeamSetup, Setup, deflector_titles
 
 __all__ = [
+    "FitData",
     "FitOptions",
-    "Measured",
+    "check_point_spread",
+    "collect_data",
     "estimated_noise",
-    "measured",
+    "point_spread",
     "strengths_of",
 ]
 
@@ -58,7 +59,7 @@ _ALIGNED = {
 
 
 @dataclass(frozen=True)
-class Measured:
+class FitData:
     """Images in units of their beams, with their instrument.
 
     `scene` has the sides of blocks; the images are its first `size` pixels. `units` (L,) are
@@ -76,13 +77,13 @@ class Measured:
     assumed: bool
     common: bool
 
-    def held(self, smoothness: float | None) -> Scene:
+    def scene_with(self, smoothness: float | None) -> Scene:
         """Return the scene with λ as it was given, or none yet, for each field."""
         fields = self.scene.strengths.shape[1]
         return replace(self.scene, smoothness=np.tile((smoothness or 0.0, 0.0), (fields, 1)))
 
 
-def measured(
+def collect_data(
     images: ArrayLike,
     *,
     strengths: ArrayLike | None,
@@ -96,7 +97,7 @@ def measured(
     fiducials: ArrayLike | None,
     options: FitOptions,
     names: Sequence[str] | None = None,
-) -> Measured:
+) -> FitData:
     """Check the inputs of a fit; see `fit` for their forms."""
     images, exposed = unpack_planes(images, "images")
     data = _checked_images(images)
@@ -140,7 +141,7 @@ def measured(
         weights=np.pad(weights, fill),
         strengths=matrix,
         beams=np.pad(beams / units[:, None, None], around, mode="edge"),
-        psf=checked_point_spread(psf, count, size),
+        psf=check_point_spread(psf, count, size),
         smoothness=np.zeros((matrix.shape[1], 2)),
         pad=pad,
         tie=_FREE_TIE if free else 30.0,
@@ -155,7 +156,7 @@ def measured(
     )
     spread = np.linalg.norm(matrix, axis=1)
     single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
-    return Measured(
+    return FitData(
         scene=scene,
         size=(height, width),
         units=units,
@@ -503,3 +504,61 @@ def _checked_fiducials(fiducials: ArrayLike | None, size: tuple[int, int]) -> Fi
         )
     # A pixel's centre is at its index; the rays count from the image's corner.
     return Fiducials(places + 0.5, displacements, errors)
+
+
+def point_spread(setup: Setup, source_size: float = 0.0, resolution: float = 0.0) -> float:
+    """Return the standard deviation in px by which an image is blurred.
+
+    Parameters
+    ----------
+    setup : Setup
+        The experiment.
+    source_size : float, default 0
+        Standard deviation of the beam's source in m; a FWHM is 2.355 times as large.
+    resolution : float, default 0
+        Standard deviation of the detector's point spread in m, at the detector.
+
+    Returns
+    -------
+    float
+        σ in px at the object: a source of size s is seen as s L/l at the detector, all of it
+        divided by the magnification.
+
+    Raises
+    ------
+    InputError
+        If a length is negative or not finite.
+    """
+    for name, length in (("source_size", source_size), ("resolution", resolution)):
+        if not 0 <= length < np.inf:
+            raise InputError(f"{name} is {length}: expected a length in m, 0 or more")
+    magnification = setup.magnification
+    width = np.hypot(source_size * (magnification - 1), resolution)
+    return float(width / magnification / setup.object_pixel_size)
+
+
+def check_point_spread(psf: Any, count: int, size: tuple[int, int]) -> list[float | FloatArray]:
+    """Return a standard deviation in px or a normalised kernel for each of `count` images."""
+    try:
+        alone = np.array(psf, dtype=np.float64).ndim in (0, 2)
+    except (TypeError, ValueError):  # widths and kernels, or kernels of several sizes
+        alone = not isinstance(psf, Sequence) or isinstance(psf, str)
+    each = [psf] * count if alone else list(psf)
+    if len(each) != count:
+        raise InputError(f"psf has {len(each)} entries: expected one, or one for each of {count}")
+    kernels: list[float | FloatArray] = []
+    for blur in each:
+        values = as_numbers("psf", blur)
+        if not values.size or not np.isfinite(values).all() or values.min() < 0:
+            raise InputError(f"psf is {blur}: expected a standard deviation in px or a kernel")
+        if values.ndim == 0:
+            if float(values) > min(size) / 8:
+                raise InputError(
+                    f"psf is {float(values):g} px: expected less than an eighth of a side"
+                )
+            kernels.append(float(values))
+            continue
+        if values.ndim != 2 or not all(side % 2 for side in values.shape) or not values.sum() > 0:
+            raise InputError(f"psf has shape {values.shape}: expected a kernel with odd sides")
+        kernels.append(values / values.sum())
+    return kernels

@@ -24,7 +24,7 @@ from napari_shadowinv.facts import (
     masked_fact,
     time_fact,
 )
-from napari_shadowinv.fitting._error_bars import BeamError
+from napari_shadowinv.fitting.posterior import BeamError
 from napari_shadowinv.fitting.verdict import Verdict
 from napari_shadowinv.inversion.variables import (
     BEAM_UNCERTAINTY,

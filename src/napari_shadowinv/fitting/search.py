@@ -20,15 +20,15 @@ from napari_shadowinv.physics.poisson import border_mean
 __all__ = [
     "COARSE_GAIN",
     "FIRST_SMOOTHNESS",
-    "HELD",
     "MIDDLE",
     "MIDDLE_SPACING",
-    "Found",
+    "SMOOTHNESS_RATIO",
+    "Minimum",
     "Start",
-    "refined",
+    "estimate_smoothness",
+    "refine_minimum",
     "search",
-    "settled",
-    "with_likely_smoothness",
+    "settle_minimum",
 ]
 
 OnStep = Callable[[str, float], None]
@@ -45,7 +45,7 @@ _SPACINGS, _EXPLAINED = (0.2, 0.14), 1.05  # px, and the χ² for which the firs
 _ROUNDS, _ROUND_STEPS, _SETTLED = 6, 40, 0.25  # of λ and κ; and by what share they may still change
 # An object's roughness is not spread evenly, as the likeliest λ and κ assume: they would round it
 # off where it is sharpest.
-HELD = 0.1  # of them
+SMOOTHNESS_RATIO = 0.1  # of them
 _SAME_FIELD = 0.03  # of the displacement, r.m.s.
 
 
@@ -64,7 +64,7 @@ class Start:
 
 
 @dataclass(frozen=True)
-class Found:
+class Minimum:
     """Where a descent has ended, in pixels that are `bin` wide."""
 
     start: str
@@ -73,7 +73,7 @@ class Found:
     displacement: FloatArray  # of all fields in the first image, px of the recorded image
     bin: int = 2
 
-    def distance(self, other: Found) -> float:
+    def distance(self, other: Minimum) -> float:
         """Return how far another displacement is from this one, relative to it (r.m.s.)."""
         size = float(np.sqrt((self.displacement**2).mean()))
         difference = self.displacement - other.displacement
@@ -90,7 +90,7 @@ def _splines_of(scene: Scene, potential: FloatArray) -> FloatArray:
     return np.asarray(values) / scene.bin**2
 
 
-def search(scene: Scene, starts: Sequence[Start], on_step: OnStep) -> list[Found]:
+def search(scene: Scene, starts: Sequence[Start], on_step: OnStep) -> list[Minimum]:
     """Descend from each start to pixels of two; return the distinct minima, best first.
 
     Of the starts that have come to the same stage before the last, those go on that are best.
@@ -100,54 +100,56 @@ def search(scene: Scene, starts: Sequence[Start], on_step: OnStep) -> list[Found
         smoothness=_COARSE_SMOOTHNESS * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1)),
         spacing=_COARSE_SPACING,
     )
-    halfway: dict[tuple[int, float], list[Found]] = {}
+    halfway: dict[tuple[int, float], list[Minimum]] = {}
     ends = []
     for start in starts:
         *before, last = start.stages
-        end = _begun(coarser(rough, start.stages[0][0]), start)
+        end = _start_minimum(coarser(rough, start.stages[0][0]), start)
         first = replace(rough, beam_spread=_HELD_BEAM) if start.beam_held else rough
         for stage in before:
-            end = _descended(first, end, stage, on_step)
+            end = _descend_stage(first, end, stage, on_step)
         if before:
             halfway.setdefault(before[-1], []).append(end)
         else:
-            ends.append(_descended(rough, end, last, on_step))
+            ends.append(_descend_stage(rough, end, last, on_step))
     for rivals in halfway.values():
-        for end in _different(rivals)[:_CONTINUED]:
-            ends.append(_descended(rough, end, starts[0].stages[-1], on_step))
-    return _different(ends)
+        for end in _distinct_minima(rivals)[:_CONTINUED]:
+            ends.append(_descend_stage(rough, end, starts[0].stages[-1], on_step))
+    return _distinct_minima(ends)
 
 
-def _different(found: list[Found]) -> list[Found]:
+def _distinct_minima(minima: list[Minimum]) -> list[Minimum]:
     """Those that differ and are not hopeless, best first."""
-    distinct: list[Found] = []
-    for candidate in sorted(found, key=lambda each: each.value):
+    distinct: list[Minimum] = []
+    for candidate in sorted(minima, key=lambda each: each.value):
         if all(better.distance(candidate) > _SAME_FIELD for better in distinct):
             distinct.append(candidate)
     return [candidate for candidate in distinct if candidate.value < _HOPELESS * distinct[0].value]
 
 
-def _begun(scene: Scene, start: Start) -> Found:
+def _start_minimum(scene: Scene, start: Start) -> Minimum:
     unknowns = scene.nothing()
     if start.potential is not None:
         unknowns.potentials[0] = _splines_of(scene, start.potential)
-    return Found(start.name, unknowns, np.inf, _displacement(scene, unknowns), scene.bin)
+    return Minimum(start.name, unknowns, np.inf, _displacement(scene, unknowns), scene.bin)
 
 
-def _descended(scene: Scene, found: Found, stage: tuple[int, float], on_step: OnStep) -> Found:
+def _descend_stage(
+    scene: Scene, minimum: Minimum, stage: tuple[int, float], on_step: OnStep
+) -> Minimum:
     factor, blur = stage
     now = replace(coarser(scene, factor), blur=blur)
-    unknowns = found.unknowns
-    for _ in range(int(np.log2(found.bin // factor))):
+    unknowns = minimum.unknowns
+    for _ in range(int(np.log2(minimum.bin // factor))):
         unknowns = finer(unknowns)
     unknowns, value, _ = descend(
         now,
         unknowns,
         iterations=_COARSE_STEPS,
         least_gain=COARSE_GAIN,
-        after_step=lambda now: on_step(found.start, now),
+        after_step=lambda now: on_step(minimum.start, now),
     )
-    return Found(found.start, unknowns, value, _displacement(now, unknowns), factor)
+    return Minimum(minimum.start, unknowns, value, _displacement(now, unknowns), factor)
 
 
 def _displacement(scene: Scene, unknowns: Unknowns) -> FloatArray:
@@ -155,14 +157,14 @@ def _displacement(scene: Scene, unknowns: Unknowns) -> FloatArray:
     return scene.bin * np.stack(each)
 
 
-def with_likely_smoothness(
-    scene: Scene, end: Found, rng: np.random.Generator, on_step: OnStep
-) -> tuple[Scene, Found]:
+def estimate_smoothness(
+    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep
+) -> tuple[Scene, Minimum]:
     """Find λ and κ, unless they are given, and the unknowns that belong to them."""
     is_fixed = bool(scene.smoothness.any())
     if not is_fixed:
         scene = replace(scene, smoothness=np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1)))
-    end = settled(scene, end, on_step)
+    end = settle_minimum(scene, end, on_step)
     if is_fixed:
         return scene, end
     for _ in range(_ROUNDS):
@@ -173,39 +175,39 @@ def with_likely_smoothness(
         if change < _SETTLED:
             break
         scene = replace(scene, smoothness=likely / smoothness_in_pixels(MIDDLE))
-        end = settled(scene, end, on_step)
-    scene = replace(scene, smoothness=HELD * likely / smoothness_in_pixels(MIDDLE))
-    return scene, settled(scene, end, on_step, least_gain=_LAST_GAIN)
+        end = settle_minimum(scene, end, on_step)
+    scene = replace(scene, smoothness=SMOOTHNESS_RATIO * likely / smoothness_in_pixels(MIDDLE))
+    return scene, settle_minimum(scene, end, on_step, least_gain=_LAST_GAIN)
 
 
-def settled(
+def settle_minimum(
     scene: Scene,
-    found: Found,
+    minimum: Minimum,
     on_step: OnStep,
     name: str = "smoothness",
     least_gain: float = COARSE_GAIN,
     steps: int = _ROUND_STEPS,
-) -> Found:
+) -> Minimum:
     """Return where a descent ends with other λ and κ, in pixels of two and without blur."""
     middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
     unknowns, value, _, _ = settle(
         middle,
-        found.unknowns,
+        minimum.unknowns,
         steps=steps,
         least_gain=least_gain,
         after_step=lambda now: on_step(name, now),
     )
-    return Found(found.start, unknowns, value, _displacement(middle, unknowns))
+    return Minimum(minimum.start, unknowns, value, _displacement(middle, unknowns))
 
 
-def refined(
-    scene: Scene, found: Found, options: FitOptions, on_step: OnStep
+def refine_minimum(
+    scene: Scene, minimum: Minimum, options: FitOptions, on_step: OnStep
 ) -> tuple[Scene, Unknowns, float, int, bool]:
     """Descend with the pixels as recorded, with rays as dense as the data need.
 
     Also returns the number of steps, and whether it converged within the allowed number.
     """
-    unknowns, steps = finer(found.unknowns), 0
+    unknowns, steps = finer(minimum.unknowns), 0
     denser = list(_SPACINGS) if options.spacing is None else [options.spacing]
     most = -(-options.max_iterations // len(denser))
     scene = replace(scene, spacing=denser.pop(0))

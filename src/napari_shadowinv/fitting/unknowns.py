@@ -1,17 +1,44 @@
-"""The unknowns of a fit, and displacements known beforehand: `Unknowns`, `Fiducials`."""
+"""The unknowns of a fit, and their prior.
+
+- all numbers that a fit determines: `Unknowns`; displacements known beforehand: `Fiducials`
+- light that adds to each image, such as a background: `AdditiveBlock`, listed in `ADDITIVE`
+- the prior of potentials, beam, brightness, frames and light: `Prior`
+
+The prior is quadratic. That of the potentials and of the beam is
+
+    ½ Σ_m (λ_m |∇⁴φ_m|² + κ_m |∇⁶φ_m|²) + ½ µ Σ_pad (|∇φ|² + φ²/ℓ²)
+    + ½ Σ (θ_ij / s_ij)² + ½ Σ |d(x_k) - d_k|² / σ_k²
+
+and brightness, frames and light have the same form. Of a smooth object the data make λ small and
+κ large, of one with kinks the other way round.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import accumulate, pairwise
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
+from scipy.fft import dctn, idctn
 
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
+from napari_shadowinv.fitting._ray_kernels import spline_tables
+from napari_shadowinv.fitting.rays import KNOT, RayModel, at_rest
+from napari_shadowinv.options import FitOptions
 
-__all__ = ["Fiducials", "Unknowns"]
-
+__all__ = [
+    "ADDITIVE",
+    "POWERS",
+    "AdditiveBlock",
+    "Fiducials",
+    "Prior",
+    "Unknowns",
+    "additive_blocks",
+]
 
 _COMMON = 2  # blocks that the images share; the others have a row for each image
 
@@ -61,12 +88,12 @@ class Unknowns(NamedTuple):
             [self.potentials, self.beam, *(block[chosen] for block in self.blocks[_COMMON:])]
         )
 
-    def with_those(self, numbers: Sequence[int], found: Unknowns) -> Unknowns:
+    def with_images(self, numbers: Sequence[int], part: Unknowns) -> Unknowns:
         """Return the unknowns with those of some images replaced."""
         blocks = [block.copy() for block in self.blocks[_COMMON:]]
-        for block, new in zip(blocks, found.blocks[_COMMON:], strict=True):
+        for block, new in zip(blocks, part.blocks[_COMMON:], strict=True):
             block[list(numbers)] = new
-        return self.from_blocks([found.potentials, found.beam, *blocks])
+        return self.from_blocks([part.potentials, part.beam, *blocks])
 
     def plus(self, other: Unknowns) -> Unknowns:
         """Return the sum of both."""
@@ -88,3 +115,265 @@ class Fiducials(NamedTuple):
     places: FloatArray
     displacements: FloatArray
     errors: FloatArray
+
+
+class AdditiveBlock(ABC):
+    """Unknown coefficients of each image, to which its light is proportional.
+
+    A fit finds the coefficients of each image together with all other unknowns, and reports
+    them with their standard deviations. They start at zero, where their Gaussian prior has its
+    mean, and are the same in pixels of any size. Image k is exp(γ_k) times the light of the rays
+    plus this light, in units of the beam.
+    """
+
+    title: ClassVar[str]
+    """Name in the result."""
+
+    @classmethod
+    @abstractmethod
+    def from_options(cls, options: FitOptions) -> Self | None:
+        """Return the block that the options ask for; None if its light is known to be zero."""
+
+    @abstractmethod
+    def spreads(self) -> FloatArray:
+        """Return the standard deviation of each coefficient before the fit, shape (n,)."""
+
+    @abstractmethod
+    def patterns(self, size: tuple[int, int]) -> FloatArray:
+        """Return the light of each coefficient of 1, in beams, shape (n, H, W)."""
+
+    def image(self, coefficients: FloatArray, size: tuple[int, int]) -> FloatArray:
+        """Return the light of coefficients, shape (H, W)."""
+        return np.asarray(np.einsum("n,nyx->yx", coefficients, self.patterns(size)))
+
+    def pull(self, image: FloatArray) -> FloatArray:
+        """Return the transpose of `image` times an image, shape (n,)."""
+        size = image.shape[0], image.shape[1]
+        return np.asarray(np.einsum("yx,nyx->n", image, self.patterns(size)))
+
+    def prior_weights(self) -> FloatArray:
+        """Return 1 / s² of each coefficient."""
+        return np.asarray(1 / np.asarray(self.spreads()) ** 2)
+
+    def scales(self, weights: FloatArray) -> FloatArray:
+        """Return approximate standard deviations by the fit, (L, n), for weights 1 / σ²."""
+        size = weights.shape[1], weights.shape[2]
+        curvature = np.einsum("lyx,nyx->ln", weights, self.patterns(size) ** 2)
+        return np.asarray(1 / np.sqrt(curvature + self.prior_weights()))
+
+
+ADDITIVE: Sequence[type[AdditiveBlock]] = ()
+
+
+def additive_blocks(options: FitOptions) -> tuple[AdditiveBlock, ...]:
+    """Return the blocks of `ADDITIVE` that the options ask for."""
+    blocks = (kind.from_options(options) for kind in ADDITIVE)
+    return tuple(block for block in blocks if block is not None)
+
+
+POWERS = (4, 6)  # of the wave number squared: |∇⁴φ|² and |∇⁶φ|²
+
+_BRIGHTNESS_WEIGHT = 1.0  # 1 / s² of their logarithm
+_STRETCH_SPREAD = 0.05  # of turns, magnifications and shears
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Gaussian prior of the unknowns, in pixels of one size.
+
+    Attributes
+    ----------
+    rays : RayModel
+        The rays of all images.
+    strengths : ndarray, shape (M,)
+        Displacement in the first image by each field's displacement.
+    smoothness : ndarray, shape (M, 2)
+        λ and κ of each field.
+    tie, decay : float
+        µ, and the length ℓ in px over which potentials fade in the pad.
+    beam_modes : int
+        Cosines of the beam's logarithm along each axis.
+    beam_spread : float
+        Standard deviation of the first of them.
+    fiducials : Fiducials or None
+        Displacements known at points.
+    bin : int
+        Side of a pixel in recorded pixels.
+    shift_spread : float
+        Standard deviation of an image's shift, px of the recorded image.
+    added : tuple of AdditiveBlock
+        Unknown light that adds to each image.
+    """
+
+    rays: RayModel
+    strengths: FloatArray
+    smoothness: FloatArray
+    tie: float
+    decay: float
+    beam_modes: int
+    beam_spread: float
+    fiducials: Fiducials | None
+    bin: int
+    shift_spread: float = 5.0
+    added: tuple[AdditiveBlock, ...] = ()
+
+    def value_and_slope(self, unknowns: Unknowns) -> tuple[float, Unknowns]:
+        """Return the sum of all terms, and its derivatives."""
+        about_rest = unknowns._replace(frames=unknowns.frames - at_rest())
+        slope = self.times(about_rest)
+        pairs = zip(slope.blocks, about_rest.blocks, strict=True)
+        value = sum(float(np.sum(a * b)) for a, b in pairs) / 2
+        if self.fiducials is None:
+            return value, slope
+        weights = 1 / self.fiducials.errors[:, None] ** 2
+        goal = weights * self.fiducials.displacements
+        displacements = self._displacements_there(unknowns.potentials)
+        value += float(np.sum(goal * (self.fiducials.displacements / 2 - displacements)))
+        self._add_there(slope.potentials, -goal)
+        return value, slope
+
+    def times(self, change: Unknowns) -> Unknowns:
+        """Return the terms' Hessian times a change."""
+        waves = dctn(change.potentials, axes=(1, 2), norm="ortho")
+        waves *= self._rough_weights
+        slope = idctn(waves, axes=(1, 2), norm="ortho")
+        for axis, steps in enumerate(self._steps(change.potentials), 1):
+            slope -= self.tie * _differences(steps, axis)
+        slope += self.tie * self._fading * change.potentials
+        if self.fiducials is not None:
+            weights = 1 / self.fiducials.errors[:, None] ** 2
+            self._add_there(slope, weights * self._displacements_there(change.potentials))
+        products = map(np.multiply, self._weights, change.blocks[1:])
+        return Unknowns.from_blocks([slope, *products])
+
+    def draw(self, like: Unknowns, rng: np.random.Generator) -> Unknowns:
+        """Return a random slope whose covariance is the terms' Hessian."""
+        shape, fields = self.rays.shape, range(len(self.smoothness))
+        rough = [self.root_of_smoothness(m, rng.normal(size=shape)) for m in fields]
+        potentials = np.stack(rough)
+        steps_y, steps_x = self._steps(potentials)
+        in_y, in_x = (rng.normal(size=steps.shape) for steps in (steps_y, steps_x))
+        along_y, along_x = self._in_pad
+        root = np.sqrt(self.tie)
+        potentials -= root * _differences(in_y * along_y, 1)
+        potentials -= root * _differences(in_x * along_x, 2)
+        potentials += root * np.sqrt(self._fading) * rng.normal(size=potentials.shape)
+        if self.fiducials is not None:
+            errors = self.fiducials.errors[:, None]
+            self._add_there(potentials, rng.normal(size=(len(errors), 2)) / errors)
+        slopes = [
+            np.sqrt(weights) * rng.normal(size=block.shape)
+            for weights, block in zip(self._weights, like.blocks[1:], strict=True)
+        ]
+        return Unknowns.from_blocks([potentials, *slopes])
+
+    def root_of_smoothness(self, field: int, values: FloatArray) -> FloatArray:
+        """Return values per cosine times the root of the roughness penalty."""
+        waves = np.sqrt(self.of_rough[field].sum(axis=0)) * values
+        return np.asarray(idctn(waves, norm="ortho"))
+
+    @cached_property
+    def of_rough(self) -> FloatArray:
+        """Penalty of each field's cosines by λ and by κ, shape (M, 2, …)."""
+        powers = np.stack([self.wave_numbers**power for power in POWERS])
+        return KNOT**2 * self.smoothness[:, :, None, None] * powers
+
+    @cached_property
+    def _rough_weights(self) -> FloatArray:
+        return np.asarray(self.of_rough.sum(axis=1))
+
+    @cached_property
+    def wave_numbers(self) -> FloatArray:
+        """k² of each cosine of the coefficients, px⁻²."""
+        waves = [np.pi * np.arange(n) / (n * KNOT) for n in self.rays.shape]
+        return np.asarray(waves[0][:, None] ** 2 + waves[1] ** 2)
+
+    def of_potentials(self) -> FloatArray:
+        """Return the approximate penalty of each field's cosines, shape (M, …)."""
+        squares = self.wave_numbers
+        lowest = (np.pi / (max(self.rays.shape) * KNOT)) ** 2 + (0.2 / self.decay) ** 2
+        # A fifth of the coefficients or so lies in the pad.
+        tied = self.tie * (0.2 * squares + lowest)
+        return np.asarray(self._rough_weights + KNOT**2 * tied)
+
+    @cached_property
+    def _weights(self) -> list[FloatArray]:
+        """1 / s² of the values of each block but the potentials."""
+        added = (block.prior_weights() for block in self.added)
+        return [self.beam_weights, np.array(_BRIGHTNESS_WEIGHT), self.frame_weights, *added]
+
+    @cached_property
+    def beam_weights(self) -> FloatArray:
+        """1 / s² of the beam's cosines, zero for those that are not used."""
+        order = np.arange(self.beam_modes)
+        square = order[:, None] ** 2 + order**2
+        used = (square > 0) & (square < self.beam_modes**2)
+        return np.where(used, square / self.beam_spread**2, 0.0)
+
+    @cached_property
+    def frame_weights(self) -> FloatArray:
+        """1 / s² of a frame's numbers."""
+        shift = self.shift_spread / self.bin
+        # Where images lie well, their corners do, too.
+        stretch = min(_STRETCH_SPREAD, shift / (max(self.rays.size) / 4))
+        return 1 / np.array([shift, stretch, stretch, shift, stretch, stretch]) ** 2
+
+    @cached_property
+    def _within(self) -> BoolArray:
+        """Which coefficients belong to the image."""
+        lines = [
+            np.abs(KNOT * (np.arange(n) - 1.0) - self.rays.pad - side / 2) <= side / 2
+            for n, side in zip(self.rays.shape, self.rays.size, strict=True)
+        ]
+        return np.asarray(lines[0][:, None] & lines[1])
+
+    @cached_property
+    def _in_pad(self) -> tuple[BoolArray, BoolArray]:
+        """Which steps between coefficients along y and x lie in the pad."""
+        inside = self._within
+        return ~(inside[1:] & inside[:-1]), ~(inside[:, 1:] & inside[:, :-1])
+
+    @cached_property
+    def _fading(self) -> FloatArray:
+        return np.where(self._within, 0.0, (KNOT / self.decay) ** 2)
+
+    def _steps(self, potentials: FloatArray) -> tuple[FloatArray, FloatArray]:
+        along_y, along_x = self._in_pad
+        in_y = (potentials[:, 1:] - potentials[:, :-1]) * along_y
+        return in_y, (potentials[:, :, 1:] - potentials[:, :, :-1]) * along_x
+
+    @cached_property
+    def _splines_there(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """Rows and columns of coefficients around each fiducial; displacement by each, (y, x)."""
+        assert self.fiducials is not None
+        place = (self.fiducials.places + self.rays.pad) / KNOT
+        cell = np.floor(place).astype(np.int64)
+        (value_y, slope_y), (value_x, slope_x) = map(spline_tables, (place - cell).T)
+        each = np.arange(4)
+        rows = (cell[:, :1] + each)[:, :, None]
+        columns = (cell[:, 1:] + each)[:, None, :]
+        along_y = np.einsum("in,jn->nij", slope_y, value_x)
+        along_x = np.einsum("in,jn->nij", value_y, slope_x)
+        return rows, columns, -np.stack([along_y, along_x], axis=1)
+
+    def _displacements_there(self, potentials: FloatArray) -> FloatArray:
+        rows, columns, tables = self._splines_there
+        total = np.einsum("m,myx->yx", self.strengths, potentials)
+        return np.asarray(np.einsum("ncij,nij->nc", tables, total[rows, columns]))
+
+    def _add_there(self, potentials: FloatArray, pulls: FloatArray) -> None:
+        rows, columns, tables = self._splines_there
+        total = np.zeros(self.rays.shape)
+        np.add.at(total, (rows, columns), np.einsum("ncij,nc->nij", tables, pulls))
+        potentials += self.strengths[:, None, None] * total
+
+
+def _differences(steps: FloatArray, axis: int) -> FloatArray:
+    """Differences of neighbours along an axis, with zeros beyond the ends."""
+    shape = list(steps.shape)
+    shape[axis] += 1
+    differences = np.zeros(shape)
+    along = differences.swapaxes(0, axis)
+    along[:-1] = steps.swapaxes(0, axis)
+    along[1:] -= steps.swapaxes(0, axis)
+    return differences

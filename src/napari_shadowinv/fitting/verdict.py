@@ -1,4 +1,4 @@
-"""Whether a fit's field may be believed: `Verdict`, `judged`.
+"""Whether a fit's field may be believed: `Verdict`, `assess_verdict`.
 
 χ² alone does not show whether a field is right: one image, or several that the object displaces
 alike, can be explained perfectly by a wrong field. The test is whether other fields explain them
@@ -15,14 +15,14 @@ from scipy import ndimage
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.fitting._error_bars import BeamError
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
+from napari_shadowinv.fitting.posterior import BeamError
 from napari_shadowinv.inversion.solution_checks import TURNED_BACK, inner_sides, turned_back
 
 __all__ = [
     "Verdict",
+    "assess_verdict",
     "hidden_contrast",
-    "judged",
 ]
 
 
@@ -102,7 +102,7 @@ class Verdict(StrEnum):
     MISFIT = "does not fit"
 
 
-def judged(
+def assess_verdict(
     *,
     chi2: FloatArray,
     names: Sequence[str],
