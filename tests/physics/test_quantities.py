@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from napari_shadowinv import InputError, OpticalSetup, ProtonSetup
+from napari_shadowinv.physics.beam import number_in_unit
 from napari_shadowinv.physics.setup import setup_from_dict
-from napari_shadowinv.physics.setup._quantities import number_in_unit
 from napari_shadowinv.pipeline import read_recipe
 
 PLAIN = {
