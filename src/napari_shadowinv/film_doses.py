@@ -16,10 +16,10 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Headline, Level, ResultKind, caution_facts
-from napari_shadowinv.film.film_response import relative_strengths
 from napari_shadowinv.film.pack import Pack
-from napari_shadowinv.physics.labels import PIXEL, label, numbers_of, place_coordinates
+from napari_shadowinv.film.unfolding import relative_strengths
 from napari_shadowinv.physics.setup import ProtonSetup
+from napari_shadowinv.physics.units import PIXEL, label, numbers_of, place_coordinates
 from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from helpers.srim import TABLES
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film import Material, Pack, PackLayer, Response, Slab
-from napari_shadowinv.film.film_response import check_increasing, relative_strengths
+from napari_shadowinv.film.unfolding import check_increasing, relative_strengths
 from napari_shadowinv.physics.setup import ProtonSetup
 
 

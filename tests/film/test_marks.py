@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film import Calibration, find_films, straighten_film
-from napari_shadowinv.film.marks import burnt_edges, usable_pixels
+from napari_shadowinv.film.scans import burnt_edges, usable_pixels
 
 SHAPE = (200, 320)
 

@@ -18,8 +18,7 @@ from napari_shadowinv.preprocessing import (
     ReferencePair,
     image_warnings,
 )
-from napari_shadowinv.preprocessing.image_checks import saturated_share, stray_pixels
-from napari_shadowinv.preprocessing.photon_transfer import dark_level
+from napari_shadowinv.preprocessing.image_checks import dark_level, saturated_share, stray_pixels
 
 SHAPE = (160, 160)
 COUNTS = 300

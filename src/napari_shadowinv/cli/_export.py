@@ -19,7 +19,7 @@ from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
 from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.io.store import DAMAGED, DONE, STATUS_NAMES, StackStore, read_stack
-from napari_shadowinv.physics.labels import display_unit
+from napari_shadowinv.physics.units import display_unit
 from napari_shadowinv.pipeline.rerun import provenance_of
 
 if TYPE_CHECKING:

@@ -20,21 +20,31 @@ from napari_shadowinv.film.calibration import (
     net_optical_density,
     unexposed_pixel,
 )
-from napari_shadowinv.film.fiducials import poses_by_fiducials
-from napari_shadowinv.film.film_response import Band, Response
-from napari_shadowinv.film.image_plates import (
+from napari_shadowinv.film.other_detectors import (
     Luminescence,
+    TrackImage,
+    Tracks,
     fading,
     fuji_luminescence,
     ge_luminescence,
 )
-from napari_shadowinv.film.marks import burnt_edges, usable_pixels
-from napari_shadowinv.film.pack import FilmType, Material, Pack, PackLayer, Slab
-from napari_shadowinv.film.registration import Poses, check_orientation, move_corners, register
-from napari_shadowinv.film.scans import find_films, read_corners, straighten_film, write_corners
-from napari_shadowinv.film.stopping import Stopping
-from napari_shadowinv.film.tracks import TrackImage, Tracks
-from napari_shadowinv.film.unfolding import Spectra, unfold
+from napari_shadowinv.film.pack import FilmType, Material, Pack, PackLayer, Slab, Stopping
+from napari_shadowinv.film.registration import (
+    Poses,
+    check_orientation,
+    move_corners,
+    poses_by_fiducials,
+    register,
+)
+from napari_shadowinv.film.scans import (
+    burnt_edges,
+    find_films,
+    read_corners,
+    straighten_film,
+    usable_pixels,
+    write_corners,
+)
+from napari_shadowinv.film.unfolding import Band, Response, Spectra, unfold
 
 __all__ = [
     "Band",

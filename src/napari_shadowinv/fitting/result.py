@@ -33,9 +33,17 @@ from napari_shadowinv.inversion.variables import (
     dataset_from_field,
 )
 from napari_shadowinv.options import FitOptions
-from napari_shadowinv.physics.labels import FLUX_DENSITY, PIXEL, label, numbers_of
 from napari_shadowinv.physics.setup import Setup, deflector_titles, setup_from_dict
-from napari_shadowinv.physics.units import PeakError, ShownField, peak_facts, shown_fields
+from napari_shadowinv.physics.units import (
+    FLUX_DENSITY,
+    PIXEL,
+    PeakError,
+    ShownField,
+    label,
+    numbers_of,
+    peak_facts,
+    shown_fields,
+)
 from napari_shadowinv.provenance import ImageOrigin, Provenance
 
 if TYPE_CHECKING:

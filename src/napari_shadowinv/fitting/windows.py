@@ -16,8 +16,8 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.inversion.variables import UNCERTAINTY, belongs, dataset_from_field
-from napari_shadowinv.physics.labels import PIXEL, label
 from napari_shadowinv.physics.setup import BeamQuantity, Setup, beam_values
+from napari_shadowinv.physics.units import PIXEL, label
 
 if TYPE_CHECKING:
     import xarray

@@ -54,8 +54,8 @@ from napari_shadowinv.inversion.readout import LinearReadout, read_out
 from napari_shadowinv.inversion.result import Inversion
 from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.physics.labels import label
 from napari_shadowinv.physics.poisson import border_mean
+from napari_shadowinv.physics.units import label
 from napari_shadowinv.transport.linear import FactorisedLaplacian, LaplacianSolver
 from napari_shadowinv.transport.objective import TransportObjective
 from napari_shadowinv.transport.sites import SitePlan

@@ -29,8 +29,7 @@ from napari_shadowinv.inversion.budget import Errors
 from napari_shadowinv.inversion.solution_checks import image_residual
 from napari_shadowinv.inversion.variables import VARIABLES, dataset_from_field
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.physics.labels import label, numbers_of
-from napari_shadowinv.physics.units import peak_facts, shown_fields
+from napari_shadowinv.physics.units import label, numbers_of, peak_facts, shown_fields
 from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:

@@ -41,7 +41,7 @@ from napari_shadowinv.io.store_checksums import (
     is_along_shots,
 )
 from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, Column, columns_of
-from napari_shadowinv.physics.labels import place_label
+from napari_shadowinv.physics.units import place_label
 
 if TYPE_CHECKING:
     import xarray

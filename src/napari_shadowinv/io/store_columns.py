@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
 
-from napari_shadowinv.physics.labels import PIXEL, display_unit
+from napari_shadowinv.physics.units import PIXEL, display_unit
 
 # Kinds of stores
 INVERSIONS = "inversions"

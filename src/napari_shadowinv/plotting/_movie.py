@@ -22,8 +22,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.files import replacing
-from napari_shadowinv.physics.labels import display_unit
-from napari_shadowinv.physics.units import prefix_for, takes_prefix
+from napari_shadowinv.physics.units import display_unit, prefix_for, takes_prefix
 from napari_shadowinv.plotting._panels import STYLE, choose_grid, image_scale, new_page
 
 if TYPE_CHECKING:

@@ -20,16 +20,16 @@ from .filters import (
     ButterworthFilter,
     Filter,
     HighPassFilter,
+    HotPixelFilter,
     LowPassFilter,
     butterworth,
     high_pass,
     low_pass,
     remove_background,
+    remove_hot_pixels,
 )
-from .hot_pixels import HotPixelFilter, remove_hot_pixels
 from .image_checks import ReferencePair, image_warnings
 from .pixels import fit_polynomial, interpolated_source
-from .radiograph import Radiograph
 from .recipe import (
     ESTIMATES,
     FILTERS,
@@ -40,7 +40,7 @@ from .recipe import (
     check_masks,
     estimate_source,
 )
-from .steps import Bin, Choice, Crop, Dark, Rotate, Step
+from .steps import Bin, Choice, Crop, Dark, Radiograph, Rotate, Step
 
 __all__ = [
     "ESTIMATES",

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import scipy
@@ -50,10 +50,6 @@ from napari_shadowinv.preprocessing.pixels import (
     interpolated_source,
 )
 from napari_shadowinv.preprocessing.steps import Choice, degree_field, width_field
-
-if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import Setup
-
 
 _LEAST_SUPPORT = 1e-6
 _NARROWEST_WAVES = 2.0  # px; a Gaussian that is narrower has waves too short for the pixels

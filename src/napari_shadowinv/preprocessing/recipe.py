@@ -21,11 +21,9 @@ from napari_shadowinv.cautions import Caution, warn_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.preprocessing import estimates, hot_pixels  # noqa: F401
 from napari_shadowinv.preprocessing.estimates import Estimate
-from napari_shadowinv.preprocessing.filters import Filter
-from napari_shadowinv.preprocessing.radiograph import Radiograph
-from napari_shadowinv.preprocessing.steps import Choice, Dark, Step, choices_of
+from napari_shadowinv.preprocessing.filters import Filter, HotPixelFilter
+from napari_shadowinv.preprocessing.steps import Choice, Dark, Radiograph, Step, choices_of
 
 if TYPE_CHECKING:
     from napari_shadowinv._system.progress import ShouldStop
@@ -59,7 +57,7 @@ FILTERS = {name: step for name, step in STEPS.items() if issubclass(step, Filter
 FIT_STEPS = {
     name: step
     for name, step in STEPS.items()
-    if name not in FILTERS or issubclass(step, hot_pixels.HotPixelFilter)
+    if name not in FILTERS or issubclass(step, HotPixelFilter)
 }
 ESTIMATES = choices_of(Estimate)
 
