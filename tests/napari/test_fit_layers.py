@@ -12,8 +12,8 @@ from napari.components import ViewerModel
 
 from napari_shadowinv import ProtonSetup, read, write
 from napari_shadowinv._napari.fit_layers import fit_layers
-from napari_shadowinv._napari.frame import Frame
 from napari_shadowinv._napari.layer_metadata import (
+    Frame,
     Result,
     displacement_of,
     layer_key,
@@ -22,8 +22,8 @@ from napari_shadowinv._napari.layer_metadata import (
     role_of,
     unit_of,
 )
-from napari_shadowinv._napari.layer_state import missing_layers
 from napari_shadowinv._napari.layers import add_layers
+from napari_shadowinv._napari.result_files import missing_layers
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.fitting import Fit, FitOptions, Verdict, fit
 from napari_shadowinv.inversion import Inversion

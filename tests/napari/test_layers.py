@@ -11,10 +11,15 @@ import pytest
 from napari.components import ViewerModel
 
 from napari_shadowinv import InputError, OpticalSetup, ProtonSetup, add_inversion, invert
-from napari_shadowinv._napari.frame import frame_for, place_image
-from napari_shadowinv._napari.layer_metadata import result_of, role_of, setup_of, unit_of
-from napari_shadowinv._napari.layers import inversion_layers, sample_arrows
-from napari_shadowinv._napari.sites import power_cells
+from napari_shadowinv._napari.layer_metadata import (
+    frame_for,
+    place_image,
+    result_of,
+    role_of,
+    setup_of,
+    unit_of,
+)
+from napari_shadowinv._napari.layers import inversion_layers, power_cells, sample_arrows
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion import Inversion
 

@@ -23,9 +23,9 @@ from napari_shadowinv._napari.layer_metadata import (
     setup_of,
     source_of,
 )
-from napari_shadowinv._napari.layer_state import missing_layers
 from napari_shadowinv._napari.layers import add_layers, sample_arrows
 from napari_shadowinv._napari.reader import get_reader, read_paths
+from napari_shadowinv._napari.result_files import missing_layers
 from napari_shadowinv._napari.stores import follow_shots
 from napari_shadowinv._napari.widgets._layers import warnings_of
 from napari_shadowinv.inversion import Inversion

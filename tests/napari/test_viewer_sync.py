@@ -8,8 +8,7 @@ import numpy as np
 from napari.components import ViewerModel
 
 from napari_shadowinv import ProtonSetup, add_inversion
-from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.layer_metadata import metadata_for, role_of
+from napari_shadowinv._napari.layer_metadata import frame_of, metadata_for, role_of
 from napari_shadowinv.inversion import Inversion
 
 

@@ -12,7 +12,7 @@ from napari.components import ViewerModel
 
 from napari_shadowinv import FileFormatError, ProtonSetup, add_inversion, read
 from napari_shadowinv._napari.layer_metadata import metadata_of, result_of, role_of
-from napari_shadowinv._napari.writer import write_result
+from napari_shadowinv._napari.result_files import write_result
 from napari_shadowinv.inversion import Inversion
 
 PLUGIN = "napari-shadowinv"

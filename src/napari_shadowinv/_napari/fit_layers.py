@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from napari_shadowinv._napari.frame import Frame
 from napari_shadowinv._napari.layer_metadata import (
     KEY,
     KINDS,
+    Frame,
     Result,
     layer_name,
     metadata_for,

@@ -14,11 +14,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from napari_shadowinv._napari.fit_layers import fit_layers
-from napari_shadowinv._napari.frame import Frame, frame_of
 from napari_shadowinv._napari.layer_metadata import (
     KEY,
     SOURCE,
+    Frame,
     Result,
+    frame_of,
     metadata_of,
     result_of,
     role_of,

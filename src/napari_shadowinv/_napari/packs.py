@@ -17,9 +17,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from napari_shadowinv._napari.frame import Frame, frame_for
 from napari_shadowinv._napari.jobs import Job
-from napari_shadowinv._napari.layer_metadata import CAME_WITH, Kind, Result, metadata_for
+from napari_shadowinv._napari.layer_metadata import (
+    CAME_WITH,
+    Frame,
+    Kind,
+    Result,
+    frame_for,
+    metadata_for,
+)
 from napari_shadowinv._napari.layers import FullLayerData, Limits
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._system.progress import OnProgress, ShouldStop

@@ -84,7 +84,7 @@ def _matches(pattern: str) -> list[Path]:
 @as_file_errors
 def _read_file(path: Path) -> list[FullLayerData]:
     from napari_shadowinv._napari.layer_metadata import result_of
-    from napari_shadowinv._napari.layer_state import layers_of_dataset
+    from napari_shadowinv._napari.result_files import layers_of_dataset
     from napari_shadowinv._napari.shots import radiograph_layers
     from napari_shadowinv.io import Radiograph, read
 

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv import io
-from napari_shadowinv._napari.frame import Frame, frame_for
 from napari_shadowinv._napari.layer_metadata import (
     CAME_WITH,
     MASK,
     SHOT,
     SOURCE,
+    Frame,
+    frame_for,
     metadata_for,
     metadata_of,
     role_of,

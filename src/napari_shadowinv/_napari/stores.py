@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._napari.frame import frame_for
-from napari_shadowinv._napari.layer_metadata import metadata_of, role_of
+from napari_shadowinv._napari.layer_metadata import frame_for, metadata_of, role_of
 from napari_shadowinv._napari.layers import (
     FullLayerData,
     arrows_in_shot,

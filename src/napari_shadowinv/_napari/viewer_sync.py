@@ -14,8 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from napari_shadowinv._napari.frame import Frame, frame_of
-from napari_shadowinv._napari.layer_metadata import metadata_of, role_of
+from napari_shadowinv._napari.layer_metadata import Frame, frame_of, metadata_of, role_of
 from napari_shadowinv.errors import InputError
 
 USER_ERRORS = (InputError, OSError, MemoryError)

@@ -18,8 +18,13 @@ from napari.utils import progress
 
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari import jobs
-from napari_shadowinv._napari.frame import frame_of
-from napari_shadowinv._napari.layer_metadata import metadata_for, result_of, role_of, unit_of
+from napari_shadowinv._napari.layer_metadata import (
+    frame_of,
+    metadata_for,
+    result_of,
+    role_of,
+    unit_of,
+)
 from napari_shadowinv._napari.viewer_sync import window_text
 from napari_shadowinv._napari.widgets import _panels
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot

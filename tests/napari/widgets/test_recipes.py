@@ -13,10 +13,15 @@ from qtpy.QtWidgets import QFileDialog
 from typer.testing import CliRunner
 
 from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
-from napari_shadowinv._napari.frame import Frame, frame_of
-from napari_shadowinv._napari.layer_metadata import metadata_for, role_of, setup_origin_of
+from napari_shadowinv._napari.layer_metadata import (
+    Frame,
+    frame_of,
+    metadata_for,
+    role_of,
+    setup_origin_of,
+)
 from napari_shadowinv._napari.layers import add_inversion
-from napari_shadowinv._napari.widgets import _recipes
+from napari_shadowinv._napari.widgets import _files
 from napari_shadowinv._napari.widgets._forms import StepsSection
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
@@ -313,7 +318,7 @@ def test_the_selected_result_is_repeated_from_its_files(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     said: list[str] = []
-    monkeypatch.setattr(_recipes, "show_info", said.append)
+    monkeypatch.setattr(_files, "show_info", said.append)
     tool = opened(InvertShot)
     tool.options.set_values({"n_sites": 200})
     tool.recipes.repeat()

@@ -25,9 +25,8 @@ from napari_shadowinv._napari.layers import add_inversion
 from napari_shadowinv._napari.widgets._forms import dump_toml
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
-from napari_shadowinv._napari.widgets.estimate_source import EstimateSource
 from napari_shadowinv._napari.widgets.forward_model import ForwardModel
-from napari_shadowinv._napari.widgets.invert_shot import InvertShot
+from napari_shadowinv._napari.widgets.invert_shot import EstimateSource, InvertShot
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image

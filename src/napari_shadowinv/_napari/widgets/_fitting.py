@@ -26,8 +26,7 @@ from napari_shadowinv._napari.widgets._forms import (
     wrapping_label,
 )
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, fact_rows
-from napari_shadowinv._napari.widgets._plots import ObjectiveCurve
-from napari_shadowinv._napari.widgets._qt import column, timer
+from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
 from napari_shadowinv.fitting import Fit, Verdict
 

@@ -18,9 +18,9 @@ from napari_shadowinv._napari.shots import radiograph_of, source_of_shot
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
+from napari_shadowinv._napari.widgets._files import RecipeButton
 from napari_shadowinv._napari.widgets._forms import StepsSection
 from napari_shadowinv._napari.widgets._qt import column
-from napari_shadowinv._napari.widgets._recipes import RecipeButton
 from napari_shadowinv._napari.widgets._results import Origins
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv._typing import BoolArray

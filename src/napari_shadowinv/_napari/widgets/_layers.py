@@ -10,7 +10,7 @@ from qtpy.QtCore import QObject, QSignalBlocker, Signal
 from qtpy.QtWidgets import QCheckBox, QWidget
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.frame import frame_of
+from napari_shadowinv._napari.layer_metadata import frame_of
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import labelled, with_button
 from napari_shadowinv._napari.widgets._qt import column, notify_errors, while_alive

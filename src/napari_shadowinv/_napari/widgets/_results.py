@@ -11,8 +11,13 @@ from napari.utils.notifications import show_warning
 from qtpy.QtCore import QObject, Signal
 from qtpy.QtWidgets import QCheckBox
 
-from napari_shadowinv._napari.frame import Frame, frame_for, frame_of, place_image
-from napari_shadowinv._napari.layer_metadata import layer_key
+from napari_shadowinv._napari.layer_metadata import (
+    Frame,
+    frame_for,
+    frame_of,
+    layer_key,
+    place_image,
+)
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import timer
 

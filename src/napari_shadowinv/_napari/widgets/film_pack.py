@@ -14,18 +14,18 @@ from qtpy import QtWidgets
 from qtpy.QtCore import QObject, Qt
 
 from napari_shadowinv._napari import packs
-from napari_shadowinv._napari.frame import frame_of
 from napari_shadowinv._napari.jobs import Finished
 from napari_shadowinv._napari.layer_metadata import (
     Result,
+    frame_of,
     may_be_mask,
     metadata_for,
     metadata_of,
     result_of,
     role_of,
 )
-from napari_shadowinv._napari.layer_state import dataset_of_layers
 from napari_shadowinv._napari.packs import PackJob
+from napari_shadowinv._napari.result_files import dataset_of_layers
 from napari_shadowinv._napari.viewer_sync import plane_in_view, window_text
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._forms import (
@@ -37,7 +37,7 @@ from napari_shadowinv._napari.widgets._forms import (
 )
 from napari_shadowinv._napari.widgets._layers import LayerPicker, LayerWatch, mask_of, new_shapes
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, ToolPanel, fact_rows
-from napari_shadowinv._napari.widgets._plots import COLOURS, Plot
+from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.hidden_files import temporary_folder
 from napari_shadowinv._typing import AnyArray, FloatArray

@@ -12,6 +12,14 @@ from napari_shadowinv._napari.jobs import PACE, Finished, FitJob, estimate_fit_t
 from napari_shadowinv._napari.shots import radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
+from napari_shadowinv._napari.widgets._files import (
+    FitRecipeButton,
+    MoreLayersButton,
+    SaveButton,
+    field_of,
+    result_to_save,
+    shown_result,
+)
 from napari_shadowinv._napari.widgets._fitting import FitView
 from napari_shadowinv._napari.widgets._forms import StepsSection
 from napari_shadowinv._napari.widgets._inputs import (
@@ -28,15 +36,7 @@ from napari_shadowinv._napari.widgets._inputs import (
 )
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._qt import side_by_side, while_alive
-from napari_shadowinv._napari.widgets._recipes import FitRecipeButton
 from napari_shadowinv._napari.widgets._results import LastResults, result_frame
-from napari_shadowinv._napari.widgets._saving import (
-    MoreLayersButton,
-    SaveButton,
-    field_of,
-    result_to_save,
-    shown_result,
-)
 from napari_shadowinv._napari.widgets._tables import ImageRow, ImageTable, beam_column
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import InputError

@@ -1,30 +1,60 @@
-"""The widget that inverts a shot: `InvertShot`."""
+"""The widgets for a single shot: `InvertShot`, and `EstimateSource` for its beam."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._napari.jobs import (
     Finished,
     FitJob,
     InversionJob,
+    Job,
     duration_in_words,
     name_of_result,
     refinement,
 )
 from napari_shadowinv._napari.layer_metadata import (
+    SOURCE,
     Result,
+    frame_of,
+    metadata_for,
     metadata_of,
     result_of,
+    setup_of,
+    setup_origin_of,
 )
-from napari_shadowinv._napari.shots import radiograph_of
+from napari_shadowinv._napari.layers import FullLayerData
+from napari_shadowinv._napari.shots import load_radiograph, radiograph_of
 from napari_shadowinv._napari.viewer_sync import show_caution
-from napari_shadowinv._napari.widgets import _forms as forms
-from napari_shadowinv._napari.widgets import _layers as layers
+from napari_shadowinv._napari.widgets._files import (
+    MoreLayersButton,
+    SaveButton,
+    field_of,
+    result_to_save,
+    shown_result,
+)
 from napari_shadowinv._napari.widgets._fitting import FitView, RefineSection
+from napari_shadowinv._napari.widgets._forms import (
+    PROBLEM_STYLE,
+    ModelPicker,
+    kinds_of,
+    labelled,
+    with_button,
+    wrapping_label,
+)
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
+from napari_shadowinv._napari.widgets._layers import (
+    LayerPicker,
+    LayerWatch,
+    MaskPicker,
+    ShotPicker,
+    image_of,
+    new_shapes,
+    warnings_of,
+)
 from napari_shadowinv._napari.widgets._panels import (
     FoldedReport,
     LivePanel,
@@ -33,27 +63,18 @@ from napari_shadowinv._napari.widgets._panels import (
     fact_rows,
 )
 from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, while_alive
-from napari_shadowinv._napari.widgets._results import (
-    ResultLayers,
-    place_inputs,
-    result_frame,
-)
-from napari_shadowinv._napari.widgets._saving import (
-    MoreLayersButton,
-    SaveButton,
-    field_of,
-    result_to_save,
-    shown_result,
-)
+from napari_shadowinv._napari.widgets._results import ResultLayers, place_inputs, result_frame
 from napari_shadowinv._system.machine import physical_memory
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level, ResultKind
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.pipeline import Cache
-from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
-from napari_shadowinv.preprocessing import Recipe
+from napari_shadowinv.pipeline.inversion_run import PREVIEW_PIXELS, PREVIEW_SITES
+from napari_shadowinv.preprocessing import ESTIMATES, Estimate, Radiograph, Recipe, estimate_source
 
 if TYPE_CHECKING:
     import napari
@@ -126,7 +147,7 @@ class InvertShot(InversionInputs, LivePanel):
         self._ready = True
 
     def _build(self) -> None:
-        self.image = layers.ShotPicker(self.viewer)
+        self.image = ShotPicker(self.viewer)
         self.make_inputs(
             lambda: self.image.layer,
             ("labels", "shapes"),
@@ -136,11 +157,11 @@ class InvertShot(InversionInputs, LivePanel):
             "inversion still uses these pixels.",
         )
         tip = "<qt>Shapes layer with a rectangle; only the image inside is inverted.</qt>"
-        self.crop = layers.LayerPicker(self.viewer, ("shapes",), tip, none="none")
+        self.crop = LayerPicker(self.viewer, ("shapes",), tip, none="none")
         self.live.setToolTip(
             f"<qt>Update the field after each change, with at most {PREVIEW_SITES:,} sites.</qt>"
         )
-        self.cost, self._pace = forms.wrapping_label(), 1.0
+        self.cost, self._pace = wrapping_label(), 1.0
         self.refine_section = RefineSection(self.refine)
         self.fit_view = FitView(self.viewer, self.panel)
         self._refined = ResultLayers(self.viewer, self)
@@ -154,18 +175,18 @@ class InvertShot(InversionInputs, LivePanel):
         )
         self.save_result = save
         self.more_layers = MoreLayersButton(self, self._last_results)
-        crop = forms.with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
-        self.add(forms.labelled("Image", self.image), *self.beam, forms.labelled("Crop", crop))
+        crop = with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
+        self.add(labelled("Image", self.image), *self.beam, labelled("Crop", crop))
         self.add(*self.settings, self.live, self.keep_earlier, self.cost, self.panel)
         self.add(self.verdict, side_by_side((save, 1), (self.more_layers, 1)), self.report)
         self.add(self.refine_section, self.fit_view)
 
     def _connect(self) -> None:
         self.image.picked.connect(self._on_image)
-        edits = layers.LayerWatch(
+        edits = LayerWatch(
             self, (self.image, self.masks, self.source_masks, self.crop, self.source.layers)
         )
-        layers.LayerWatch(self, (self.image,)).edited.connect(self._forget_report)
+        LayerWatch(self, (self.image,)).edited.connect(self._forget_report)
         # Also for runs that are cancelled, or refused before they start.
         self.panel.button.clicked.connect(self._empty_report)
         self.panel.runner.started.connect(self._on_start)
@@ -176,13 +197,13 @@ class InvertShot(InversionInputs, LivePanel):
 
     def request(self, preview: bool = False) -> InversionJob:
         layer: Any = self.image.layer
-        image = layers.image_of(layer)
+        image = image_of(layer)
         recipe = self.recipe()
         mask = self.masks.usable(layer)
         self.source.check(mask)
         shot = replace(
             radiograph_of(layer, image),
-            warnings=layers.warnings_of(layer),
+            warnings=warnings_of(layer),
             mask=mask,
             source_mask=self.hidden_from_source(layer),
         )
@@ -319,13 +340,13 @@ class InvertShot(InversionInputs, LivePanel):
         """Show the estimated time and memory for large images."""
         try:
             recipe = Recipe(steps=self.all_steps())
-            shape = recipe.shape_after(layers.image_of(self.image.layer).shape)
+            shape = recipe.shape_after(image_of(self.image.layer).shape)
             cost = estimate_cost(shape, self.options.model(), self._pace)  # type: ignore[arg-type]
         except InputError:
             self.cost.setVisible(False)  # Run reports the problem
             return
         self.cost.setText(cost.text)
-        self.cost.setStyleSheet(forms.PROBLEM_STYLE if cost.exceeds_memory else "")
+        self.cost.setStyleSheet(PROBLEM_STYLE if cost.exceeds_memory else "")
         self.cost.setVisible(bool(cost.text))
 
     def _learn_pace(self, inversion: Inversion) -> None:
@@ -356,5 +377,85 @@ class InvertShot(InversionInputs, LivePanel):
 
     @notify_errors
     def _draw_crop(self) -> None:
-        layers.image_of(self.image.layer)
-        self.crop.layer = layers.new_shapes(self.viewer, self.image.layer, "crop", "add_rectangle")
+        image_of(self.image.layer)
+        self.crop.layer = new_shapes(self.viewer, self.image.layer, "crop", "add_rectangle")
+
+
+@dataclass(frozen=True, eq=False)
+class SourceJob(Job):
+    estimate: Estimate
+    shot: Radiograph  # its image may be lazy
+    image: Any
+    made_from: dict[str, str]
+    preview: bool
+
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FloatArray:
+        report = Reporter(on_progress, should_stop)
+        report("source", 0, None, self.estimate.title)
+        shot = load_radiograph(self.shot, "the image")
+        max_pixels = PREVIEW_PIXELS if self.preview else None
+        by = partial(Cache().source, self.estimate, most_pixels=max_pixels)
+        source = estimate_source(self.estimate, shot, should_stop, by=by)
+        report("source", 1, 1)
+        return source
+
+    def layers(self, content: FloatArray) -> list[FullLayerData]:
+        """Describe the source as a layer over its image."""
+        layer: Any = self.image
+        layer_data = (
+            content,
+            {
+                "name": f"{layer.name} source{' preview' if self.preview else ''}",
+                "metadata": metadata_for(
+                    SOURCE,
+                    "",
+                    setup_of(layer),
+                    setup_origin=setup_origin_of(layer),
+                    made_from=self.made_from,
+                    source_mask=self.shot.source_mask,
+                ),
+                "colormap": layer.colormap.name,
+                "contrast_limits": tuple(layer.contrast_limits),
+                **frame_of(layer).keywords(),
+            },
+            "image",
+        )
+        return [layer_data]
+
+
+class EstimateSource(LivePanel):
+    """Choose a shot and a method, and add the estimated source as an image layer."""
+
+    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+        tip = "Estimate the beam and add it as an image layer."
+        super().__init__(viewer, "estimate-source", RunPanel("Estimate source", "Estimate", tip))
+        self.image = ShotPicker(viewer)
+        tip = "Labels or shapes on pixels that the estimate ignores."
+        self.masks = MaskPicker(viewer, lambda: self.image.layer, ("labels", "shapes"), tip)
+        self.method = ModelPicker("Method", kinds_of(ESTIMATES))
+        self.method.set_kind("total-variation")
+        self.live.setToolTip("Update the estimate after each change.")
+        self.add(labelled("Image", self.image), self.masks, self.method)
+        self.add(self.live, self.keep_earlier, self.panel)
+        edits = LayerWatch(self, (self.image, self.masks))
+        for signal in (self.image.picked, self.masks.changed, self.method.changed, edits.edited):
+            signal.connect(self.on_change)
+        self.restore_last()
+        self._ready = True
+
+    def parts(self) -> dict[str, Any]:
+        return {"method": self.method, "painted_is_unusable": self.masks}
+
+    def request(self, preview: bool = False) -> SourceJob:
+        layer: Any = self.image.layer
+        image = image_of(layer)
+        mask = self.masks.usable(layer)
+        model: Any = self.method.model()
+        estimate = model.adapt_to(setup_of(layer), image.shape)
+        made_from = {"image": layer.name, "estimate": estimate.summary}
+        if mask is not None:
+            made_from["source_mask"] = self.masks.summary(layer)
+        return SourceJob(estimate, Radiograph(image, source_mask=mask), layer, made_from, preview)
+
+    def show_result(self, finished: Finished, job: SourceJob) -> None:
+        self.show_layers(job.image, finished.layer_data, job.preview)

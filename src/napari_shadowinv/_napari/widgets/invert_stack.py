@@ -15,19 +15,19 @@ from qtpy.QtWidgets import QCheckBox, QFileDialog, QHeaderView, QLabel, QLineEdi
 
 from napari_shadowinv._napari.layer_metadata import main_layers, may_be_shot, role_of
 from napari_shadowinv._napari.stores import follow_shots, shot_rows
-from napari_shadowinv._napari.widgets._forms import PathEdit, RowPicker, labelled
-from napari_shadowinv._napari.widgets._inputs import InversionInputs
-from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
-from napari_shadowinv._napari.widgets._panels import Outcome, ReportTable, RunPanel, ToolPanel
-from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, timer, while_alive
-from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
-from napari_shadowinv._napari.widgets._saving import (
+from napari_shadowinv._napari.widgets._files import (
     MoreLayersButton,
     SaveButton,
     field_of,
     shot_to_save,
     shown_result,
 )
+from napari_shadowinv._napari.widgets._forms import PathEdit, RowPicker, labelled
+from napari_shadowinv._napari.widgets._inputs import InversionInputs
+from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
+from napari_shadowinv._napari.widgets._panels import Outcome, ReportTable, RunPanel, ToolPanel
+from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, timer, while_alive
+from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
 from napari_shadowinv._napari.widgets._stack_jobs import (
     FolderEdit,
     StackJob,

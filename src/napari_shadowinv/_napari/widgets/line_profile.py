@@ -20,7 +20,7 @@ from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._layers import LayerPicker, kind_of, new_shapes, shown_plane
 from napari_shadowinv._napari.widgets._panels import WIDTH
-from napari_shadowinv._napari.widgets._plots import COLOURS, Plot
+from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 
