@@ -30,7 +30,7 @@ from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.io.store_writing import ShotWriter
 from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import read_shot
-from napari_shadowinv.stack._sources import reader_text
+from napari_shadowinv.stack._shots import reader_text
 
 OPTIONS = InversionOptions(n_sites=100)
 

@@ -13,7 +13,7 @@ import xarray as xr
 from napari_shadowinv import invert_stack, run_stack, synthetic_image
 from napari_shadowinv.io.store import DONE
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.stack._discovery import find_shots
+from napari_shadowinv.stack._shots import find_shots
 
 SHAPE, COUNT = (32, 36), 4
 
@@ -85,4 +85,4 @@ def test_slice_of_shots_holds_its_shots(kind, images, tmp_path):
     part = items[1:3]
     assert len(part) == 2
     for shot, image in zip(part, images[1:3], strict=True):
-        np.testing.assert_array_equal(shot.load()[0], image)
+        np.testing.assert_array_equal(shot.images.read()[0], image)

@@ -350,8 +350,8 @@ def test_a_row_is_repeated_from_its_provenance(pack: Path) -> None:
         reader=read_shot,
         warm_start=1,
     )
-    work = stack.work(("potential",))
-    inversion = work.invert(stack.shots.items[0].load()[0], stack.beam, workers=1)
+    images, _ = stack.shots.items[0].images.load()
+    inversion = stack.task.run(images, stack.beam, workers=1)
     write("film0.shadowinv", inversion)
     assert rerun("film0.shadowinv").is_identical
     assert "brightness 1.25 (the image was divided by it)" in flat(

@@ -10,9 +10,8 @@
 
 from napari_shadowinv.stack._lazy import invert_stack, stack_statistics
 from napari_shadowinv.stack._plan import STORED
-from napari_shadowinv.stack._run import run_stack
-from napari_shadowinv.stack._sources import read_shot
-from napari_shadowinv.stack._status import RunStatus
+from napari_shadowinv.stack._run import RunStatus, run_stack
+from napari_shadowinv.stack._shots import read_shot
 from napari_shadowinv.stack._worker import ShotOutcome
 from napari_shadowinv.stack.watch import watch_stack
 

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from importlib import import_module
 from multiprocessing import resource_tracker
 from typing import Any
@@ -24,7 +25,7 @@ from napari_shadowinv._system.hidden_files import temporary_folder
 from napari_shadowinv._system.machine import available_threads, defer_interrupts
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.stack._sources import BlockShot, Shot
+from napari_shadowinv.stack._shots import BlockReference, ImageReference, Shot
 
 _ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
 _TRIMMING = "MALLOC_TRIM_THRESHOLD_"
@@ -150,8 +151,11 @@ class _Threads:
         return value
 
     def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
-        """Start ``task(shots, *args)``; the future has `add_done_callback` and `cancel`."""
-        return self._pool.submit(task, shots, *args)
+        """Start ``task(shots, blocks, *args)``, where a block is the computed image of a shot.
+
+        The future has `add_done_callback` and `cancel`.
+        """
+        return self._pool.submit(task, shots, [None] * len(shots), *args)
 
     def result(self, future: Any) -> Any:
         """Return the result of a task, or None if its worker died and it is repeated.
@@ -209,13 +213,17 @@ class _Cluster:
     def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
         # A dask array may live on the cluster already, so its blocks are the cluster's tasks.
         with self._as_engine_error():
-            handed = [
-                self._client.compute(shot.block.to_delayed().ravel()[0])
-                if isinstance(shot, BlockShot)
-                else shot
+            blocks = [
+                self._client.compute(shot.images.block.to_delayed().ravel()[0])
+                if isinstance(shot.images, BlockReference)
+                else None
                 for shot in shots
             ]
-            return self._client.submit(task, handed, *args, pure=False)
+            bare = [
+                shot if block is None else replace(shot, images=ImageReference())
+                for shot, block in zip(shots, blocks, strict=True)
+            ]
+            return self._client.submit(task, bare, blocks, *args, pure=False)
 
     def result(self, future: Any) -> Any:
         from distributed.scheduler import KilledWorker

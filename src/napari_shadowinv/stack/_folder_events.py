@@ -18,7 +18,7 @@ from typing import Any
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order
-from napari_shadowinv.stack._sources import stamp
+from napari_shadowinv.stack._shots import stamp
 
 _POLL_S = 1.0  # between two looks at a folder without file-system events
 _FOLDER_CHECK_S = 1.0  # between two checks that the folder still exists

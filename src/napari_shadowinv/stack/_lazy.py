@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -15,16 +16,22 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._system.validation import check_instance
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.variables import SETUPS_LABEL, variable_labels
+from napari_shadowinv.inversion.variables import SETUPS_LABEL
 from napari_shadowinv.io.store import DONE, with_places
 from napari_shadowinv.io.store_columns import INVERSIONS, column_values, columns_of
 from napari_shadowinv.physics.setup import SETUPS
 from napari_shadowinv.preprocessing import Recipe
-from napari_shadowinv.stack import _plan
-from napari_shadowinv.stack._plan import choose_sites
-from napari_shadowinv.stack._shots import Stack
-from napari_shadowinv.stack._sources import Reader, Shot, read_shot
-from napari_shadowinv.stack._worker import Beam, Work
+from napari_shadowinv.stack._plan import (
+    Stack,
+    attributes_of,
+    choose_sites,
+    coordinates_of,
+    describe_stack,
+    dtype_of,
+    values_of_beam,
+)
+from napari_shadowinv.stack._shots import ArrayReference, ImageReference, Reader, Shot, read_shot
+from napari_shadowinv.stack._worker import Beam, Task
 
 if TYPE_CHECKING:
     import xarray
@@ -184,7 +191,7 @@ def invert_stack(
             "the recipe has a section fit, and invert_stack inverts: use run_stack to fit, or "
             "leave the section out"
         )
-    stack = _plan.describe_stack(
+    stack = describe_stack(
         shots,
         recipe,
         variables=variables,
@@ -199,24 +206,23 @@ def invert_stack(
 
 def _invert(
     label: str,
-    shot: Any,
-    beam: Beam | Shot | None,
-    work: Work,
+    shot: Shot,
+    block: AnyArray | None,
+    beam: Beam | None,
+    task: Task,
     previous: dict[str, Any] | None = None,
     keep: bool = False,
 ) -> dict[str, Any]:
     """Invert one shot; return its variables, and the inversion if the next shot starts from it."""
     try:
-        image = shot[0] if isinstance(shot, np.ndarray) else shot.load()[0]
+        images, _ = (shot.images if block is None else ArrayReference(block[0])).load()
+        source = None if shot.source is None else shot.source.images.read()[0]
         start = None if previous is None else previous["inversion"]
-        if beam is None or isinstance(beam, Beam):
-            inversion = work.invert(image, beam, start=start)
-        else:
-            inversion = work.invert(image, None, beam.load()[0], start=start)
+        inversion = task.run(images, beam, source, start=start)
     except InputError as error:
         raise InputError(f"{label}: {error}") from error
     return {
-        **work.arrays(inversion),
+        **task.arrays(inversion),
         **column_values(INVERSIONS, inversion),
         **({"inversion": inversion} if keep else {}),
     }
@@ -235,51 +241,51 @@ class _Graph:
         from dask.delayed import delayed
         from dask.highlevelgraph import HighLevelGraph
 
-        self._stack = stack
+        self._stack, shots = stack, stack.shots
         self._token = token = tokenize(
-            stack.shots.items if stack.shots.array is None else stack.shots.array.name,
-            None if stack.sources is None else stack.sources.items,
+            [shot.images for shot in shots.items] if shots.array is None else shots.array.name,
+            [shot.source and shot.source.images for shot in shots.items],
             None if stack.beam is None else stack.beam.key,
             stack.source_text(None),
-            stack.inputs.shot.mask,
-            stack.inputs.shot.source_mask,
-            stack.recipe.model_dump_json(),
-            stack.variables,
+            stack.task.inputs.shot.mask,
+            stack.task.inputs.shot.source_mask,
+            stack.task.recipe.model_dump_json(),
+            stack.task.variables,
             stack.warm_start,
         )
         self._inverted = f"invert-shot-{token}"
-        dependencies: list[Any] = [] if stack.shots.array is None else [stack.shots.array]
+        dependencies: list[Any] = [] if shots.array is None else [shots.array]
         self._beam: Any = None
         if stack.beam is not None:
             # One node, so that a worker gets the source once and not with each shot.
             self._beam = delayed(stack.beam, name=f"beam-{stack.beam.key}", traverse=False)
             dependencies.append(self._beam)
-        work = delayed(stack.work(stack.variables), name=f"work-{token}", traverse=False)
+        task = delayed(stack.task, name=f"task-{token}", traverse=False)
         tasks: dict[Any, Any] = {
-            (self._inverted, index): self._task(index, work.key)
-            for index in range(len(stack.shots))
+            (self._inverted, index): self._task(index, task.key) for index in range(len(shots))
         }
         self._shots = HighLevelGraph.from_collections(
-            self._inverted, tasks, dependencies=[*dependencies, work]
+            self._inverted, tasks, dependencies=[*dependencies, task]
         )
 
-    def _task(self, index: int, work: Any) -> tuple[Any, ...]:
+    def _task(self, index: int, task: Any) -> tuple[Any, ...]:
         stack = self._stack
-        array = stack.shots.array
-        shot = stack.shots.items[index] if array is None else (array.name, index, 0, 0)
-        beam = stack.source_of(index) if self._beam is None else self._beam.key
+        shot, array, block = stack.shots.items[index], stack.shots.array, None
+        if array is not None:
+            shot, block = replace(shot, images=ImageReference()), (array.name, index, 0, 0)
+        beam = None if self._beam is None else self._beam.key
         run = stack.warm_start
         previous = (self._inverted, index - 1) if index % run else None
         keep = run > 1 and (index + 1) % run != 0
-        return (_invert, stack.shots.label(index), shot, beam, work, previous, keep)
+        return (_invert, stack.shots.label(index), shot, block, beam, task, previous, keep)
 
     def dataset(self) -> xarray.Dataset:
         import xarray as xr
 
         stack = self._stack
         variables: dict[str, Any] = {}
-        for name, (dims, labels) in variable_labels(stack.setup).items():
-            if name not in stack.variables:
+        for name, (dims, labels) in stack.task.labels.items():
+            if name not in stack.task.variables:
                 continue
             if stack.is_shared(name):
                 variables[name] = (dims, self._shared_array(name, dims), labels)
@@ -293,9 +299,7 @@ class _Graph:
             if column.value is not None:
                 values = self._per_shot_array(column.key, (), column.kind)
                 variables[column.key] = (("shot",), values, column.labels)
-        dataset = xr.Dataset(
-            variables, coords=_plan.coordinates_of(stack), attrs=_plan.attributes_of(stack)
-        )
+        dataset = xr.Dataset(variables, coords=coordinates_of(stack), attrs=attributes_of(stack))
         return dataset if setups is None else with_places(dataset)
 
     def _per_shot_array(self, name: str, dims: tuple[str, ...], dtype: Any = None) -> Any:
@@ -314,13 +318,13 @@ class _Graph:
         )
         da: Any = import_module("dask.array")
         chunks = ((1,) * sizes["shot"], *((sizes[dim],) for dim in dims))
-        return da.Array(graph, layer, chunks, dtype=dtype or _plan.dtype_of(name))
+        return da.Array(graph, layer, chunks, dtype=dtype or dtype_of(name))
 
     def _shared_array(self, name: str, dims: tuple[str, ...]) -> Any:
         from dask.delayed import delayed
 
-        beam = delayed(_plan.values_of_beam, pure=True)(self._beam, self._stack.recipe.options)
+        beam = delayed(values_of_beam, pure=True)(self._beam, self._stack.task.recipe.options)
         value = delayed(_pick, pure=True)(beam, name, False)
         da: Any = import_module("dask.array")
         shape = tuple(self._stack.sizes[dim] for dim in dims)
-        return da.from_delayed(value, shape, dtype=_plan.dtype_of(name))
+        return da.from_delayed(value, shape, dtype=dtype_of(name))

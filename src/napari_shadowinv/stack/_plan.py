@@ -1,17 +1,16 @@
-"""Description of a stack before any shot is inverted: `describe_stack` returns a `Stack`.
+"""Plan of a stack before any shot is inverted: `describe_stack` returns a `Stack`.
 
 Its number of sites follows from the accuracy: `choose_sites`.
 """
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Collection, Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,13 +25,15 @@ from napari_shadowinv._system.arrays import (
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import check_instance
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.inversion import Inversion, count_sites
+from napari_shadowinv.inversion import count_sites
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, checked_source, number_of_sites
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import sha256, text_of
-from napari_shadowinv.io.store import FORMAT
-from napari_shadowinv.options import FitChoices, InversionOptions
+from napari_shadowinv.io.store import FORMAT, OWN_SETUPS
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Inputs, collect_inputs
 from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.pipeline.shot_table import ShotRow, is_table
@@ -44,27 +45,153 @@ from napari_shadowinv.preprocessing import (
     UniformEstimate,
 )
 from napari_shadowinv.provenance import Origin
-from napari_shadowinv.stack._discovery import Shots, find_shots, find_source, usual_shape
-from napari_shadowinv.stack._shots import FitStack, Stack, TableStack
-from napari_shadowinv.stack._sources import (
+from napari_shadowinv.stack._shots import (
+    ArrayReference,
     Reader,
+    RowsReference,
+    Shot,
+    Shots,
+    checksum,
+    find_shots,
+    find_source,
+    first_image,
     read_shot,
     reader_text,
+    table_shots,
+    usual_shape,
 )
-from napari_shadowinv.stack._table_shots import (
-    RowShot,
-    first_image,
-    object_shots,
-    row_shots,
+from napari_shadowinv.stack._worker import (
+    Beam,
+    FitTask,
+    InvertTask,
+    shared_plan,
+    threads_here,
 )
-from napari_shadowinv.stack._worker import Beam, shared_plan, threads_here
 
-if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import Setup
-
+CHAINED = "each shot from an earlier one, as they arrived"
 
 MAX_TRIED_SHOTS = 10  # at the beginning of a stack
 _DECIDING_SHOTS = 3
+
+# Variables that are stored of an inversion, and of a fit, by default.
+STORED = ("potential", "displacement", "caustic")
+FITTED = ("potential", "displacement", "displacement_uncertainty")
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """Plan of a stack: its shots, the task of each, and everything that they share.
+
+    The beam of a table belongs to rows without source and mask, and is None if any has one. Nothing
+    is stored once for all rows, because a row that is added later may have its own.
+    """
+
+    shots: Shots
+    task: InvertTask | FitTask
+    beam: Beam | None  # to invert, after all steps; None if shots have their own
+    common: AnyArray | None = None  # measured source of rows to invert without one, as recorded
+    reader: str = ""  # name of the reader of the files
+    warm_start: int = 1  # shots in a group, each initialised from the one before
+    as_arrived: bool = False  # whether its shots are numbered as they arrive in a folder
+    chained: bool = False  # whether each shot starts from an earlier one, without groups
+
+    @property
+    def warm_start_text(self) -> str:
+        """Description of the shots that start from others."""
+        return CHAINED if self.chained else str(self.warm_start)
+
+    @property
+    def chooses_sites(self) -> bool:
+        """Whether the number of sites still has to be derived from the accuracy."""
+        is_adaptive = self.beam is not None and self.task.recipe.options.is_adaptive
+        return is_adaptive and isinstance(self.task, InvertTask)
+
+    def with_sites(self, n_sites: int) -> Stack:
+        """Return the stack with the number of sites derived from the accuracy."""
+        assert isinstance(self.task, InvertTask)
+        return replace(self, task=self.task.with_sites(n_sites))
+
+    @cached_property
+    def sizes(self) -> dict[str, int]:
+        height, width = self.task.shape
+        sizes = {"shot": len(self.shots), "y": height, "x": width, "component": 2}
+        if isinstance(self.task, FitTask):
+            return sizes
+        # Sites of shots with their own beams are stored only if they do not depend on the beam.
+        beam = self.beam or Beam.of(self.task.shape, None, self.task.moved.mask)
+        return {**sizes, "site": count_sites(beam.image, self.task.recipe.options, mask=beam.mask)}
+
+    @property
+    def setup_texts(self) -> dict[str, str]:
+        """Description of the setup, for the store's identity."""
+        if self.task.by_row:
+            return {OWN_SETUPS: "a row for each shot"}
+        setup = self.task.setup
+        return {OWN_SETUPS: "", "setup": "" if setup is None else setup.model_dump_json()}
+
+    @property
+    def setups(self) -> list[str] | None:
+        """The setup of each shot after the steps, as JSON; None unless they have their own."""
+        if not self.task.by_row or self.task.setup is None:
+            return None
+        bare = replace(self.task.inputs.shot, mask=None, source_mask=None)
+        moved = (
+            self.task.recipe.move(replace(bare, setup=_row_of(shot).setup)).setup
+            for shot in self.shots.items
+        )
+        return ["" if setup is None else setup.model_dump_json() for setup in moved]
+
+    def source_text(self, shots: int | None) -> str:
+        """Describe the source of the first shots."""
+        estimate = self.task.recipe.estimate
+        if isinstance(self.task, InvertTask) and self.task.by_row:
+            if self.common is not None:
+                return f"sha256 {checksum(self.common)}"
+            if self.task.estimate is None:
+                return "uniform"
+        sources = [shot.source.name for shot in self.shots.items[:shots] if shot.source is not None]
+        if sources:
+            return f"one for each shot: {', '.join(sources)}"
+        if self.beam is not None and self.beam.source is not None:
+            return f"sha256 {checksum(self.beam.source)}"
+        if self.beam is None and estimate is not None:
+            return f"estimated from each shot: {estimate.model_dump_json()}"
+        return "uniform"
+
+    def is_shared(self, name: str) -> bool:
+        """Return whether all shots share a variable, which is stored once."""
+        if self.beam is None or self.task.by_row:
+            return False
+        return name in ("sites", "site_mass", "mask") or (
+            name == "source" and self.beam.source is not None
+        )
+
+    @property
+    def shot_task(self) -> InvertTask | FitTask:
+        """The task without the variables that are stored once."""
+        names = tuple(name for name in self.task.variables if not self.is_shared(name))
+        return replace(self.task, variables=names)
+
+    def reordered(self, order: Sequence[int]) -> Stack:
+        """Return the stack with its shots in another order."""
+        return replace(self, shots=self.shots.reordered(order))
+
+    def changed(self, index: int, origin: dict[str, Any]) -> str:
+        """Name the part of a shot that differs from its report; empty if none does."""
+        shot, label = self.shots.items[index], self.shots.label(index)
+        if self.task.by_row and (difference := _row_of(shot).difference(origin)):
+            return f"the row of {label} ({difference})"
+        if not shot.images.unchanged(origin):
+            return label
+        # A common source is compared once, as a part of the store's identity.
+        if shot.source is None or self.common is not None:
+            return ""
+        return "" if shot.source.images.unchanged(origin["source"]) else f"the source of {label}"
+
+
+def _row_of(shot: Shot) -> RowsReference:
+    assert isinstance(shot.images, RowsReference)
+    return shot.images
 
 
 def choose_sites(stack: Stack, should_stop: ShouldStop | None = None) -> Stack:
@@ -81,18 +208,18 @@ def choose_sites(stack: Stack, should_stop: ShouldStop | None = None) -> Stack:
 def needed_shares(stack: Stack, should_stop: ShouldStop | None = None) -> list[float]:
     """Return the share of the default number of sites that each of the first shots needs."""
     assert stack.beam is not None
-    options = stack.recipe.options
-    most = count_sites(stack.beam.image, options, mask=stack.beam.mask)
-    work, needed = stack.work(()), []
+    assert isinstance(stack.task, InvertTask)
+    most = count_sites(stack.beam.image, stack.task.recipe.options, mask=stack.beam.mask)
+    needed = []
     for shot in stack.shots.items[:MAX_TRIED_SHOTS]:
         try:
-            content, _ = shot.load()
-            inversion = work.invert(content, stack.beam, workers=1, should_stop=should_stop)
+            images, _ = shot.images.load()
+            inversion = stack.task.run(images, stack.beam, workers=1, should_stop=should_stop)
         except InversionCancelled:
             raise
         except Exception:  # the error is reported when it is its turn
             continue
-        needed.append(cast("Inversion", inversion).report.n_sites / most)
+        needed.append(inversion.report.n_sites / most)
         if len(needed) == _DECIDING_SHOTS:
             break
     return needed
@@ -101,13 +228,8 @@ def needed_shares(stack: Stack, should_stop: ShouldStop | None = None) -> list[f
 def with_enough_sites(stack: Stack, shares: list[float]) -> Stack:
     """Return the stack with enough sites for each of these shares."""
     # A margin has its own sites, which are not counted here.
-    most = number_of_sites(stack.shape, stack.recipe.options)
+    most = number_of_sites(stack.task.shape, stack.task.recipe.options)
     return stack.with_sites(max(4, round(max(shares, default=1.0) * most)))
-
-
-# Variables that are stored of an inversion, and of a fit, by default.
-STORED = ("potential", "displacement", "caustic")
-FITTED = ("potential", "displacement", "displacement_uncertainty")
 
 
 def describe_stack(
@@ -145,15 +267,46 @@ def describe_stack(
             f"got {len(shot_sources)} sources for {len(stack_shots)} shots: expected one, or one "
             "for each shot"
         )
-    reader_name = reader_text(reader)
+    image = None if sources is None or shot_sources is not None else np.asarray(sources, np.float64)
+    task: InvertTask | FitTask
+    common = None
     if resolved.fit is not None:
-        return _fit_stack(
-            stack_shots, inputs, sources, resolved, variables, warm_start, reader_name
-        )
-    rows = [shot.row for shot in stack_shots.items if isinstance(shot, RowShot)]
+        task, beam = _plan_fit(inputs, shot_sources, image, resolved, variables, warm_start)
+    else:
+        task, beam = _plan_inversion(stack_shots, inputs, image, resolved, variables, warm_start)
+        common = image if task.by_row else None
+    if shot_sources is not None or (common is not None and beam is None):
+        alone = None if common is None else Shot("", ArrayReference(common))
+        stack_shots = _with_sources(stack_shots, shot_sources, alone, by_row=task.by_row)
+    return Stack(stack_shots, task, beam, common, reader_text(reader), warm_start)
+
+
+def _with_sources(
+    shots: Shots, sources: Shots | None, alone: Shot | None, *, by_row: bool
+) -> Shots:
+    """Return the shots with a source of each, or one alone, except rows that name their own."""
+    items = [
+        shot
+        if by_row and shot.rows[0].source is not None
+        else replace(shot, source=alone if sources is None else sources.items[index])
+        for index, shot in enumerate(shots.items)
+    ]
+    return replace(shots, items=items)
+
+
+def _plan_inversion(
+    shots: Shots,
+    inputs: Inputs,
+    source: AnyArray | None,
+    recipe: Recipe,
+    variables: Collection[str] | None,
+    warm_start: int,
+) -> tuple[InvertTask, Beam | None]:
+    """Return the task of an inversion, and the beam that all shots share."""
+    rows = [row for shot in shots.items for row in shot.rows]
     own_masks = any(row.mask is not None for row in rows)
     per_shot = own_masks or any(row.source is not None for row in rows)
-    beam = None if per_shot else _shared_beam(inputs, sources)
+    beam = None if per_shot else _shared_beam(inputs, source)
     if beam is None and warm_start > 1:
         raise InputError(
             f"warm_start is {warm_start} and each shot has its own source or mask: the previous "
@@ -163,23 +316,43 @@ def describe_stack(
     options = inputs.recipe.options
     ragged = own_masks or (beam is None and (options.boundary == "free" or options.is_adaptive))
     chosen = _checked_variables(variables, inputs.recipe, ragged=ragged)
-    if not rows:
-        return Stack(stack_shots, inputs, beam, shot_sources, chosen, warm_start, reader_name)
-    common = (
-        None if sources is None or shot_sources is not None else np.asarray(sources, np.float64)
-    )
-    guess = resolved.estimate
-    return TableStack(
-        stack_shots,
-        inputs,
-        beam,
-        shot_sources,
-        chosen,
-        warm_start,
-        reader_name,
-        common=common,
-        estimate=guess,
-    )
+    task = InvertTask(inputs=inputs, variables=chosen, by_row=bool(rows), estimate=recipe.estimate)
+    return task, beam
+
+
+def _plan_fit(
+    inputs: Inputs,
+    sources: Shots | None,
+    source: AnyArray | None,
+    recipe: Recipe,
+    variables: Collection[str] | None,
+    warm_start: int,
+) -> tuple[FitTask, Beam | None]:
+    """Return the task of a fit, and the beam as recorded, because a fit applies the steps."""
+    check_fit(recipe)
+    task = FitTask(inputs=inputs, variables=(), requested=recipe)
+    if warm_start > 1:
+        raise InputError(f"warm_start is {warm_start}: fits start on their own; leave it out")
+    fields = task.choices.fields
+    if fields is not None and len(fields) > 1:
+        raise InputError(
+            f"the recipe fits the fields {', '.join(fields)}, and a store holds one: fit "
+            "one field, or each shot alone with shadowinv fit"
+        )
+    # An estimate or a list of sources gives each shot its own beam.
+    per_shot = sources is not None or inputs.recipe.estimate not in (None, UniformEstimate())
+    beam = None if per_shot else Beam.of(inputs.shot.shape, source, None)
+    labels = task.labels
+    if task.choices.options.samples < 2:
+        labels.pop("displacement_uncertainty")
+    for name in variables or ():
+        if name not in labels:
+            raise InputError(
+                f"there is no variable {name!r} of a fit: expected one or more of "
+                f"{', '.join(labels)}"
+            )
+    defaults = tuple(name for name in FITTED if name in labels)
+    return replace(task, variables=tuple(variables or defaults)), beam
 
 
 def _describe_inputs(
@@ -276,64 +449,22 @@ def _describe_table(
             f"received a reader for the table {table}, which names files: leave the reader out"
         )
     parts = part.get("channel"), part.get("variable")
-    if recipe.fit is None:
-        rows = row_shots(table, recipe, *parts)
-        items = list(rows.values())
-        return Shots(items, tuple(rows), shape or usual_shape(items)), items[0].setup
-    if not isinstance(table, Path):
-        raise InputError("received rows of a table to fit, expected its file: write it first")
-    by_name = object_shots(table, recipe, *parts)
-    first = first_image(list(by_name.values()))
-    assert isinstance(first.image, Radiograph)
-    return Shots(list(by_name.values()), tuple(by_name), first.image.shape), first.setup
+    items = table_shots(table, recipe, *parts)
+    if recipe.fit is not None:
+        image = first_image(items)
+        assert isinstance(image.image, Radiograph)
+        return Shots(items, image.image.shape), image.setup
+    return Shots(items, shape or usual_shape(items)), _row_of(items[0]).setup
 
 
-def _fit_stack(
-    stack_shots: Shots,
-    inputs: Inputs,
-    sources: Any,
-    recipe: Recipe,
-    variables: Collection[str] | None,
-    warm_start: int,
-    reader: str,
-) -> FitStack:
-    check_fit(recipe)
-    choices = recipe.fit or FitChoices()
-    if warm_start > 1:
-        raise InputError(f"warm_start is {warm_start}: fits start on their own; leave it out")
-    if choices.fields is not None and len(choices.fields) > 1:
-        raise InputError(
-            f"the recipe fits the fields {', '.join(choices.fields)}, and a store holds one: fit "
-            "one field, or each shot alone with shadowinv fit"
-        )
-    shot_sources = sources if isinstance(sources, Shots) else None
-    image = None if sources is None or shot_sources is not None else np.asarray(sources, np.float64)
-    # An estimate or a list of sources gives each shot its own beam.
-    per_shot = shot_sources is not None or inputs.recipe.estimate not in (None, UniformEstimate())
-    beam = None if per_shot else Beam.of(stack_shots.shape, image, None)
-    stack = FitStack(stack_shots, inputs, beam, shot_sources, (), 1, reader, fit_recipe=recipe)
-    labels = stack.labels
-    if choices.options.samples < 2:
-        labels.pop("displacement_uncertainty")
-    for name in variables or ():
-        if name not in labels:
-            raise InputError(
-                f"there is no variable {name!r} of a fit: expected one or more of "
-                f"{', '.join(labels)}"
-            )
-    defaults = tuple(name for name in FITTED if name in labels)
-    return replace(stack, variables=tuple(variables or defaults))
-
-
-def _shared_beam(inputs: Inputs, sources: Any) -> Beam | None:
+def _shared_beam(inputs: Inputs, source: AnyArray | None) -> Beam | None:
     """Return the common source after all steps, and mask; None if each shot has its own source."""
     moved = inputs.recipe.move(inputs.shot)
     if isinstance(inputs.recipe.source, UniformEstimate):
         return Beam.of(moved.shape, None, moved.mask)
-    if sources is None or isinstance(sources, Shots):
+    if source is None:
         return None
-    beam = np.asarray(sources, np.float64)
-    ready = inputs.recipe.prepare(replace(inputs.shot, image=beam, source=beam))
+    ready = inputs.recipe.prepare(replace(inputs.shot, image=source, source=source))
     assert ready.source is not None
     checked_source(ready.source, ready.mask)
     return Beam.of(ready.shape, ready.source, ready.mask)
@@ -362,9 +493,9 @@ def _checked_variables(
 
 
 def coordinates_of(stack: Stack) -> dict[str, Any]:
-    is_table = isinstance(stack, TableStack)
     # Where setups differ, so may the pixels' size.
-    plane = dataset_from_field(np.zeros((2, *stack.shape)), None, None if is_table else stack.setup)
+    setup = None if stack.task.by_row else stack.task.setup
+    plane = dataset_from_field(np.zeros((2, *stack.task.shape)), None, setup)
     shots = stack.shots
     numbers = np.arange(len(shots)) if shots.coordinate is None else shots.coordinate
     coords: dict[str, Any] = {str(name): value for name, value in plane.coords.items()}
@@ -374,16 +505,8 @@ def coordinates_of(stack: Stack) -> dict[str, Any]:
 
 
 def attributes_of(stack: Stack) -> dict[str, str]:
-    attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.setup).attrs
-    kind = "fit" if isinstance(stack, FitStack) else "inversion"
-    provenance = stack.inputs.provenance.model_copy(update={"setup": stack.setup, "kind": kind})
-    return {
-        "format": FORMAT,
-        **attributes,
-        "options": stack.recipe.options.model_dump_json(),
-        "provenance": provenance.to_json(),
-        **({"fields": json.dumps([stack.fitted_field])} if isinstance(stack, FitStack) else {}),
-    }
+    attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.task.setup).attrs
+    return {"format": FORMAT, **attributes, **stack.task.attributes}
 
 
 def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:

@@ -1,46 +1,157 @@
-"""A run: every shot of a stack into one store, robust against errors and interruptions."""
+"""A run: every shot of a stack into one store, robust against errors and interruptions.
+
+- the run: `run_stack`; its status: `RunStatus`
+- the content of a new store: `contents_of`
+- checks and order of a store to be continued: `resume`, `match_store`, `append_shots`
+"""
 
 from __future__ import annotations
 
+import json
 import queue
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from napari_shadowinv import __version__
 from napari_shadowinv._system.locking import locked
 from napari_shadowinv._system.machine import clear_up_when_terminated
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import as_model, check_instance
-from napari_shadowinv.errors import InversionCancelled
+from napari_shadowinv._typing import BoolArray
+from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
-from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_store_path
+from napari_shadowinv.io.store import (
+    DONE,
+    FAILED,
+    PENDING,
+    StackStore,
+    check_files,
+    check_store_path,
+)
 from napari_shadowinv.io.store_writing import (
+    Contents,
     ShotWriter,
+    Variable,
     create_store,
+    grow_store,
     remove_unfinished,
     summarise,
 )
 from napari_shadowinv.pipeline.run_options import RunOptions
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._engines import Engine, WorkerDiedError, engine_for, is_local
-from napari_shadowinv.stack._plan import STORED, choose_sites, describe_stack
-from napari_shadowinv.stack._resume import append_shots, contents_of, reopen_damaged, resume
-from napari_shadowinv.stack._shots import Stack
-from napari_shadowinv.stack._sources import Reader, read_shot
-from napari_shadowinv.stack._status import OnStatus, RunStatus
-from napari_shadowinv.stack._worker import ShotOutcome, TaskContext, run_shots
+from napari_shadowinv.stack._plan import (
+    CHAINED,
+    STORED,
+    Stack,
+    attributes_of,
+    choose_sites,
+    coordinates_of,
+    describe_stack,
+    dtype_of,
+    values_of_beam,
+)
+from napari_shadowinv.stack._shots import Reader, checksum, read_shot
+from napari_shadowinv.stack._worker import InvertTask, ShotOutcome, TaskContext, run_shots
 
 if TYPE_CHECKING:
     import xarray
 
+    from napari_shadowinv.fitting import Fit
+    from napari_shadowinv.inversion import Inversion
 
+WATCHING = "watching"  # name of the engine of a watched folder
 _POLL_S = 0.25  # between two looks at the engine and at `should_stop`
+_CHOSEN_SITES = "chosen_sites"  # attribute: number of sites from the accuracy and the first shots
+_APPENDED = "appended_at"  # attribute: numbers of the first shots appended by later runs
+NUMBERED_AS_ARRIVED = {
+    "order": "as they arrived"
+}  # attribute: the order does not follow from the names
+_ALTERNATIVES = "use the same, overwrite the store, or choose another name"
+
+
+@dataclass(frozen=True)
+class RunStatus:
+    """Status of a run, or of a watched folder.
+
+    Attributes
+    ----------
+    total, done, failed : int
+        Numbers of shots, including earlier runs.
+    doubtful : int
+        Shots that are done, with warnings.
+    waiting : int
+        Shots that have not ended; of a watched folder, files that have arrived.
+    ended : int
+        Shots that have ended in this run.
+    seconds : float
+        Time of this run; of a watched folder, the time during which shots were inverted.
+    engine : str
+        Name of the engine that inverts the shots.
+    stage : str
+        Current stage of the preparation, before all shots.
+    name, outcome : str, ShotOutcome or None
+        The shot that has just ended, if any, and its outcome.
+    result : Inversion, Fit or None
+        Its result, for a watched folder; do not keep a reference.
+    again : bool
+        Whether the shot was inverted before and its file has changed since.
+    failures : tuple of (str, str)
+        Names of the failed shots, with the reasons.
+    note : str
+        A sentence for the user.
+    """
+
+    total: int = 0
+    done: int = 0
+    failed: int = 0
+    doubtful: int = 0
+    waiting: int = 0
+    ended: int = 0
+    seconds: float = 0.0
+    engine: str = ""
+    stage: str = ""
+    name: str = ""
+    outcome: ShotOutcome | None = None
+    result: Inversion | Fit | None = None
+    again: bool = False
+    failures: tuple[tuple[str, str], ...] = ()
+    note: str = ""
+
+    @property
+    def rate(self) -> float:
+        """Shots per second in this run, 0 before the first has ended."""
+        return self.ended / self.seconds if self.seconds > 0 else 0.0
+
+    @property
+    def remaining(self) -> float | None:
+        """Seconds until the waiting shots have ended at the same rate; None if unknown."""
+        return self.waiting / self.rate if self.rate else None
+
+    @property
+    def text(self) -> str:
+        """The numbers of shots."""
+        is_watch = self.engine == WATCHING
+        numbers = [
+            f"{self.done} done" if is_watch else f"{self.done} of {self.total} done",
+            f"{self.failed} failed" if self.failed else "",
+            f"{self.doubtful} with warnings" if self.doubtful else "",
+            f"{self.waiting} waiting" if is_watch and self.waiting else "",
+        ]
+        return ", ".join(filter(None, numbers))
+
+
+OnStatus = Callable[[RunStatus], None]
 
 
 def run_stack(
@@ -192,7 +303,7 @@ class _Run:
 
     def report(self, engine: str, outcome: ShotOutcome | None = None) -> None:
         shots = self._stack.shots
-        name = "" if outcome is None else shots.names[outcome.index]
+        name = "" if outcome is None else shots.items[outcome.index].name
         if outcome is not None:
             self._ended += 1
             self._counts[outcome.status] += 1
@@ -257,8 +368,7 @@ class _Run:
 
     def _shared(self, engine: Engine) -> tuple[Any, Any]:
         stack = self._stack
-        per_shot = tuple(name for name in stack.variables if not stack.is_shared(name))
-        context = TaskContext(self._writer, stack.work(per_shot), engine.workers)
+        context = TaskContext(self._writer, stack.shot_task, engine.workers)
         # A name that no earlier run has used: dask would reuse the earlier value.
         name = f"settings-{self._store.attributes['store_id']}-{time.time_ns()}"
         beam = stack.beam and engine.share(stack.beam, f"beam-{stack.beam.key}")
@@ -275,9 +385,8 @@ class _Run:
                 yield list(range(first, pending[-1] + 1))
 
     def _start(self, engine: Engine, batch: list[int], beam: Any, context: Any) -> Any:
-        shots = self._stack.shots
-        labels = [(index, index in self._todo, self._stack.source_of(index)) for index in batch]
-        items = [shots.items[index] for index in batch]
+        labels = [(index, index in self._todo) for index in batch]
+        items = [self._stack.shots.items[index] for index in batch]
         return engine.submit(run_shots, items, labels, beam, context, engine.stop)
 
     def _wait(self, engine: Engine, ended: queue.SimpleQueue[Any]) -> Any:
@@ -305,3 +414,180 @@ class _Run:
             self._todo.discard(outcome.index)
             self.report(engine.name, outcome)
         return True
+
+
+def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
+    identity = {name: value for name, value in _identity(stack, dtype).items() if value}
+    attributes: dict[str, Any] = {**attributes_of(stack), **identity}
+    if stack.as_arrived:
+        attributes |= NUMBERED_AS_ARRIVED
+    if isinstance(stack.task, InvertTask) and stack.task.sites_chosen:
+        attributes[_CHOSEN_SITES] = stack.task.recipe.options.n_sites
+    return Contents(stack.sizes, _variables(stack, dtype), _coordinates(stack), attributes)
+
+
+def _coordinates(stack: Stack) -> dict[str, Variable]:
+    return {name: _stored_coordinate(values) for name, values in coordinates_of(stack).items()}
+
+
+def _stored_coordinate(coordinate: Any) -> Variable:
+    if isinstance(coordinate, tuple):
+        dim, values, attributes = coordinate
+        dims: tuple[str, ...] = (dim,)
+    else:
+        dims, values, attributes = coordinate.dims, coordinate.values, dict(coordinate.attrs)
+    values = np.asarray(values)
+    if values.dtype.kind in "UO":
+        return Variable(dims, str, attributes, values.astype(object))
+    if values.dtype.kind in "mM":
+        # As numbers, because Zarr has no times; the units say which.
+        attributes = {**attributes, "units": "ns since 1970-01-01"}
+        numbers = values.astype("datetime64[ns]").astype("int64")
+        return Variable(dims, np.dtype("int64"), attributes, numbers)
+    return Variable(dims, values.dtype, attributes, values)
+
+
+def _variables(stack: Stack, dtype: np.dtype[Any]) -> dict[str, Variable]:
+    variables: dict[str, Variable] = {}
+    for name, (dims, labels) in stack.task.labels.items():
+        if name not in stack.task.variables:
+            continue
+        exact = dtype_of(name).kind != "f" or "site" in dims
+        stored = dtype_of(name) if exact else dtype
+        if stack.beam is not None and stack.is_shared(name):
+            values = np.asarray(values_of_beam(stack.beam, stack.task.recipe.options)[name])
+            variables[name] = Variable(dims, stored, labels, values)
+        else:
+            variables[name] = Variable(("shot", *dims), stored, labels, None)
+    return variables
+
+
+def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> dict[str, str]:
+    """Return the attributes that must agree for a store with `shots` shots to be continued."""
+    height, width = stack.task.shape
+    shot = stack.task.inputs.shot
+    steps = [step.model_dump(mode="json") for step in stack.task.recipe.steps]
+    return {
+        **stack.task.identity,
+        **stack.setup_texts,
+        "source_image": stack.source_text(shots),
+        "mask_image": _mask_text(shot.mask) or "none",
+        "steps": json.dumps(steps) if steps else "",
+        "source_mask_image": _mask_text(shot.source_mask),
+        "image_size": f"{width} × {height} px",
+        "stored": f"{', '.join(stack.task.variables)} as {dtype}",
+        "reader": stack.reader,
+        "warm_start": stack.warm_start_text,
+    }
+
+
+def _mask_text(mask: BoolArray | None) -> str:
+    return "" if mask is None else f"sha256 {checksum(mask)}"
+
+
+def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
+    """Return the stack in the order of its store, new shots last; an `InputError` if it differs."""
+    if store.attributes.get("warm_start") == CHAINED and not stack.as_arrived:
+        raise InputError(
+            f"{store.path} was written by watching a folder, where each shot starts from the one "
+            "before: continue with shadowinv watch, overwrite the store, or choose another name"
+        )
+    stack = stack.reordered(_order(store, stack.shots.names))
+    stack = match_store(store, stack, dtype)
+    for index in np.flatnonzero(store.statuses() == DONE):
+        changed = stack.changed(int(index), store.report(int(index)))
+        if changed:
+            raise InputError(
+                f"{changed} has changed since it was inverted into {store.path}: overwrite the "
+                "store or choose another name"
+            )
+    return stack
+
+
+def reopen_damaged(store: StackStore) -> StackStore:
+    """Read all of a store, mark its damaged shots as pending, and return it as it is now.
+
+    Raises
+    ------
+    FileFormatError
+        If there is damage that cannot be repaired from the shots.
+    """
+    damage = StackStore(store.path, every_byte=True).damage
+    for index in damage.shots:
+        ShotWriter.of(store).reopen(index)
+    if not (damage.shots or damage.files):
+        return store
+    store = StackStore(store.path)
+    if damage.files:
+        summarise(store)
+        check_files(store := StackStore(store.path, every_byte=True))
+    return store
+
+
+def match_store(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
+    """Return the stack with the store's number of sites; an `InputError` if they do not match."""
+    if stack.chooses_sites and _CHOSEN_SITES in store.attributes:
+        stack = stack.with_sites(int(store.attributes[_CHOSEN_SITES]))
+    identity = _identity(stack, dtype, len(store.names))
+    for name, value in {**identity, "package_version": __version__}.items():
+        before = str(store.attributes.get(name, ""))
+        if before != value:
+            article = "" if name.endswith("s") else "a "
+            raise InputError(
+                f"{store.path} was started with {article}different {name.replace('_', ' ')} "
+                f"({_difference(before, value)}): {_ALTERNATIVES}"
+            )
+    return stack
+
+
+def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:
+    """Return the positions of the store's shots among `names`, then of the new ones."""
+    # A shot keeps its number for good, so new ones go to the end wherever their names sort.
+    count = len(store.names)
+    if names[:count] == store.names:
+        return list(range(len(names)))
+    places = {name: place for place, name in enumerate(names)}
+    lost = [name for name in store.names if name not in places]
+    if lost or len(places) < len(names):
+        missing = (
+            f"{count} there, {len(names)} given, without {lost[0]}" if lost else "different order"
+        )
+        raise InputError(
+            f"{store.path} was started with different shots ({missing}): {_ALTERNATIVES}"
+        )
+    known_places = [places[name] for name in store.names]
+    if NUMBERED_AS_ARRIVED.items() <= store.attributes.items():
+        return [*known_places, *sorted(set(range(len(names))) - set(known_places))]
+    # Shots of a run keep their order; names of later runs may sort before them.
+    ends = [0, *store.attributes.get(_APPENDED, []), count]
+    for first, last in pairwise(ends):
+        for index in range(first + 1, last):
+            if known_places[index] < known_places[index - 1]:
+                raise InputError(
+                    f"{store.path} was started with the shots in a different order "
+                    f"({store.names[index - 1]} before {store.names[index]}): {_ALTERNATIVES}"
+                )
+    return [*known_places, *sorted(set(range(len(names))) - set(known_places))]
+
+
+def _difference(before: str, now: str) -> str:
+    try:
+        old, new = json.loads(before), json.loads(now)
+        names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+        return ", ".join(f"{name}: {old.get(name)} there, {new.get(name)} now" for name in names)
+    except (ValueError, AttributeError, TypeError):
+        return f"{shorten(before or 'none', 80)} there, {shorten(now or 'none', 80)} now"
+
+
+def append_shots(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> StackStore:
+    """Append shots that arrived since the last run, as pending, to the store."""
+    coordinates = {
+        name: np.asarray(coordinate.values)[len(store.names) :]
+        for name, coordinate in _coordinates(stack).items()
+        if coordinate.along_shots
+    }
+    begins = [*store.attributes.get(_APPENDED, []), len(store.names)]
+    source = _identity(stack, dtype)["source_image"]
+    attributes = {"source_image": source, _APPENDED: begins}
+    grow_store(store.path, coordinates, attributes)
+    return StackStore(store.path)

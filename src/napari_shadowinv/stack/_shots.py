@@ -1,268 +1,583 @@
-"""Many shots with all inputs of their inversion: `Stack`, `TableStack`, `FitStack`."""
+"""Shots of a stack, each read on demand: `Shot`, and where they come from.
+
+- one image, or several: `ArrayReference`, `BlockReference`, `FileReference`, `RowsReference`
+- all shots of an array, of files or of a list: `find_shots`; of a table: `table_shots`
+- their sources: `find_source`
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import glob
+import hashlib
+import inspect
+import json
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from napari_shadowinv._typing import AnyArray
-from napari_shadowinv.inversion import count_sites
-from napari_shadowinv.inversion.variables import fit_labels, variable_labels
-from napari_shadowinv.io.store import OWN_SETUPS
-from napari_shadowinv.options import FitChoices
-from napari_shadowinv.pipeline import Inputs
-from napari_shadowinv.pipeline.fit_run import usual_fields
-from napari_shadowinv.preprocessing import Estimate, Radiograph, Recipe
-from napari_shadowinv.stack._discovery import Shots
-from napari_shadowinv.stack._fit_work import FitWork
-from napari_shadowinv.stack._sources import ArrayShot, Shot, checksum
-from napari_shadowinv.stack._table_shots import RowShot, RowWork
-from napari_shadowinv.stack._worker import Beam, Work
+import numpy as np
+from numpy.typing import ArrayLike
+
+from napari_shadowinv._system.arrays import PLANE, unpack_array
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.files import in_counting_order, sha256, text_of
+from napari_shadowinv.io.formats import PRADFORMAT, TEXT, kind_of
+from napari_shadowinv.io.images import read_tiff_page, tiff_pages
+from napari_shadowinv.io.reading import read_radiograph
+from napari_shadowinv.physics.setup import Setup, setup_from_dict
+from napari_shadowinv.pipeline import FitShot
+from napari_shadowinv.pipeline.files import read_part
+from napari_shadowinv.pipeline.fit_shots import read_rows, row_setup
+from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, rows_to_invert
+from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import Setup
+    import xarray
 
-CHAINED = "each shot from an earlier one, as they arrived"
+Reader = Callable[..., ArrayLike]
+
+_GLOB = re.compile(r"[*?\[]")
+_MAX_SHAPE_READS = 3  # shots that are read for the shape of all
+
+
+class ImageReference:
+    """An image, or several of one object, read on demand; it can be sent to a worker."""
+
+    def load(self) -> tuple[tuple[FitShot, ...], dict[str, Any]]:
+        """Return the images with all that is known of each, and metadata as `read` does."""
+        image, metadata = self.read()
+        return (FitShot(Radiograph(image)),), metadata
+
+    def read(self) -> tuple[AnyArray, dict[str, Any]]:
+        """Return the image and its ``sha256``, with ``warnings`` for the shot's report if any."""
+        raise NotImplementedError
+
+    def shape(self) -> tuple[int, ...]:
+        """Return the shape of the image, which has to be read."""
+        return np.shape(self.read()[0])
+
+    def unchanged(self, origin: dict[str, Any]) -> bool:
+        """Return whether the image still agrees with the metadata from `load`."""
+        return bool(self.read()[1]["sha256"] == origin.get("sha256"))
 
 
 @dataclass(frozen=True, eq=False)
-class Stack:
-    """Shots, and everything that their inversions share."""
+class ArrayReference(ImageReference):
+    """An image in memory."""
 
-    shots: Shots
-    inputs: Inputs  # recipe, masks, and their origin
-    beam: Beam | None  # source, after all steps, and mask of all shots; None if each has its own
-    sources: Shots | None  # one for each shot, if these were measured
-    variables: tuple[str, ...]
-    warm_start: int = 1  # shots in a group, each initialised from the one before
-    reader: str = ""  # name of the reader of the files
-    sites_chosen: bool = False  # whether the number of sites follows from the accuracy
-    as_arrived: bool = False  # whether its shots are numbered as they arrive in a folder
-    chained: bool = False  # whether each shot starts from an earlier one, without groups
+    image: AnyArray = field(repr=False)
 
-    @property
-    def warm_start_text(self) -> str:
-        """Description of the shots that start from others."""
-        return CHAINED if self.chained else str(self.warm_start)
+    def read(self) -> tuple[AnyArray, dict[str, Any]]:
+        return self.image, {"sha256": checksum(self.image)}
+
+
+@dataclass(frozen=True, eq=False)
+class BlockReference(ImageReference):
+    """An image of a dask array (shot, H, W), computed by dask's current scheduler."""
+
+    array: Any = field(repr=False)
+    index: int
 
     @property
-    def recipe(self) -> Recipe:
-        return self.inputs.recipe
+    def block(self) -> Any:
+        """The image as an array (1, H, W), without the tasks of other images."""
+        dask: Any = import_module("dask")
+        return dask.optimize(self.array.blocks[self.index])[0]
 
-    @property
-    def chooses_sites(self) -> bool:
-        """Whether the number of sites still has to be derived from the accuracy."""
-        return self.beam is not None and self.recipe.options.is_adaptive
+    def read(self) -> tuple[AnyArray, dict[str, Any]]:
+        return ArrayReference(_plain_image(self.block.compute()[0])).read()
 
-    def with_sites(self, n_sites: int) -> Stack:
-        """Return the stack with the number of sites derived from the accuracy."""
-        options = self.recipe.options.model_copy(update={"n_sites": n_sites})
-        provenance = self.inputs.provenance
-        recipe = provenance.recipe.model_copy(update={"options": options})
-        inputs = replace(
-            self.inputs,
-            recipe=self.recipe.model_copy(update={"options": options}),
-            provenance=provenance.model_copy(update={"recipe": recipe}),
-        )
-        return replace(self, inputs=inputs, sites_chosen=True)
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Otherwise the tasks of all images would be sent with it.
+        return BlockReference, (self.block, 0)
 
-    @cached_property
-    def moved(self) -> Radiograph:
-        """Masks and setup after the steps that move pixels; its image means nothing."""
-        return self.recipe.move(self.inputs.shot)
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.moved.shape
+@dataclass(frozen=True)
+class FileReference(ImageReference):
+    """A file that holds one image, or a page of a TIFF that holds many."""
 
-    @property
-    def setup(self) -> Setup | None:
-        return self.moved.setup
+    path: Path  # absolute, so that a worker elsewhere finds it
+    reader: Reader
+    page: int | None = None  # the reader takes it as a keyword
 
-    @cached_property
-    def sizes(self) -> dict[str, int]:
-        height, width = self.shape
-        # Sites of shots with their own beams are stored only if they do not depend on the beam.
-        beam = self.beam or Beam.of(self.shape, None, self.moved.mask)
-        sites = count_sites(beam.image, self.recipe.options, mask=beam.mask)
-        return {"shot": len(self.shots), "y": height, "x": width, "component": 2, "site": sites}
+    def __dask_tokenize__(self) -> tuple[Any, ...]:
+        # A changed file is another input, so dask must not reuse its result.
+        from dask.base import normalize_token
 
-    @property
-    def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
-        """Dimensions and labels of all variables that its shots can have."""
-        return variable_labels(self.setup)
+        file_stamp = stamp(self.path) if self.path.exists() else {}
+        return (str(self.path), normalize_token(self.reader), self.page, *file_stamp.values())
 
-    @property
-    def options_text(self) -> str:
-        """The options as JSON, except those that do not affect the results."""
-        options = self.recipe.options
-        if self.sites_chosen:
-            options = options.model_copy(update={"n_sites": None})
-        return options.model_dump_json(exclude={"threads"})
+    def read(self) -> tuple[AnyArray, dict[str, Any]]:
+        if self.page is not None:
+            image, metadata = _read(self.reader, self.path, page=self.page)
+            return image, {"sha256": checksum(image), **metadata}
+        image, metadata = _read(self.reader, self.path)
+        return image, {**stamp(self.path), "sha256": sha256(self.path), **metadata}
 
-    @property
-    def fit_text(self) -> str:
-        """The choices of a fit as JSON, except its options; empty for inversions."""
-        return ""
+    def unchanged(self, origin: dict[str, Any]) -> bool:
+        """Compare a file like those of a table's rows, and a page by its checksum."""
+        return super().unchanged(origin) if self.page is not None else _agrees(self.path, origin)
 
-    @property
-    def setup_texts(self) -> dict[str, str]:
-        """Description of the setup, for the store's identity."""
+
+@dataclass(frozen=True, eq=False)
+class RowsReference(ImageReference):
+    """Several images of one object to fit, or one image to invert, from rows of a table."""
+
+    rows: tuple[ShotRow, ...]
+    recipe: Recipe
+    channel: str | None = None
+    variable: str | None = None
+    to_invert: bool = False
+    setup: Setup | None = None  # of the image to invert as recorded
+    unused: tuple[str, ...] = ()  # columns that only fits use
+
+    def __dask_tokenize__(self) -> tuple[Any, ...]:
+        # A changed file is another input, so dask must not reuse its result.
+        files = [(name, path) for row in self.rows for name, path in row.files.items()]
+        stamps = [stamp(path) for _, path in files if path.exists()]
         setup = "" if self.setup is None else self.setup.model_dump_json()
-        return {OWN_SETUPS: "", "setup": setup}
+        content = json.dumps([self._summaries(), [(name, str(path)) for name, path in files]])
+        return content, json.dumps(stamps), setup, str(self.channel), str(self.variable)
 
-    @property
-    def setups(self) -> list[str] | None:
-        """The setup of each shot after the steps, as JSON; None unless they have their own."""
-        return None
+    def load(self) -> tuple[tuple[FitShot, ...], dict[str, Any]]:
+        """Return the images, and the files of their rows."""
+        images = read_rows(self.rows, self.recipe, channel=self.channel, variable=self.variable)
+        files = {
+            name: {**stamp(path), "sha256": sha256(path)} for name, path in self._files().items()
+        }
+        origin: dict[str, Any] = {"files": files, "rows": self._summaries()}
+        if not self.to_invert:
+            return images, origin
+        (image,) = images
+        assert isinstance(image.image, Radiograph)
+        warnings = file_doubts(image.image)
+        if self.unused:
+            text = (
+                f"the table has {', '.join(self.unused)}, which an inversion does not use: fit the "
+                "image to use it"
+            )
+            warnings.append(Caution("file", text))
+        metadata = {**files["file 1"], **origin, "warnings": warnings}
+        return (replace(image, setup=self.setup),), metadata
 
-    def source_text(self, shots: int | None) -> str:
-        """Describe the source of the first shots."""
-        estimate = self.recipe.estimate
-        if self.sources is not None:
-            return f"one for each shot: {', '.join(self.sources.names[:shots])}"
-        if self.beam is not None and self.beam.source is not None:
-            return f"sha256 {checksum(self.beam.source)}"
-        if self.beam is None and estimate is not None:
-            return f"estimated from each shot: {estimate.model_dump_json()}"
-        return "uniform"
+    def shape(self) -> tuple[int, ...]:
+        return read_part(self.rows[0].file, self.channel, self.variable).shape
 
-    def is_shared(self, name: str) -> bool:
-        """Return whether all shots share a variable."""
-        return (
-            self.beam is not None
-            and name in ("sites", "site_mass", "source", "mask")
-            and not (name == "source" and self.beam.source is None)
+    def unchanged(self, origin: dict[str, Any]) -> bool:
+        """Compare the rows, and existing files by size and time or checksum."""
+        before = origin.get("files", {})
+        return self._summaries() == origin.get("rows") and all(
+            _agrees(path, before.get(name, {})) for name, path in self._files().items()
         )
 
-    def source_of(self, index: int) -> Shot | None:
-        """Reference to the measured source of one shot; None if it is shared, or estimated."""
-        return None if self.sources is None else self.sources.items[index]
+    def difference(self, origin: dict[str, Any]) -> str:
+        """Describe the difference from the row to invert, or its setup, in a report."""
+        (row,) = self.rows
+        (before,) = origin.get("rows") or ({},)
+        if before != row.summary:
+            return _differences(before, row.summary)
+        entries = origin.get("provenance", {}).get("recipe", {}).get("setup")
+        setup_before = None if entries is None else setup_from_dict(entries)
+        # The setup of a row may have been in an image that was removed.
+        if setup_before == self.setup or (self.setup is None and not row.file.exists()):
+            return ""
+        setups = (setup_before, self.setup)
+        return _differences(*({} if setup is None else setup.model_dump() for setup in setups))
 
-    def reordered(self, order: Sequence[int]) -> Stack:
-        """Return the stack with its shots, and their sources, in another order."""
-        sources = None if self.sources is None else self.sources.reordered(order)
-        return replace(self, shots=self.shots.reordered(order), sources=sources)
+    def _files(self) -> dict[str, Path]:
+        """Return the files by the names of their columns and the numbers of their rows."""
+        return {
+            f"{name} {number}": path
+            for number, row in enumerate(self.rows, 1)
+            for name, path in row.files.items()
+        }
 
-    def work(self, variables: tuple[str, ...]) -> Work | FitWork:
-        """Return the task of each shot, which computes some variables."""
-        return Work(self.shots.shape, self.inputs, variables, self.sites_chosen)
-
-    def changed(self, index: int, origin: dict[str, Any]) -> str:
-        """Name the part of a shot that differs from its report; empty if none does."""
-        if not self.shots.items[index].unchanged(origin):
-            return self.shots.label(index)
-        source = None if self.sources is None else self.source_of(index)
-        if source is not None and not source.unchanged(origin["source"]):
-            return f"the source of {self.shots.label(index)}"
-        return ""
+    def _summaries(self) -> list[dict[str, Any]]:
+        return [row.summary for row in self.rows]
 
 
-@dataclass(frozen=True, eq=False)
-class TableStack(Stack):
-    """A stack of rows of a table: shots may have their own setup, source and mask.
+def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    return ", ".join(
+        f"{name}: {before.get(name)} there, {now.get(name)} now"
+        for name in {**before, **now}
+        if before.get(name) != now.get(name)
+    )
 
-    The beam belongs to rows without source and mask, and is None if any has one. Nothing is shared,
-    because a row that is added later may have its own; the setup of the first row sets the units.
+
+def _agrees(path: Path, before: Mapping[str, Any]) -> bool:
+    """Compare a file by size and time, and only where these differ by its checksum."""
+    if not path.exists():
+        return True  # removed after it was inverted
+    return stamp(path).items() <= before.items() or sha256(path) == before.get("sha256")
+
+
+def stamp(path: Path) -> dict[str, int]:
+    """Return size and time of a file, which identify its content."""
+    status = path.stat()
+    return {"size": status.st_size, "mtime_ns": status.st_mtime_ns}
+
+
+def checksum(array: AnyArray) -> str:
+    """Return the SHA-256 of an array's values, shape and type, in hexadecimal."""
+    digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
+    digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def reader_text(reader: Reader) -> str:
+    """Return the name of a reader, so that a store is not continued with another."""
+    if isinstance(reader, functools.partial):
+        keywords = ", ".join(f"{name}={value!r}" for name, value in sorted(reader.keywords.items()))
+        return f"{reader_text(reader.func)}({keywords})"
+    module, name = reader.__module__, getattr(reader, "__qualname__", type(reader).__qualname__)
+    package = __name__.partition(".")[0]
+    # Modules of this package may move; existing stores can still be continued.
+    return f"{package}.{name}" if module.startswith(f"{package}.") else f"{module}.{name}"
+
+
+def read_shot(
+    path: Path,
+    *,
+    page: int | None = None,
+    channel: str | int | None = None,
+    variable: str | None = None,
+    warnings: list[Caution] | None = None,
+) -> FloatArray:
+    """Read the image of a shot; this is the default reader.
+
+    Parameters
+    ----------
+    path, channel, variable
+        As for `napari_shadowinv.io.read_radiograph`, whose errors this raises.
+    page : int, optional
+        Of a TIFF with many pages, from 0.
+    warnings : list of Caution, optional
+        Receives the reasons to doubt the image.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
     """
+    if page is None:
+        shot = read_radiograph(path, channel=channel, variable=variable)
+    else:
+        image, file_warnings = read_tiff_page(path, page, channel=channel)
+        shot = Radiograph(image, warnings=file_warnings)
+    if warnings is not None:
+        warnings.extend(file_doubts(shot))
+    return shot.image
 
-    common: AnyArray | None = None  # measured source of rows without one, as recorded
-    estimate: Estimate | None = None  # the same, if it is estimated
 
-    @property
-    def setup_texts(self) -> dict[str, str]:
-        return {OWN_SETUPS: "a row for each shot"}
+def file_doubts(shot: Radiograph) -> list[Caution]:
+    """Return the reasons to doubt the image of a file in a stack."""
+    ignored = [name for name in ("source", "mask") if getattr(shot, name) is not None]
+    if not ignored:
+        return list(shot.warnings)
+    text = (
+        f"the file contains its own {' and '.join(ignored)}, which a stack ignores: pass one for "
+        "the whole stack"
+    )
+    return [*shot.warnings, Caution("file", text)]
 
-    def source_text(self, shots: int | None) -> str:
-        if self.common is not None:
-            return f"sha256 {checksum(self.common)}"
-        return super().source_text(shots) if self.estimate is not None else "uniform"
 
-    def is_shared(self, name: str) -> bool:
-        return False
+def _read(reader: Reader, path: Path, **options: int) -> tuple[AnyArray, dict[str, Any]]:
+    """Read the image of a file, and warnings if the reader supports them."""
+    if "warnings" not in inspect.signature(reader).parameters:
+        return _plain_image(reader(path, **options)), {}
+    warnings: list[Caution] = []
+    image = _plain_image(reader(path, **options, warnings=warnings))
+    return image, {"warnings": warnings} if warnings else {}
 
-    def source_of(self, index: int) -> Shot | None:
-        if self._shot(index).row.source is not None or self.beam is not None:
-            return None
-        alone = None if self.common is None else ArrayShot(self.common)
-        return super().source_of(index) or alone
 
-    @property
-    def setups(self) -> list[str] | None:
-        if self.setup is None:
-            return None
-        recorded = (self._shot(index).setup for index in range(len(self.shots)))
-        bare = replace(self.inputs.shot, mask=None, source_mask=None)
-        moved = (self.recipe.move(replace(bare, setup=setup)).setup for setup in recorded)
-        return ["" if setup is None else setup.model_dump_json() for setup in moved]
-
-    def work(self, variables: tuple[str, ...]) -> RowWork:
-        shape, chosen = self.shots.shape, self.sites_chosen
-        return RowWork(shape, self.inputs, variables, chosen, self.estimate)
-
-    def changed(self, index: int, origin: dict[str, Any]) -> str:
-        difference = self._shot(index).difference(origin)
-        if difference:
-            return f"the row of {self.shots.label(index)} ({difference})"
-        return super().changed(index, origin)
-
-    def _shot(self, index: int) -> RowShot:
-        shot = self.shots.items[index]
-        assert isinstance(shot, RowShot)
-        return shot
+def _plain_image(image: Any) -> AnyArray:
+    """Return an image without labels; an `InputError` if it has its own mask."""
+    values, usable = unpack_array(image, "the shot")
+    if usable is not None:
+        raise InputError(
+            f"the shot has {int((~usable).sum())} masked pixels of its own: give one mask for the "
+            "whole stack, or describe the shots in a table with a mask each"
+        )
+    return np.asarray(values)
 
 
 @dataclass(frozen=True, eq=False)
-class FitStack(Stack):
-    """A stack to fit; its beam is as recorded, because the fit applies the steps itself."""
+class Shot:
+    """One exposure of a stack."""
 
-    fit_recipe: Recipe = field(default_factory=Recipe)  # with the original setup and choices
-
-    @property
-    def chooses_sites(self) -> bool:
-        return False
+    name: str  # for messages and tables
+    images: ImageReference
+    source: Shot | None = None  # as measured, unless it is shared or estimated
 
     @property
-    def choices(self) -> FitChoices:
-        return self.fit_recipe.fit or FitChoices()
+    def rows(self) -> tuple[ShotRow, ...]:
+        """Its rows of a table, one for each image."""
+        return self.images.rows if isinstance(self.images, RowsReference) else ()
 
-    @property
-    def fitted_field(self) -> str:
-        """Name of the field that is fitted to each shot."""
-        setups = None if self.setup is None else [self.setup]
-        (name,) = self.choices.fields or usual_fields(setups)
-        return name
+
+@dataclass(frozen=True, eq=False)
+class Shots:
+    """The shots of a stack, in order."""
+
+    items: Sequence[Shot]
+    shape: tuple[int, int]  # that they should have
+    coordinate: Any = None  # values of the coordinate ``shot`` of an xarray object
+    array: Any = None  # the same images as one dask array, chunks of one shot, if they came so
+    mask: BoolArray | None = None  # pixels that can be used, if they came as masked arrays
+
+    def __len__(self) -> int:
+        return len(self.items)
 
     @cached_property
-    def sizes(self) -> dict[str, int]:
-        height, width = self.shape
-        return {"shot": len(self.shots), "y": height, "x": width, "component": 2}
+    def names(self) -> tuple[str, ...]:
+        """Names of the shots."""
+        return tuple(shot.name for shot in self.items)
 
-    @property
-    def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
-        return fit_labels(self.fitted_field, self.setup)
+    def label(self, index: int) -> str:
+        """Name and number of a shot, for messages."""
+        name = self.items[index].name
+        return f"shot {index}" if name == str(index) else f"shot {index} ({name})"
 
-    @property
-    def options_text(self) -> str:
-        return self.choices.options.model_dump_json(exclude={"threads"})
+    def reordered(self, order: Sequence[int]) -> Shots:
+        """Return these shots in another order."""
+        if list(order) == list(range(len(self))):
+            return self
+        return replace(
+            self,
+            items=[self.items[index] for index in order],
+            coordinate=None if self.coordinate is None else self.coordinate[list(order)],
+            array=None if self.array is None else self.array[list(order)].rechunk((1, -1, -1)),
+        )
 
-    @property
-    def fit_text(self) -> str:
-        return self.choices.model_dump_json(exclude={"options"}, exclude_none=True)
 
-    def is_shared(self, name: str) -> bool:
-        return False
+def find_shots(
+    shots: Any, *, reader: Reader = read_shot, shape: tuple[int, int] | None = None
+) -> Shots:
+    """Return references to the shots of an array, of files or of a list."""
+    if isinstance(shots, Shots):
+        return replace(shots, shape=shape or usual_shape(shots.items))
+    if isinstance(shots, (str, Path)):
+        return _from_path(str(shots), reader, shape)
+    if hasattr(shots, "dims") and hasattr(shots, "coords"):
+        return _from_xarray(shots)
+    if isinstance(shots, Sequence) and all(isinstance(item, (str, Path)) for item in shots):
+        return _from_files([Path(item) for item in shots], reader, shape)
+    if isinstance(shots, Sequence) and all(np.ndim(item) == 2 for item in shots):
+        shapes = {np.shape(item) for item in shots}
+        if len(shapes) > 1:
+            raise InputError(
+                f"shots have shapes {', '.join(map(str, sorted(shapes)))}: expected the same "
+                "shape for all"
+            )
+        planes = [unpack_array(item, f"shots[{k}]") for k, item in enumerate(shots)]
+        shots = np.stack([np.asarray(values) for values, _ in planes])
+        if any(usable is not None for _, usable in planes):
+            masked = [np.zeros(shots.shape[1:], bool) if use is None else ~use for _, use in planes]
+            shots = np.ma.MaskedArray(shots, np.stack(masked))
+    if not hasattr(shots, "ndim"):
+        raise InputError(
+            f"shots are a {type(shots).__name__}: expected an array (shot, y, x), an xarray "
+            "object, paths, a glob such as 'shots/*.tif', or a multi-page TIFF"
+        )
+    return _from_array(shots)
 
-    def work(self, variables: tuple[str, ...]) -> FitWork:
-        shot = self.inputs.shot
-        choices = self.choices.model_copy(update={"fields": (self.fitted_field,)})
-        cleared = {
-            "source": self.fit_recipe.estimate,
-            "mask": None,
-            "source_mask": None,
-            "fit": choices,
-        }
-        recipe = self.fit_recipe.model_copy(update=cleared)
-        return FitWork(recipe, self.shape, self.setup, variables, shot.mask, shot.source_mask)
+
+def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shots:
+    path = Path(text)
+    # Path.is_dir raises an error if a name is too long.
+    if os.path.isdir(path):
+        raise InputError(f"{text} is a folder: specify the files, such as '{text}/*.tif'")
+    if _GLOB.search(text) and not os.path.exists(path):
+        paths = in_counting_order(map(Path, glob.glob(text, recursive=True)))
+        if not paths:
+            raise InputError(
+                f"no file matches {text}: expected shots; check the folder and pattern"
+            )
+        return _from_files(paths, reader, shape)
+    pages = _page_count(path, reader)
+    if pages == 1:
+        return _from_files([path], reader, shape)
+    items = [
+        Shot(f"{text_of(path.name)}[{page}]", FileReference(path.absolute(), reader, page))
+        for page in range(pages)
+    ]
+    return Shots(items, shape or usual_shape(items))
+
+
+def _page_count(path: Path, reader: Reader) -> int:
+    """Return the number of pages of a TIFF, if the reader can select them."""
+    knows_pages = "page" in inspect.signature(reader).parameters
+    return tiff_pages(path) if knows_pages and kind_of(path) == "tiff" else 1
+
+
+def _from_files(paths: Sequence[Path], reader: Reader, shape: tuple[int, int] | None) -> Shots:
+    if not paths:
+        raise InputError("shots are an empty list: expected at least one path")
+    items = [
+        Shot(name, FileReference(path.absolute(), reader))
+        for name, path in zip(_names_of(paths), paths, strict=True)
+    ]
+    return Shots(items, shape or usual_shape(items))
+
+
+def _names_of(paths: Sequence[Path]) -> tuple[str, ...]:
+    """Names of files, with their folders if they differ only there."""
+    names = tuple(text_of(path.name) for path in paths)
+    if len(set(names)) < len(names):
+        names = tuple(text_of(path) for path in paths)
+    if len(set(names)) < len(names):
+        twice = next(name for name, count in Counter(names).items() if count > 1)
+        raise InputError(f"shots contain {twice} twice: expected each file once")
+    return names
+
+
+def usual_shape(items: Sequence[Shot]) -> tuple[int, int]:
+    """Shape of most of the first few shots that can be read; bad ones fail later, by name."""
+    shapes: Counter[tuple[int, ...]] = Counter()
+    first_error: Exception | None = None
+    for shot in items:
+        try:
+            shapes[shot.images.shape()] += 1
+        except (OSError, ValueError) as error:
+            first_error = first_error or error
+        if shapes.total() == _MAX_SHAPE_READS:
+            break
+    if not shapes:
+        raise FileFormatError(f"none of {len(items)} shots can be read, the first: {first_error}")
+    usual = shapes.most_common(1)[0][0]
+    if len(usual) != 2:
+        raise InputError(f"shots have shape {usual}, expected (y, x): choose one channel or plane")
+    return usual[0], usual[1]
+
+
+def _from_xarray(shots: xarray.DataArray | xarray.Dataset) -> Shots:
+    if hasattr(shots, "data_vars"):
+        planes = [name for name, variable in shots.data_vars.items() if variable.ndim == 3]
+        chosen = ["image"] if "image" in planes else planes
+        if len(chosen) != 1:
+            raise InputError(
+                f"the dataset has {len(planes)} variables with three dimensions: expected one, "
+                "(shot, y, x), or one called 'image'; select it"
+            )
+        shots = shots[chosen[0]]
+    name = next((dim for dim in shots.dims if str(dim).lower() not in PLANE), "shot")
+    coordinate = shots.coords.get(name)
+    values, _ = unpack_array(shots, "shots", ("shot", *PLANE))
+    return _from_array(values, None if coordinate is None else coordinate.values)
+
+
+def _from_array(shots: Any, coordinate: Any = None) -> Shots:
+    da: Any = import_module("dask.array")
+    if shots.ndim != 3 or 0 in shots.shape:
+        raise InputError(
+            f"shots have shape {shots.shape}, expected (shot, y, x) with at least one shot"
+        )
+    count = shots.shape[0]
+    if not np.isfinite(shots.shape).all():
+        raise InputError(
+            f"shots have the unknown shape {shots.shape}: call compute_chunk_sizes() first"
+        )
+    mask = _common_mask(shots)
+    images: Sequence[ImageReference]
+    if isinstance(shots, da.Array):
+        array = shots.rechunk((1, -1, -1))
+        images = [BlockReference(array, index) for index in range(count)]
+    else:
+        array = da.from_array(np.asarray(shots), chunks=(1, -1, -1))
+        images = [ArrayReference(plane) for plane in np.asarray(shots)]
+    names = map(str, range(count) if coordinate is None else coordinate)
+    items = [Shot(name, image) for name, image in zip(names, images, strict=True)]
+    return Shots(items, (shots.shape[1], shots.shape[2]), coordinate, array, mask)
+
+
+def _common_mask(shots: Any) -> BoolArray | None:
+    """Return the pixels that no shot of a masked array masks."""
+    if isinstance(getattr(shots, "_meta", None), np.ma.MaskedArray):
+        raise InputError(
+            "shots are a dask array of masked arrays: give the mask as mask=, and the values as "
+            "dask.array.ma.getdata(shots)"
+        )
+    if not isinstance(shots, np.ma.MaskedArray) or not np.ma.getmaskarray(shots).any():
+        return None
+    masked: BoolArray = np.ma.getmaskarray(shots)
+    if (masked != masked[0]).any():
+        raise InputError(
+            "shots have different masks, expected the same in all: mask pixels that are masked in "
+            "any (mask=~shots.mask.any(axis=0)), or describe them in a table with a mask each"
+        )
+    common: BoolArray = ~masked[0]
+    return common
+
+
+def find_source(source: Any, *, reader: Reader = read_shot) -> AnyArray | Shots | None:
+    """Return the undisturbed beam as one image, or as many."""
+    if source is None:
+        return None
+    single = isinstance(source, (str, Path)) and not _GLOB.search(str(source))
+    if single and _page_count(Path(source), reader) == 1:
+        return FileReference(Path(source).absolute(), reader).read()[0]
+    if getattr(source, "ndim", None) == 2:
+        return np.asarray(source)
+    sources = find_shots(source, reader=reader)
+    return sources.items[0].images.read()[0] if len(sources) == 1 else sources
+
+
+def table_shots(
+    table: Path | Sequence[ShotRow], recipe: Recipe, channel: str | None, variable: str | None
+) -> list[Shot]:
+    """Return the shots of a table, or of its rows: to fit if the recipe says so, or to invert."""
+    if recipe.fit is not None:
+        if not isinstance(table, Path):
+            raise InputError("received rows of a table to fit, expected its file: write it first")
+        by_name = rows_by_shot(table, {})
+        return [
+            Shot(name, RowsReference(_with_absolute_paths(rows), recipe, channel, variable))
+            for name, rows in by_name.items()
+        ]
+    rows, unused = rows_to_invert(table)
+    shots = []
+    for name, row in zip(_names_of([row.file for row in rows]), rows, strict=True):
+        (row,) = _with_absolute_paths([row])
+        setup = row_setup(row, _read_geometry(row, channel, variable), recipe)
+        images = RowsReference((row,), recipe, channel, variable, True, setup, unused)
+        shots.append(Shot(name, images))
+    return shots
+
+
+def _with_absolute_paths(rows: Sequence[ShotRow]) -> tuple[ShotRow, ...]:
+    """Return rows with absolute paths, for workers elsewhere."""
+    return tuple(
+        row.model_copy(update={name: path.absolute() for name, path in row.files.items()})
+        for row in rows
+    )
+
+
+def _read_geometry(row: ShotRow, channel: str | None, variable: str | None) -> Radiograph:
+    """Read an image if its file may contain a geometry; return an empty one otherwise."""
+    try:
+        if kind_of(row.file) in (PRADFORMAT.name, TEXT.name):
+            return read_part(row.file, channel, variable)
+    except (OSError, ValueError):
+        pass  # its shot fails, by name
+    return Radiograph(np.zeros((1, 1)))
+
+
+def first_image(shots: Sequence[Shot]) -> FitShot:
+    """Return the first image of the first shot of a table that can be read, to fit."""
+    first_error: Exception | None = None
+    for shot in shots:
+        assert isinstance(shot.images, RowsReference)
+        try:
+            images, _ = replace(shot.images, rows=shot.images.rows[:1]).load()
+            return images[0]
+        except (OSError, ValueError) as error:
+            first_error = first_error or error  # its shot fails later, by name
+    raise FileFormatError(f"none of {len(shots)} shots can be read, the first: {first_error}")

@@ -1,7 +1,7 @@
-"""Tasks of a worker: `Work` inverts one shot, `run_shots` several and writes each.
+"""Tasks of a worker: `InvertTask` inverts one shot, `FitTask` fits one.
 
-`run_shots` consists of `try_shot` and `write_shot`. For stacks to fit, `FitWork` replaces `Work`
-and has the same methods.
+- several shots one after the other, each written to the store: `run_shots`
+- its two parts: `try_shot`, `write_shot`
 """
 
 from __future__ import annotations
@@ -9,12 +9,15 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import json
 import multiprocessing
 import sys
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,15 +28,23 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion, plan_sites
-from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
+from napari_shadowinv.inversion.variables import dataset_from_field, fit_labels, variable_labels
 from napari_shadowinv.io.store import DONE, FAILED
-from napari_shadowinv.io.store_columns import INVERSIONS, column_values
+from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, column_values
 from napari_shadowinv.io.store_writing import GrowingStore, ShotWriter
-from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.pipeline import Cache, Inputs, run_prepared
-from napari_shadowinv.preprocessing import UniformEstimate
-from napari_shadowinv.stack._fit_work import FitWork
-from napari_shadowinv.stack._sources import Shot, checksum
+from napari_shadowinv.options import FitChoices, InversionOptions
+from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.pipeline import (
+    Cache,
+    FitShot,
+    Inputs,
+    collect_inputs,
+    run_fit,
+    run_prepared,
+)
+from napari_shadowinv.pipeline.fit_run import usual_fields
+from napari_shadowinv.preprocessing import Estimate, Radiograph, Recipe, UniformEstimate
+from napari_shadowinv.stack._shots import ArrayReference, Shot, checksum
 from napari_shadowinv.transport.sites import SitePlan
 
 _REFRESH_S = 10.0  # workers come and go, but asking takes milliseconds
@@ -115,19 +126,116 @@ class _SharedSites(Cache):
         return shared_plan(beam, options, measured=measured, should_stop=should_stop)
 
 
-@dataclass(frozen=True, eq=False)
-class Work:
-    """Task of every shot of a stack."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Task:
+    """Work on each shot of a stack, and the description of its results."""
 
-    shape: tuple[int, int]  # of the shots as recorded
-    inputs: Inputs  # without an image; shots inverted at once share the cores
-    variables: tuple[str, ...]
-    sites_chosen: bool = False  # as the first shots needed them
-    shots: ClassVar[str] = INVERSIONS
+    kind: ClassVar[str]  # of the results, for their provenance
 
-    def invert(
+    inputs: Inputs  # recipe and masks of all shots, without an image
+    variables: tuple[str, ...]  # of a result
+    by_row: bool = False  # whether shots are rows with their own setups, sources and masks
+
+    @property
+    def recipe(self) -> Recipe:
+        return self.inputs.recipe
+
+    @cached_property
+    def moved(self) -> Radiograph:
+        """Masks and setup after the steps that move pixels; its image means nothing."""
+        return self.recipe.move(self.inputs.shot)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.moved.shape
+
+    @property
+    def setup(self) -> Setup | None:
+        return self.moved.setup
+
+    @property
+    def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
+        """Dimensions and labels of all variables that the results can have."""
+        raise NotImplementedError
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """The choices that affect the results, as JSON."""
+        raise NotImplementedError
+
+    @property
+    def attributes(self) -> dict[str, str]:
+        """Attributes of a dataset of the results."""
+        provenance = self.inputs.provenance
+        provenance = provenance.model_copy(update={"setup": self.setup, "kind": self.kind})
+        options = self.recipe.options.model_dump_json()
+        return {"options": options, "provenance": provenance.to_json()}
+
+    def run(
         self,
-        content: Any,
+        images: Sequence[FitShot],
+        beam: Beam | None,
+        source: AnyArray | None = None,
+        *,
+        start: Any = None,
+        workers: int | None = None,
+        should_stop: ShouldStop | None = None,
+    ) -> Inversion | Fit:
+        """Invert or fit a shot, whose source is `source`, or else that of the beam."""
+        raise NotImplementedError
+
+    def arrays(self, result: Any) -> dict[str, AnyArray]:
+        """Return the variables by name, fields in SI units among them."""
+        planes, field = self._planes(result)
+        if any(name not in planes for name in self.variables):
+            in_si = dataset_from_field(field.displacement, field.potential, result.setup)
+            planes |= {str(name): in_si[name].values for name in in_si.data_vars}
+        return {name: planes[name] for name in self.variables if name in planes}
+
+    def _planes(self, result: Any) -> tuple[dict[str, AnyArray], Any]:
+        """Return variables in pixels by name, and the field that others follow from."""
+        raise NotImplementedError
+
+    def report(self, result: Any) -> dict[str, Any]:
+        """Return the report of a shot."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InvertTask(Task):
+    """Inversion of each shot."""
+
+    kind = "inversion"
+
+    estimate: Estimate | None = None  # of the source of rows without one
+    sites_chosen: bool = False  # whether the number of sites follows from the accuracy
+
+    @property
+    def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
+        return variable_labels(self.setup)
+
+    @property
+    def identity(self) -> dict[str, str]:
+        options = self.recipe.options
+        if self.sites_chosen:
+            options = options.model_copy(update={"n_sites": None})
+        return {"fit": "", "options": options.model_dump_json(exclude={"threads"})}
+
+    def with_sites(self, n_sites: int) -> InvertTask:
+        """Return the task with the number of sites derived from the accuracy."""
+        options = self.recipe.options.model_copy(update={"n_sites": n_sites})
+        provenance = self.inputs.provenance
+        recipe = provenance.recipe.model_copy(update={"options": options})
+        inputs = replace(
+            self.inputs,
+            recipe=self.recipe.model_copy(update={"options": options}),
+            provenance=provenance.model_copy(update={"recipe": recipe}),
+        )
+        return replace(self, inputs=inputs, sites_chosen=True)
+
+    def run(
+        self,
+        images: Sequence[FitShot],
         beam: Beam | None,
         source: AnyArray | None = None,
         *,
@@ -136,14 +244,20 @@ class Work:
         should_stop: ShouldStop | None = None,
     ) -> Inversion:
         """Apply the recipe to a shot as recorded, and to its source if it has its own."""
-        image = getattr(content, "image", content)
-        shape = getattr(image, "shape", None) or np.shape(image)
-        if shape != self.shape:
+        (image,) = images
+        assert isinstance(image.image, Radiograph)
+        shape, expected = np.shape(image.image.image), self.inputs.shot.shape
+        if shape != expected:
             reference = "the others" if beam is None or beam.source is None else "the source"
-            raise InputError(f"image has shape {shape}, expected {self.shape} as {reference}")
-        if source is not None and np.shape(source) != self.shape:
-            raise InputError(f"source has shape {np.shape(source)}, expected {self.shape}")
-        inputs = self.collect_inputs(content, beam, source)
+            raise InputError(f"image has shape {shape}, expected {expected} as {reference}")
+        if source is not None and np.shape(source) != expected:
+            raise InputError(f"source has shape {np.shape(source)}, expected {expected}")
+        if self.by_row:
+            inputs = self._inputs_of_row(image, image.image, beam, source)
+        else:
+            values = np.asarray(image.image.image, dtype=np.float64)
+            shot = replace(self.inputs.shot, image=values, source=source)
+            inputs = replace(self.inputs, shot=shot)
         recipe = inputs.recipe
         ready = recipe.prepare(inputs.shot, should_stop)
         if beam is None and isinstance(recipe.source, UniformEstimate):
@@ -160,32 +274,178 @@ class Work:
         inversion = run_prepared(inputs, ready, cache=sites, start=start, should_stop=should_stop)
         return _with_sites_reason(inversion) if self.sites_chosen else inversion
 
-    def collect_inputs(self, content: Any, beam: Beam | None, source: AnyArray | None) -> Inputs:
-        """Return the inputs of the recipe."""
-        values = np.asarray(content, dtype=np.float64)
-        return replace(self.inputs, shot=replace(self.inputs.shot, image=values, source=source))
+    def _inputs_of_row(
+        self, row: FitShot, image: Radiograph, beam: Beam | None, source: AnyArray | None
+    ) -> Inputs:
+        """Return the image of a row over its brightness, with its own source, mask and setup."""
+        common = self.inputs
+        self._check_setup(row.setup)
+        bare = Radiograph(
+            image.image / (row.brightness or 1.0), path=image.path, metadata=image.metadata
+        )
+        recipe = common.recipe.model_copy(
+            update={
+                # A common source is already in the beam.
+                "source": self.estimate if beam is None else common.recipe.source,
+                "setup": row.setup,
+                "mask": row.mask,
+            }
+        )
+        inputs = collect_inputs(
+            recipe,
+            bare,
+            source=source if row.source is None else row.source,
+            mask=common.shot.mask if row.mask is None else None,
+            source_mask=common.shot.source_mask,
+        )
+        if beam is None:
+            inputs.recipe.check(inputs.shot)
+        entries: dict[str, Any] = {"brightness": row.brightness}
+        if row.source is None:
+            entries["source"] = common.provenance.image.source
+        return replace(inputs, provenance=inputs.provenance.with_image(**entries))
 
-    def arrays(self, inversion: Inversion) -> dict[str, AnyArray]:
-        """Return the variables by name, fields in SI units among them."""
-        labels = variable_labels()
-        arrays = {name: getattr(inversion, name) for name in self.variables if name in labels}
-        if len(arrays) < len(self.variables):
-            fields = dataset_from_field(
-                inversion.displacement, inversion.potential, inversion.setup
+    def _check_setup(self, setup: Setup | None) -> None:
+        first = self.recipe.setup
+        kinds = [None if setup is None else setup.kind, None if first is None else first.kind]
+        if kinds[0] != kinds[1]:
+            texts = [f"a setup of kind '{kind}'" if kind else "no setup" for kind in kinds]
+            raise InputError(
+                f"it has {texts[0]}, and the first row of its table {texts[1]}: a store has the "
+                "units of one kind of setup; give all rows such a setup, or use two tables"
             )
-            arrays |= {name: fields[name].values for name in self.variables if name not in labels}
-        return arrays
 
-    def report(self, inversion: Inversion) -> dict[str, Any]:
-        """Return the report of a shot."""
-        headline = inversion.headline
-        return {
-            **dataclasses.asdict(inversion.report),
-            "stages": inversion.report.seconds,
+    def _planes(self, result: Inversion) -> tuple[dict[str, AnyArray], Any]:
+        names = variable_labels().keys() & set(self.variables)
+        return {name: getattr(result, name) for name in names}, result
+
+    def report(self, result: Inversion) -> dict[str, Any]:
+        """Return the report of a shot, with its own provenance if it is a row of a table."""
+        headline = result.headline
+        entries = {
+            **dataclasses.asdict(result.report),
+            "stages": result.report.seconds,
             "level": headline.level.value,
             "headline": headline.text,
-            **column_values(self.shots, inversion),
+            **column_values(ROWS if self.by_row else INVERSIONS, result),
         }
+        if self.by_row:
+            assert result.provenance is not None
+            entries["provenance"] = json.loads(result.provenance.to_json())
+        return entries
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FitTask(Task):
+    """Fit of the forward model to each shot, from its images as recorded."""
+
+    kind = "fit"
+
+    requested: Recipe  # without the setups of a table's rows, which come with the images
+
+    @property
+    def choices(self) -> FitChoices:
+        return self.requested.fit or FitChoices()
+
+    @property
+    def field(self) -> str:
+        """Name of the field that is fitted to each shot."""
+        setups = None if self.setup is None else [self.setup]
+        (name,) = self.choices.fields or usual_fields(setups)
+        return name
+
+    @property
+    def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
+        return fit_labels(self.field, self.setup)
+
+    @property
+    def identity(self) -> dict[str, str]:
+        choices = self.choices
+        return {
+            "fit": choices.model_dump_json(exclude={"options"}, exclude_none=True),
+            "options": choices.options.model_dump_json(exclude={"threads"}),
+        }
+
+    @property
+    def attributes(self) -> dict[str, str]:
+        return {**super().attributes, "fields": json.dumps([self.field])}
+
+    def run(
+        self,
+        images: Sequence[FitShot],
+        beam: Beam | None,
+        source: AnyArray | None = None,
+        *,
+        start: Any = None,
+        workers: int | None = None,
+        should_stop: ShouldStop | None = None,
+    ) -> Fit:
+        """Fit a shot; `start` is ignored."""
+        common = beam.source if source is None and beam is not None else source
+        completed = [self._completed(shot, common) for shot in images]
+        fit = run_fit(self._recipe, completed, should_stop=should_stop)
+        shape = fit.fields[0].potential.shape
+        if shape != self.shape:
+            raise InputError(f"the field has shape {shape}, expected {self.shape} as the others")
+        if fit.setup != self.setup:
+            raise InputError(
+                "the setup of its first image differs from that of the other shots' first images, "
+                "and a store has one: write these shots into another store"
+            )
+        return fit
+
+    @property
+    def _recipe(self) -> Recipe:
+        """The recipe for a worker; simultaneous fits share the cores."""
+        options = self.choices.options
+        if options.threads is None:
+            options = options.model_copy(update={"threads": 1})
+        choices = self.choices.model_copy(update={"fields": (self.field,), "options": options})
+        cleared = {"setup": None, "mask": None, "source_mask": None, "fit": choices}
+        return self.requested.model_copy(update={"source": self.requested.estimate, **cleared})
+
+    def _completed(self, shot: FitShot, source: AnyArray | None) -> FitShot:
+        """Complete an image with setup, source and masks of the stack."""
+        assert isinstance(shot.image, Radiograph)
+        common = self.inputs.shot
+        return replace(
+            shot,
+            image=replace(shot.image, image=np.asarray(shot.image.image, dtype=np.float64)),
+            setup=self.requested.setup if shot.setup is None else shot.setup,
+            source=source if shot.source is None else shot.source,
+            mask=common.mask if shot.mask is None else shot.mask,
+            source_mask=common.source_mask if shot.source_mask is None else shot.source_mask,
+        )
+
+    def _planes(self, result: Fit) -> tuple[dict[str, AnyArray], Any]:
+        (field,) = result.fields
+        planes = {
+            "potential": field.potential,
+            "displacement": field.displacement,
+            "displacement_uncertainty": field.uncertainty,
+        }
+        return {name: plane for name, plane in planes.items() if plane is not None}, field
+
+    def report(self, result: Fit) -> dict[str, Any]:
+        """Return the report of a shot."""
+        report, doubt = dataclasses.asdict(result.report), result.verdict_caution
+        entries = {
+            **column_values(FITS, result),
+            "explanation": result.explanation,
+            "chi2_images": result.chi2.tolist(),
+            "brightness": result.brightness.tolist(),
+            "strengths": result.strengths.tolist(),
+            "objective": result.report.objective,
+            "stages": report["seconds"],
+            "warnings": [] if doubt is None else [dataclasses.asdict(doubt)],
+        }
+        provenance = result.provenance
+        if provenance is not None and any(image.file for image in provenance.images):
+            entries["images"] = [
+                image.model_dump(mode="json", exclude_none=True, exclude={"mask", "source_mask"})
+                for image in provenance.images
+            ]
+        return entries
 
 
 def _with_sites_reason(inversion: Inversion) -> Inversion:
@@ -285,26 +545,32 @@ class TaskContext:
     """Context that the tasks of all shots share."""
 
     writer: ShotWriter
-    work: Work | FitWork
+    task: Task
     workers: int | None
 
 
 def run_shots(
-    shots: list[Any],
-    labels: list[tuple[int, bool, Shot | None]],
+    shots: list[Shot],
+    blocks: list[AnyArray | None],
+    labels: list[tuple[int, bool]],
     beam: Beam | None,
     context: TaskContext,
     stop: Any = None,
 ) -> list[ShotOutcome]:
-    """Task: invert, or fit, some shots one after the other and write each."""
+    """Task: invert, or fit, some shots one after the other and write each.
+
+    A shot is replaced by its block of a dask array if a cluster has computed that already.
+    """
     should_stop = None if stop is None else stop.is_set
     previous: Inversion | Fit | None = None
     outcomes = []
-    for shot, (index, is_pending, source) in zip(shots, labels, strict=True):
-        attempt = try_shot(context.work, shot, beam, source, previous, context.workers, should_stop)
+    for shot, block, (index, is_pending) in zip(shots, blocks, labels, strict=True):
+        if block is not None:
+            shot = replace(shot, images=ArrayReference(block[0]))
+        attempt = try_shot(context.task, shot, beam, previous, context.workers, should_stop)
         previous = attempt.result
         if is_pending:
-            outcomes.append(write_shot(context.writer, context.work, index, attempt))
+            outcomes.append(write_shot(context.writer, context.task, index, attempt))
     return outcomes
 
 
@@ -320,10 +586,9 @@ class Attempt:
 
 
 def try_shot(
-    work: Any,
-    shot: Any,
+    task: Task,
+    shot: Shot,
     beam: Beam | None,
-    source: Shot | None = None,
     start: Any = None,
     workers: int | None = None,
     should_stop: ShouldStop | None = None,
@@ -333,12 +598,12 @@ def try_shot(
     origin: dict[str, Any] = {}
     result, failure = None, ""
     try:
-        image, origin = _load_shot(shot)
-        shot_source = None
-        if source is not None:
-            shot_source, origin["source"] = source.load()
-        result = work.invert(
-            image, beam, shot_source, start=start, workers=workers, should_stop=should_stop
+        images, origin = shot.images.load()
+        source = None
+        if shot.source is not None:
+            source, origin["source"] = shot.source.images.read()
+        result = task.run(
+            images, beam, source, start=start, workers=workers, should_stop=should_stop
         )
     except InversionCancelled:
         raise
@@ -349,7 +614,7 @@ def try_shot(
 
 
 def write_shot(
-    writer: ShotWriter | GrowingStore, work: Any, index: int, attempt: Attempt
+    writer: ShotWriter | GrowingStore, task: Task, index: int, attempt: Attempt
 ) -> ShotOutcome:
     """Write the result or the failure of a shot."""
     result = attempt.result
@@ -358,10 +623,10 @@ def write_shot(
         failed = {"reason": attempt.failure, "seconds": attempt.seconds}
         writer.fail(index, {**attempt.origin, **failed, "warnings": cautions})
         return ShotOutcome(index, FAILED, attempt.seconds, attempt.failure)
-    entries = work.report(result)
+    entries = task.report(result)
     warnings = {"warnings": [*entries["warnings"], *cautions]}
     report = {**entries, "seconds": attempt.seconds, **attempt.origin, **warnings}
-    writer.write(index, work.arrays(result), report)
+    writer.write(index, task.arrays(result), report)
     spent = time.perf_counter() - attempt.began
     count = len(report["warnings"])
     return ShotOutcome(index, DONE, spent, converged=result.report.converged, warnings=count)
@@ -375,11 +640,3 @@ def failure_text(error: Exception) -> str:
     if isinstance(error, InputError | OSError):
         return str(error) or kind
     return f"{kind}: {error}"
-
-
-def _load_shot(shot: Any) -> tuple[AnyArray, dict[str, Any]]:
-    """Load a shot; a block of a dask array on a cluster has been computed already."""
-    if isinstance(shot, np.ndarray):
-        return shot[0], {"sha256": checksum(shot[0])}
-    loaded: tuple[AnyArray, dict[str, Any]] = shot.load()
-    return loaded

@@ -32,20 +32,41 @@ from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_store_path
 from napari_shadowinv.io.store_writing import GrowingStore, create_store, remove_unfinished
 from napari_shadowinv.pipeline.run_options import WatchOptions
-from napari_shadowinv.stack._discovery import Shots
 from napari_shadowinv.stack._folder_events import Arrivals, checked_folder, observing
 from napari_shadowinv.stack._plan import (
     MAX_TRIED_SHOTS,
+    Stack,
     describe_stack,
     needed_shares,
     with_enough_sites,
 )
-from napari_shadowinv.stack._resume import NUMBERED_AS_ARRIVED, contents_of, match_store
-from napari_shadowinv.stack._run import stored_variables
-from napari_shadowinv.stack._shots import FitStack, Stack
-from napari_shadowinv.stack._sources import FileShot, Reader, Shot, read_shot, stamp
-from napari_shadowinv.stack._status import WATCHING, OnStatus, RunStatus
-from napari_shadowinv.stack._worker import Attempt, ShotOutcome, failure_text, try_shot, write_shot
+from napari_shadowinv.stack._run import (
+    NUMBERED_AS_ARRIVED,
+    WATCHING,
+    OnStatus,
+    RunStatus,
+    contents_of,
+    match_store,
+    stored_variables,
+)
+from napari_shadowinv.stack._shots import (
+    FileReference,
+    ImageReference,
+    Reader,
+    Shot,
+    Shots,
+    read_shot,
+    stamp,
+)
+from napari_shadowinv.stack._worker import (
+    Attempt,
+    FitTask,
+    InvertTask,
+    ShotOutcome,
+    failure_text,
+    try_shot,
+    write_shot,
+)
 
 if TYPE_CHECKING:
     import xarray
@@ -62,19 +83,19 @@ _CLOCK_RESOLUTION_S = 2.0  # of file times, on any file system
 _POLL_S = 0.25  # between two looks at `should_stop` while nothing arrives
 
 
-def _is_unchanged(shot: FileShot, report: dict[str, Any], stamp_now: dict[str, int]) -> bool:
+def _is_unchanged(file: FileReference, report: dict[str, Any], stamp_now: dict[str, int]) -> bool:
     """Return whether a file still agrees with its report."""
     # Within the resolution of file times it may have changed at the same time.
     if time.time() - stamp_now["mtime_ns"] / 1e9 < _CLOCK_RESOLUTION_S and "sha256" in report:
-        return bool(sha256(shot.path) == report["sha256"])
-    return shot.unchanged(report)
+        return bool(sha256(file.path) == report["sha256"])
+    return file.unchanged(report)
 
 
 class _ShapeUnknownError(Exception):
     """The shape is unknown until a shot has arrived."""
 
 
-class _NoShot(Shot):
+class _NoImage(ImageReference):
     """Placeholder before any shot has arrived."""
 
     def shape(self) -> tuple[int, ...]:
@@ -90,24 +111,28 @@ class StackMaker:
     reader: Reader
     chained: bool  # whether each shot starts from an earlier one
 
-    def shot(self, name: str) -> FileShot:
-        return FileShot(self.folder / name, self.reader)
+    def file(self, name: str) -> FileReference:
+        return FileReference(self.folder / name, self.reader)
+
+    def shot(self, name: str) -> Shot:
+        return Shot(text_of(name), self.file(name))
 
     def before_any(self) -> Stack | None:
         """Return the stack before a shot has arrived; None if its shape is unknown."""
         try:
-            return self._describe([_NoShot()], [""])
+            return self._describe([Shot("", _NoImage())])
         except _ShapeUnknownError:
             return None
 
     def of(self, names: Sequence[str]) -> Stack:
         """Return the stack of some shots, the first of which can be read."""
-        return self._describe([self.shot(name) for name in names], names)
+        return self._describe([self.shot(name) for name in names])
 
-    def _describe(self, items: Sequence[Shot], names: Sequence[str]) -> Stack:
-        stack = self.describe(Shots(items, tuple(map(text_of, names)), (0, 0)))
+    def _describe(self, items: Sequence[Shot]) -> Stack:
+        stack = self.describe(Shots(items, (0, 0)))
         # Shots start from each other only on the same sites.
-        chained = self.chained and stack.beam is not None and not isinstance(stack, FitStack)
+        on_same_sites = stack.beam is not None and isinstance(stack.task, InvertTask)
+        chained = self.chained and on_same_sites
         return replace(stack, as_arrived=True, chained=chained)
 
 
@@ -116,7 +141,6 @@ class _RunningShot:
     """A shot in work, with its attempt."""
 
     name: str
-    shot: FileShot
     stamp_before: dict[str, int]  # of its file, before it was read
     lane: int
     attempt: Future[Attempt]
@@ -146,7 +170,7 @@ class Watch:
         self._failures: dict[str, str] = {}
         self._overwrite = False
         self._stack: Stack | None = None
-        self._work: Any = None  # once the number of sites is known
+        self._task: InvertTask | FitTask | None = None  # once the number of sites is known
         self._pool = ThreadPoolExecutor(_LANES)
         self._abandoned = Event()
         self._running: deque[_RunningShot] = deque()
@@ -231,11 +255,11 @@ class Watch:
     def _begin(self, name: str) -> None:
         while any(name == running.name for running in self._running):
             self._finish()  # it may have changed since it was read
-        shot = self._stacks.shot(name)
+        file = self._stacks.file(name)
         try:
-            stamp_now = stamp(shot.path)
+            stamp_now = stamp(file.path)
             report = self._previous_report(text_of(name))
-            if report is not None and _is_unchanged(shot, report, stamp_now):
+            if report is not None and _is_unchanged(file, report, stamp_now):
                 if not self._arrivals.waiting:
                     self.report()
                 return
@@ -244,10 +268,10 @@ class Watch:
             return  # removed before its turn
         lane = self._begun % _LANES
         self._begun += 1
-        attempt = self._submit(name, shot, lane)
+        attempt = self._submit(name, lane)
         attempt.add_done_callback(lambda _: self._arrivals.wake())
         self._busy_since = self._busy_since if self._running else time.monotonic()
-        self._running.append(_RunningShot(name, shot, stamp_now, lane, attempt))
+        self._running.append(_RunningShot(name, stamp_now, lane, attempt))
         self.report()
 
     def _finish(self) -> None:
@@ -258,8 +282,9 @@ class Watch:
         if not self._running:
             self._busy_s += time.monotonic() - self._busy_since
         stamp_after = {**stamp_before, **attempt.origin}
-        with suppress(OSError):
-            stamp_after = stamp(running.shot.path) if attempt.failure else stamp_after
+        if attempt.failure:
+            with suppress(OSError):
+                stamp_after = stamp(self._stacks.file(running.name).path)
         if not stamp_before.items() <= stamp_after.items():
             self._arrivals.put_back(running.name)  # it was written to while it was read
             return
@@ -294,36 +319,35 @@ class Watch:
         pending = name in self._redo or store.status(index) == PENDING
         return None if pending else store.report(index)
 
-    def _submit(self, name: str, shot: FileShot, lane: int) -> Future[Attempt]:
-        failed = self._prepare(name, shot) if self._work is None else None
+    def _submit(self, name: str, lane: int) -> Future[Attempt]:
+        shot = self._stacks.shot(name)
+        failed = self._prepare(name, shot) if self._task is None else None
         if failed is not None:
             done: Future[Attempt] = Future()
             done.set_result(failed)
             return done
-        stack = self._stack
-        assert stack is not None
-        source, start = stack.source_of(0), self._lanes[lane]
+        assert self._stack is not None
+        assert self._task is not None
+        beam, start = self._stack.beam, self._lanes[lane]
         # Alone, it has all the cores.
         workers = _LANES if self._running or self._arrivals.waiting else 1
-        return self._pool.submit(
-            try_shot, self._work, shot, stack.beam, source, start, workers, self._is_stopped
-        )
+        return self._pool.submit(try_shot, self._task, shot, beam, start, workers, self._is_stopped)
 
-    def _prepare(self, name: str, shot: FileShot) -> Attempt | None:
+    def _prepare(self, name: str, shot: Shot) -> Attempt | None:
         """Describe the stack by its first shot; return a failed attempt if that is impossible."""
         began = time.perf_counter()
         names = [name, *self._arrivals.peek(MAX_TRIED_SHOTS - 1)]
         stack = self._stack
         if stack is None:
             try:
-                shot.shape()
+                shot.images.shape()
             except Exception as error:
                 return Attempt(began, time.perf_counter() - began, {}, failure=failure_text(error))
             store = self.store
             if store is not None:
                 # Earlier shots are a better reference for the size of the images.
                 existing = (
-                    earlier for earlier in store.done() if self._stacks.shot(earlier).path.exists()
+                    earlier for earlier in store.done() if self._stacks.file(earlier).path.exists()
                 )
                 names = [*islice(existing, MAX_TRIED_SHOTS), *names]
             stack = self._stacks.of(names)
@@ -336,19 +360,18 @@ class Watch:
             shares = needed_shares(replace(stack, shots=shots), self._should_stop)
             if not shares:
                 # It fails the same way, and a later shot decides.
-                return try_shot(stack.work(()), shot, stack.beam, None, None, 1, self._should_stop)
+                return try_shot(stack.task, shot, stack.beam, None, 1, self._should_stop)
             stack = with_enough_sites(stack, shares)
         self._use_stack(stack)
         return None
 
     def _use_stack(self, stack: Stack) -> None:
         self._stack = stack
-        per_shot = tuple(name for name in stack.variables if not stack.is_shared(name))
-        self._work = stack.work(per_shot)
+        self._task = stack.shot_task
 
     def _write(self, name: str, attempt: Attempt) -> ShotOutcome:
         early = self._early
-        if attempt.result is None and (self._work is None or self.store is None):
+        if attempt.result is None and (self._task is None or self.store is None):
             early[name] = {**attempt.origin, "reason": attempt.failure, "seconds": attempt.seconds}
             return ShotOutcome(len(early) - 1, FAILED, attempt.seconds, attempt.failure)
         store = self.store or self._create_store([*early, name])
@@ -361,14 +384,14 @@ class Watch:
         index = store.append(name) if number is None else number
         if store.status(index) == DONE:
             store.reopen(index)
-        return write_shot(store, self._work, index, attempt)
+        assert self._task is not None
+        return write_shot(store, self._task, index, attempt)
 
     def _create_store(self, names: Sequence[str]) -> GrowingStore:
         """Create the store with its first shots."""
         assert self._stack is not None
-        first = tuple(dict.fromkeys(names))
-        shots = replace(self._stack.shots, items=[_NoShot()] * len(first), names=first)
-        stack = replace(self._stack, shots=shots)
+        items = [Shot(name, _NoImage()) for name in dict.fromkeys(names)]
+        stack = replace(self._stack, shots=replace(self._stack.shots, items=items))
         created = create_store(
             self._path, contents_of(stack, self._dtype), overwrite=self._overwrite
         )
