@@ -393,6 +393,24 @@ def test_an_object_that_a_crop_cuts_is_reported(amplitude):
         assert {"cut-object", "closed-edge"} & warnings, widths
 
 
+def test_the_weaker_part_of_an_object_that_a_crop_cuts_is_reported():
+    shape = (128, 128)
+    strong = phantoms.gaussian_blob(shape, 120.0, 10.0, (60.0, 50.0)).displacement
+    weak = phantoms.gaussian_blob(shape, 40.0, 10.0, (70.0, 90.0)).displacement
+    image = np.random.default_rng(3).poisson(1000 * synthetic_image(strong + weak))
+    source = np.full(shape, 1000.0)
+    assert "cut-object" in codes_of(invert(image[:, :100], source=source[:, :100]))
+    assert not codes_of(invert(image, source=source))
+
+
+@pytest.mark.parametrize("seed", [3392, 3813, 3997])
+def test_noise_along_the_edge_is_no_cut_object(seed):
+    blob = phantoms.gaussian_blob((96, 96), 16.0, 9.0, (48.0, 48.0))
+    image = np.random.default_rng(seed).poisson(200 * synthetic_image(blob.displacement))
+    source = np.full(image.shape, 200.0)
+    assert not codes_of(invert(image, source=source, options=InversionOptions(n_sites=1000)))
+
+
 def test_a_jet_across_the_image_is_not_cut():
     x = np.indices((96, 96))[1]
     potential = 12 * np.exp(-((x - 47) ** 2) / (2 * 6.0**2))

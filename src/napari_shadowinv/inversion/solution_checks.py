@@ -42,6 +42,11 @@ them (200 × 200 px and the reference images):
   that the edge cuts in half has 0.87 to 1 of its peak along the edge, real plumes up to 0.72; a
   jet is as strong at the edge as elsewhere, but nothing crosses the edge. A dipole's field, and an
   object cut off by less than half, are indistinguishable from a plume.
+- **An edge cuts the object.** The contrast at the edge is 0.4 and more of the strongest inside for
+  21 of 22 random objects that a crop cuts and that no other sign shows, and at most 0.31 for real
+  plumes and reference images. Of another 100 cropped objects 42 were more than 5 % and three totals
+  wrong, 5 of them without a warning: faint ones at 400 to 900 counts, and fields that cross the
+  edge where they leave no contrast. None of 223 objects that end inside the image was doubted.
 """
 
 from __future__ import annotations
@@ -145,7 +150,7 @@ _AT_EDGE = 0.8  # of the peak
 _CROSSING = 0.1  # of the displacement along the edge
 
 _CONTRAST_BLUR = 0.025  # of the shorter side
-_MIN_EDGE_CONTRAST = 0.6  # of the strongest contrast of the same sign
+_MIN_EDGE_CONTRAST = 0.4  # of the strongest contrast of the same sign
 _MAX_OPPOSITE_CONTRAST = 0.35  # of the contrast at an edge, at the opposite edge
 _MIN_SIGN_CONTRAST = 0.03  # of the strongest contrast
 _CONTRAST_DEVIATIONS, _BEAM_DEVIATIONS = 7.0, 4.0
@@ -415,8 +420,8 @@ def _cut_by_edge(prepared: Prepared, noise: ImageNoise, beam_difference: float) 
     is_lit = mask & (prepared.source > 0)
     ratio = prepared.image / np.where(is_lit, prepared.source, 1.0)
     contrast = np.where(is_lit, ratio / (prepared.image[mask].mean() / mean) - 1, 0.0)
-    contrast = ndimage.gaussian_filter(contrast, width, mode="nearest", truncate=3.0)
-    # At the edge half of the Gaussian repeats the edge's pixels.
+    contrast = ndimage.gaussian_filter(contrast, width, truncate=3.0)
+    # Along an edge the noise is √2 times as large, in a corner twice.
     by_noise = noise.typical * np.sqrt(noise.clumping / (2 * np.pi)) / width
     strongest = float(np.abs(contrast).max())
     least = max(_CONTRAST_DEVIATIONS * by_noise, _BEAM_DEVIATIONS * beam_difference)
@@ -438,9 +443,10 @@ def _cut_by_edge(prepared: Prepared, noise: ImageNoise, beam_difference: float) 
             ):
                 return (
                     f"the {side} edge of the image seems to cut the object: the image's contrast "
-                    "there is as strong as inside, and what lies beyond is missing, which makes "
-                    "the field wrong, by 7 to 73 % in tests; use a wider crop or field of view, "
-                    "or try a free boundary (--boundary free), see docs/boundary.md"
+                    "is strong there and weak at the opposite edge, and what lies beyond is "
+                    "missing, which makes the field wrong, by 7 to 73 % in tests; use a wider crop "
+                    "or field of view, or try a free boundary (--boundary free), see "
+                    "docs/boundary.md"
                 )
     return ""
 
