@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, ValidationError, model_validator
+from pydantic import BeforeValidator, ValidationError, model_validator
 
 from napari_shadowinv import __version__
 from napari_shadowinv._system.validation import CheckedModel
@@ -26,7 +26,6 @@ from napari_shadowinv.preprocessing.recipe import Recipe
 
 __all__ = ["ImageOrigin", "MaskOrigin", "Origin", "Provenance", "index_masks"]
 
-_CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 # Characters of a mask, of a table and of the whole: HDF5 keeps no attribute longer than 64,000.
 _MAX_MASK, _MAX_FIDUCIALS, _MAX_TEXT = 48_000, 9_000, 54_000
 _MASKS = ("mask", "source_mask")
@@ -45,7 +44,6 @@ class Origin(CheckedModel):
         Shape as recorded.
     """
 
-    model_config = _CONFIG
     file: str = ""
     sha256: str = ""
     variable: str | None = None
@@ -140,7 +138,6 @@ class Provenance(CheckedModel):
         The film pack.
     """
 
-    model_config = _CONFIG
     kind: Literal["inversion", "fit", "film pack"]
     version: str = __version__
     recipe: Recipe = Recipe()

@@ -24,6 +24,7 @@ from napari_shadowinv.errors import InputError
 
 PLANE = ("y", "x")
 VECTOR = ("component", *PLANE)
+NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation, normal noise
 PIXELS, SQUARE_PIXELS = "px", "px²"
 
 _UNNAMED = re.compile(r"dim_\d+")  # xarray's names for dimensions that got none
@@ -141,6 +142,13 @@ def checked_plane(values: Any, name: str, least: int = 1) -> AnyArray:
     return array
 
 
+def check_finite(name: str, values: FloatArray) -> None:
+    """Raise an `InputError` if a value is NaN or infinite."""
+    bad = values.size - np.count_nonzero(np.isfinite(values))
+    if bad:
+        raise InputError(f"{name} has {bad} values that are NaN or infinite: all must be finite")
+
+
 def checked_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str = "image") -> BoolArray:
     """Return a mask as booleans, all true by default, or raise an `InputError`."""
     if mask is None:
@@ -237,6 +245,12 @@ def _spacing(array: Any, dim: str, name: str) -> float | None:
         )
     metres = _METRES.get(str(coordinate.attrs.get("units", "")).strip())
     return None if metres is None else abs(mean) * metres
+
+
+def blocks_of(plane: AnyArray, side: int) -> AnyArray:
+    """Return a plane as blocks, shape (rows, side, columns, side), cut where none is complete."""
+    rows, columns = (length // side for length in plane.shape)
+    return plane[: rows * side, : columns * side].reshape(rows, side, columns, side)
 
 
 def order_by_value(values: FloatArray) -> AnyArray:

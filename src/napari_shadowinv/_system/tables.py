@@ -1,6 +1,6 @@
 """Tables as comma-separated values, with the lines of their rows for messages.
 
-- the cells of a table: `read_table`; its rows as models: `read_rows`
+- the cells of a table: `read_table`; its rows as models: `read_rows`; to a file: `write_cells`
 - whether a file begins with column names: `has_column_names`
 
 Semicolons and tabs separate cells, too. Empty lines and lines that begin with ``#`` are skipped.
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_args
 
@@ -130,6 +130,16 @@ def read_rows(
                 entries[name] = str(path.parent / entries[name])
         models[line] = validated(model, {**(shared or {}), **entries}, f"{path}, line {line}")
     return models
+
+
+def write_cells(
+    path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[str, object]]
+) -> None:
+    """Write a table from the cells of its rows by column; missing ones are empty."""
+    with Path(path).open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def has_column_names(path: Path) -> bool:

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic._internal._model_construction import ModelMetaclass
 
 from napari_shadowinv.errors import InputError
@@ -39,8 +39,11 @@ class _CheckedMeta(ModelMetaclass):
 class CheckedModel(BaseModel, metaclass=_CheckedMeta):
     """Model that refuses a wrong value with an `InputError` of one sentence.
 
-    `model_validate` raises pydantic's own error, which lists all mistakes; see `validated`.
+    It cannot be changed and has no other fields. `model_validate` raises pydantic's own error,
+    which lists all mistakes; see `validated`.
     """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 
     def __setattr__(self, name: str, value: Any) -> None:
         try:

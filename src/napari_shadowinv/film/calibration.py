@@ -275,6 +275,17 @@ def _unexposed_level(background: AnyArray, channel: str) -> float:
     return value
 
 
+def checked_scan(scan: ArrayLike) -> AnyArray:
+    """Return a colour scan without its alpha channel, or raise an `InputError`."""
+    values = np.asarray(scan)
+    if values.ndim != 3 or values.shape[-1] not in (3, 4) or not values.size:
+        raise InputError(
+            f"the scan has shape {values.shape}: expected (height, width, 3), in red, green and "
+            "blue"
+        )
+    return values[..., :3]
+
+
 def unexposed_pixel(scan: ArrayLike) -> FloatArray:
     """Return the pixel of unexposed film, shape (3,), from its scan, shape (H, W, 3).
 
@@ -379,12 +390,7 @@ def combined_dose(
     InputError
         As `dose`, and if the scan has no colours.
     """
-    values = np.asarray(scan)
-    if values.ndim != 3:
-        raise InputError(
-            f"the scan has shape {values.shape}: expected (height, width, 3), in red, green and "
-            "blue"
-        )
+    values = checked_scan(scan)
     shape = values.shape[:2]
     weights, weighted = np.zeros(shape), np.zeros(shape)
     squares, counted, outside = np.zeros(shape), np.zeros(shape), np.ones(shape, bool)

@@ -25,7 +25,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from napari_shadowinv._system.safety import as_file_errors, small_text
 from napari_shadowinv._system.validation import CheckedModel, suggestion
@@ -194,8 +194,6 @@ def _from_srim(path: Path) -> Stopping:
     return Stopping(energies, losses * 1000 * grams * _PER_M, 1000 * grams)
 
 
-_CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
-
 _SEEN_FROM = {
     None: "the source (assumed)",
     "source": "the source",
@@ -206,7 +204,6 @@ _SEEN_FROM = {
 class Material(CheckedModel):
     """Material with its stopping of protons, by a table from SRIM or by Bethe's formula."""
 
-    model_config = _CONFIG
     density: float | None = Field(
         default=None, gt=0, title="Density (kg/m³)", description="Where there is no table."
     )
@@ -268,7 +265,6 @@ MATERIALS = {
 class Slab(CheckedModel):
     """Layer of one material, also from a text such as ``13 um Al``."""
 
-    model_config = _CONFIG
     material: str
     thickness: float = Field(gt=0, le=0.1, title="Thickness (m)")
 
@@ -303,7 +299,6 @@ Slabs = Annotated[tuple[Slab, ...], BeforeValidator(_split_slabs)]
 class FilmType(CheckedModel):
     """Type of film: its layers in the order in which protons cross them, and its calibration."""
 
-    model_config = _CONFIG
     before: Slabs = Field(default=(), title="Before", description="In front of the active layer.")
     active: Slab = Field(title="Active layer", description="Such as 12 um HD active.")
     behind: Slabs = Field(default=(), title="Behind", description="Behind the active layer.")
@@ -336,7 +331,6 @@ FILM_TYPES = {
 class PackLayer(CheckedModel):
     """Film of the pack, and the filters in front of it."""
 
-    model_config = _CONFIG
     film: str = Field(title="Film", description="Its type.")
     filters: Slabs = Field(
         default=(), title="Filters", description="In front of it, such as 13 um Al; 25 um Fe."
@@ -367,7 +361,6 @@ class Pack(CheckedModel):
     that it leaves out from the built-in one.
     """
 
-    model_config = _CONFIG
     layers: tuple[PackLayer, ...] = Field(
         min_length=1, title="Layers", description="Films and the filters in front of each."
     )

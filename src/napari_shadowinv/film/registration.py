@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from scipy import fft, ndimage
 from scipy.optimize import isotonic_regression
 
+from napari_shadowinv._system.arrays import NORMAL_MAD, blocks_of
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -196,8 +197,7 @@ def move_corners(corners: ArrayLike, shift: ArrayLike, turn: float, scale: float
     """Return corners of a film, moved and turned by its pose, which is in px of `scale`."""
     places = np.asarray(corners, np.float64)
     axes, middle, _ = upright(places)
-    c, s = np.cos(turn), np.sin(turn)
-    around = (places - middle) @ axes.T @ np.array([[c, s], [-s, c]])
+    around = (places - middle) @ axes.T @ _rotation(turn)
     return np.asarray(middle + (around + scale * np.asarray(shift)) @ axes)
 
 
@@ -353,7 +353,7 @@ def _compare(first: int, second: int, films: list[_Film]) -> _Pair | None:
         if not (power > 0 and (gain := (moved[both] @ reference[both]) / power) > 0):
             return None
         residual = reference[both] - gain * moved[both]
-        usual = 1.4826 * np.median(np.abs(residual)) + 1e-300
+        usual = NORMAL_MAD * np.median(np.abs(residual)) + 1e-300
         weight = 1 / (1 + (residual / (2 * usual)) ** 2)
         normal = gain * slopes.T @ (weight[:, None] * slopes)
         step = np.linalg.lstsq(normal, slopes.T @ (weight * residual), rcond=None)[0]
@@ -478,14 +478,9 @@ def _fit_poses(pairs: list[_Pair], edges: FloatArray) -> Poses:
 
 def _large(image: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Large structure in few pixels, and how much of each of them is known."""
-    height, width = (length // _LARGE * _LARGE for length in image.shape)
-
-    def sum_blocks(plane: FloatArray) -> FloatArray:
-        part = plane[:height, :width]
-        return np.asarray(part.reshape(height // _LARGE, _LARGE, -1, _LARGE).sum(axis=(1, 3)))
-
-    counts = sum_blocks(usable.astype(np.float64))
-    return sum_blocks(np.where(usable, image, 0.0)) / np.maximum(counts, 1.0), counts / _LARGE**2
+    planes = (usable.astype(np.float64), np.where(usable, image, 0.0))
+    counts, sums = (blocks_of(plane, _LARGE).sum(axis=(1, 3)) for plane in planes)
+    return np.asarray(sums / np.maximum(counts, 1.0)), np.asarray(counts / _LARGE**2)
 
 
 def _greatest_correlation(

@@ -12,7 +12,6 @@ Corners are in px of the scan, (y, x), from the film's top left in the direction
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -20,11 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from napari_shadowinv._system.tables import read_rows
+from napari_shadowinv._system.arrays import NORMAL_MAD
+from napari_shadowinv._system.tables import read_rows, write_cells
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.film.calibration import Calibration, net_optical_density
+from napari_shadowinv.film.calibration import Calibration, checked_scan, net_optical_density
 
 __all__ = [
     "burnt_edges",
@@ -153,17 +153,6 @@ def common_shape(sizes: ArrayLike) -> tuple[int, int]:
     """Return the common shape for straightened films of sizes (n, 2)."""
     height, width = np.median(np.asarray(sizes, np.float64), axis=0)
     return round(height), round(width)
-
-
-def checked_scan(scan: ArrayLike) -> AnyArray:
-    """Return a colour scan without its alpha channel, or raise an `InputError`."""
-    values = np.asarray(scan)
-    if values.ndim != 3 or values.shape[-1] not in (3, 4) or not values.size:
-        raise InputError(
-            f"the scan has shape {values.shape}: expected (height, width, 3), in red, green and "
-            "blue"
-        )
-    return values[..., :3]
 
 
 def checked_corners(corners: ArrayLike) -> FloatArray:
@@ -357,17 +346,17 @@ def read_corners(path: str | Path) -> dict[str, FloatArray]:
 
 def write_corners(path: str | Path, films: dict[str, FloatArray]) -> None:
     """Write a table that `read_corners` reads."""
-    with Path(path).open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow(_CornerRow.model_fields)
-        for name, corners in films.items():
-            rows.writerow([name, *(f"{value:.2f}" for value in np.ravel(corners))])
+    columns = list(_CornerRow.model_fields)
+    rows = [
+        dict(zip(columns, [name, *(f"{value:.2f}" for value in np.ravel(corners))], strict=True))
+        for name, corners in films.items()
+    ]
+    write_cells(path, columns, rows)
 
 
 _SAMPLE_STEP_PX = 8  # between the samples of the smooth background
 _BACKGROUND_SAMPLES = 13  # side of the median that gives the background
 _SCATTER_SAMPLES = 25  # side of the median that gives its scatter
-_NORMAL_MAD = 1.4826
 _MIN_SCATTERS = 6.0  # by which a mark differs from the background
 _MIN_DENSITY = 0.04  # by which it differs, too, in optical density
 _MARK_BLUR_PX = 1.0
@@ -439,7 +428,7 @@ def usable_pixels(
     samples = excess[first::_SAMPLE_STEP_PX, first::_SAMPLE_STEP_PX]
     usual = ndimage.median_filter(samples, _BACKGROUND_SAMPLES, mode="nearest")
     scatter = ndimage.median_filter(np.abs(samples - usual), _SCATTER_SAMPLES, mode="nearest")
-    least = np.maximum(_resample(_MIN_SCATTERS * _NORMAL_MAD * scatter, excess), _MIN_DENSITY)
+    least = np.maximum(_resample(_MIN_SCATTERS * NORMAL_MAD * scatter, excess), _MIN_DENSITY)
     marked = np.abs(excess - _resample(usual, excess)) > least
     labels, count = ndimage.label(marked)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)

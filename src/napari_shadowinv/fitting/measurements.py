@@ -15,7 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
-from napari_shadowinv._system.arrays import as_numbers, join_masks, mask_of_each, unpack_planes
+from napari_shadowinv._system.arrays import (
+    NORMAL_MAD,
+    as_numbers,
+    join_masks,
+    mask_of_each,
+    unpack_planes,
+)
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import check_instance
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -40,7 +46,6 @@ _MIN_SIGMA_PX = 1e-6  # of a fiducial; the square of less overflows
 _BLOCK = 8  # px; sides are filled up to a multiple of it, for pixels four times as wide
 _SMALLEST_SIDE = 32
 _BYTES_PER_PIXEL, _BYTES_PER_PIXEL_AND_IMAGE = 2000, 600  # measured peak
-_NORMAL_MAD = 1.4826
 _LEAST_NOISE = 0.005  # of the beam: what the model itself is off by, about
 _LARGEST_NOISE = 1e6  # of the beam, of the least noisy pixel
 _LEAST_COUNTS = 1.0
@@ -238,7 +243,7 @@ def estimated_noise(image: FloatArray, used: BoolArray) -> float:
     both_used = used[1:, 1:] & used[1:, :-1] & used[:-1, 1:] & used[:-1, :-1]
     if not both_used.any():
         return 0.0
-    return float(_NORMAL_MAD * np.median(np.abs(differences[both_used])) / 2)
+    return float(NORMAL_MAD * np.median(np.abs(differences[both_used])) / 2)
 
 
 def _checked_images(images: ArrayLike) -> FloatArray:

@@ -27,7 +27,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import ndimage
 from scipy.optimize import nnls
 
-from napari_shadowinv._system.arrays import order_by_value
+from napari_shadowinv._system.arrays import NORMAL_MAD, order_by_value
 from napari_shadowinv._typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -125,19 +125,18 @@ def _is_quiet(ratio: FloatArray, means: FloatArray, variance: FloatArray) -> Boo
         share = (residual * slope).sum(axis=(2, 3), keepdims=True) / (slope**2).sum()
         residual = residual - share * slope
     square = (residual**2).sum(axis=(2, 3)) / (_CELLS**2 - 3)
-    spread = 1.4826 * float(np.nanmedian(np.abs(means - 1)))
+    spread = NORMAL_MAD * float(np.nanmedian(np.abs(means - 1)))
     allowed = max(_MAX_CURVATURE * spread, _MIN_CURVATURE) ** 2
     quiet = square <= _MAX_NOISE_RATIO * variance + allowed
     if not quiet.any():
         return np.asarray(quiet)
     # A flank may look like a plane, but stands out from the beam's slow differences.
     away = np.abs(means - np.median(means[quiet]))
-    spread = 1.4826 * float(np.median(away[quiet]))
+    spread = NORMAL_MAD * float(np.median(away[quiet]))
     return np.asarray(quiet & (away <= _MAX_DEVIATIONS * spread))
 
 
 _CLIPPED_AT = 4.0  # in standard deviations of normal noise
-_NORMAL_MAD = 1.4826
 _DEVIATIONS = 5.0
 _BINS, _SAMPLES = 24, 20_000  # of brightness, and the pixels that are looked at
 
@@ -246,7 +245,7 @@ def _rms(values: FloatArray) -> float:
 
 def _clipped_rms(differences: FloatArray) -> float:
     """Return the standard deviation, with differences clipped that noise does not explain."""
-    limit = _CLIPPED_AT * _NORMAL_MAD * float(np.median(differences))
+    limit = _CLIPPED_AT * NORMAL_MAD * float(np.median(differences))
     return _rms(np.minimum(differences, limit)) if limit > 0 else _rms(differences)
 
 
@@ -330,7 +329,7 @@ def _without_hot_pixels(tiles: FloatArray) -> FloatArray:
     """Clip each tile about its median."""
     middle = np.median(tiles[..., ::2, ::2], axis=(2, 3), keepdims=True)
     spread = np.median(np.abs(tiles[..., ::2, ::2] - middle), axis=(2, 3), keepdims=True)
-    limit = _CLIP_DEVIATIONS * _NORMAL_MAD * spread
+    limit = _CLIP_DEVIATIONS * NORMAL_MAD * spread
     return np.clip(tiles, middle - limit, middle + limit)
 
 

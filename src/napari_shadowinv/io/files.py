@@ -3,7 +3,7 @@
 - its fingerprint: `sha256`; its name as text: `text_of`; many in order: `in_counting_order`
 - refuse a header that promises more than there is: `check_promise`
 - refuse an output before hours of work: `check_output`, `check_folder_of`
-- write all of a file or nothing: `replacing`
+- write all of a file or nothing: `replacing`, `write_toml`
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ import errno
 import hashlib
 import os
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from napari_shadowinv._system.hidden_files import MAX_NAME_BYTES, hidden_name, sweep
 from napari_shadowinv._system.machine import clear_up_when_terminated, defer_interrupts
@@ -117,6 +118,14 @@ def check_folder_of(path: Path) -> None:
         raise FileFormatError(
             f"{path} cannot be written: the folder {path.parent} is read-only; choose another"
         )
+
+
+def write_toml(path: str | Path, content: Mapping[str, Any], overwrite: bool = False) -> None:
+    """Write keys and values as a TOML file, completely or not at all."""
+    import tomli_w
+
+    with replacing(path, overwrite) as temporary:
+        temporary.write_text(tomli_w.dumps(content), encoding="utf-8")
 
 
 @contextmanager

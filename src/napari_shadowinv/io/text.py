@@ -35,6 +35,7 @@ from typing import Any
 import numpy as np
 
 from napari_shadowinv._system.safety import check_size
+from napari_shadowinv._system.tables import is_number
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError
 
@@ -188,20 +189,12 @@ def _parse_row(path: Path, number: int, line: str, width: int | None) -> FloatAr
     try:
         return np.fromiter(map(float, words), dtype=np.float64, count=len(words))
     except ValueError:
-        word = next(word for word in words if not _is_number(word)).strip()
+        word = next(word for word in words if not is_number(word)).strip()
         excerpt = word if len(word) <= 30 else f"{word[:30]}…"
         raise FileFormatError(
             f"{path}, line {number} has {excerpt!r}: expected numbers with a decimal point, "
             "separated by spaces or commas; start lines of text with #"
         ) from None
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _parse_geometry(path: Path, number: int, line: str) -> dict[str, float]:
@@ -225,7 +218,7 @@ def _parse_geometry(path: Path, number: int, line: str) -> dict[str, float]:
     fits = {unit, expected} <= _UNITS.keys() and (unit in _ENERGY_UNITS) == (
         expected in _ENERGY_UNITS
     )
-    if value is not None and fits and _is_number(value["number"]):
+    if value is not None and fits and is_number(value["number"]):
         return {name: float(value["number"]) * (_UNITS[unit] / _UNITS[expected])}
     if entry["sign"].isspace():
         # Prose that happens to begin with a key and a number.

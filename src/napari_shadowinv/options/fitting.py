@@ -49,7 +49,7 @@ class FitOptions(CheckedModel):
     'fading'
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(allow_inf_nan=False)
 
     smoothness: float | None = Field(
         default=None,
@@ -200,7 +200,7 @@ class FitChoices(CheckedModel):
     ('B', 'E')
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(allow_inf_nan=False)
 
     fields: tuple[str, ...] | None = Field(
         default=None,

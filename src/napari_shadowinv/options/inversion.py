@@ -32,7 +32,7 @@ class InversionOptions(CheckedModel):
     0.001
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(allow_inf_nan=False)
 
     n_sites: int | None = Field(
         default=None,

@@ -23,7 +23,6 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import (
-    ConfigDict,
     Field,
     ValidationInfo,
     field_validator,
@@ -206,8 +205,6 @@ class BeamSetup(CheckedModel):
     in_pradformat: ClassVar[bool] = False  # whether that format can describe the beam
     # Whether a small source magnifies the object onto a film or plate, as it does with particles.
     projects: ClassVar[bool] = False
-
-    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 
     kind: str = Field(title="Kind", description="Kind of probe.")
     source_object_distance: float = Field(

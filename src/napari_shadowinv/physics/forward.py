@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solveh_banded
 
-from napari_shadowinv._system.arrays import PIXELS, VECTOR, plain_array
+from napari_shadowinv._system.arrays import PIXELS, VECTOR, check_finite, plain_array
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import FloatArray, IntArray
@@ -352,7 +352,7 @@ def _edge_integral(row: int, cut: float, ya: float, xa: float, yb: float, xb: fl
 
 
 # A cubic spline without knots next to the border needs four samples.
-_MIN_SIDE_PX = 4
+MIN_SIDE_PX = 4
 # Fixed, so that sums are formed in the same order whatever the number of threads.
 _N_BANDS = 32
 _BYTES_PER_PIXEL = 72  # displacement, its spline, source and image
@@ -411,7 +411,7 @@ def synthetic_image(
     >>> synthetic_image(displacement)[0]
     array([0., 0., 1., 1., 1.])
     """
-    field = _checked_displacement(displacement)
+    field = _finite_displacement(displacement)
     shape = (field.shape[1], field.shape[2])
     flux = _checked_source(source, shape)
     if rays_per_pixel < 1:
@@ -468,27 +468,28 @@ def jacobian_determinant(displacement: ArrayLike) -> FloatArray:
     >>> float(jacobian_determinant([0.5 * y, 1.0 * x])[2, 2])
     3.0
     """
-    field = _checked_displacement(displacement)
+    field = _finite_displacement(displacement)
     (dy_dy, dy_dx), (dx_dy, dx_dx) = (np.gradient(component, edge_order=2) for component in field)
     determinant: FloatArray = (1 + dy_dy) * (1 + dx_dx) - dy_dx * dx_dy
     return determinant
 
 
-def _checked_displacement(displacement: ArrayLike) -> FloatArray:
+def checked_displacement(displacement: ArrayLike) -> FloatArray:
+    """Return a displacement as floats, or raise an `InputError` if a spline cannot be fitted."""
     plain = plain_array(displacement, "displacement", VECTOR, unit=PIXELS)
     check_memory(plain.shape[-2:], _BYTES_PER_PIXEL, "an image")
     field = np.asarray(plain, dtype=np.float64)
-    if field.ndim != 3 or field.shape[0] != 2:
+    if field.ndim != 3 or field.shape[0] != 2 or min(field.shape[1:]) < MIN_SIDE_PX:
         raise InputError(
-            f"displacement has shape {field.shape}: expected (2, height, width), "
-            "the y component first"
+            f"displacement has shape {field.shape}: expected (2, height, width), the y component "
+            f"first, at least {MIN_SIDE_PX} pixels each way"
         )
-    if min(field.shape[1:]) < _MIN_SIDE_PX:
-        raise InputError(
-            f"displacement has shape {field.shape}: the image must be at least "
-            f"{_MIN_SIDE_PX} × {_MIN_SIDE_PX} pixels"
-        )
-    _refuse_non_finite("displacement", field)
+    return field
+
+
+def _finite_displacement(displacement: ArrayLike) -> FloatArray:
+    field = checked_displacement(displacement)
+    check_finite("displacement", field)
     return field
 
 
@@ -501,7 +502,7 @@ def _checked_source(source: ArrayLike | None, shape: tuple[int, int]) -> FloatAr
             f"source has shape {plain.shape}, displacement describes {shape}: they must match"
         )
     flux = np.ascontiguousarray(plain, dtype=np.float64)
-    _refuse_non_finite("source", flux)
+    check_finite("source", flux)
     if flux.min() < 0:
         raise InputError(
             f"source has {np.count_nonzero(flux < 0)} negative pixels (lowest {flux.min():g}): "
@@ -510,12 +511,6 @@ def _checked_source(source: ArrayLike | None, shape: tuple[int, int]) -> FloatAr
     if flux.max() == 0:
         raise InputError("source is zero everywhere: at least one pixel must have flux")
     return flux
-
-
-def _refuse_non_finite(name: str, values: FloatArray) -> None:
-    bad = values.size - np.count_nonzero(np.isfinite(values))
-    if bad:
-        raise InputError(f"{name} has {bad} values that are NaN or infinite: all must be finite")
 
 
 def _bands(height: int) -> list[tuple[int, int]]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import dctn, idctn
 
-from napari_shadowinv._system.arrays import SQUARE_PIXELS, checked_plane, plain_array
+from napari_shadowinv._system.arrays import SQUARE_PIXELS, check_finite, checked_plane, plain_array
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
@@ -98,9 +98,7 @@ def _checked(name: str, values: ArrayLike) -> FloatArray:
     plain = plain_array(values, name)
     check_memory(plain.shape, _BYTES_PER_PIXEL, "a linear inversion")
     array = np.asarray(checked_plane(plain, name), dtype=np.float64)
-    bad = array.size - np.count_nonzero(np.isfinite(array))
-    if bad:
-        raise InputError(f"{name} has {bad} values that are NaN or infinite: all must be finite")
+    check_finite(name, array)
     return array
 
 

@@ -30,10 +30,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 
-from napari_shadowinv._system.arrays import PIXELS, VECTOR, plain_array
+from napari_shadowinv._system.arrays import plain_array
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.forward import MIN_SIDE_PX, checked_displacement, synthetic_image
 from napari_shadowinv.physics.setup import Setup, deflector_titles
 
 __all__ = [
@@ -43,8 +43,6 @@ __all__ = [
     "transferred_displacement",
 ]
 
-# A cubic spline needs four samples.
-_MIN_SIDE_PX = 4
 # Share of a pixel by which rounding may put an image's edge beyond the other's.
 _EDGE_TOLERANCE_PX = 1e-6
 # Pixels that differ by less are the same ones, divided and multiplied by a magnification.
@@ -176,7 +174,7 @@ def transferred_displacement(
     >>> float(transferred_displacement(np.ones((2, 4, 4)), setup, slow)[0, 0, 0])
     2.22
     """
-    field = _checked_field(displacement)
+    field = checked_displacement(displacement)
     factor = _angle_ratio(recorded_with, setup, deflector, dispersion)
     ratio = setup.object_pixel_size / recorded_with.object_pixel_size
     old = (field.shape[1], field.shape[2])
@@ -231,24 +229,13 @@ def _require_same_kind(recorded_with: Setup, setup: Setup) -> None:
         )
 
 
-def _checked_field(displacement: ArrayLike) -> FloatArray:
-    plain = plain_array(displacement, "displacement", VECTOR, unit=PIXELS)
-    field = np.asarray(plain, dtype=np.float64)
-    if field.ndim != 3 or field.shape[0] != 2 or min(field.shape[1:]) < _MIN_SIDE_PX:
-        raise InputError(
-            f"displacement has shape {field.shape}: expected (2, height, width), the y component "
-            f"first, at least {_MIN_SIDE_PX} pixels each way"
-        )
-    return field
-
-
 def _covered_shape(old: tuple[int, int], ratio: float) -> tuple[int, int]:
     """Height and width in pixels of the new size that fit into the old image."""
     height, width = (math.floor(n / ratio + _EDGE_TOLERANCE_PX) for n in old)
-    if min(height, width) < _MIN_SIDE_PX:
+    if min(height, width) < MIN_SIDE_PX:
         raise InputError(
             f"the known field covers {height} × {width} pixels of the other setup: expected at "
-            f"least {_MIN_SIDE_PX} × {_MIN_SIDE_PX}; check the pixel sizes"
+            f"least {MIN_SIDE_PX} × {MIN_SIDE_PX}; check the pixel sizes"
         )
     return height, width
 
@@ -256,10 +243,10 @@ def _covered_shape(old: tuple[int, int], ratio: float) -> tuple[int, int]:
 def _checked_shape(
     shape: tuple[int, int], old: tuple[int, int], ratio: float, setup: Setup
 ) -> tuple[int, int]:
-    if len(shape) != 2 or min(shape) < _MIN_SIDE_PX:
+    if len(shape) != 2 or min(shape) < MIN_SIDE_PX:
         raise InputError(
             f"the other image has shape {tuple(shape)}: expected (height, width), at least "
-            f"{_MIN_SIDE_PX} pixels each way"
+            f"{MIN_SIDE_PX} pixels each way"
         )
     most = _covered_shape(old, ratio)
     if shape[0] > most[0] or shape[1] > most[1]:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from pydantic import ConfigDict
 
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
@@ -86,7 +85,6 @@ class Film:
 class _Fiducial(CheckedModel):
     """A mark through the pack, in px of a film's scan."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     film: int
     name: str
     y: float

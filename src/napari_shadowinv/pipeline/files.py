@@ -15,7 +15,8 @@ from typing import Any
 
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv._system.validation import validated
-from napari_shadowinv.io import read_radiograph, read_toml, replacing
+from napari_shadowinv.io import read_radiograph, read_toml
+from napari_shadowinv.io.files import write_toml
 from napari_shadowinv.physics.setup import SETUPS, Setup, setup_from_dict
 from napari_shadowinv.preprocessing import MeasuredSource, Radiograph, Recipe
 
@@ -36,13 +37,9 @@ def write_recipe(path: Path, recipe: Recipe, *, overwrite: bool = False) -> None
 
     A `FileFormatError` is raised if the file exists, unless `overwrite`, or cannot be written.
     """
-    import tomli_w
-
     folder = resolved_path(Path(path).parent)
     relative = _map_files(recipe, lambda file: Path(os.path.relpath(resolved_path(file), folder)))
-    content = _without_defaults(relative)
-    with replacing(path, overwrite) as whole:
-        Path(whole).write_text(tomli_w.dumps(content), encoding="utf-8")
+    write_toml(path, _without_defaults(relative), overwrite)
 
 
 def read_part(path: Path, channel: str | None = None, variable: str | None = None) -> Radiograph:

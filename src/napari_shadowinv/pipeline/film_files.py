@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -18,12 +17,13 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from napari_shadowinv._system.tables import read_rows
+from napari_shadowinv._system.tables import read_rows, write_cells
 from napari_shadowinv._system.validation import validated
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.film import Calibration, Pack, PackLayer
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read_toml, replacing, write
+from napari_shadowinv.io.files import in_counting_order, write_toml
 from napari_shadowinv.io.formats import PRADFORMAT, SCAN_SUFFIXES, SITES, TIFF
 from napari_shadowinv.io.pradformat import write_radiograph
 
@@ -129,7 +129,8 @@ def write_layers(
             written.append(write(folder / row["file"], fluence, overwrite=overwrite))
         if setups and form == "tiff":
             row["setup"] = f"{name}.toml"
-            written.append(_write_setup(folder / row["setup"], setups[k].model_dump(), overwrite))
+            write_toml(folder / row["setup"], setups[k].model_dump(), overwrite)
+            written.append(folder / row["setup"])
         elif not setups:
             row["energy"] = f"{doses.energies[k]:.6g}"
             row["strength"] = f"{doses.strengths[k]:.6g}"
@@ -138,19 +139,9 @@ def write_layers(
         rows.append(row)
     table = folder / LAYERS_TABLE
     columns = [name for name in _COLUMNS if any(name in row for row in rows)]
-    with replacing(table, overwrite) as temporary, Path(temporary).open("w", newline="") as text:
-        lines = csv.DictWriter(text, columns, restval="")
-        lines.writeheader()
-        lines.writerows(rows)
+    with replacing(table, overwrite) as temporary:
+        write_cells(temporary, columns, rows)
     return [*written, table]
-
-
-def _write_setup(path: Path, content: dict[str, Any], overwrite: bool) -> Path:
-    import tomli_w
-
-    with replacing(path, overwrite) as temporary:
-        Path(temporary).write_text(tomli_w.dumps(content), encoding="utf-8")
-    return path
 
 
 def _map_files(pack: Pack, move: Callable[[Path], Path]) -> Pack:
@@ -225,7 +216,7 @@ def draft_pack(
     facts = facts or NewPack()
     folder = Path(folder)
     try:
-        files = sorted((path for path in folder.iterdir() if path.is_file()), key=_natural_key)
+        files = in_counting_order(path for path in folder.iterdir() if path.is_file())
     except OSError as error:
         raise FileFormatError(
             f"{folder} cannot be read as a folder ({error.strerror}): choose the folder of the "
@@ -291,19 +282,10 @@ def write_new_pack(folder: Path, entries: Mapping[str, Any], *, overwrite: bool 
     InputError
         If the entries do not describe a pack; the message names the reason.
     """
-    import tomli_w
-
     path = Path(folder) / PACK_FILE
     validated(Pack, dict(entries), str(path))
-    with replacing(path, overwrite) as unfinished:
-        Path(unfinished).write_text(tomli_w.dumps(dict(entries)), encoding="utf-8")
+    write_toml(path, entries, overwrite)
     return path
-
-
-def _natural_key(path: Path) -> list[tuple[int, str]]:
-    """Sort key that takes digits as numbers."""
-    parts = re.findall(r"\d+|\D+", path.name.lower())
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _film_type_of(path: Path, types: tuple[str, ...]) -> str | None:

@@ -17,7 +17,7 @@ _RARE: Any = {"panel": "Rarely used options of a run"}
 class _StoreOptions(CheckedModel):
     """Choices of a store, and of a run that resumes it."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(allow_inf_nan=False)
 
     variables: tuple[str, ...] | None = Field(
         default=None,

@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
-from napari_shadowinv._system.tables import has_column_names, is_number, read_rows
+from napari_shadowinv._system.tables import has_column_names, is_number, read_rows, write_cells
 from napari_shadowinv._system.validation import CheckedModel, suggestion, validated
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import replacing, text_of
@@ -56,7 +55,7 @@ class ShotRow(CheckedModel):
     quantity is a label.
     """
 
-    model_config = ConfigDict(frozen=True, extra="allow")
+    model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, _BeamValue]
     file: Path = Field(title="Image", description="Its file.")
     setup: Path | None = Field(
@@ -151,7 +150,6 @@ _FIT_COLUMNS = ("strength", "psf", "noise")
 
 
 class _Fiducial(CheckedModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
     y: float
     x: float
     dy: float
@@ -251,13 +249,8 @@ def write_table(path: Path, rows: Sequence[ShotRow]) -> None:
         if row.exclude:
             cells["exclude"] = "yes"
     columns = [name for name in ShotRow.columns() if any(name in cells for cells in table_cells)]
-    with (
-        replacing(path, overwrite=True) as draft,
-        Path(draft).open("w", newline="", encoding="utf-8") as file,
-    ):
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows(table_cells)
+    with replacing(path, overwrite=True) as draft:
+        write_cells(draft, columns, table_cells)
 
 
 def _used_rows(table: Path | Sequence[ShotRow], shared: Mapping[str, Any]) -> dict[int, ShotRow]:

@@ -36,6 +36,7 @@ import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field, PrivateAttr
 
+from napari_shadowinv._system.arrays import NORMAL_MAD
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution, OnCaution, warn_of
@@ -455,7 +456,7 @@ def _fit_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray, report: Repo
     scale = 0.0
     for _ in range(_MOST_FITS):
         residual = _gaussian(parameters, y, x) - sample
-        previous, scale = scale, max(pixels.NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
+        previous, scale = scale, max(NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
         if abs(scale - previous) < 1e-2 * scale:
             break
         parameters = fitted(parameters, "soft_l1", scale)

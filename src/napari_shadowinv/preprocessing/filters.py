@@ -30,6 +30,7 @@ import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field
 
+from napari_shadowinv._system.arrays import NORMAL_MAD
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -215,8 +216,7 @@ def butterworth(
     values, _ = pixels.checked_pixels(image)
     cutoff = pixels.checked_number("cutoff", cutoff, above=0, unit="px")
     order = pixels.checked_integer("order", order, least=1)
-    if kind not in ("high", "low"):
-        raise InputError(f"kind is {kind!r}, expected 'high' or 'low'")
+    pixels.check_kind(kind, "high", "low")
     wave_numbers = _wave_numbers(values.shape)
     octaves = np.full(wave_numbers.shape, -np.inf)
     np.log(wave_numbers * (cutoff / (2 * np.pi)), out=octaves, where=wave_numbers > 0)
@@ -305,8 +305,7 @@ def remove_background(
     InversionCancelled
         If `should_stop` returned true.
     """
-    if kind not in ("divide", "subtract"):
-        raise InputError(f"kind is {kind!r}, expected 'divide' or 'subtract'")
+    pixels.check_kind(kind, "divide", "subtract")
     values, _ = pixels.checked_pixels(image)
     background = pixels.fit_polynomial(values, degree, mask=mask, should_stop=should_stop)
     if kind == "subtract":
@@ -512,4 +511,4 @@ def _deviation(difference: FloatArray) -> float:
     """Return the robust standard deviation about zero."""
     size = np.abs(difference)
     # In few-bit images more than half the pixels can equal their median.
-    return float(pixels.NORMAL_MAD * np.median(size)) or float(_NORMAL_MEAN * size.mean())
+    return float(NORMAL_MAD * np.median(size)) or float(_NORMAL_MEAN * size.mean())

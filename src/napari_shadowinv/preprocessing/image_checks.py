@@ -31,8 +31,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import fft, ndimage
 from scipy.optimize import nnls
 
-from napari_shadowinv._system.arrays import order_by_value
-from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv._system.arrays import NORMAL_MAD, blocks_of, order_by_value
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 
 __all__ = [
@@ -42,8 +42,6 @@ __all__ = [
     "saturated_share",
     "stray_pixels",
 ]
-
-_NORMAL_MAD = 1.4826
 
 # Saturation
 _MIN_PLATEAU_PIXELS, _MIN_PLATEAU_SHARE = 10, 5e-4
@@ -196,7 +194,7 @@ def stray_pixels(image: FloatArray, mask: BoolArray | None = None) -> BoolArray:
     if not mean > 0:
         return stray
     bends = part[:, 3:] - 3 * part[:, 2:-1] + 3 * part[:, 1:-2] - part[:, :-3]
-    noise = _NORMAL_MAD * float(np.median(np.abs(bends))) / math.sqrt(20)
+    noise = NORMAL_MAD * float(np.median(np.abs(bends))) / math.sqrt(20)
     step = np.abs(image[1:-1, 1:-1] - image[1:-1, :-2])
     # Few pixels differ enough from the one on their left to be compared with all.
     rows, columns = np.nonzero(step > max(_STRAY_DEVIATIONS * noise, _STRAY_STEP * mean))
@@ -302,10 +300,10 @@ class ReferencePair:
     def _blocks(self) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Image and source in blocks of pixels, of mean 1, and the blocks that are usable."""
         step = _coarse_step(self.image.shape)
-        usable = _block_mean(self.mask, step) > _USABLE
+        usable = blocks_of(self.mask, step).mean(axis=(1, 3)) > _USABLE
         planes = []
         for plane in (self.image, self.source):
-            blocks = _block_mean(plane, step)
+            blocks = blocks_of(plane, step).mean(axis=(1, 3))
             planes.append(blocks / max(float(blocks[usable].mean()), 1e-300))
         return planes[0], planes[1], usable
 
@@ -328,12 +326,6 @@ class ReferencePair:
 
 def _coarse_step(shape: tuple[int, ...]) -> int:
     return max(1, -(-max(shape) // _COARSE_SIDE_PX))
-
-
-def _block_mean(values: AnyArray, step: int) -> FloatArray:
-    rows, columns = (side // step for side in values.shape)
-    cut = values[: rows * step, : columns * step]
-    return np.asarray(cut.reshape(rows, step, columns, step).mean(axis=(1, 3)))
 
 
 def _contrast(values: FloatArray, usable: BoolArray) -> float:
@@ -517,13 +509,13 @@ class _NoisyPlane:
         """Differences over the brightness, clipped."""
         brightness, differences = self._local
         values = differences / np.maximum(brightness, _MIN_DARK * abs(float(brightness.mean())))
-        limit = _CLIPPED_AT * _NORMAL_MAD * float(np.median(np.abs(values)))
+        limit = _CLIPPED_AT * NORMAL_MAD * float(np.median(np.abs(values)))
         return np.clip(values, -limit, limit)
 
 
 def _clipped_variance(differences: FloatArray) -> float:
     sizes = np.abs(differences)
-    limit = _CLIPPED_AT * _NORMAL_MAD * float(np.median(sizes))
+    limit = _CLIPPED_AT * NORMAL_MAD * float(np.median(sizes))
     return float((sizes[sizes <= limit] ** 2).mean()) / _CLIPPED_VARIANCE
 
 

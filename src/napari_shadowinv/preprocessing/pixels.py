@@ -17,7 +17,7 @@ import scipy
 from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import checked_mask, checked_plane, unpack_shot
+from napari_shadowinv._system.arrays import NORMAL_MAD, checked_mask, checked_plane, unpack_shot
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -77,8 +77,7 @@ def interpolated_source(
     D. Garcia, "Robust smoothing of gridded data in one and higher dimensions with missing
     values", Computational Statistics & Data Analysis 54, 1167 (2010).
     """
-    if kind not in ("biharmonic", "laplace"):
-        raise InputError(f"kind is {kind!r}, expected 'biharmonic' or 'laplace'")
+    check_kind(kind, "biharmonic", "laplace")
     values, usable = beam_pixels(image, mask)
     width = checked_number("width", width, above=0, unit="px")
     power = 2 if kind == "biharmonic" else 1
@@ -151,7 +150,6 @@ def _double_rows(coarse: FloatArray, side: int) -> FloatArray:
 
 _HIGHEST_DEGREE = 10
 _MOST_REWEIGHTINGS = 50
-NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation, normal noise
 # As a share of the mean: the floor to which an inversion raises an image's dark pixels.
 _FLOOR = 1e-3
 MOST_EXTRAPOLATION = 10.0  # times the brightest pixel seen
@@ -198,6 +196,12 @@ def checked_integer(name: str, value: int, *, least: int, most: int | None = Non
         limits = f"at least {least}" if most is None else f"from {least} to {most}"
         raise InputError(f"{name} is {value!r}, expected an integer {limits}")
     return number
+
+
+def check_kind(kind: str, *kinds: str) -> None:
+    """Raise an `InputError` unless a kind is one of those that there are."""
+    if kind not in kinds:
+        raise InputError(f"kind is {kind!r}, expected {' or '.join(map(repr, kinds))}")
 
 
 def beam_pixels(image: ArrayLike, mask: ArrayLike | None) -> tuple[FloatArray, BoolArray]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.cautions import OnCaution
 
 
-_CONFIG = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 _LEAST_VISIBLE = 0.1  # of an object under the source mask, for the inversion to see it
 _LEAST_OBJECT = 10  # pixels
 _MOST_FALL = 10.0  # times below the dimmest pixel seen
@@ -85,8 +84,6 @@ class Recipe(CheckedModel):
     >>> Recipe.model_validate_json(recipe.model_dump_json()) == recipe
     True
     """
-
-    model_config = _CONFIG
 
     steps: tuple[AnyStep, ...] = Field(
         default=(), title="Steps", description="What is done to the image first, in this order."

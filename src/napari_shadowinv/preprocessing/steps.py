@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field, PlainSerializer
+from pydantic import BeforeValidator, Field, PlainSerializer
 from pydantic.fields import FieldInfo
 
+from napari_shadowinv._system.arrays import blocks_of
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
@@ -67,6 +68,11 @@ class Radiograph:
         """Shape (H, W) of the image."""
         height, width = self.image.shape
         return height, width
+
+    @property
+    def usable(self) -> BoolArray:
+        """Pixels that can be used: where the mask is true, or without a mask the finite ones."""
+        return np.isfinite(self.image) if self.mask is None else self.mask
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -119,8 +125,8 @@ class Radiograph:
             return self
         binned = replace(
             self.map_planes(
-                lambda plane: _blocks(plane, factor).sum(axis=(1, 3)),
-                lambda mask: np.asarray(_blocks(mask, factor).all(axis=(1, 3))),
+                lambda plane: blocks_of(plane, factor).sum(axis=(1, 3)),
+                lambda mask: np.asarray(blocks_of(mask, factor).all(axis=(1, 3))),
             ),
             setup=None if self.setup is None else bin_setup(self.setup, factor),
             metadata={**self.metadata, "bin": factor * int(self.metadata.get("bin", 1))},
@@ -130,12 +136,6 @@ class Radiograph:
         return binned.add_notes(f"binned {factor} × {factor}{cut}")
 
 
-def _blocks(array: AnyArray, factor: int) -> AnyArray:
-    rows, columns = (n // factor for n in array.shape)
-    cropped = array[: rows * factor, : columns * factor]
-    return cropped.reshape(rows, factor, columns, factor)
-
-
 _SMALLEST_SIDE = 4  # px of a crop
 _MIN_SHARE = 0.999  # of a rotated pixel that must have data
 
@@ -143,7 +143,6 @@ _MIN_SHARE = 0.999  # of a rotated pixel that must have data
 class Choice(CheckedModel):
     """One of several ways to do something, with its parameters."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     title: ClassVar[str]  # in forms
     key: ClassVar[str]  # the field that names it in files, "step" or "method"
     # The parameter that the command's flag of the same name sets; "" if each has its own flag.
@@ -307,7 +306,7 @@ class Dark(Step):
                     "shot's 'dark'"
                 )
             dark = shot.dark
-        usable = np.isfinite(shot.image) if shot.mask is None else shot.mask
+        usable = shot.usable
         image = shot.image - dark
         if usable.any() and not image[usable].mean() > 0:
             raise InputError(
@@ -361,7 +360,7 @@ class Rotate(Step):
         return rotated.add_notes(f"rotated by {self.angle:g}°")
 
     def _interpolate(self, shot: Radiograph) -> Radiograph:
-        usable = np.isfinite(shot.image) if shot.mask is None else shot.mask
+        usable = shot.usable
         share = self._move(usable.astype(np.float64))
         mask = share > _MIN_SHARE
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from qtpy.QtWidgets import QLabel, QSpinBox
 
 from napari_shadowinv._napari import layer_metadata as about
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 class PhantomRecipe(CheckedModel):
     """A simulated object with parameters of its field."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     title: ClassVar[str]
     # Kind of setup that the object requires; empty for any setup, or none.
     probe: ClassVar[str] = ""
