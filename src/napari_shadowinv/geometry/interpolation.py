@@ -25,6 +25,9 @@ of natural neighbour interpolation" (1981); paper, section III.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -36,23 +39,28 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 __all__ = [
     "BLOCK",
-    "PATCH",
     "WIDTH",
     "CloughTocher",
     "corner_weights",
-    "fill_patch",
     "fit_gradients",
-    "locate",
-    "mesh_arrays",
     "natural_neighbor",
-    "nearest_corner",
-    "value_on_patch",
     "with_gradients",
     "with_mirror_images",
 ]
 
-
+BLOCK = 2048  # queries that share one walk; fixed, so that threads change nothing
+WIDTH = 8  # numbers in a cache line
 _LARGEST_CAVITY = 256
+_PATCH = 31  # numbers that describe the surface over a triangle
+_CACHED_PATCHES = 512  # triangles whose patches are remembered
+
+
+def _in_blocks(
+    kernel: Callable[..., None], queries: FloatArray, threads: int | None, *operands: Any
+) -> None:
+    """Call a kernel on ranges of the blocks of queries."""
+    blocks = -(-len(queries) // BLOCK)
+    in_ranges(kernel, blocks, available_threads(threads), queries, *operands, smallest=2)
 
 
 @njit(nogil=True, cache=True)
@@ -177,7 +185,7 @@ def _interpolate_blocks(
         t = 0
         for q in range(block * BLOCK, min((block + 1) * BLOCK, queries.shape[0])):
             y, x = queries[q]
-            t = locate(vertices, neighbors, points, t, y, x)
+            t = _locate(vertices, neighbors, points, t, y, x)
             met = -1
             for k in range(3):
                 corner = vertices[t, k]
@@ -225,14 +233,10 @@ def natural_neighbor(
     out = np.empty((len(points), columns.shape[1]))
     for column in range(columns.shape[1]):
         result = np.empty(len(points))
-        surface = (*mesh_arrays(triangulation), np.ascontiguousarray(columns[:, column]))
-        work = -(-len(points) // BLOCK), available_threads(threads), points
-        in_ranges(_interpolate_blocks, *work, *surface, result, smallest=2)
+        surface = (*_mesh_arrays(triangulation), np.ascontiguousarray(columns[:, column]))
+        _in_blocks(_interpolate_blocks, points, threads, *surface, result)
         out[:, column] = result
     return out.reshape(len(points), *at_sites.shape[1:])
-
-
-WIDTH = 8  # numbers in a cache line; a constant, so that loops are unrolled
 
 
 @njit(nogil=True, cache=True)
@@ -275,8 +279,11 @@ def _minimise_bending(
     gradients: FloatArray,
     surface: FloatArray,
 ) -> None:
-    """Do the sweep of `fit_gradients`, starting from `gradients`; write values and gradients."""
-    n = values.shape[0]
+    """Make one Jacobi sweep towards the gradients of least bending along the edges.
+
+    Values (n, k) and gradients (n, 2, k) of k sets are written to the surface (n, 3, k).
+    """
+    n, width = values.shape
     system = np.zeros((n, 3))
     for t in range(vertices.shape[0]):
         for k in range(3):
@@ -290,7 +297,7 @@ def _minimise_bending(
                 system[i, 0] += stiffness * ey * ey
                 system[i, 1] += stiffness * ey * ex
                 system[i, 2] += stiffness * ex * ex
-                for s in range(WIDTH):
+                for s in range(width):
                     rise = 3 * (values[b, s] - values[a, s])
                     slope_there = gradients[j, 0, s] * ey + gradients[j, 1, s] * ex
                     pull = stiffness * (rise - slope_there) / 2
@@ -300,7 +307,7 @@ def _minimise_bending(
         yy, yx, xx = system[i]
         determinant = yy * xx - yx * yx
         fitted = determinant > 1e-12 * (yy + xx) ** 2
-        for s in range(WIDTH):
+        for s in range(width):
             surface[i, 0, s] = values[i, s]
             ry, rx = surface[i, 1, s], surface[i, 2, s]
             if fitted:
@@ -315,12 +322,9 @@ def with_gradients(triangulation: RegularTriangulation, values: FloatArray) -> F
 
     The gradients equal `fit_gradients`, started from the mean of the triangles around each site.
     """
-    vertices, neighbors, points = mesh_arrays(triangulation)
     gradients = np.zeros((len(values), 2, WIDTH))
-    _mean_slopes(vertices, points, values, gradients)
-    surface = np.zeros((len(values), 3, WIDTH))
-    _minimise_bending(vertices, neighbors, points, values, gradients, surface)
-    return surface
+    _mean_slopes(triangulation.vertices, triangulation.points, values, gradients)
+    return _bend_least(triangulation, values, gradients)
 
 
 @njit(nogil=True, cache=True)
@@ -336,28 +340,28 @@ def _weigh_corners(
     weights: FloatArray,
 ) -> None:
     """Do blocks `start` to `stop` of the queries."""
-    p, f, g, patch = np.empty((3, 2)), np.zeros(3), np.zeros((3, 2)), np.empty(PATCH)
+    p, f, g, patch = np.empty((3, 2)), np.zeros(3), np.zeros((3, 2)), np.empty(_PATCH)
     for block in range(start, stop):
         t = 0
         for q in range(block * BLOCK, min((block + 1) * BLOCK, queries.shape[0])):
             y, x = queries[q]
-            t = locate(vertices, neighbors, points, t, y, x)
+            t = _locate(vertices, neighbors, points, t, y, x)
             a, b, c = vertices[t]
             if a < n and b < n and c < n:
                 p[0], p[1], p[2] = points[a], points[b], points[c]
                 corners[q, 0], corners[q, 1], corners[q, 2] = a, b, c
                 for k in range(3):
                     f[k] = 1.0
-                    fill_patch(p, f, g, patch)
-                    weights[q, k, 0], _ = value_on_patch(patch, y, x)
+                    _fill_patch(p, f, g, patch)
+                    weights[q, k, 0], _ = _value_on_patch(patch, y, x)
                     f[k] = 0.0
                     for axis in range(2):
                         g[k, axis] = 1.0
-                        fill_patch(p, f, g, patch)
-                        weights[q, k, 1 + axis], _ = value_on_patch(patch, y, x)
+                        _fill_patch(p, f, g, patch)
+                        weights[q, k, 1 + axis], _ = _value_on_patch(patch, y, x)
                         g[k, axis] = 0.0
                 continue
-            nearest = nearest_corner(vertices[t], points, n, y, x)
+            nearest = _nearest_corner(vertices[t], points, n, y, x)
             if nearest >= 0:
                 corners[q] = nearest
                 weights[q, 0, 0] = 1.0
@@ -374,16 +378,9 @@ def corner_weights(
     gradient along y and x. Neighbours in the list should be neighbours in the plane.
     """
     corners, weights = np.zeros((len(queries), 3), np.int32), np.zeros((len(queries), 3, 3))
-    mesh = *mesh_arrays(triangulation), len(triangulation.sites)
-    blocks = -(-len(queries) // BLOCK)
-    operands = queries, *mesh, corners, weights
-    in_ranges(_weigh_corners, blocks, available_threads(threads), *operands, smallest=2)
+    mesh = *_mesh_arrays(triangulation), len(triangulation.sites)
+    _in_blocks(_weigh_corners, queries, threads, *mesh, corners, weights)
     return corners, weights
-
-
-BLOCK = 2048  # queries that share one walk; fixed, so that threads change nothing
-PATCH = 31  # numbers that describe the surface over a triangle
-_CACHED_PATCHES = 512  # triangles whose patches are remembered
 
 
 def with_mirror_images(
@@ -410,60 +407,31 @@ def with_mirror_images(
     return points, origin, sense
 
 
-@njit(nogil=True, cache=True)
-def _sweep(
-    vertices: Indices,
-    neighbors: Indices,
-    points: FloatArray,
-    values: FloatArray,
-    gradients: FloatArray,
-    n: int,
-) -> FloatArray:
-    """Make one Jacobi sweep towards the gradients of least bending along the edges."""
-    system = np.zeros((n, 5))
-    for t in range(vertices.shape[0]):
-        for k in range(3):
-            a, b = vertices[t, (k + 1) % 3], vertices[t, (k + 2) % 3]
-            if neighbors[t, k] < t or a >= n or b >= n:
-                continue
-            ey, ex = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
-            length2 = ey * ey + ex * ex
-            stiffness = 1.0 / (length2 * np.sqrt(length2))
-            rise = 3 * (values[b] - values[a])
-            for i, j in ((a, b), (b, a)):
-                slope_there = gradients[j, 0] * ey + gradients[j, 1] * ex
-                pull = stiffness * (rise - slope_there) / 2
-                system[i, 0] += stiffness * ey * ey
-                system[i, 1] += stiffness * ey * ex
-                system[i, 2] += stiffness * ex * ex
-                system[i, 3] += pull * ey
-                system[i, 4] += pull * ex
-    fitted = gradients.copy()
-    for i in range(n):
-        yy, yx, xx, ry, rx = system[i]
-        determinant = yy * xx - yx * yx
-        if determinant > 1e-12 * (yy + xx) ** 2:
-            fitted[i, 0] = (ry * xx - rx * yx) / determinant
-            fitted[i, 1] = (rx * yy - ry * yx) / determinant
-    return fitted
-
-
 def fit_gradients(
     triangulation: RegularTriangulation, values: FloatArray, gradients: FloatArray, sweeps: int = 1
 ) -> FloatArray:
     """Improve gradients at the sites so that the surface bends least along the edges."""
     for _ in range(sweeps):
-        gradients = _sweep(*mesh_arrays(triangulation), values, gradients, len(values))
+        surface = _bend_least(triangulation, values[:, None], gradients[:, :, None])
+        gradients = np.ascontiguousarray(surface[:, 1:, 0])
     return gradients
 
 
-def mesh_arrays(triangulation: RegularTriangulation) -> tuple[Indices, Indices, FloatArray]:
+def _bend_least(
+    triangulation: RegularTriangulation, values: FloatArray, gradients: FloatArray
+) -> FloatArray:
+    surface = np.zeros((len(values), 3, values.shape[1]))
+    _minimise_bending(*_mesh_arrays(triangulation), values, gradients, surface)
+    return surface
+
+
+def _mesh_arrays(triangulation: RegularTriangulation) -> tuple[Indices, Indices, FloatArray]:
     """Return vertices, neighbours and points of a triangulation, as kernels take them."""
     return triangulation.vertices, triangulation.neighbors, triangulation.points
 
 
 @njit(nogil=True, cache=True)
-def locate(
+def _locate(
     vertices: Indices, neighbors: Indices, points: FloatArray, start: int, y: float, x: float
 ) -> int:
     """Walk to the triangle that holds (y, x)."""
@@ -500,8 +468,8 @@ def _edge_ordinates(
 
 
 @njit(nogil=True, cache=True)
-def fill_patch(p: FloatArray, f: FloatArray, g: FloatArray, patch: FloatArray) -> None:
-    """Compute the coefficients for `value_on_patch` of the surface over the triangle p.
+def _fill_patch(p: FloatArray, f: FloatArray, g: FloatArray, patch: FloatArray) -> None:
+    """Compute the coefficients for `_value_on_patch` of the surface over the triangle p.
 
     Three barycentric coordinates as a y + b x + c; then ordinates: at each vertex, along the edge
     opposite to it near its two ends, inside that edge's patch, on the way from the vertex to
@@ -528,7 +496,7 @@ def fill_patch(p: FloatArray, f: FloatArray, g: FloatArray, patch: FloatArray) -
 
 
 @njit(nogil=True, cache=True)
-def value_on_patch(patch: FloatArray, y: float, x: float) -> tuple[float, float]:
+def _value_on_patch(patch: FloatArray, y: float, x: float) -> tuple[float, float]:
     """Return the value at (y, x) of the surface over a triangle, and the point's least coordinate.
 
     That is negative where the triangle does not hold the point.
@@ -573,7 +541,7 @@ def _evaluate_blocks(
     """Evaluate blocks `start` to `stop` of the queries."""
     n = values.shape[0]
     p, f, g = np.empty((3, 2)), np.empty(3), np.empty((3, 2))
-    patches = np.empty((_CACHED_PATCHES, PATCH))
+    patches = np.empty((_CACHED_PATCHES, _PATCH))
     triangle_of_slot = np.empty(_CACHED_PATCHES, np.int64)
     for block in range(start, stop):
         # Nothing is left from the block before, so that it does not matter who has worked on it.
@@ -582,14 +550,14 @@ def _evaluate_blocks(
         for q in range(block * BLOCK, min((block + 1) * BLOCK, queries.shape[0])):
             y, x = queries[q]
             if triangle_of_slot[t % _CACHED_PATCHES] == t:
-                out[q], least = value_on_patch(patch, y, x)
+                out[q], least = _value_on_patch(patch, y, x)
                 if least >= 0:
                     continue
-            t = locate(vertices, neighbors, points, t, y, x)
+            t = _locate(vertices, neighbors, points, t, y, x)
             slot = t % _CACHED_PATCHES
             patch = patches[slot]
             if triangle_of_slot[slot] == t:
-                out[q], _ = value_on_patch(patch, y, x)
+                out[q], _ = _value_on_patch(patch, y, x)
                 continue
             outside = False
             for k in range(3):
@@ -601,11 +569,11 @@ def _evaluate_blocks(
                 for axis in range(2):
                     p[k, axis], g[k, axis] = points[a, axis], gradients[a, axis]
             if not outside:
-                fill_patch(p, f, g, patch)
+                _fill_patch(p, f, g, patch)
                 triangle_of_slot[slot] = t
-                out[q], _ = value_on_patch(patch, y, x)
+                out[q], _ = _value_on_patch(patch, y, x)
                 continue
-            nearest = nearest_corner(vertices[t], points, n, y, x)
+            nearest = _nearest_corner(vertices[t], points, n, y, x)
             if nearest >= 0:
                 out[q] = (
                     values[nearest]
@@ -615,7 +583,7 @@ def _evaluate_blocks(
 
 
 @njit(nogil=True, cache=True)
-def nearest_corner(corners: Indices, points: FloatArray, n: int, y: float, x: float) -> int:
+def _nearest_corner(corners: Indices, points: FloatArray, n: int, y: float, x: float) -> int:
     """Return the corner nearest to (y, x) that is a site, or -1 between ghosts alone."""
     nearest, least = -1, np.inf
     for a in corners:
@@ -661,7 +629,6 @@ class CloughTocher:
         if not queries.flags.writeable:  # the kernel is compiled for one type
             queries = queries.copy()
         out = np.zeros(len(queries))
-        surface = (*mesh_arrays(self._triangulation), self._values, self._gradients)
-        blocks = -(-len(queries) // BLOCK)
-        in_ranges(_evaluate_blocks, blocks, self._threads, queries, *surface, out, smallest=2)
+        surface = (*_mesh_arrays(self._triangulation), self._values, self._gradients)
+        _in_blocks(_evaluate_blocks, queries, self._threads, *surface, out)
         return out
