@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from napari_shadowinv._system.safety import as_input_errors
-from napari_shadowinv._system.validation import validated
+from napari_shadowinv._system.validation import validate
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
@@ -292,6 +292,6 @@ class FilmDoses:
             provenance=provenance,
             cautions=tuple(map(Caution.from_json, json.loads(attributes.get("warnings", "[]")))),
             pixel_size=None if size is None else float(size),
-            setups=tuple(validated(ProtonSetup, entry, "the pack's setup") for entry in setups),
+            setups=tuple(validate(ProtonSetup, entry, "the pack's setup") for entry in setups),
             created=str(attributes.get("created", "")),
         )

@@ -467,7 +467,7 @@ def test_errors_have_units():
     budget = dataclasses.replace(
         invert(synthetic_image(pair().displacement)).errors, beam=ErrorEstimate(3.0, 2.0)
     )
-    twice = budget.scaled(2.0)
+    twice = budget.times(2.0)
     assert twice.beam == (6.0, 4.0)
     assert twice.noise.rms == 2 * budget.noise.rms
     assert twice.of_peak == pytest.approx(budget.of_peak)

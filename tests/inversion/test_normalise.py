@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.normalise import floored_by, number_of_sites, prepare
+from napari_shadowinv.inversion.normalise import flooring_for, number_of_sites, prepare
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 
 
@@ -27,7 +27,7 @@ def test_many_images_of_one_source_are_floored_as_each_alone(flux, masked):
     options = InversionOptions(flux=flux, boundary="free", negative="clip")
     mask = rng.random((20, 30)) > 0.2 if masked else None
     source = rng.random((20, 30))
-    floored = floored_by(source, options, mask)
+    floored = flooring_for(source, options, mask)
     for _ in range(3):
         image = 10 * rng.normal(size=(20, 30))
         expected = prepare(image, source, options, mask).floored_image

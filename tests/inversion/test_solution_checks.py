@@ -20,7 +20,7 @@ from napari_shadowinv.inversion.solution_checks import (
     image_residual,
     inner_sides,
     mark_caustics,
-    turned_back,
+    turning_displacement,
 )
 from napari_shadowinv.io import read
 from napari_shadowinv.options import InversionOptions
@@ -230,10 +230,10 @@ def test_inner_sides_of_a_field_from_the_middle_point_outwards():
     assert sides.depth == 3
     for side, distance in zip(sides.outwards, (26.5, 26.5, 36.5, 36.5), strict=True):
         np.testing.assert_allclose(side, distance)
-    assert turned_back(sides) == pytest.approx(31.5)
+    assert turning_displacement(sides) == pytest.approx(31.5)
     shifted = inner_sides(np.ones((2, 60, 80)), np.ones((60, 80), bool))
     assert shifted is not None
-    assert turned_back(shifted) == 0
+    assert turning_displacement(shifted) == 0
 
 
 def test_inner_sides_need_pixels_along_all_sides():

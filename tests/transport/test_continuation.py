@@ -10,7 +10,7 @@ from napari_shadowinv.geometry.density import Density, split_pixels
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.physics.forward import jacobian_determinant
-from napari_shadowinv.transport.minimise import blurred
+from napari_shadowinv.transport.minimise import blur_image
 from napari_shadowinv.transport.sites import plan_levels
 from napari_shadowinv.transport.solvers import solve
 
@@ -85,7 +85,7 @@ def residual(level, weights, image):
 
 def residual_when_blurred(level, weights, image, width, parts=8):
     """The blur of a piecewise-constant image, not of its pixels' values."""
-    blur = blurred(split_pixels(image, parts), parts * width)
+    blur = blur_image(split_pixels(image, parts), parts * width)
     return residual(level.split(parts), parts**2 * weights, blur)
 
 
@@ -97,7 +97,7 @@ def smooth_image():
 @pytest.mark.parametrize("width", [0.01, 0.1, 0.5, 3.0, 12.0, 50.0])
 def test_blurring_keeps_flux_and_sign_at_any_width(width):
     image = raised(one_pixel())
-    spread = blurred(image, width)
+    spread = blur_image(image, width)
     assert spread.sum() == pytest.approx(image.sum(), rel=1e-12)
     assert spread.min() > 0
     assert image.min() * (1 - 1e-12) <= spread.min() < spread.max() <= image.max() * (1 + 1e-12)
@@ -106,15 +106,15 @@ def test_blurring_keeps_flux_and_sign_at_any_width(width):
 def test_blurring_twice_adds_variances():
     image = raised(salt())
     np.testing.assert_allclose(
-        blurred(blurred(image, 3.0), 4.0), blurred(image, 5.0), rtol=1e-10, atol=0
+        blur_image(blur_image(image, 3.0), 4.0), blur_image(image, 5.0), rtol=1e-10, atol=0
     )
 
 
 def test_wide_blur_of_means_equals_narrower_blurs():
     image = 0.1 + np.random.default_rng(3).random((210, 331)) ** 8
     image[40:90, 200:260] *= 5
-    narrow = blurred(blurred(blurred(image, 24.0), 24.0), 30.0)
-    wide = blurred(image, np.sqrt(24.0**2 + 24.0**2 + 30.0**2))
+    narrow = blur_image(blur_image(blur_image(image, 24.0), 24.0), 30.0)
+    wide = blur_image(image, np.sqrt(24.0**2 + 24.0**2 + 30.0**2))
     np.testing.assert_allclose(wide, narrow, rtol=0.01)
     assert np.ptp(narrow) > 0.1 * narrow.mean()
 

@@ -93,7 +93,7 @@ def test_all_levels_stop_when_asked_to(threads):
 
     plan = plan_levels(gaussian_beam(), 4000, lloyd_iterations=1_000_000, threads=threads)
     with pytest.raises(InversionCancelled):
-        plan.levels.with_reporter(Reporter(None, soon)).made(threads)
+        plan.levels.with_reporter(Reporter(None, soon)).compute_all(threads)
 
 
 def test_levels_do_not_depend_on_threads():

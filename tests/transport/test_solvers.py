@@ -11,7 +11,7 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.transport.minimise import blurred, descend, newton
+from napari_shadowinv.transport.minimise import blur_image, descend, newton
 from napari_shadowinv.transport.objective import TransportObjective
 from napari_shadowinv.transport.sites import plan_levels
 from napari_shadowinv.transport.solvers import solve
@@ -165,12 +165,12 @@ def test_threads_do_not_change_the_weights():
 def test_blurring_keeps_the_flux_and_adds_variances():
     image = np.zeros((81, 101))
     image[40, 50] = 7.0
-    spread = blurred(image, 5.0)
+    spread = blur_image(image, 5.0)
     y, x = np.indices(image.shape)
     assert spread.sum() == pytest.approx(7.0, rel=1e-12)
     assert ((y - 40) ** 2 * spread).sum() / 7 == pytest.approx(25.0, rel=1e-6)
     assert ((x - 50) ** 2 * spread).sum() / 7 == pytest.approx(25.0, rel=1e-6)
-    assert blurred(image, 40.0).sum() == pytest.approx(7.0, rel=1e-12)
+    assert blur_image(image, 40.0).sum() == pytest.approx(7.0, rel=1e-12)
 
 
 def test_a_few_almost_empty_cells_do_not_shorten_the_steps():

@@ -1,9 +1,9 @@
 """Arrays as users hold them: numpy's masked arrays and xarray's labelled ones.
 
 - values in the order of the axes, and the mask: `unpack_array`
-- the same where a mask has no meaning: `plain_array`; in any order: `unmasked`
+- the same where a mask has no meaning: `plain_array`; in any order: `refuse_masked`
 - image, source and mask of one shot: `unpack_shot`; several planes: `unpack_planes`
-- numbers as floats: `as_numbers`; a plane of them: `checked_plane`; a mask: `checked_mask`
+- numbers as floats: `as_numbers`; a plane of them: `check_plane`; a mask: `check_mask`
 - two masks together: `join_masks`; size of a pixel by the coordinates: `coordinate_spacing`
 - places of values in their order: `order_by_value`
 
@@ -61,13 +61,15 @@ def unpack_array(
 
 def plain_array(values: Any, name: str, dims: Sequence[str] = PLANE, *, unit: str = "") -> AnyArray:
     """Return the values in the order of `dims`; refuse masked ones, which have no meaning here."""
-    plain: AnyArray = np.asarray(unpack_array(unmasked(values, name), name, dims, unit=unit)[0])
+    plain: AnyArray = np.asarray(
+        unpack_array(refuse_masked(values, name), name, dims, unit=unit)[0]
+    )
     if plain.dtype.kind not in "buif":
         raise InputError(f"{name} has values of type {plain.dtype}, expected real numbers")
     return plain
 
 
-def unmasked(values: Any, name: str) -> Any:
+def refuse_masked(values: Any, name: str) -> Any:
     """Return the values unchanged, unless some are masked."""
     if isinstance(values, np.ma.MaskedArray) and np.ma.getmaskarray(values).any():
         raise InputError(
@@ -125,7 +127,7 @@ def mask_of_each(mask: BoolArray | None, data: FloatArray) -> BoolArray | None:
     return np.broadcast_to(mask, data.shape) if mask is not None and fits else None
 
 
-def checked_plane(values: Any, name: str, least: int = 1) -> AnyArray:
+def check_plane(values: Any, name: str, least: int = 1) -> AnyArray:
     """Return real numbers in two dimensions, `least` or more each way, or raise an `InputError`."""
     array = np.asarray(values)
     if array.ndim != 2:
@@ -149,7 +151,7 @@ def check_finite(name: str, values: FloatArray) -> None:
         raise InputError(f"{name} has {bad} values that are NaN or infinite: all must be finite")
 
 
-def checked_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str = "image") -> BoolArray:
+def check_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str = "image") -> BoolArray:
     """Return a mask as booleans, all true by default, or raise an `InputError`."""
     if mask is None:
         return np.ones(shape, dtype=np.bool_)
@@ -169,7 +171,7 @@ def checked_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str = "im
 def as_numbers(name: str, values: ArrayLike) -> FloatArray:
     """Return a copy of values as floats, or raise an `InputError` that shows the values."""
     try:
-        return np.array(unmasked(values, name), dtype=np.float64)
+        return np.array(refuse_masked(values, name), dtype=np.float64)
     except InputError:
         raise
     except (TypeError, ValueError) as error:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, TypeVar, get_args
 from pydantic import BaseModel
 
 from napari_shadowinv._system.safety import as_file_errors, check_regular, small_text
-from napari_shadowinv._system.validation import suggestion, validated
+from napari_shadowinv._system.validation import suggestion, validate
 from napari_shadowinv.errors import FileFormatError, InputError
 
 _MAX_HEADER_BYTES = 100_000
@@ -128,7 +128,7 @@ def read_rows(
         for name, field in model.model_fields.items():
             if name in entries and _is_file_name(entries[name], field.annotation):
                 entries[name] = str(path.parent / entries[name])
-        models[line] = validated(model, {**(shared or {}), **entries}, f"{path}, line {line}")
+        models[line] = validate(model, {**(shared or {}), **entries}, f"{path}, line {line}")
     return models
 
 

@@ -40,7 +40,7 @@ class CheckedModel(BaseModel, metaclass=_CheckedMeta):
     """Model that refuses a wrong value with an `InputError` of one sentence.
 
     It cannot be changed and has no other fields. `model_validate` raises pydantic's own error,
-    which lists all mistakes; see `validated`.
+    which lists all mistakes; see `validate`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
@@ -60,7 +60,7 @@ def as_model(model_class: type[Model], value: Any, name: str) -> Model:
     if isinstance(value, model_class):
         return value
     if value is None or isinstance(value, Mapping):
-        return validated(model_class, value or {}, name)
+        return validate(model_class, value or {}, name)
     raise InputError(f"{name} is {_shorten(value)}, expected {model_class.__name__}")
 
 
@@ -73,7 +73,7 @@ def check_instance(value: object, expected: type | tuple[type, ...], name: str) 
     raise InputError(f"{name} is {_shorten(value)}, expected {titles}")
 
 
-def validated(
+def validate(
     model_class: type[Model], mapping: Mapping[str, Any], where: str = "parameters"
 ) -> Model:
     """Make a model from a mapping, or raise an `InputError` that begins with `where`."""

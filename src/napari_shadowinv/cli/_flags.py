@@ -22,7 +22,7 @@ from pydantic.fields import FieldInfo
 from typer import Argument, Option
 from typer.core import TyperCommand, TyperGroup
 
-from napari_shadowinv._system.validation import Model, suggestion, validated
+from napari_shadowinv._system.validation import Model, suggestion, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import IMAGE_TITLES
 from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
@@ -437,7 +437,7 @@ def takes_run(model: type[BaseModel]) -> Callable[[Callable[..., None]], Callabl
 def run_options(model: type[Model], flags: dict[str, Any]) -> Model:
     """Return the choices of a run from the flags of `takes_run`, and remove these."""
     chosen = {name: flags.pop(name) for name in model.model_fields if name in flags}
-    return validated(model, chosen, "flags")
+    return validate(model, chosen, "flags")
 
 
 def takes_fit(command: Callable[..., None]) -> Callable[..., None]:
@@ -476,7 +476,7 @@ def recipe_of(
     if "margin" in flags and chosen.get("boundary") != "free":
         raise InputError("received --margin: it needs --boundary free")
     steps, source = _steps(flags, base.steps), _estimate(flags, base)
-    inversion_options = validated(InversionOptions, chosen, where)
+    inversion_options = validate(InversionOptions, chosen, where)
     changes = {"steps": steps, "source": source, "options": inversion_options}
     return base.model_copy(update=changes)
 
@@ -488,7 +488,7 @@ def fit_recipe_of(
     before = base.fit or FitChoices()
     chosen = {**before.options.model_dump(exclude_unset=True), **options}
     chosen |= {name: flags[name] for name in FitOptions.model_fields if name in flags}
-    fit_options = validated(FitOptions, chosen, where)
+    fit_options = validate(FitOptions, chosen, where)
     changes = {name: flags[name] for name in FitChoices.model_fields if name in flags}
     values = before.model_dump(exclude_none=True, exclude={"options"})
     in_metres = ("source_size", "resolution")
@@ -497,7 +497,7 @@ def fit_recipe_of(
         in_metres if "psf" in changes else ("psf",) if changes.keys() & set(in_metres) else ()
     )
     values = {name: value for name, value in values.items() if name not in replaced}
-    choices = validated(FitChoices, {**values, **changes, "options": fit_options}, "fit")
+    choices = validate(FitChoices, {**values, **changes, "options": fit_options}, "fit")
     return base.model_copy(update={"steps": _steps(flags, base.steps), "fit": choices})
 
 
@@ -515,7 +515,7 @@ def _steps(flags: Mapping[str, Any], steps: tuple[Step, ...]) -> tuple[Step, ...
             flag = _step_flag(kind, next(iter(changes)))
             raise InputError(f"received --{flag}: it needs --{key}")
         before = {} if index is None else result[index].values()
-        step = validated(kind, {**before, **changes}, f"--{key}")
+        step = validate(kind, {**before, **changes}, f"--{key}")
         if index is None:
             later = [i for i, s in enumerate(result) if order.index(s.name()) > order.index(key)]
             result.insert(later[0] if later else len(result), step)
@@ -545,4 +545,4 @@ def _estimate(flags: Mapping[str, Any], base: Recipe) -> Any:
             choices = " or ".join(f"--source-from {key}" for key in methods)
             raise InputError(f"received --source-{name.replace('_', '-')}: it needs {choices}")
     before = base.estimate.values() if base.estimate and base.estimate.name() == method else {}
-    return validated(ESTIMATES[method], {**before, **changes}, f"--source-from {method}")
+    return validate(ESTIMATES[method], {**before, **changes}, f"--source-from {method}")

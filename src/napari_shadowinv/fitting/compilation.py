@@ -18,7 +18,7 @@ from napari_shadowinv.fitting import _ray_kernels
 from napari_shadowinv.fitting.rays import RayModel
 from napari_shadowinv.geometry.compiler import is_code_cached
 from napari_shadowinv.inversion import compilation as of_transport
-from napari_shadowinv.inversion.machine_code import how_often
+from napari_shadowinv.inversion.machine_code import compilation_frequency
 
 __all__ = ["ensure_compiled", "is_compiled"]
 
@@ -67,5 +67,5 @@ def _compile_rays(report: Reporter) -> None:
         lambda: rays.jacobian(potential, counts, beam),
     )
     for step, work in enumerate(works):
-        report("compile", step, None, "rays, " + how_often())
+        report("compile", step, None, "rays, " + compilation_frequency())
         work()

@@ -17,7 +17,11 @@ from scipy.ndimage import gaussian_filter
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
 from napari_shadowinv.fitting.posterior import BeamError
-from napari_shadowinv.inversion.solution_checks import TURNED_BACK, inner_sides, turned_back
+from napari_shadowinv.inversion.solution_checks import (
+    TURNED_BACK,
+    inner_sides,
+    turning_displacement,
+)
 
 __all__ = [
     "Verdict",
@@ -327,7 +331,7 @@ def _share_turned_back(displacement: FloatArray, used: BoolArray) -> float:
     """The mean displacement across the edge over the r.m.s. one; 0 if a mask covers the edge."""
     sides = inner_sides(displacement, used)
     rms = float(np.sqrt((displacement**2).sum(axis=0).mean()))
-    return 0.0 if sides is None else turned_back(sides) / max(rms, 1e-12)
+    return 0.0 if sides is None else turning_displacement(sides) / max(rms, 1e-12)
 
 
 def _share_bent_at_edge(displacement: FloatArray) -> float:

@@ -216,7 +216,7 @@ def turn(points: FloatArray, scratch: FloatArray, a: int, b: int, c: int) -> int
 
 
 @kernel
-def _lifted(
+def _lift(
     points: FloatArray, weights: FloatArray, a: int, b: int, c: int, v: int
 ) -> tuple[float, float, float]:
     """Return the determinant of the lifted a, b, c seen from v, its permanent, and the area."""
@@ -240,7 +240,7 @@ def edge_state(
     points: FloatArray, weights: FloatArray, scratch: FloatArray, p: int, a: int, b: int, q: int
 ) -> int:
     """Classify the edge a-b; p, a, q, b go around it counter-clockwise."""
-    height, size, _ = _lifted(points, weights, q, a, b, p)
+    height, size, _ = _lift(points, weights, q, a, b, p)
     if height >= -LIFT_BOUND * size:
         return LEGAL
     if turn(points, scratch, p, a, q) <= 0:
@@ -255,7 +255,7 @@ def excess(
     points: FloatArray, weights: FloatArray, a: int, b: int, c: int, v: int
 ) -> tuple[float, float]:
     """Return by how much the weight of v must rise to touch (a, b, c), and a bound of the error."""
-    height, size, area = _lifted(points, weights, a, b, c, v)
+    height, size, area = _lift(points, weights, a, b, c, v)
     if area <= 0.0:
         return 0.0, np.inf
     return -height / area, LIFT_BOUND * size / area

@@ -259,7 +259,7 @@ class RegularTriangulation:
         while self._mesh.hidden.any() and ghosts != self._mesh.weights[-1]:
             ghosts = self._mesh.weights[-1]
             if flips.raise_hidden(self._mesh) == flips.EXHAUSTED:
-                raise RuntimeError(self._exhausted())
+                raise RuntimeError(self._exhaustion_text())
             self.forget()
             # The ghosts follow if the lightest sites were raised; then a site may hide again.
             self._weigh_ghosts()
@@ -290,7 +290,7 @@ class RegularTriangulation:
         size = 6 * (n + count) + 6
         used = 3 * old.counters[SIZE]
 
-        def grown(values: Indices, spare: int) -> Indices:
+        def lengthen(values: Indices, spare: int) -> Indices:
             larger = np.empty(size, np.int32)
             larger[:used] = values[:used] + np.where(values[:used] >= spare, count, 0)
             return larger
@@ -304,15 +304,15 @@ class RegularTriangulation:
         twin._mesh = Mesh(
             points=np.concatenate([old.points[:n], positions[order], old.points[n:]]),
             weights=np.concatenate([old.weights[:n], np.zeros(count), old.weights[n:]]),
-            corners=grown(old.corners, n),
-            twins=grown(old.twins, size),
+            corners=lengthen(old.corners, n),
+            twins=lengthen(old.twins, size),
             hidden=np.append(old.hidden, np.ones(count, np.bool_)),
             stack=np.empty(STACK_SIZE, np.int64),
             counters=counters,
             scratch=np.empty(16),
         )
         if flips.add(twin._mesh, n + insertion_order(count)) == flips.EXHAUSTED:
-            raise RuntimeError(twin._exhausted())
+            raise RuntimeError(twin._exhaustion_text())
         return twin
 
     def _build(self, alive: Callable[[], None] | None = None) -> None:
@@ -322,9 +322,9 @@ class RegularTriangulation:
                 alive()
             last = min(first + _SITES_PER_PART, order.size)
             if flips.build(self._mesh, order, first, last) == flips.EXHAUSTED:
-                raise RuntimeError(self._exhausted())
+                raise RuntimeError(self._exhaustion_text())
 
-    def _exhausted(self) -> str:
+    def _exhaustion_text(self) -> str:
         return (
             f"the triangulation of {self._mesh.hidden.size} sites was not finished within "
             f"{self._mesh.counters[LIMIT]} flips: please report it with the sites and weights"

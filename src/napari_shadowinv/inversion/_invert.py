@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import checked_mask, unpack_array, unpack_shot
+from napari_shadowinv._system.arrays import check_mask, unpack_array, unpack_shot
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
@@ -38,7 +38,7 @@ from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.preprocessing.image_checks import image_warnings
 from napari_shadowinv.transport.margin import Margin, edge_flux
 from napari_shadowinv.transport.sites import Levels, SitePlan, plan_levels
-from napari_shadowinv.transport.solvers import LevelSolution, fitted_flux, solve
+from napari_shadowinv.transport.solvers import LevelSolution, fit_flux_factor, solve
 
 __all__ = ["count_sites", "invert", "plan_sites"]
 
@@ -90,7 +90,7 @@ def plan_sites(
     if options.is_adaptive:
         return plan
     levels = plan.levels.with_reporter(Reporter(on_progress, should_stop))
-    return replace(plan, levels=levels.made(options.threads))
+    return replace(plan, levels=levels.compute_all(options.threads))
 
 
 def _plan(
@@ -139,9 +139,9 @@ class _SiteDomain(NamedTuple):
 def _site_domain(
     source: ArrayLike, options: InversionOptions, mask: ArrayLike | None
 ) -> _SiteDomain:
-    usable = None if mask is None else checked_mask(mask, np.shape(source))
+    usable = None if mask is None else check_mask(mask, np.shape(source))
     check_memory(np.shape(source), normalise.bytes_per_pixel(options), "an inversion")
-    beam = normalise.checked_source(source, usable)
+    beam = normalise.check_source(source, usable)
     if usable is not None:
         beam = normalise.masked_source(beam, usable, options)
     n_sites = normalise.number_of_sites(beam.shape, options)
@@ -252,7 +252,9 @@ def invert(
         levels = plan.levels.with_reporter(report)
     with _measure_time("transport", seconds):
         if plan.margin is not None and options.flux == "fit":
-            image_flux = fitted_flux(levels, prepared.floored_image, plan.margin, options, report)
+            image_flux = fit_flux_factor(
+                levels, prepared.floored_image, plan.margin, options, report
+            )
             scale = prepared.flux_scale / image_flux
             prepared = prepare(image, source, options, mask, flux_scale=scale)
         noise = ImageNoise(prepared.in_units(), options)
@@ -402,7 +404,7 @@ def _read_fields(
     def report_share(share: float, first: int, last: int) -> None:
         report("read-out", round(first + share * (last - first)), _STEPS)
 
-    def reprojected(source: FloatArray, first: int, last: int) -> FloatArray:
+    def reproject(source: FloatArray, first: int, last: int) -> FloatArray:
         return synthetic_image(
             displacement,
             source,
@@ -418,12 +420,12 @@ def _read_fields(
     flux_left: dict[str, float] = {}
     flux_entered: dict[str, float] = {}
     if plan.margin is None:
-        reprojection = reprojected(source, _READ_STEPS, _STEPS)
+        reprojection = reproject(source, _READ_STEPS, _STEPS)
     else:
         halfway = (_READ_STEPS + _STEPS) // 2
         of_image, of_margin = plan.margin.parts(source)
-        from_image = reprojected(of_image, _READ_STEPS, halfway)
-        from_margin = reprojected(of_margin, halfway, _STEPS)
+        from_image = reproject(of_image, _READ_STEPS, halfway)
+        from_margin = reproject(of_margin, halfway, _STEPS)
         reprojection = plan.within(from_image + from_margin)
         flux_left, flux_entered = edge_flux(from_image, from_margin, plan.margin)
     inner = plan.within(potential)

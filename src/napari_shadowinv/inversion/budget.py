@@ -152,7 +152,7 @@ class Errors:
             "of sites",
         )
 
-    def scaled(self, factor: float) -> Errors:
+    def times(self, factor: float) -> Errors:
         """Return the budget in another unit; 1 px of displacement is `factor` of it."""
         lengths = {
             field.name: _scale_error(getattr(self, field.name), factor)

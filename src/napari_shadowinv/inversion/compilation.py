@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
-from napari_shadowinv.inversion.machine_code import how_often, is_compiled
+from napari_shadowinv.inversion.machine_code import compilation_frequency, is_compiled
 
 _NODES = 300  # enough for a multigrid
 
@@ -25,7 +25,7 @@ def ensure_compiled(
         return
     from napari_shadowinv.inversion import invert
 
-    Reporter(on_progress, should_stop)("compile", 0, None, how_often())
+    Reporter(on_progress, should_stop)("compile", 0, None, compilation_frequency())
     y, x = np.indices((64, 64)) / 64  # enough sites for every kernel to be used
     uneven = np.exp(-4 * (y + x))
     invert(uneven * (1 + y * x), source=uneven, should_stop=should_stop)

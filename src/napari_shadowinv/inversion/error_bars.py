@@ -49,7 +49,7 @@ from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.geometry.power_diagram import pixel_shares
 from napari_shadowinv.inversion._invert import invert, plan_sites
-from napari_shadowinv.inversion.normalise import bytes_per_pixel, floored_by, prepare
+from napari_shadowinv.inversion.normalise import bytes_per_pixel, flooring_for, prepare
 from napari_shadowinv.inversion.readout import LinearReadout, read_out
 from napari_shadowinv.inversion.result import Inversion
 from napari_shadowinv.inversion.variables import dataset_from_field
@@ -226,11 +226,11 @@ class FullResampling:
 
     def image(self, seed: Seed) -> FloatArray:
         """Draw a noisy image, as the transport sees it."""
-        return self._floored(self.draw(np.random.default_rng(seed)))
+        return self._apply_floor(self.draw(np.random.default_rng(seed)))
 
     @cached_property
-    def _floored(self) -> Callable[[FloatArray], FloatArray]:
-        return floored_by(self.plan.source, self.options, self.plan.mask)
+    def _apply_floor(self) -> Callable[[FloatArray], FloatArray]:
+        return flooring_for(self.plan.source, self.options, self.plan.mask)
 
 
 @dataclass(frozen=True)
@@ -530,7 +530,7 @@ def uncertainty(
     image_fields = np.stack([inversion.potential, *inversion.displacement])
     outcomes: list[tuple[int, float, bool]] = []
 
-    def solved(seeds: list[Seed], report: Reporter) -> Iterator[FloatArray]:
+    def solve_samples(seeds: list[Seed], report: Reporter) -> Iterator[FloatArray]:
         for sample in _in_order(resampling.sample, [[seed] for seed in seeds], workers, report):
             solution = sample.solution  # large, so not stored
             outcomes.append((solution.iterations, solution.residual, solution.converged))
@@ -538,10 +538,10 @@ def uncertainty(
 
     off = 0.0
     if method == "resolve":
-        scatter = reduce(add, map(Scatter.of, solved(seeds, report)))
+        scatter = reduce(add, map(Scatter.of, solve_samples(seeds, report)))
     else:
         quietly = Reporter(None, should_stop)
-        checked = np.array(list(solved(seeds[:_CHECKED], quietly)))
+        checked = np.array(list(solve_samples(seeds[:_CHECKED], quietly)))
         clean = prepare(image, plan.source, clipping, plan.mask).floored_image
         response = _in_thread(lambda: LinearResampling(resampling, clean, options.threads), quietly)
         linear = _in_thread(lambda: response.changes(seeds[:_CHECKED]), quietly)

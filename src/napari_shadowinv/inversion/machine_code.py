@@ -1,7 +1,7 @@
 """Machine code of the kernels, cached from one run to the next.
 
 - whether it is cached: `is_compiled`; its folder: `code_folder`
-- how often compilation delays a run, in words: `how_often`
+- how often compilation delays a run, in words: `compilation_frequency`
 - share its work between two processes: `compiling_together`
 """
 
@@ -51,7 +51,7 @@ def compiling_together() -> Iterator[None]:
         helper.wait()
 
 
-def how_often() -> str:
+def compilation_frequency() -> str:
     """Return how often compilation delays a run, in words."""
     from napari_shadowinv.geometry.compiler import is_code_cached
 

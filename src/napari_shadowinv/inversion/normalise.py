@@ -1,7 +1,7 @@
 """An image and a source made ready for the transport.
 
-- check and normalise: `prepare`; a source alone: `checked_source`
-- only normalise, many images of one source: `floored_by`
+- check and normalise: `prepare`; a source alone: `check_source`
+- only normalise, many images of one source: `flooring_for`
 - the margin of a free boundary, and how many sites: `margin_around`, `number_of_sites`
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import checked_mask, checked_plane
+from napari_shadowinv._system.arrays import check_mask, check_plane
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -62,9 +62,9 @@ def prepare(
     flux_scale: float | None = None,
 ) -> Prepared:
     """Check an image and its source, and bring them to the same flux, or divide by `flux_scale`."""
-    shape = checked_plane(image, "image", _SMALLEST_SIDE).shape
+    shape = check_plane(image, "image", _SMALLEST_SIDE).shape
     check_memory(shape, bytes_per_pixel(options), "an inversion")
-    usable = checked_mask(mask, shape)
+    usable = check_mask(mask, shape)
     values = _finite_image(image, "image", usable)
     negative = int((values < 0).sum())
     if negative and options.negative == "refuse":
@@ -78,7 +78,7 @@ def prepare(
     if source is None:
         beam = np.where(usable, values.sum() / usable.sum(), 0.0)
     else:
-        beam = checked_source(source, usable)
+        beam = check_source(source, usable)
         relative_beam, relative_image = (a[usable] / a[usable].mean() for a in (beam, values))
         is_same = np.abs(relative_beam - relative_image).max() <= _MAX_ROUNDING
         if is_same and np.ptp(relative_beam) > 2 * _MAX_ROUNDING:
@@ -115,7 +115,7 @@ def prepare(
     )
 
 
-def floored_by(
+def flooring_for(
     source: FloatArray, options: InversionOptions, mask: BoolArray | None
 ) -> Callable[[FloatArray], FloatArray]:
     """Return a function from an image to the `floored_image` of `prepare`, for one source and mask.
@@ -123,18 +123,18 @@ def floored_by(
     It clips images instead of checking them; quantities of the source are computed once.
     """
     usable = np.ones(source.shape, bool) if mask is None else mask
-    beam = checked_source(source, usable)
+    beam = check_source(source, usable)
     flux, count, unit = beam.sum(), usable.sum(), power_of_two(beam)
     conserved = options.flux != "known"
     floored_flux = masked_source(beam, usable, options).sum() if conserved else None
 
-    def floored(image: FloatArray) -> FloatArray:
+    def apply_floor(image: FloatArray) -> FloatArray:
         values = _clip_negative(np.where(usable, image, 0.0))
         if conserved:
             values /= values.sum() / flux
         return _raise_to_floor(values, options.floor * values.sum() / count, floored_flux) / unit
 
-    return floored
+    return apply_floor
 
 
 def _clip_negative(values: FloatArray) -> FloatArray:
@@ -198,9 +198,9 @@ def _warnings(
     return tuple(cautions)
 
 
-def checked_source(source: ArrayLike, mask: BoolArray | None = None) -> FloatArray:
+def check_source(source: ArrayLike, mask: BoolArray | None = None) -> FloatArray:
     """Return a source as floats, 0 where masked, or raise an `InputError`."""
-    shape = checked_plane(source, "source", _SMALLEST_SIDE).shape
+    shape = check_plane(source, "source", _SMALLEST_SIDE).shape
     if mask is not None and shape != mask.shape:
         raise InputError(f"source has shape {shape}, image {mask.shape}: they must match")
     beam = _finite_image(source, "source", np.ones(shape, bool) if mask is None else mask)

@@ -338,7 +338,7 @@ class Inversion:
             field = setup.main_field
             (unit,) = (si_field.unit for si_field in setup.si_fields if si_field.name == field.name)
             factor = np.abs(setup.field_in_si(field.name, np.ones((2, 1, 1)))).max()
-            in_si = dataclasses.asdict(self.errors.scaled(float(factor)))
+            in_si = dataclasses.asdict(self.errors.times(float(factor)))
             history["errors_si"] = json.dumps({"field": field.name, "unit": unit, **in_si})
         dataset = dataset_from_field(
             self.displacement, self.potential, setup, attributes=history | dict(attributes or {})

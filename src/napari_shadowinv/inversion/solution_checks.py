@@ -3,7 +3,7 @@
 - the difference of re-projection and image: `image_residual`
 - whether more sites would reduce it: `is_coarse`
 - the cautions about a solution: `find_cautions`
-- signs that a field continues beyond the edge of its image: `inner_sides`, `turned_back`
+- signs that a field continues beyond the edge of its image: `inner_sides`, `turning_displacement`
 
 Each sign was chosen to be absent in images whose field is known to be right and to appear where it
 is wrong; `docs/trust.md` lists them with advice. The limits, and the measurements on either side of
@@ -73,7 +73,7 @@ __all__ = [
     "image_residual",
     "inner_sides",
     "is_coarse",
-    "turned_back",
+    "turning_displacement",
 ]
 
 
@@ -116,7 +116,7 @@ def inner_sides(displacement: FloatArray, mask: BoolArray) -> Sides | None:
     return Sides(depth, outwards, along)
 
 
-def turned_back(sides: Sides) -> float:
+def turning_displacement(sides: Sides) -> float:
     """Return the mean displacement towards or away from the edge on all sides, px.
 
     An edge that keeps rays or fields from leaving turns them back on all sides.
@@ -385,7 +385,7 @@ def _cut_off(displacement: FloatArray, mask: BoolArray, noise: ImageNoise, rms: 
     sides = inner_sides(displacement, mask)
     if sides is None:
         return ""
-    turned = turned_back(sides)
+    turned = turning_displacement(sides)
     by_noise = noise.largest * np.sqrt(sides.depth / sum(side.size for side in sides.outwards))
     peak = float(np.hypot(*displacement)[mask].max())
     if turned > max(TURNED_BACK * rms, _BAND_DEVIATIONS * by_noise):

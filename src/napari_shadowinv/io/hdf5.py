@@ -1,6 +1,6 @@
 """Arrays of any HDF5 file, by name.
 
-- the array that the user names: `read_hdf5`, as an image `read_plane`; the choice: `held_arrays`
+- the array that the user names: `read_hdf5`, as an image `read_plane`; the choice: `list_arrays`
 - for callers that know the layout: an item, `member`; its values, `load_dataset`; `check_arrays`
 - write one: `hdf5_in_memory`; compare its checksum: `check_hdf5_seal`
 
@@ -172,7 +172,7 @@ def read_hdf5(path: Path, name: str) -> AnyArray:
         item = member(path, file, name)
         if isinstance(item, h5py.Dataset) and _is_numeric(item):
             return load_dataset(path, item)
-        content = ", ".join(held_arrays(path, file)) or "none"
+        content = ", ".join(list_arrays(path, file)) or "none"
     raise InputError(f"{path} has no array {name!r}: it holds {content}")
 
 
@@ -187,7 +187,7 @@ def read_plane(path: Path, name: str) -> tuple[AnyArray, dict[str, Any]]:
     return array, {"kind": "hdf5", "variable": name}
 
 
-def held_arrays(path: Path, file: Any) -> list[str]:
+def list_arrays(path: Path, file: Any) -> list[str]:
     """List the first images of an open file and its groups, with shape and type."""
     images = [
         f"{name!r} ({'×'.join(map(str, item.shape))} {item.dtype})"

@@ -27,7 +27,7 @@ from napari_shadowinv.inversion.variables import (
     dataset_from_field,
     setup_from_dataset,
 )
-from napari_shadowinv.io.hdf5 import hdf5_in_memory, held_arrays, load_dataset, member
+from napari_shadowinv.io.hdf5 import hdf5_in_memory, list_arrays, load_dataset, member
 from napari_shadowinv.io.writing import require
 from napari_shadowinv.provenance import Provenance
 
@@ -112,7 +112,7 @@ def read_pradformat(path: Path) -> tuple[AnyArray, dict[str, Any]] | xarray.Data
         return _read_inversion(path, attributes)
     object_type = f"the object type {kind!r}" if kind else "no attribute 'object_type'"
     with h5py.File(path, "r") as file:
-        names = ", ".join(held_arrays(path, file))
+        names = ", ".join(list_arrays(path, file))
     advice = f"name one of its arrays with variable, of {names}" if names else "export it as TIFF"
     raise FileFormatError(
         f"{path} is an HDF5 file with {object_type}: expected a pradformat radiograph or "

@@ -392,7 +392,7 @@ class GrowingStore:
         """Return the number of a shot, None if it is not there yet."""
         return self._numbers.get(name)
 
-    def done(self) -> Iterator[str]:
+    def done_names(self) -> Iterator[str]:
         """Yield the names of the shots that are done."""
         for name, index in self._numbers.items():
             if self._statuses[index] == DONE:

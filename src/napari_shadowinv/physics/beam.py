@@ -30,7 +30,7 @@ from pydantic import (
     model_validator,
 )
 
-from napari_shadowinv._system.arrays import checked_plane, plain_array, unmasked
+from napari_shadowinv._system.arrays import check_plane, plain_array, refuse_masked
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
@@ -398,14 +398,14 @@ def displacement_from_potential(potential: ArrayLike) -> FloatArray:
     >>> displacement_from_potential(np.tile(np.arange(4.0) ** 2, (3, 1)))[1, 0, 1:]
     array([-2., -4., -6.])
     """
-    values = checked_plane(plain_array(potential, "potential"), "potential", 3)
+    values = check_plane(plain_array(potential, "potential"), "potential", 3)
     plane = np.asarray(values, dtype=np.float64)
     return -np.stack([np.gradient(plane, axis=axis, edge_order=2) for axis in (0, 1)])
 
 
 def scale_by(values: ArrayLike, factor: float) -> FloatArray:
     """Values times a factor, as float64."""
-    product: FloatArray = np.asarray(unmasked(values, "values"), dtype=np.float64) * factor
+    product: FloatArray = np.asarray(refuse_masked(values, "values"), dtype=np.float64) * factor
     return product
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import dctn, idctn
 
-from napari_shadowinv._system.arrays import SQUARE_PIXELS, check_finite, checked_plane, plain_array
+from napari_shadowinv._system.arrays import SQUARE_PIXELS, check_finite, check_plane, plain_array
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
@@ -74,7 +74,7 @@ def border_mean(potential: ArrayLike) -> float:
     plane or empty.
     """
     plain = plain_array(potential, "potential", unit=SQUARE_PIXELS)
-    values = np.asarray(checked_plane(plain, "potential"), dtype=np.float64)
+    values = np.asarray(check_plane(plain, "potential"), dtype=np.float64)
     border = np.ones(values.shape, dtype=bool)
     border[1:-1, 1:-1] = False
     return float(values[border].mean())
@@ -97,7 +97,7 @@ def _solve_neumann(laplacian: FloatArray) -> FloatArray:
 def _checked(name: str, values: ArrayLike) -> FloatArray:
     plain = plain_array(values, name)
     check_memory(plain.shape, _BYTES_PER_PIXEL, "a linear inversion")
-    array = np.asarray(checked_plane(plain, name), dtype=np.float64)
+    array = np.asarray(check_plane(plain, name), dtype=np.float64)
     check_finite(name, array)
     return array
 

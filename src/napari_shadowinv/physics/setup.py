@@ -39,7 +39,7 @@ from pydantic_core import PydanticKnownError
 from scipy import constants
 
 from napari_shadowinv._system.arrays import VECTOR, plain_array
-from napari_shadowinv._system.validation import nearest, validated
+from napari_shadowinv._system.validation import nearest, validate
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.beam import (
@@ -547,7 +547,7 @@ def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> Setup:
         raise InputError(
             f"{where}: 'kind' is {kind!r}, {_expected_kind()}{_suggest_kind(str(kind))}"
         )
-    return validated(SETUPS[kind], mapping, where)
+    return validate(SETUPS[kind], mapping, where)
 
 
 def bin_setup(setup: Setup, factor: int) -> Setup:

@@ -60,7 +60,7 @@ class Cache:
         self._plan = key, source, mask, plan
         return plan
 
-    def solved(self, plan: SitePlan) -> Inversion | None:
+    def last_inversion(self, plan: SitePlan) -> Inversion | None:
         """Return the last inversion passed to `keep`, if it has these sites."""
         solved = self._solved
         return solved[1] if solved is not None and solved[0] is plan else None

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from napari_shadowinv._system.safety import resolved_path
-from napari_shadowinv._system.validation import validated
+from napari_shadowinv._system.validation import validate
 from napari_shadowinv.io import read_radiograph, read_toml
 from napari_shadowinv.io.files import write_toml
 from napari_shadowinv.physics.setup import SETUPS, Setup, setup_from_dict
@@ -29,7 +29,7 @@ def read_recipe(path: Path) -> Recipe:
     An `InputError` names an invalid entry; a `FileFormatError` gives the reason if the file cannot
     be read.
     """
-    return _map_files(validated(Recipe, read_toml(path), str(path)), Path(path).parent.joinpath)
+    return _map_files(validate(Recipe, read_toml(path), str(path)), Path(path).parent.joinpath)
 
 
 def write_recipe(path: Path, recipe: Recipe, *, overwrite: bool = False) -> None:

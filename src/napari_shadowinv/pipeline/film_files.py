@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from napari_shadowinv._system.tables import read_rows, write_cells
-from napari_shadowinv._system.validation import validated
+from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.film import Calibration, Pack, PackLayer
 from napari_shadowinv.film_doses import FilmDoses
@@ -66,7 +66,7 @@ def read_pack(path: Path) -> Pack:
         entries["layers"] = [row.model_dump() for row in rows.values()]
     if isinstance(entries.get("setup"), str):
         entries["setup"] = read_toml(path.parent / entries["setup"])
-    return _map_files(validated(Pack, entries, str(path)), path.parent.joinpath)
+    return _map_files(validate(Pack, entries, str(path)), path.parent.joinpath)
 
 
 def write_layers(
@@ -283,7 +283,7 @@ def write_new_pack(folder: Path, entries: Mapping[str, Any], *, overwrite: bool 
         If the entries do not describe a pack; the message names the reason.
     """
     path = Path(folder) / PACK_FILE
-    validated(Pack, dict(entries), str(path))
+    validate(Pack, dict(entries), str(path))
     write_toml(path, entries, overwrite)
     return path
 

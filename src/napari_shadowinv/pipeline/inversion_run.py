@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import (
+    check_plane,
     check_spacing,
-    checked_plane,
     join_masks,
     unpack_array,
     unpack_mask,
@@ -30,7 +30,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.inversion.compilation import ensure_compiled
-from napari_shadowinv.inversion.normalise import checked_source, prepare
+from napari_shadowinv.inversion.normalise import check_source, prepare
 from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.physics.setup import deflection_warnings, setup_warnings
@@ -203,7 +203,7 @@ def run_prepared(
         plan=plan,
         options=options,
         # The final result must not depend on earlier previews.
-        start=cache.solved(plan) if preview else start,
+        start=cache.last_inversion(plan) if preview else start,
         on_progress=on_progress,
         should_stop=should_stop,
     )
@@ -244,7 +244,7 @@ def _source(
         doubts.extend(uniform_warnings(shot.shape, shot.setup, centre=centre))
     if shot.source is not None:
         usable = np.ones(shot.shape, bool) if shot.mask is None else shot.mask
-        return checked_source(shot.source, usable)
+        return check_source(shot.source, usable)
     assert estimate is not None
     estimate = estimate.adapt_to(shot.setup, recorded, matrix)
     report("source", 0, None, estimate.title)
@@ -402,7 +402,7 @@ def radiograph_of(image: Shot, name: str) -> Radiograph:
 
 def plane_of(values: Any, name: str) -> FloatArray:
     """Return an image as floats; an `InputError` if it is none."""
-    array = checked_plane(values, name)
+    array = check_plane(values, name)
     check_memory(array.shape, _BYTES_PER_PIXEL, "an image")
     return array.astype(np.float64)
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from napari_shadowinv._system.tables import has_column_names, is_number, read_rows, write_cells
-from napari_shadowinv._system.validation import CheckedModel, suggestion, validated
+from napari_shadowinv._system.validation import CheckedModel, suggestion, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import replacing, text_of
 from napari_shadowinv.io.formats import SITES
@@ -193,7 +193,7 @@ def shot_rows(
                 f"({texts[name]}): expected one for each image, separated by commas"
             )
     return [
-        validated(
+        validate(
             ShotRow,
             _drop_none({"file": image, **shared, **{name: columns[name][k] for name in columns}}),
             str(image),

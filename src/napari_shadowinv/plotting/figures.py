@@ -83,15 +83,15 @@ def report_figure(
         mean = float(inversion.source.mean())
         limits = intensity_limits(inversion.image / mean)
 
-        def hidden(plane: FloatArray) -> FloatArray:
+        def blank_masked(plane: FloatArray) -> FloatArray:
             return np.where(inversion.mask, plane, np.nan)
 
-        draw_intensity(panels[0], hidden(inversion.image / mean), "Image", limits)
-        draw_potential(panels[1], hidden(inversion.potential), setup)
+        draw_intensity(panels[0], blank_masked(inversion.image / mean), "Image", limits)
+        draw_potential(panels[1], blank_masked(inversion.potential), setup)
         outline_caustics(panels[1], inversion.caustic)
         draw_field(panels[2], field)
         outline_caustics(panels[2], inversion.caustic)
-        reprojection = hidden(inversion.reprojection / mean)
+        reprojection = blank_masked(inversion.reprojection / mean)
         draw_intensity(panels[3], reprojection, "Re-projection", limits)
         residual = next(fact for fact in facts if fact.key == "image_residual")
         _draw_residual(panels[4], inversion, residual.short.capitalize())

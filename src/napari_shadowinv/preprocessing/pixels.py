@@ -17,7 +17,7 @@ import scipy
 from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import NORMAL_MAD, checked_mask, checked_plane, unpack_shot
+from napari_shadowinv._system.arrays import NORMAL_MAD, check_mask, check_plane, unpack_shot
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -163,8 +163,8 @@ def checked_pixels(
     Masked pixels, which may be NaN, are set to the mean of the usable ones.
     """
     image, _, mask = unpack_shot(image, None, mask)
-    values = np.array(checked_plane(image, name, 1), dtype=np.float64)
-    usable = checked_mask(mask, values.shape, name)
+    values = np.array(check_plane(image, name, 1), dtype=np.float64)
+    usable = check_mask(mask, values.shape, name)
     bad = int((~np.isfinite(values[usable])).sum())
     if bad:
         raise InputError(

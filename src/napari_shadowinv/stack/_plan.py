@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import (
+    check_mask,
     check_spacing,
-    checked_mask,
     join_masks,
     unpack_array,
     unpack_mask,
@@ -28,7 +28,7 @@ from napari_shadowinv._system.validation import check_instance
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion import count_sites
-from napari_shadowinv.inversion.normalise import bytes_per_pixel, checked_source, number_of_sites
+from napari_shadowinv.inversion.normalise import bytes_per_pixel, check_source, number_of_sites
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.store import FORMAT, OWN_SETUPS
@@ -394,8 +394,8 @@ def _describe_inputs(
             f"source has shape {sources.shape}, shots {stack_shots.shape}: they must match"
         )
     mask = join_masks(mask, stack_shots.mask, lit)
-    usable = None if mask is None else checked_mask(mask, stack_shots.shape)
-    bare = None if source_mask is None else checked_mask(source_mask, stack_shots.shape)
+    usable = None if mask is None else check_mask(mask, stack_shots.shape)
+    bare = None if source_mask is None else check_mask(source_mask, stack_shots.shape)
     if recipe.setup is not None:
         check_spacing(shots, "shots", recipe.setup.pixel_sizes)
     if recipe.fit is None and not recipe.steps:
@@ -466,7 +466,7 @@ def _shared_beam(inputs: Inputs, source: AnyArray | None) -> Beam | None:
         return None
     ready = inputs.recipe.prepare(replace(inputs.shot, image=source, source=source))
     assert ready.source is not None
-    checked_source(ready.source, ready.mask)
+    check_source(ready.source, ready.mask)
     return Beam.of(ready.shape, ready.source, ready.mask)
 
 
@@ -516,7 +516,7 @@ def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:
     plan = shared_plan(beam, options)
     level = plan.levels[-1]
     mask = np.ones(beam.shape, bool) if beam.mask is None else beam.mask
-    source = None if beam.source is None else checked_source(beam.source, beam.mask)
+    source = None if beam.source is None else check_source(beam.source, beam.mask)
     return {
         "sites": level.sites - plan.margin_width,
         "site_mass": level.mass * plan.unit,

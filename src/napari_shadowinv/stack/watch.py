@@ -346,9 +346,8 @@ class Watch:
             store = self.store
             if store is not None:
                 # Earlier shots are a better reference for the size of the images.
-                existing = (
-                    earlier for earlier in store.done() if self._stacks.file(earlier).path.exists()
-                )
+                done = store.done_names()
+                existing = (name for name in done if self._stacks.file(name).path.exists())
                 names = [*islice(existing, MAX_TRIED_SHOTS), *names]
             stack = self._stacks.of(names)
             if store is not None:

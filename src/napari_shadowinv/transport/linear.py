@@ -601,7 +601,7 @@ class LaplacianSolver:
         """
         if laplacian is not None:
             self._matrix = _with_ground(laplacian, ground)
-        right = self._centred(right)
+        right = self._centre(right)
         scale = self._norm(right)
         solution: FloatArray = np.zeros(self._n)
         if scale == 0.0:
@@ -623,9 +623,9 @@ class LaplacianSolver:
                 relative = self._norm(residual) / scale
             if not energy > 0.0:
                 break
-        return self._centred(solution), iterations, relative
+        return self._centre(solution), iterations, relative
 
-    def _centred(self, values: FloatArray) -> FloatArray:
+    def _centre(self, values: FloatArray) -> FloatArray:
         """Subtract the mean, to which a network without a ground is insensitive."""
         return values if self._grounded else values - values.mean()
 

@@ -45,7 +45,7 @@ from napari_shadowinv.transport.sites import Level
 
 __all__ = [
     "SHORTEST_STEP",
-    "blurred",
+    "blur_image",
     "descend",
     "newton",
     "sharpen",
@@ -235,7 +235,7 @@ def descend(
     residual = np.inf
     steps = 0
 
-    def scaled(weights: FloatArray) -> tuple[float, FloatArray]:
+    def scaled_problem(weights: FloatArray) -> tuple[float, FloatArray]:
         nonlocal residual
         value, gradient = objective.value_and_gradient(area * weights)
         residual = float(np.max(np.abs(gradient) / mass))
@@ -250,7 +250,7 @@ def descend(
             raise StopIteration
 
     result = minimize(
-        scaled,
+        scaled_problem,
         start / area,
         jac=True,
         method=method,
@@ -281,7 +281,7 @@ _SHARES_OF_PREDICTION = (1.0, 0.5, 0.25)
 _MIN_PREDICTED_SHARE = 1e-2  # of the smallest flux to reach
 
 
-def blurred(image: FloatArray, width: float, threads: int | None = 1) -> FloatArray:
+def blur_image(image: FloatArray, width: float, threads: int | None = 1) -> FloatArray:
     """Blur a positive image by a standard deviation in px, mirrored at the border.
 
     The kernel is the discrete Gaussian (T. Lindeberg, IEEE Trans. Pattern Anal. Mach. Intell. 12,

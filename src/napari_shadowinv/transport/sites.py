@@ -63,7 +63,7 @@ class Level:
     centroids: FloatArray  # (n, 2): centres of that flux; the sites after many Lloyd steps
     triangulation: RegularTriangulation  # Delaunay's; copy it before changing weights
     shape: tuple[int, int]  # (H, W) of the source
-    lloyd_iterations: int  # made
+    lloyd_iterations: int
 
     @property
     def spacing(self) -> float:
@@ -109,12 +109,12 @@ class Levels(Sequence[Level]):
         self,
         counts: tuple[int, ...],
         make: Callable[[int, Reporter], Level],
-        made: dict[int, _Slot] | None = None,
+        slots: dict[int, _Slot] | None = None,
         report: Reporter | None = None,
     ) -> None:
         self.counts = counts
         self._make = make
-        self._made = {} if made is None else made
+        self._slots = {} if slots is None else slots
         self._report = report or Reporter()
 
     @property
@@ -133,7 +133,7 @@ class Levels(Sequence[Level]):
 
     def __getitem__(self, number: int | slice) -> Level | Levels:
         if isinstance(number, slice):
-            return Levels(self.counts[number], self._make, self._made, self._report)
+            return Levels(self.counts[number], self._make, self._slots, self._report)
         return self.at(self.counts[number])
 
     def at(self, count: int) -> Level:
@@ -143,20 +143,20 @@ class Levels(Sequence[Level]):
     def up_to(self, count: int) -> Levels:
         """Return the levels with fewer than `count` sites, and the level with `count`."""
         counts = (*(level_count for level_count in self.counts if level_count < count), count)
-        return Levels(counts, self._make, self._made, self._report)
+        return Levels(counts, self._make, self._slots, self._report)
 
     def with_reporter(self, report: Reporter | None) -> Levels:
         """Return the same levels with another report for those still to be computed."""
-        return Levels(self.counts, self._make, self._made, report)
+        return Levels(self.counts, self._make, self._slots, report)
 
-    def made(self, threads: int | None = None) -> Levels:
+    def compute_all(self, threads: int | None = None) -> Levels:
         """Compute all levels; the result offers no others and no longer refers to the source."""
         with self.in_background(threads) as begin:
             # In parallel with the finest level, which takes three times as long as all others.
             begin(self.counts[:-1])
             for count in reversed(self.counts):
                 self.at(count)
-        return Levels(self.counts, _refuse_level, self._made)
+        return Levels(self.counts, _refuse_level, self._slots)
 
     @contextmanager
     def in_background(
@@ -175,7 +175,7 @@ class Levels(Sequence[Level]):
 
         def begin(counts: Sequence[int]) -> None:
             for count in counts:
-                if count not in self._made:
+                if count not in self._slots:
                     self._report("sites", 0, None, f"{count:,} sites")
                     pool.submit(quiet.at, count)
 
@@ -186,7 +186,7 @@ class Levels(Sequence[Level]):
             pool.shutdown(cancel_futures=True)
 
     def _level(self, count: int, report: Reporter) -> Level:
-        slot = self._made.setdefault(count, _Slot())
+        slot = self._slots.setdefault(count, _Slot())
         while not slot.lock.acquire(timeout=_POLL_S):
             report("sites", 0, None, f"{count:,} sites")
         try:

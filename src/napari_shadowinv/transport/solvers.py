@@ -3,7 +3,7 @@
 - with the solver, tolerance and limits of the options: `solve`
 - an answer of one level, with a smooth potential everywhere: `LevelSolution`
 - the problem of one level: `Target`
-- the factor on an image of unknown exposure: `fitted_flux`
+- the factor on an image of unknown exposure: `fit_flux_factor`
 
 References
 ----------
@@ -26,11 +26,11 @@ from napari_shadowinv.geometry.density import Density, split_pixels
 from napari_shadowinv.geometry.interpolation import CloughTocher, fit_gradients
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.transport.margin import Margin
-from napari_shadowinv.transport.minimise import blurred, descend, newton, sharpen
+from napari_shadowinv.transport.minimise import blur_image, descend, newton, sharpen
 from napari_shadowinv.transport.objective import OpenObjective, Solution, TransportObjective
 from napari_shadowinv.transport.sites import RATIO, Level, Levels
 
-__all__ = ["LevelSolution", "Target", "fitted_flux", "solve"]
+__all__ = ["LevelSolution", "Target", "fit_flux_factor", "solve"]
 
 
 _COARSE_TOLERANCE = 3e-2
@@ -153,7 +153,7 @@ def _solve_levels(
         tolerance = options.tolerance if finest or times <= RATIO else coarse
         objective = target.objective(level)
         if not solutions and by_newton:
-            solution = target.sharpened(level, tolerance, report)
+            solution = target.solve_blurred_first(level, tolerance, report)
         else:
             weights = None
             if solutions:
@@ -189,13 +189,13 @@ def _restart(
     level: Level, target: Target, stalled: Solution | None, report: Reporter | None
 ) -> LevelSolution:
     """Solve the finest level from zero weights, because a coarser one stalled."""
-    solution = target.sharpened(level, target.options.tolerance, report)
+    solution = target.solve_blurred_first(level, target.options.tolerance, report)
     if stalled is not None and stalled.residual < solution.residual:
         solution = replace(stalled, iterations=solution.iterations)
     return LevelSolution.of_level(level, target.objective(level), solution)
 
 
-def fitted_flux(
+def fit_flux_factor(
     levels: Levels,
     image: FloatArray,
     margin: Margin,
@@ -269,20 +269,24 @@ class Target:
         triangulation = level.triangulation.copy()
         return TransportObjective(triangulation, level.mass, self.density, threads=threads)
 
-    def softened(self, level: Level, blur: float, factor: int) -> TransportObjective:
+    def blurred_objective(self, level: Level, blur: float, factor: int) -> TransportObjective:
         """Pose it for pixels split by a factor along each side, then blurred by `blur` of them."""
         pixels = split_pixels(self.density.image, factor)
         margin = self.margin and self.margin.split(factor)
         decay_length = self.options.decay_length and factor * self.options.decay_length
         options = self.options.model_copy(update={"decay_length": decay_length})
-        return Target.of(blurred(pixels, blur, options.threads), margin, options).objective(level)
+        return Target.of(blur_image(pixels, blur, options.threads), margin, options).objective(
+            level
+        )
 
-    def sharpened(self, level: Level, tolerance: float, report: Reporter | None) -> Solution:
+    def solve_blurred_first(
+        self, level: Level, tolerance: float, report: Reporter | None
+    ) -> Solution:
         """Solve a level from zero weights, by way of blurred images."""
         return sharpen(
             level,
             self.objective(level),
-            self.softened,
+            self.blurred_objective,
             tolerance=tolerance,
             max_iterations=self.options.max_iterations,
             report=report,

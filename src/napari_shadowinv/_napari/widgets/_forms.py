@@ -19,7 +19,7 @@ from napari_shadowinv._napari.widgets._editors import (
     unit_of_title,
 )
 from napari_shadowinv._napari.widgets._qt import column, notify_errors, side_by_side
-from napari_shadowinv._system.validation import validated
+from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import STEPS, Step
 
@@ -191,7 +191,7 @@ class ModelForm(QtWidgets.QWidget):
     def model(self) -> BaseModel:
         """Return the validated model, or raise an `InputError`."""
         name = self._model_class.__name__.removesuffix("Options").removesuffix("Setup").lower()
-        return validated(self._model_class, self.values(), name)
+        return validate(self._model_class, self.values(), name)
 
     def _on_change(self) -> None:
         self._keep_one_alternative()

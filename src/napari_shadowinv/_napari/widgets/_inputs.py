@@ -22,7 +22,7 @@ from napari_shadowinv._napari.widgets._files import RecipeButton
 from napari_shadowinv._napari.widgets._forms import StepsSection
 from napari_shadowinv._napari.widgets._qt import column
 from napari_shadowinv._napari.widgets._results import Origins
-from napari_shadowinv._system.validation import validated
+from napari_shadowinv._system.validation import validate
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import InversionOptions
@@ -450,7 +450,7 @@ class OptionsForm(forms.ModelForm):
         return self.values()
 
     def _load(self, values: dict[str, object], path: str) -> None:
-        validated(self._model_class, values, path)
+        validate(self._model_class, values, path)
         self.set_values(values)
 
 

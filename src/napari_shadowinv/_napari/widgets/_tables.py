@@ -25,7 +25,7 @@ from napari_shadowinv._napari.widgets._editors import format_number, parse_numbe
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, PathEdit, labelled, small_button
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, kind_of, stack_of
 from napari_shadowinv._napari.widgets._qt import column, notify_errors, side_by_side, while_alive
-from napari_shadowinv._system.validation import validated
+from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import SITES
 from napari_shadowinv.physics.setup import SETUPS, BeamQuantity, Setup, beam_quantities
@@ -463,7 +463,7 @@ class ShotTable(QWidget):
         if not mask or row.mask is None or mask != row.mask.name:
             changes["mask"] = self._folder / mask if mask else None
         entries = row.model_dump(exclude={"strength"})  # tables have another form of it
-        edited = validated(ShotRow, {**entries, **changes}, f"'{row.file.name}'")
+        edited = validate(ShotRow, {**entries, **changes}, f"'{row.file.name}'")
         return edited.model_copy(update={"strength": row.strength})
 
     @property

@@ -38,7 +38,7 @@ from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._qt import side_by_side, while_alive
 from napari_shadowinv._napari.widgets._results import LastResults, result_frame
 from napari_shadowinv._napari.widgets._tables import ImageRow, ImageTable, beam_column
-from napari_shadowinv._system.validation import validated
+from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import point_spread
 from napari_shadowinv.options import FitChoices, FitOptions
@@ -353,7 +353,7 @@ class FitImages(ToolPanel):
         """Return the setup of an image, its own or the reference's, with the beam of its row."""
         base = self._base_setup(row, setup)
         values = {**base.model_dump(), self.images.beam.name: self.images.beam_value(row)}
-        return validated(SETUPS[setup.kind], values, f"the setup of '{row.name}'")
+        return validate(SETUPS[setup.kind], values, f"the setup of '{row.name}'")
 
     def _base_setup(self, row: ImageRow, setup: Setup) -> Setup:
         row_setup = row.setup if row.plane is None and row != self.images.reference else None
