@@ -58,34 +58,42 @@ class StackJob:
         on_done: Callable[[int | None], None] = lambda _: None,
     ) -> RunStatus:
         """Invert the pending shots; `on_done` gets each finished shot before the window does."""
-        from napari_shadowinv.stack import run_stack
 
         def update(status: RunStatus) -> None:
             if status.stage:
                 on_progress(Progress("prepare", 0, None, status.stage))
                 return
             # The layers must be ready before the window reads the status.
-            if status.done:
+            if self._changes_layers(status):
                 outcome = status.outcome
                 on_done(None if outcome is None or outcome.reason else outcome.index)
             self.status = status
-            step = status.done + status.failed
-            on_progress(Progress("shots", step, status.total, status.text))
+            on_progress(self._progress(status))
 
         on_progress(Progress("prepare", 0, None, "shots and source"))
-        run_stack(
+        self._start(
             self.shots,
             self.out,
             self.recipe,
             source=self.source,
             mask=self.mask,
             source_mask=self.source_mask,
-            run=self.run_options,
-            scheduler=self.scheduler,
             on_progress=update,
             should_stop=should_stop,
         )
         return self.status
+
+    def _start(self, *args: Any, **keywords: Any) -> None:
+        from napari_shadowinv.stack import run_stack
+
+        run_stack(*args, run=self.run_options, scheduler=self.scheduler, **keywords)
+
+    def _changes_layers(self, status: RunStatus) -> bool:
+        """Whether the layers may change with a status that follows the current one."""
+        return bool(status.done)
+
+    def _progress(self, status: RunStatus) -> Progress:
+        return Progress("shots", status.done + status.failed, status.total, status.text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,17 +168,23 @@ class StackRequest(Job):
                 role = str(role_of(keywords))
                 self._limits[role] = _widen_limits(self._limits[role], np.asarray(data[index]))
 
-    def _describe(self, shot: int | None = None) -> None:
+    def _store_layers(self, shot: int | None) -> list[FullLayerData]:
+        """Describe the layers of the store; none if that has to wait for the next shot."""
         from napari_shadowinv._napari.stores import store_layers
 
         try:
             layers = store_layers(self.job.out, shot=shot)
         except (InputError, OSError):
-            return  # try again after the next shot
+            return []
+        for _, keywords, _kind in layers:
+            keywords["metadata"][KEY]["made_from"] = self.origins.attributes()
+        return layers
+
+    def _describe(self, shot: int | None = None) -> None:
+        layers = self._store_layers(shot)
         # napari's cache of a pending shot would hide that it is done.
         placement = {"cache": False, **self.placement}
         for _, keywords, kind in layers:
-            keywords["metadata"][KEY]["made_from"] = self.origins.attributes()
             if kind == "image":
                 limits = keywords["contrast_limits"]
                 self._limits[str(role_of(keywords))] = limits
@@ -246,40 +260,19 @@ class WatchJob(StackJob):
     waiting: int = 0  # files that have arrived
     note: str = ""
 
-    def run(
-        self,
-        on_progress: OnProgress,
-        should_stop: ShouldStop,
-        on_done: Callable[[int | None], None] = lambda _: None,
-    ) -> RunStatus:
-        """Watch until stopped; `on_done` gets each finished shot, as in a run."""
+    def _start(self, *args: Any, **keywords: Any) -> None:
         from napari_shadowinv.stack import watch_stack
 
-        def update(status: RunStatus) -> None:
-            if status.stage:
-                on_progress(Progress("prepare", 0, None, status.stage))
-                return
-            self.waiting, self.note = status.waiting, status.note or self.note
-            outcome = status.outcome
-            if status.done and (outcome is not None or not self.status.total):
-                on_done(None if outcome is None or outcome.reason else outcome.index)
-            self.status = status
-            stage = "shots" if status.ended and status.waiting else "wait"
-            note = f" ({self.note})" if self.note else ""
-            on_progress(Progress(stage, status.ended, None, f"{status.text}{note}"))
+        watch_stack(*args, watch=self.watch_options, **keywords)
 
-        watch_stack(
-            self.shots,
-            self.out,
-            self.recipe,
-            source=self.source,
-            mask=self.mask,
-            source_mask=self.source_mask,
-            watch=self.watch_options,
-            on_progress=update,
-            should_stop=should_stop,
-        )
-        return self.status
+    def _changes_layers(self, status: RunStatus) -> bool:
+        self.waiting, self.note = status.waiting, status.note or self.note
+        return bool(status.done) and (status.outcome is not None or not self.status.total)
+
+    def _progress(self, status: RunStatus) -> Progress:
+        stage = "shots" if status.ended and status.waiting else "wait"
+        note = f" ({self.note})" if self.note else ""
+        return Progress(stage, status.ended, None, f"{status.text}{note}")
 
 
 @dataclass
@@ -325,7 +318,7 @@ class WatchRequest(StackRequest):
         elif index is not None and not self._is_due():
             return
         else:
-            growth.layer_data = self._describe_longer()
+            growth.layer_data = self._store_layers(growth.reference_shot) or None
         current = growth.layer_data or self.layer_data
         for number in growth.new_shots if current else ():
             self._include_shot(current, number)
@@ -342,17 +335,6 @@ class WatchRequest(StackRequest):
     def _is_due(self) -> bool:
         is_behind = isinstance(self.job, WatchJob) and self.job.waiting > 1
         return not is_behind or time.monotonic() > self.growth.updated_at + _UPDATE_INTERVAL_S
-
-    def _describe_longer(self) -> list[FullLayerData] | None:
-        from napari_shadowinv._napari.stores import store_layers
-
-        try:
-            layer_data = store_layers(self.job.out, shot=self.growth.reference_shot)
-        except (InputError, OSError):
-            return None  # try again after the next shot
-        for _, keywords, _kind in layer_data:
-            keywords["metadata"][KEY]["made_from"] = self.origins.attributes()
-        return layer_data
 
 
 def shot_in_view(viewer: Any, layers: Sequence[Any]) -> int | None:
