@@ -30,7 +30,7 @@ from napari_shadowinv import (
     watch_stack,
 )
 from napari_shadowinv._system.locking import locked
-from napari_shadowinv.cli import _watch
+from napari_shadowinv.cli import _batch
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
 from napari_shadowinv.stack import RunStatus, _folder_events, watch
 
@@ -498,14 +498,14 @@ def test_ctrl_c_is_the_normal_end_unless_files_wait(
 ):
     np.save(tmp_path / "reference.npy", SOURCE)
     put(folder, *range(files))
-    update = _watch._WatchPrinter.update
+    update = _batch._WatchPrinter.update
 
     def update_and_interrupt(printer: Any, progress: RunStatus) -> None:
         update(printer, progress)
         if progress.outcome is not None:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(_watch._WatchPrinter, "update", update_and_interrupt)
+    monkeypatch.setattr(_batch._WatchPrinter, "update", update_and_interrupt)
     result = shadowinv(
         "watch", folder, "--pattern", "*.npy", "--source", tmp_path / "reference.npy",
         "--n-sites", 100, "--out", out,

@@ -19,7 +19,6 @@ from napari_shadowinv.cli import (
     _fit_command,
     _shot_commands,
     _stack_commands,
-    _watch_command,
 )
 from napari_shadowinv.cli._flags import HELP_NAMES, HelpfulCommand, HelpfulGroup
 from napari_shadowinv.cli._terminal import EXIT_MISTAKE, notify_errors
@@ -86,7 +85,7 @@ app.command(cls=HelpfulCommand, epilog=_shot_commands.FORWARD_EPILOG)(_shot_comm
 app.command(cls=HelpfulCommand)(_shot_commands.info)
 app.command(cls=HelpfulCommand)(_shot_commands.demo)
 app.command(cls=HelpfulCommand, epilog=_stack_commands.BATCH_EPILOG)(_stack_commands.batch)
-app.command(cls=HelpfulCommand, epilog=_watch_command.EPILOG)(_watch_command.watch)
+app.command(cls=HelpfulCommand, epilog=_stack_commands.WATCH_EPILOG)(_stack_commands.watch)
 app.command(cls=HelpfulCommand)(_stack_commands.status)
 app.command(cls=HelpfulCommand)(_stack_commands.export)
 app.command(cls=HelpfulCommand)(_stack_commands.movie)

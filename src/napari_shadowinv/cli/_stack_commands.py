@@ -1,4 +1,4 @@
-"""Commands for many shots: `batch`, `status`, `export` and `movie`."""
+"""Commands for many shots: `batch`, `watch`, `status`, `export` and `movie`."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-from napari_shadowinv.cli import _flags, _inputs
+from napari_shadowinv.cli import _flags
 from napari_shadowinv.cli._inputs import recipe_for_shots
-from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups
-from napari_shadowinv.pipeline.run_options import RunOptions
+from napari_shadowinv.cli._terminal import notify_errors, say
+from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 
 # Help of options, where it is longer than a line.
 HELP = {
@@ -23,6 +23,8 @@ HELP = {
     "(.csv) with one row per shot.",
     "fit": "Fit the forward model to each shot instead of inverting it, with the recipe's section "
     "[fit]; table rows with the same shot are images of one object.",
+    "fit each": "Fit the forward model to each shot instead of inverting it, with the recipe's "
+    "section [fit].",
     "out": "Output folder, or file for csv. Default: the store's name, in the current folder.",
 }
 BATCH_EPILOG = """
@@ -49,6 +51,19 @@ shot, file, energy, setup
 [bold]Exit codes[/bold]
 0 all done; 1 some shots failed, the others are written; 2 invalid input;
 3 all done, but some did not converge or are not determined; 130 cancelled, continue with --resume.
+"""
+WATCH_EPILOG = """
+[bold]Examples[/bold]
+shadowinv watch shots --source reference.tif --out night.shadowinv.zarr
+shadowinv watch shots --pattern '*.bmp' --channel mean --bin 2 --out night.shadowinv.zarr
+shadowinv watch shots --source reference.tif --out night.shadowinv.zarr --idle 600
+
+Press Ctrl-C to stop. The same command continues with the same store.
+
+[bold]Exit codes[/bold]
+0 all shots that arrived are done; 1 some failed, the others are written; 2 invalid input, or the
+folder disappeared; 3 all done, but some did not converge or are not determined; 130 stopped
+by Ctrl-C while files were waiting.
 """
 
 
@@ -93,11 +108,10 @@ def batch(
         source=None if source is None else Path(source),
         mask=mask,
         source_mask=source_mask,
+        save_to=save_recipe,
+        overwrite=run.overwrite,
+        quiet=quiet,
     )
-    if save_recipe is not None:
-        _inputs.save_recipe(save_recipe, chosen, [recipe, setup, options], run.overwrite)
-    if not quiet:
-        warn_of_setups([(chosen.setup, None)])
     run_batch(
         shots,
         out,
@@ -109,6 +123,49 @@ def batch(
         quiet=quiet,
         scheduler=scheduler or "processes",
     )
+
+
+@notify_errors
+@_flags.takes_run(WatchOptions)
+def watch(
+    folder: Annotated[
+        Path, typer.Argument(help="Folder in which the shots appear.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option(help="Output store: name.shadowinv.zarr.")],
+    source: _flags.SourceFile = None,
+    mask: _flags.MaskFile = None,
+    source_mask: _flags.SourceMask = None,
+    recipe: _flags.RecipeFile = None,
+    save_recipe: _flags.SaveRecipe = None,
+    setup: _flags.SetupFile = None,
+    options: _flags.OptionsFile = None,
+    fit: Annotated[bool, typer.Option("--fit", help=HELP["fit each"])] = False,
+    channel: _flags.Channel = None,
+    variable: _flags.Variable = None,
+    clip_negative: _flags.ClipNegative = False,
+    quiet: _flags.Quiet = False,
+    *,
+    flags: dict[str, Any],
+) -> None:
+    """Invert or fit each new shot in a folder, and append it to a store."""
+    from napari_shadowinv.cli._batch import run_watch
+
+    run = _flags.run_options(WatchOptions, flags)
+    chosen = recipe_for_shots(
+        flags,
+        recipe,
+        options,
+        setup,
+        fit=fit,
+        clip_negative=clip_negative,
+        source=source,
+        mask=mask,
+        source_mask=source_mask,
+        save_to=save_recipe,
+        overwrite=run.overwrite,
+        quiet=quiet,
+    )
+    run_watch(folder, out, chosen, run, channel=channel, variable=variable, quiet=quiet)
 
 
 @notify_errors
