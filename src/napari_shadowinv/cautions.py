@@ -78,6 +78,11 @@ class Caution:
     def __str__(self) -> str:
         return self.text
 
+    @property
+    def short(self) -> str:
+        """The observation in a few words, for a headline."""
+        return self.text if self.code == "other" else CAUTION_CODES[self.code]
+
     def about(self, name: str) -> Caution:
         """Return the same caution with the name of its image or film in front."""
         return Caution(self.code, f"{name}: {self.text}")

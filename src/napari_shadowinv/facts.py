@@ -25,6 +25,7 @@ __all__ = [
     "ResultKind",
     "caution_facts",
     "error_fact",
+    "in_headline",
     "masked_fact",
     "time_fact",
 ]
@@ -76,7 +77,7 @@ class Headline:
     level : Level
         Sound without warnings, doubtful with warnings, failed if the solver did not converge.
     text : str
-        The warnings, then the peak of the main field with its error.
+        The warnings in a few words, then the peak of the main field with its error.
     """
 
     level: Level
@@ -110,6 +111,11 @@ class Fact:
     level: Level = Level.SOUND
     is_detail: bool = False
     short: str = ""
+
+
+def in_headline(cautions: Iterable[Caution]) -> list[str]:
+    """Return cautions in a few words, each once; their facts have the sentences."""
+    return list(dict.fromkeys(caution.short for caution in cautions))
 
 
 def caution_facts(cautions: Iterable[Caution]) -> list[Fact]:

@@ -15,7 +15,7 @@ from napari_shadowinv._system.validation import validate
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Headline, Level, ResultKind, caution_facts
+from napari_shadowinv.facts import Fact, Headline, Level, ResultKind, caution_facts, in_headline
 from napari_shadowinv.film.pack import Pack
 from napari_shadowinv.film.unfolding import relative_strengths
 from napari_shadowinv.physics.setup import ProtonSetup
@@ -140,7 +140,7 @@ class FilmDoses:
     @property
     def headline(self) -> Headline:
         """Warnings, number of films and their energies in one line."""
-        texts = [caution.text for caution in self.cautions]
+        texts = in_headline(self.cautions)
         level = Level.DOUBTFUL if texts else Level.SOUND
         return Headline(level, "; ".join([*texts, f"{len(self.energies)} films, {self._range}"]))
 

@@ -16,7 +16,7 @@ from napari_shadowinv import (
     read,
     synthetic_image,
 )
-from napari_shadowinv.cautions import Caution
+from napari_shadowinv.cautions import CAUTION_CODES, Caution
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.phantoms import ellipse_pair, gaussian_blob
 
@@ -541,6 +541,6 @@ def test_the_headline_puts_warnings_before_the_peak(image):
     assert f"{peak(inversion.displacement):.2f}" in inversion.headline.text
     doubtful = inversion.with_warnings([Caution("beam", "the beam is wrong")]).headline
     assert doubtful.level == "doubtful"
-    assert doubtful.text == f"the beam is wrong; {inversion.headline.text}"
+    assert doubtful.text == f"{CAUTION_CODES['beam']}; {inversion.headline.text}"
     unconverged = dataclasses.replace(inversion.report, converged=False)
     assert dataclasses.replace(inversion, report=unconverged).headline.level == "failed"

@@ -21,6 +21,7 @@ from napari_shadowinv.facts import (
     ResultKind,
     caution_facts,
     error_fact,
+    in_headline,
     masked_fact,
     time_fact,
 )
@@ -308,7 +309,7 @@ class Fit:
     @property
     def headline(self) -> Headline:
         """Verdict and its reason, warnings and convergence in one line."""
-        texts = [f"{self.verdict.upper()}: {self.explanation}", *map(str, self.warnings)]
+        texts = [f"{self.verdict.upper()}: {self.explanation}", *in_headline(self.warnings)]
         level = Level.DOUBTFUL if self.cautions else Level.SOUND
         if not self.report.converged:
             level = Level.FAILED

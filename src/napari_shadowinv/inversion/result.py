@@ -22,6 +22,7 @@ from napari_shadowinv.facts import (
     ResultKind,
     caution_facts,
     error_fact,
+    in_headline,
     masked_fact,
     time_fact,
 )
@@ -215,12 +216,11 @@ class Inversion:
         error = None if self.errors is None else self.errors.of_peak
         (field,) = shown_fields([self.displacement], setup, mask=self.mask)
         cautions = self.report.warnings
-        texts = [caution.text for caution in cautions]
-        level = Level.DOUBTFUL if cautions else Level.SOUND
+        texts = in_headline(each for each in cautions if each.code != "not-converged")
+        level = Level.DOUBTFUL if texts else Level.SOUND
         if not self.report.converged:
             level = Level.FAILED
-            if all(caution.code != "not-converged" for caution in cautions):
-                texts.insert(0, "not converged: do not trust the field")
+            texts.insert(0, "not converged: do not trust the field")
         return Headline(level, "; ".join([*texts, field.peak_text(error)]))
 
     @property

@@ -314,11 +314,14 @@ def fact_line(facts: Iterable[Fact]) -> str:
 
 def footer_lines(facts: Iterable[Fact], headline: str, letters: int) -> list[tuple[str, str]]:
     """Return the facts that a headline does not contain as lines; long ones have their own."""
-    shown = [fact for fact in facts if fact.key not in CAUTION_CODES and fact.text not in headline]
-    is_long = {fact: len(fact.text) > letters // 2 for fact in shown}
-    paragraphs = [fact_line(fact for fact in shown if not is_long[fact])]
-    paragraphs += [fact_line([fact]) for fact in shown if is_long[fact]]
-    return [(line, QUIET_COLOUR) for text in paragraphs for line in textwrap.wrap(text, letters)]
+    shown = [fact for fact in facts if fact.key != "verdict" and fact.text not in headline]
+    warnings = [fact for fact in shown if fact.key in CAUTION_CODES]
+    quiet = [fact for fact in shown if fact not in warnings]
+    is_long = {fact: len(fact.text) > letters // 2 for fact in quiet}
+    paragraphs = [(fact_line([fact]), ALARM_COLOUR) for fact in warnings]
+    paragraphs.append((fact_line(fact for fact in quiet if not is_long[fact]), QUIET_COLOUR))
+    paragraphs += [(fact_line([fact]), QUIET_COLOUR) for fact in quiet if is_long[fact]]
+    return [(line, colour) for text, colour in paragraphs for line in textwrap.wrap(text, letters)]
 
 
 def write_footer(figure: Figure, lines: list[tuple[str, str]], grid: Grid) -> None:

@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args, get_origin
 from pydantic import BaseModel
 from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
+from qtpy.QtGui import QColor
 from qtpy.QtWidgets import QSizePolicy, QWidget
 from superqt import QCollapsible
 
@@ -26,7 +27,8 @@ from napari_shadowinv.preprocessing import STEPS, Step
 # For each key a title, and the model's class, if any.
 Kinds = dict[str, tuple[str, type[BaseModel] | None]]
 
-PROBLEM_STYLE = "color: #d9822b;"
+PROBLEM_COLOUR = QColor("#d9822b")
+PROBLEM_STYLE = f"color: {PROBLEM_COLOUR.name()};"
 _LABEL_WIDTH_PX = 80
 INDENT = 12
 TOML = "TOML (*.toml)"

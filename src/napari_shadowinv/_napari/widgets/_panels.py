@@ -20,7 +20,12 @@ from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import main_layers
 from napari_shadowinv._napari.viewer_sync import USER_ERRORS, window_text
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, section, wrapping_label
+from napari_shadowinv._napari.widgets._forms import (
+    PROBLEM_COLOUR,
+    PROBLEM_STYLE,
+    section,
+    wrapping_label,
+)
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.cautions import CAUTION_CODES
@@ -205,6 +210,7 @@ _LEVEL_STYLES = {
     Level.DOUBTFUL: PROBLEM_STYLE,
     Level.FAILED: "color: #e05252;",
 }
+_ROW_SPACING_PX = 4
 _SETTLE_MS = 10  # merges simultaneous changes
 
 
@@ -341,7 +347,7 @@ class RunPanel(QtWidgets.QWidget):
 def fact_rows(facts: Iterable[Fact], *, details: bool | None = False) -> list[tuple[str, str]]:
     """Return facts as rows: of the result, of the solver (`details`) or, with None, of both.
 
-    The headline and the verdict already show the warnings.
+    Warnings have rows of their own.
     """
     return [
         (fact.title, window_text(fact.text))
@@ -357,6 +363,7 @@ class ReportTable(QtWidgets.QTableWidget):
         super().__init__(0, 2)
         self.horizontalHeader().setVisible(False)
         self.verticalHeader().setVisible(False)
+        self.verticalHeader().setMinimumSectionSize(1)
         self.setEditTriggers(QtWidgets.QAbstractItemView.EditTrigger.NoEditTriggers)
         self.setShowGrid(False)
         self.setWordWrap(True)
@@ -375,6 +382,8 @@ class ReportTable(QtWidgets.QTableWidget):
                 item = QtWidgets.QTableWidgetItem(text)
                 item.setTextAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignTop)
                 item.setToolTip(text)
+                if texts[0] == "Warning":
+                    item.setForeground(PROBLEM_COLOUR)
                 self.setItem(row, column, item)
         self.setVisible(True)
         self._fit()
@@ -393,6 +402,8 @@ class ReportTable(QtWidgets.QTableWidget):
 
     def _fit(self) -> None:
         self.resizeRowsToContents()
+        for row in range(self.rowCount()):
+            self.setRowHeight(row, self.rowHeight(row) + _ROW_SPACING_PX)
         self.setFixedHeight(self.verticalHeader().length() + 2 * self.frameWidth())
 
 
@@ -425,7 +436,7 @@ class FoldedReport(QtWidgets.QWidget):
 
 
 class VerdictLine(QtWidgets.QLabel):
-    """A coloured line below Run with the level of trust, the warnings and the peak."""
+    """A coloured line below Run with level of trust, warnings in a few words, and peak."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
-from qtpy.QtGui import QColor
 from qtpy.QtWidgets import (
     QFileDialog,
     QHeaderView,
@@ -22,7 +21,7 @@ from qtpy.QtWidgets import (
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.widgets._editors import format_number, parse_number
-from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, PathEdit, labelled, small_button
+from napari_shadowinv._napari.widgets._forms import PROBLEM_COLOUR, PathEdit, labelled, small_button
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, kind_of, stack_of
 from napari_shadowinv._napari.widgets._qt import column, notify_errors, side_by_side, while_alive
 from napari_shadowinv._system.validation import validate
@@ -33,7 +32,6 @@ from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_tabl
 
 _MAX_SHOWN_ROWS = 8
 _PREFIXED_UNIT = "m"  # cells show it, with the prefix of each number
-_PROBLEM_COLOUR = QColor(PROBLEM_STYLE.removeprefix("color: ").removesuffix(";"))
 
 
 @dataclass(frozen=True)
@@ -140,7 +138,7 @@ class NumberTable(QTableWidget):
         try:
             parse_number(item.text() or "0", spec.unit)
         except InputError as error:
-            item.setForeground(_PROBLEM_COLOUR)
+            item.setForeground(PROBLEM_COLOUR)
             item.setToolTip(f"<qt>{error}</qt>")
 
 
