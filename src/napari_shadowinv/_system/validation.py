@@ -1,9 +1,10 @@
-"""One clear sentence for a parameter that is wrong."""
+"""Models of parameters: one clear sentence for a wrong one, and the paths in them."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -85,6 +86,22 @@ def validate(
         return model_class.model_validate(mapping)
     except ValidationError as error:
         raise InputError(f"{where}: {_error_sentence(model_class, error)}") from error
+
+
+def map_paths(model: Model, move: Callable[[Path], Path]) -> Model:
+    """Return a model with each path in its fields, and the fields of these, replaced by `move`."""
+
+    def moved(content: Any) -> Any:
+        if isinstance(content, Path):
+            return move(content)
+        if isinstance(content, BaseModel):
+            return map_paths(content, move)
+        if isinstance(content, Mapping):
+            return {name: moved(value) for name, value in content.items()}
+        return tuple(map(moved, content)) if isinstance(content, tuple) else content
+
+    changes = {name: place for name, value in model if (place := moved(value)) != value}
+    return model.model_copy(update=changes)
 
 
 def nearest(name: str, choices: Collection[str]) -> str | None:

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from napari_shadowinv._system.safety import resolved_path
-from napari_shadowinv._system.validation import validate
+from napari_shadowinv._system.validation import map_paths, validate
 from napari_shadowinv.io import read_radiograph, read_toml
 from napari_shadowinv.io.files import write_toml
 from napari_shadowinv.physics.setup import SETUPS, Setup, setup_from_dict
-from napari_shadowinv.preprocessing import MeasuredSource, Radiograph, Recipe
+from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 __all__ = ["read_part", "read_recipe", "setup_from", "write_recipe"]
 
@@ -29,7 +29,7 @@ def read_recipe(path: Path) -> Recipe:
     An `InputError` names an invalid entry; a `FileFormatError` gives the reason if the file cannot
     be read.
     """
-    return _map_files(validate(Recipe, read_toml(path), str(path)), Path(path).parent.joinpath)
+    return map_paths(validate(Recipe, read_toml(path), str(path)), Path(path).parent.joinpath)
 
 
 def write_recipe(path: Path, recipe: Recipe, *, overwrite: bool = False) -> None:
@@ -38,7 +38,7 @@ def write_recipe(path: Path, recipe: Recipe, *, overwrite: bool = False) -> None
     A `FileFormatError` is raised if the file exists, unless `overwrite`, or cannot be written.
     """
     folder = resolved_path(Path(path).parent)
-    relative = _map_files(recipe, lambda file: Path(os.path.relpath(resolved_path(file), folder)))
+    relative = map_paths(recipe, lambda file: Path(os.path.relpath(resolved_path(file), folder)))
     write_toml(path, _without_defaults(relative), overwrite)
 
 
@@ -74,20 +74,6 @@ def _kind_of(entries: Mapping[str, Any]) -> str:
     """Return the first kind of setup that alone has one of the entries, empty without one."""
     kinds = (kind for kind, model in SETUPS.items() if entries.keys() & model.own_fields())
     return next(kinds, "")
-
-
-def _map_files(recipe: Recipe, move: Any) -> Recipe:
-    changes: dict[str, Any] = {
-        name: move(getattr(recipe, name))
-        for name in ("mask", "source_mask")
-        if getattr(recipe, name) is not None
-    }
-    if (dark := recipe.dark_file) is not None:
-        recipe = recipe.with_dark_file(move(dark))
-    source = recipe.source
-    if isinstance(source, MeasuredSource) and source.file is not None:
-        changes["source"] = source.model_copy(update={"file": move(source.file)})
-    return recipe.model_copy(update=changes)
 
 
 def _without_defaults(recipe: Recipe) -> dict[str, Any]:

@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from napari_shadowinv._system.tables import read_rows, write_cells
-from napari_shadowinv._system.validation import validate
+from napari_shadowinv._system.validation import map_paths, validate
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.film import Calibration, Pack, PackLayer
 from napari_shadowinv.film_doses import FilmDoses
@@ -66,7 +66,7 @@ def read_pack(path: Path) -> Pack:
         entries["layers"] = [row.model_dump() for row in rows.values()]
     if isinstance(entries.get("setup"), str):
         entries["setup"] = read_toml(path.parent / entries["setup"])
-    return _map_files(validate(Pack, entries, str(path)), path.parent.joinpath)
+    return map_paths(validate(Pack, entries, str(path)), path.parent.joinpath)
 
 
 def write_layers(
@@ -142,27 +142,6 @@ def write_layers(
     with replacing(table, overwrite) as temporary:
         write_cells(temporary, columns, rows)
     return [*written, table]
-
-
-def _map_files(pack: Pack, move: Callable[[Path], Path]) -> Pack:
-    def with_moved(model: Any, *names: str) -> Any:
-        files = {name: getattr(model, name) for name in names}
-        return model.model_copy(
-            update={name: move(file) for name, file in files.items() if file is not None}
-        )
-
-    changes = {
-        "films": {
-            name: with_moved(film, "calibration", "unexposed") for name, film in pack.films.items()
-        },
-        "materials": {
-            name: with_moved(material, "table") for name, material in pack.materials.items()
-        },
-        "layers": tuple(with_moved(layer, "file", "mask") for layer in pack.layers),
-    }
-    return Pack.model_validate(
-        {**dict(with_moved(pack, "scan", "corners", "fiducials")), **changes}
-    )
 
 
 PACK_FILE = "pack.toml"
