@@ -29,8 +29,7 @@ from napari_shadowinv.pipeline import (
     run_refinement,
     write_layers,
 )
-from napari_shadowinv.pipeline.fit_run import refinement_choices
-from napari_shadowinv.pipeline.fit_shots import read_rows
+from napari_shadowinv.pipeline.fit_run import read_row_images, refinement_choices
 from napari_shadowinv.pipeline.rerun import provenance_of
 from napari_shadowinv.pipeline.shot_table import shot_rows
 from napari_shadowinv.pipeline.static_checks import run_checks
@@ -127,7 +126,7 @@ def energy_windows(folder: Path) -> Example:
     table = write_layers(doses, folder)[-1]
     steps = (Crop(y=(14, 46), x=(20, 60)),)
     recipe = Recipe(steps=steps, fit=FitChoices(options=PLAIN))
-    shots = read_rows(shot_rows([table], {}, {}), recipe)
+    shots = read_row_images(shot_rows([table], {}, {}), recipe)
     result = run_fit(recipe, shots)
     checks = run_checks(recipe, shots, result, left_out=False, window=2)
     written = write(Path("a.shadowinv"), checks.add_to(result.to_dataset()))

@@ -117,7 +117,7 @@ def fit(
     from napari_shadowinv.cli import _fit_result, _static_result
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, suffixes_for
     from napari_shadowinv.pipeline import write_recipe
-    from napari_shadowinv.pipeline.fit_shots import read_rows
+    from napari_shadowinv.pipeline.fit_run import read_row_images
     from napari_shadowinv.pipeline.shot_table import shot_rows
     from napari_shadowinv.pipeline.static_checks import run_checks
 
@@ -141,7 +141,7 @@ def fit(
         flags, recipe, options, source=source, brightness=brightness, mask=mask
     )
     _inputs.protect_files_of(chosen, list(outputs))
-    shots = read_rows(rows, chosen, channel=channel, variable=variable)
+    shots = read_row_images(rows, chosen, channel=channel, variable=variable)
     _inputs.check_setup(result, shots[0].setup, chosen.fit.fields if chosen.fit else None)
     warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)
     names = [str(row.file) for row in rows]

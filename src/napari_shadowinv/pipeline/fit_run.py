@@ -1,6 +1,7 @@
 """From several images of one object to its fields by a recipe: `run_fit`, `run_comparison`.
 
 - one image with its measurements: `FitShot`
+- images of a table's rows or of flags: `read_row_images`; their setup: `row_setup`
 - the complete inputs of a fit: `collect_fit_inputs`
 - an inversion refined by a fit that starts from its field: `run_refinement`
 """
@@ -26,9 +27,16 @@ from napari_shadowinv.inversion.budget import ASSUMED_VARIATION
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.options import FitChoices, FitOptions, KindOfNoise
 from napari_shadowinv.physics.projection import default_deflector
-from napari_shadowinv.physics.setup import Setup, deflector_titles, setup_warnings
+from napari_shadowinv.physics.setup import (
+    Setup,
+    beam_quantities,
+    deflector_titles,
+    setup_from_dict,
+    setup_warnings,
+)
+from napari_shadowinv.pipeline.files import read_part, setup_from
 from napari_shadowinv.pipeline.inversion_run import Inputs, Shot, collect_inputs, radiograph_of
-from napari_shadowinv.pipeline.shot_table import fiducials_from
+from napari_shadowinv.pipeline.shot_table import ShotRow, fiducials_from
 from napari_shadowinv.preprocessing import (
     FIT_STEPS,
     Estimate,
@@ -46,7 +54,9 @@ __all__ = [
     "check_fit",
     "collect_fit_inputs",
     "compared_fields",
+    "read_row_images",
     "refinement_choices",
+    "row_setup",
     "run_comparison",
     "run_fit",
     "run_refinement",
@@ -561,3 +571,63 @@ def _common_values(
             "none"
         )
     return tuple(values)
+
+
+def read_row_images(
+    rows: Sequence[ShotRow],
+    recipe: Recipe,
+    *,
+    channel: str | None = None,
+    variable: str | None = None,
+) -> tuple[FitShot, ...]:
+    """Read the images of rows, whose energies or wavelengths complete the setups.
+
+    Parameters
+    ----------
+    rows : sequence of ShotRow
+        Description of each image.
+    recipe : Recipe
+        Its setup applies to images without one.
+    channel, variable : str, optional
+        Part of each file to read; the channel also applies to sources.
+    """
+    return tuple(_read_row_image(row, recipe, channel, variable) for row in rows)
+
+
+def _read_row_image(
+    row: ShotRow, recipe: Recipe, channel: str | None, variable: str | None
+) -> FitShot:
+    shot = read_part(row.file, channel, variable)
+    beam = None if row.source_file is None else read_part(row.source_file, channel)
+    return FitShot(
+        image=shot,
+        setup=row_setup(row, shot, recipe),
+        source="unknown" if row.source == "unknown" else beam,
+        mask=row.mask,
+        strength=row.strength,
+        brightness=row.brightness,
+        psf=row.psf,
+        noise=row.noise,
+    )
+
+
+def row_setup(row: ShotRow, shot: Radiograph, recipe: Recipe) -> Setup | None:
+    """Return the setup of an image from its row, the recipe, or its file, in this order.
+
+    An `InputError` is raised if the row has an energy or a wavelength, no strength, and there is no
+    setup to complete it. With a strength, an energy without a setup is a name of the image.
+    """
+    changes = row.beam
+    if row.setup is not None:
+        return setup_from(row.setup, shot.metadata.get("geometry"), changes)
+    setup = recipe.setup or shot.setup
+    if setup is not None:
+        return setup_from_dict({**setup.model_dump(), **changes}, str(row.file))
+    if not changes or row.strength is not None:
+        return None
+    nouns = " and ".join(beam_quantities()[name].noun for name in changes)
+    article = "an" if nouns[0] in "aeiou" else "a"
+    raise InputError(
+        f"{row.file} has {article} {nouns} of {row.beam_text} and no setup: give the rest of the "
+        "geometry with --setup"
+    )

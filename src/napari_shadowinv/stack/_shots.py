@@ -36,7 +36,7 @@ from napari_shadowinv.io.reading import read_radiograph
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
 from napari_shadowinv.pipeline import FitShot
 from napari_shadowinv.pipeline.files import read_part
-from napari_shadowinv.pipeline.fit_shots import read_rows, row_setup
+from napari_shadowinv.pipeline.fit_run import read_row_images, row_setup
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, rows_to_invert
 from napari_shadowinv.preprocessing import Radiograph, Recipe
 
@@ -150,7 +150,9 @@ class RowsReference(ImageReference):
 
     def load(self) -> tuple[tuple[FitShot, ...], dict[str, Any]]:
         """Return the images, and the files of their rows."""
-        images = read_rows(self.rows, self.recipe, channel=self.channel, variable=self.variable)
+        images = read_row_images(
+            self.rows, self.recipe, channel=self.channel, variable=self.variable
+        )
         files = {
             name: {**stamp(path), "sha256": sha256(path)} for name, path in self._files().items()
         }

@@ -50,6 +50,8 @@ class StackJob:
     run_options: RunOptions = field(default_factory=RunOptions)
     scheduler: str = "threads"
     status: RunStatus = field(default_factory=_empty_status)  # the window reads it at any time
+    waiting: int = 0  # shots that have not ended, or files that have arrived
+    note: str = ""
 
     def run(
         self,
@@ -63,6 +65,7 @@ class StackJob:
             if status.stage:
                 on_progress(Progress("prepare", 0, None, status.stage))
                 return
+            self.waiting, self.note = status.waiting, status.note or self.note
             # The layers must be ready before the window reads the status.
             if self._changes_layers(status):
                 outcome = status.outcome
@@ -257,8 +260,6 @@ class WatchJob(StackJob):
     """A folder to watch, as `shots`: the arguments of `stack.watch_stack`, and the status."""
 
     watch_options: WatchOptions = field(default_factory=WatchOptions)
-    waiting: int = 0  # files that have arrived
-    note: str = ""
 
     def _start(self, *args: Any, **keywords: Any) -> None:
         from napari_shadowinv.stack import watch_stack
@@ -266,7 +267,6 @@ class WatchJob(StackJob):
         watch_stack(*args, watch=self.watch_options, **keywords)
 
     def _changes_layers(self, status: RunStatus) -> bool:
-        self.waiting, self.note = status.waiting, status.note or self.note
         return bool(status.done) and (status.outcome is not None or not self.status.total)
 
     def _progress(self, status: RunStatus) -> Progress:
