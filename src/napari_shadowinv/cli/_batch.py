@@ -462,7 +462,7 @@ class _WatchPrinter:
         summary, doubts = _shot_summary(status.result)
         summary = f"  {summary}  {outcome.seconds:.2f} s{waiting}{doubts}"
         name = _shorten_name(name, _LINE_COLUMNS - len(summary))
-        self._print(self.out, f"{name}{summary}", _style(doubts))
+        self._print(self.out, f"{name}{summary}", "yellow" if doubts else "")
         for warning in status.result.cautions:
             if warning.code not in self.warned:
                 self.warned.add(warning.code)
@@ -470,10 +470,6 @@ class _WatchPrinter:
 
     def _print(self, console: Console, text: str, style: str = "") -> None:
         console.print(plain(text, style), soft_wrap=True, highlight=False)
-
-
-def _style(doubts: str) -> str:
-    return "yellow" if doubts else ""
 
 
 def _shorten_name(name: str, columns: int) -> str:

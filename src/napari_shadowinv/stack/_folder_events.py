@@ -274,7 +274,9 @@ def observing(
                 f"{arrivals.folder} is polled once a second"
             )
     if observer is None:
-        observer = _start_polling(arrivals)
+        from watchdog.observers.polling import PollingObserver
+
+        observer = _schedule(PollingObserver(timeout=_POLL_S), arrivals)
     try:
         arrivals.open(reports_closing=reports_closing)
         yield
@@ -291,12 +293,6 @@ def _start_observer(arrivals: Arrivals) -> tuple[Any, bool]:
     # With full events, a file moved here from elsewhere differs from a created one.
     observer = observer_class(generate_full_events=True) if reports_closing else observer_class()
     return _schedule(observer, arrivals), reports_closing
-
-
-def _start_polling(arrivals: Arrivals) -> Any:
-    from watchdog.observers.polling import PollingObserver
-
-    return _schedule(PollingObserver(timeout=_POLL_S), arrivals)
 
 
 def _schedule(observer: Any, arrivals: Arrivals) -> Any:

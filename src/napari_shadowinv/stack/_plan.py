@@ -96,11 +96,6 @@ class Stack:
     chained: bool = False  # whether each shot starts from an earlier one, without groups
 
     @property
-    def warm_start_text(self) -> str:
-        """Description of the shots that start from others."""
-        return CHAINED if self.chained else str(self.warm_start)
-
-    @property
     def chooses_sites(self) -> bool:
         """Whether the number of sites still has to be derived from the accuracy."""
         is_adaptive = self.beam is not None and self.task.recipe.options.is_adaptive
@@ -171,10 +166,6 @@ class Stack:
         """The task without the variables that are stored once."""
         names = tuple(name for name in self.task.variables if not self.is_shared(name))
         return replace(self.task, variables=names)
-
-    def reordered(self, order: Sequence[int]) -> Stack:
-        """Return the stack with its shots in another order."""
-        return replace(self, shots=self.shots.reordered(order))
 
     def changed(self, index: int, origin: dict[str, Any]) -> str:
         """Name the part of a shot that differs from its report; empty if none does."""

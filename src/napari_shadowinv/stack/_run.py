@@ -12,7 +12,7 @@ import queue
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from textwrap import shorten
@@ -477,7 +477,7 @@ def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> d
         "image_size": f"{width} × {height} px",
         "stored": f"{', '.join(stack.task.variables)} as {dtype}",
         "reader": stack.reader,
-        "warm_start": stack.warm_start_text,
+        "warm_start": CHAINED if stack.chained else str(stack.warm_start),
     }
 
 
@@ -492,8 +492,8 @@ def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
             f"{store.path} was written by watching a folder, where each shot starts from the one "
             "before: continue with shadowinv watch, overwrite the store, or choose another name"
         )
-    stack = stack.reordered(_order(store, stack.shots.names))
-    stack = match_store(store, stack, dtype)
+    shots = stack.shots.reordered(_order(store, stack.shots.names))
+    stack = match_store(store, replace(stack, shots=shots), dtype)
     for index in np.flatnonzero(store.statuses() == DONE):
         changed = stack.changed(int(index), store.report(int(index)))
         if changed:

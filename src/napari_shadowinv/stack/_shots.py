@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     import xarray
 
 Reader = Callable[..., ArrayLike]
+Value = TypeVar("Value")
 
 _GLOB = re.compile(r"[*?\[]")
 _MAX_SHAPE_READS = 3  # shots that are read for the shape of all
@@ -117,10 +118,14 @@ class FileReference(ImageReference):
         return (str(self.path), normalize_token(self.reader), self.page, *file_stamp.values())
 
     def read(self) -> tuple[AnyArray, dict[str, Any]]:
+        options: dict[str, Any] = {} if self.page is None else {"page": self.page}
+        warnings: list[Caution] = []
+        if "warnings" in inspect.signature(self.reader).parameters:
+            options["warnings"] = warnings
+        image = _plain_image(self.reader(self.path, **options))
+        metadata: dict[str, Any] = {"warnings": warnings} if warnings else {}
         if self.page is not None:
-            image, metadata = _read(self.reader, self.path, page=self.page)
             return image, {"sha256": checksum(image), **metadata}
-        image, metadata = _read(self.reader, self.path)
         return image, {**stamp(self.path), "sha256": sha256(self.path), **metadata}
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
@@ -291,15 +296,6 @@ def file_doubts(shot: Radiograph) -> list[Caution]:
     return [*shot.warnings, Caution("file", text)]
 
 
-def _read(reader: Reader, path: Path, **options: int) -> tuple[AnyArray, dict[str, Any]]:
-    """Read the image of a file, and warnings if the reader supports them."""
-    if "warnings" not in inspect.signature(reader).parameters:
-        return _plain_image(reader(path, **options)), {}
-    warnings: list[Caution] = []
-    image = _plain_image(reader(path, **options, warnings=warnings))
-    return image, {"warnings": warnings} if warnings else {}
-
-
 def _plain_image(image: Any) -> AnyArray:
     """Return an image without labels; an `InputError` if it has its own mask."""
     values, usable = unpack_array(image, "the shot")
@@ -443,21 +439,27 @@ def _names_of(paths: Sequence[Path]) -> tuple[str, ...]:
 
 def usual_shape(items: Sequence[Shot]) -> tuple[int, int]:
     """Shape of most of the first few shots that can be read; bad ones fail later, by name."""
-    shapes: Counter[tuple[int, ...]] = Counter()
-    first_error: Exception | None = None
-    for shot in items:
-        try:
-            shapes[shot.images.shape()] += 1
-        except (OSError, ValueError) as error:
-            first_error = first_error or error
-        if shapes.total() == _MAX_SHAPE_READS:
-            break
-    if not shapes:
-        raise FileFormatError(f"none of {len(items)} shots can be read, the first: {first_error}")
-    usual = shapes.most_common(1)[0][0]
+    shapes = _read_first(items, lambda shot: shot.images.shape(), _MAX_SHAPE_READS)
+    usual = Counter(shapes).most_common(1)[0][0]
     if len(usual) != 2:
         raise InputError(f"shots have shape {usual}, expected (y, x): choose one channel or plane")
     return usual[0], usual[1]
+
+
+def _read_first(items: Sequence[Shot], read: Callable[[Shot], Value], count: int) -> list[Value]:
+    """Read the first shots that can be read; others fail later, by name."""
+    values: list[Value] = []
+    first_error: Exception | None = None
+    for shot in items:
+        try:
+            values.append(read(shot))
+        except (OSError, ValueError) as error:
+            first_error = first_error or error
+        if len(values) == count:
+            break
+    if not values:
+        raise FileFormatError(f"none of {len(items)} shots can be read, the first: {first_error}")
+    return values
 
 
 def _from_xarray(shots: xarray.DataArray | xarray.Dataset) -> Shots:
@@ -574,12 +576,9 @@ def _read_geometry(row: ShotRow, channel: str | None, variable: str | None) -> R
 
 def first_image(shots: Sequence[Shot]) -> FitShot:
     """Return the first image of the first shot of a table that can be read, to fit."""
-    first_error: Exception | None = None
-    for shot in shots:
+
+    def read(shot: Shot) -> FitShot:
         assert isinstance(shot.images, RowsReference)
-        try:
-            images, _ = replace(shot.images, rows=shot.images.rows[:1]).load()
-            return images[0]
-        except (OSError, ValueError) as error:
-            first_error = first_error or error  # its shot fails later, by name
-    raise FileFormatError(f"none of {len(shots)} shots can be read, the first: {first_error}")
+        return replace(shot.images, rows=shot.rows[:1]).load()[0][0]
+
+    return _read_first(shots, read, 1)[0]

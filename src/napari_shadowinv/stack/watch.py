@@ -480,11 +480,8 @@ def watch_stack(
     with clear_up_when_terminated(), locked(path):
         remove_unfinished(path)
         loop.open(overwrite=watch.overwrite, redo_failed=watch.redo_failed)
-        note = partial(_report_note, loop)
-        with observing(arrivals, polling=watch.polling, on_note=note):
+        with observing(
+            arrivals, polling=watch.polling, on_note=lambda text: loop.report(note=text)
+        ):
             loop.run(watch.idle, watch.max_shots)
     return read_stack(path) if loop.store is not None else None
-
-
-def _report_note(loop: Watch, sentence: str) -> None:
-    loop.report(note=sentence)
