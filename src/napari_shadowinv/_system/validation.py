@@ -75,9 +75,16 @@ def check_instance(value: object, expected: type | tuple[type, ...], name: str) 
 
 
 def validate(
-    model_class: type[Model], mapping: Mapping[str, Any], where: str = "parameters"
+    model_class: type[Model],
+    mapping: Mapping[str, Any],
+    where: str = "parameters",
+    *,
+    by_title: bool = False,
 ) -> Model:
-    """Make a model from a mapping, or raise an `InputError` that begins with `where`."""
+    """Make a model from a mapping, or raise an `InputError` that begins with `where`.
+
+    It names the fields by their keys, for a form by their titles.
+    """
     if not isinstance(mapping, Mapping):
         raise InputError(
             f"{where}: received {_shorten(mapping)}, expected a table of keys and values"
@@ -85,7 +92,7 @@ def validate(
     try:
         return model_class.model_validate(mapping)
     except ValidationError as error:
-        raise InputError(f"{where}: {_error_sentence(model_class, error)}") from error
+        raise InputError(f"{where}: {_error_sentence(model_class, error, by_title)}") from error
 
 
 def map_paths(model: Model, move: Callable[[Path], Path]) -> Model:
@@ -117,7 +124,9 @@ def suggestion(name: str, choices: Collection[str]) -> str:
     return f"did you mean '{match}'?" if match else f"expected one of {', '.join(choices)}"
 
 
-def _error_sentence(model_class: type[BaseModel], error: ValidationError) -> str:
+def _error_sentence(
+    model_class: type[BaseModel], error: ValidationError, by_title: bool = False
+) -> str:
     details = error.errors(include_url=False)
     intended = {
         nearest(str(detail["loc"][-1]), _locate(model_class, detail["loc"])[0].model_fields)
@@ -125,7 +134,7 @@ def _error_sentence(model_class: type[BaseModel], error: ValidationError) -> str
         if detail["type"] == "extra_forbidden"
     }
     return "; ".join(
-        _error_clause(model_class, dict(detail))
+        _error_clause(model_class, dict(detail), by_title)
         for detail in details
         if not (detail["type"] == "missing" and detail["loc"][-1] in intended)
     )
@@ -162,7 +171,7 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
     return [model for part in get_args(annotation) for model in _models_in(part)]
 
 
-def _error_clause(model_class: type[BaseModel], detail: dict[str, Any]) -> str:
+def _error_clause(model_class: type[BaseModel], detail: dict[str, Any], by_title: bool) -> str:
     model, names = _locate(model_class, detail["loc"])
     name = ".".join(names)
     kind, context = detail["type"], detail.get("ctx", {})
@@ -176,9 +185,11 @@ def _error_clause(model_class: type[BaseModel], detail: dict[str, Any]) -> str:
         hint = suggestion(str(context["tag"]), expected)
         return f"'{name}.{tag_key}' is '{context['tag']}', {hint}"
     field = model.model_fields.get(names[-1]) if names else None
-    title = _lower(field.title) if field is not None and field.title else "it"
+    title = "it"
+    if field is not None and field.title:
+        name, title = (field.title, title) if by_title else (name, _lower(field.title))
     if kind == "missing":
-        return f"'{name}' is missing, give the {title}"
+        return f"'{name}' is missing" + ("" if by_title else f", give the {title}")
     if not name:
         return str(context.get("error", detail["msg"]))
     received = f"'{name}' is {_shorten(detail['input'])}"

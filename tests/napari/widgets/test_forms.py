@@ -180,3 +180,14 @@ def test_what_was_kept_is_loaded_and_damage_is_forgiven(qtbot: Any, settings_fol
     form = the_form(qtbot, InversionOptions)
     form.set_values({"seed": "many", "unknown": 3, "floor": None, "readout": "none"})
     assert form.model() == InversionOptions()
+
+
+def test_mistakes_name_the_fields_by_their_labels(qtbot: Any) -> None:
+    form = the_form(qtbot, ProtonSetup)
+    form.set_values({"energy": 14.7e6, "pixel_size": 1e-6})
+    with pytest.raises(InputError) as refused:
+        form.model()
+    text = str(refused.value)
+    assert "'Source to object (m)' is missing" in text
+    assert "'Kinetic energy (MeV)' is 14700000.0: it must be at most" in text
+    assert not any(key in text for key in ("source_object_distance", "'energy'"))

@@ -132,7 +132,7 @@ class ModelForm(QtWidgets.QWidget):
         self.editors: dict[str, Editor] = {}
         rows = QtWidgets.QFormLayout()
         rows.setContentsMargins(0, 0, 0, 0)
-        rows.setRowWrapPolicy(QtWidgets.QFormLayout.RowWrapPolicy.WrapLongRows)
+        rows.setRowWrapPolicy(QtWidgets.QFormLayout.RowWrapPolicy.DontWrapRows)
         rows.setFieldGrowthPolicy(QtWidgets.QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
         rows.setLabelAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignVCenter)
         layout = column(self)
@@ -192,8 +192,8 @@ class ModelForm(QtWidgets.QWidget):
 
     def model(self) -> BaseModel:
         """Return the validated model, or raise an `InputError`."""
-        name = self._model_class.__name__.removesuffix("Options").removesuffix("Setup").lower()
-        return validate(self._model_class, self.values(), name)
+        name = getattr(self._model_class, "title", "options")
+        return validate(self._model_class, self.values(), name, by_title=True)
 
     def _on_change(self) -> None:
         self._keep_one_alternative()

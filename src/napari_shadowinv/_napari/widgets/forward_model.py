@@ -415,7 +415,7 @@ class ForwardModel(ToolPanel):
         )
         self._last = LastResults(viewer, self)
         size = side_by_side((self.width_px, 1), (QLabel("×"), 0), (self.height_px, 1))
-        self._size_row = forms.labelled("Size", size)
+        self._size_row = forms.labelled("Size (px)", size)
         self.add(self.object, *self._potential_rows, self._size_row, self.setup)
         self.add(forms.labelled("Source", self.source), self._last.keep_earlier)
         self.add(self.panel, self.warning, self.save_result)
@@ -556,6 +556,5 @@ class ForwardModel(ToolPanel):
 def _side(name: str) -> QSpinBox:
     side = QSpinBox()
     side.setRange(4, _MAX_SIDE_PX)
-    side.setSuffix(" px")
     side.setToolTip(f"{name} of the image in px.")
     return side
