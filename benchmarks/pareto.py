@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from napari_shadowinv import InversionOptions, invert, plan_sites
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.inversion.readout import read_out
-from napari_shadowinv.transport.objective import Solution, TransportObjective
+from napari_shadowinv.transport.minimise import Solution, TransportObjective
 from napari_shadowinv.transport.solvers import LevelSolution
 from reference import DATA, Case, toroid_case
 

@@ -22,7 +22,7 @@ from napari_shadowinv.geometry import flips
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import FLIPS, RegularTriangulation
-from napari_shadowinv.transport.objective import TransportObjective
+from napari_shadowinv.transport.minimise import TransportObjective
 from reference import toroid_case
 
 PARTS = {  # function, or file of functions, that belong to a part of the work

@@ -21,7 +21,7 @@ from napari_shadowinv import InversionOptions, invert, plan_sites
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.inversion.normalise import prepare
-from napari_shadowinv.transport.objective import TransportObjective
+from napari_shadowinv.transport.minimise import TransportObjective
 from napari_shadowinv.transport.sites import SitePlan
 from napari_shadowinv.transport.solvers import solve
 from reference import toroid_case

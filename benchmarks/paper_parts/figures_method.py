@@ -16,7 +16,7 @@ from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.inversion.readout import read_centroids
 from napari_shadowinv.physics import phantoms
-from napari_shadowinv.transport.objective import TransportObjective
+from napari_shadowinv.transport.minimise import TransportObjective
 from napari_shadowinv.transport.sites import Level, lloyd, plan_levels, sample_sites
 from paper_parts.drawing import (
     GREY,

@@ -8,7 +8,7 @@ import pytest
 from napari_shadowinv import InputError, InversionOptions, invert, plan_sites, synthetic_image
 from napari_shadowinv.inversion.error_bars import uncertainty
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.transport.margin import Margin, edge_flux
+from napari_shadowinv.transport.sites import Margin, edge_flux
 
 SIDE, AROUND = 100, 40
 FREE = InversionOptions(boundary="free", n_sites=4000)

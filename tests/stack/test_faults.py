@@ -33,8 +33,8 @@ from napari_shadowinv import (
     invert_stack,
     read,
 )
-from napari_shadowinv._system import locking
-from napari_shadowinv._system.locking import locked
+from napari_shadowinv._system import hidden_files
+from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.stack import _engines
@@ -395,7 +395,7 @@ def shot_of(name: str) -> int:
 def quick(monkeypatch) -> None:
     """Make signs of life come, and their absence count, within a moment."""
     for name, seconds in (("_BEAT_S", 0.02), ("_WATCH_S", 1.0), ("_SETTLE_S", 0.05)):
-        monkeypatch.setattr(locking, name, seconds)
+        monkeypatch.setattr(hidden_files, name, seconds)
 
 
 @contextmanager
@@ -424,7 +424,7 @@ class TestLocks:
         code = f"""
             import time
             from pathlib import Path
-            from napari_shadowinv._system.locking import locked
+            from napari_shadowinv._system.hidden_files import locked
             with locked(Path({str(path)!r})):
                 print("locked", flush=True)
                 time.sleep(60)
@@ -494,7 +494,7 @@ class TestLocks:
     def test_of_two_that_take_a_stale_lock_one_gets_it(self, tmp_path, quick, monkeypatch):
         lock = tmp_path / ".store.lock"
         lock.write_text('{"host": "elsewhere", "pid": 7}')
-        monkeypatch.setattr(locking, "_SETTLE_S", 0.3)
+        monkeypatch.setattr(hidden_files, "_SETTLE_S", 0.3)
 
         def sign() -> None:
             wait_for(lambda: "elsewhere" not in lock.read_text(), "the first to sign")

@@ -13,7 +13,7 @@ import zarr
 
 from helpers.store_content import content
 from napari_shadowinv import FileFormatError, InputError, InversionOptions, read
-from napari_shadowinv._system.locking import locked
+from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.io.store_checksums import SEAL
 from napari_shadowinv.io.store_writing import ShotWriter

@@ -29,7 +29,7 @@ from napari_shadowinv import (
     read,
     watch_stack,
 )
-from napari_shadowinv._system.locking import locked
+from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv.cli import _batch
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
 from napari_shadowinv.stack import RunStatus, _folder_events, watch

@@ -5,7 +5,7 @@ import pytest
 
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
-from napari_shadowinv.transport.objective import TransportObjective
+from napari_shadowinv.transport.minimise import TransportObjective
 
 
 @pytest.fixture

@@ -11,8 +11,7 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.transport.minimise import blur_image, descend, newton
-from napari_shadowinv.transport.objective import TransportObjective
+from napari_shadowinv.transport.minimise import TransportObjective, blur_image, descend, newton
 from napari_shadowinv.transport.sites import plan_levels
 from napari_shadowinv.transport.solvers import solve
 

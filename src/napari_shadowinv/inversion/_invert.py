@@ -36,8 +36,7 @@ from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.preprocessing.image_checks import image_warnings
-from napari_shadowinv.transport.margin import Margin, edge_flux
-from napari_shadowinv.transport.sites import Levels, SitePlan, plan_levels
+from napari_shadowinv.transport.sites import Levels, Margin, SitePlan, edge_flux, plan_levels
 from napari_shadowinv.transport.solvers import LevelSolution, fit_flux_factor, solve
 
 __all__ = ["count_sites", "invert", "plan_sites"]

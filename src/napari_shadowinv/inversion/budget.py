@@ -29,8 +29,7 @@ from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.inversion.readout import LinearResponse
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.units import PeakError
-from napari_shadowinv.transport.minimise import with_full_cells
-from napari_shadowinv.transport.objective import Solution
+from napari_shadowinv.transport.minimise import Solution, with_full_cells
 from napari_shadowinv.transport.sites import RATIO, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
 

@@ -57,7 +57,7 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.physics.units import label
 from napari_shadowinv.transport.linear import FactorisedLaplacian, LaplacianSolver
-from napari_shadowinv.transport.objective import TransportObjective
+from napari_shadowinv.transport.minimise import TransportObjective
 from napari_shadowinv.transport.sites import SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target, solve
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv import __version__
-from napari_shadowinv._system.locking import locked
+from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv._system.machine import clear_up_when_terminated
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import as_model, check_instance

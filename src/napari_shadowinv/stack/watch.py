@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.locking import locked
+from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv._system.machine import clear_up_when_terminated, defer_interrupts
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import as_model

@@ -25,10 +25,16 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.density import Density, split_pixels
 from napari_shadowinv.geometry.interpolation import CloughTocher, fit_gradients
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.transport.margin import Margin
-from napari_shadowinv.transport.minimise import blur_image, descend, newton, sharpen
-from napari_shadowinv.transport.objective import OpenObjective, Solution, TransportObjective
-from napari_shadowinv.transport.sites import RATIO, Level, Levels
+from napari_shadowinv.transport.minimise import (
+    OpenObjective,
+    Solution,
+    TransportObjective,
+    blur_image,
+    descend,
+    newton,
+    sharpen,
+)
+from napari_shadowinv.transport.sites import RATIO, Level, Levels, Margin
 
 __all__ = ["LevelSolution", "Target", "fit_flux_factor", "solve"]
 
