@@ -1244,14 +1244,14 @@ def test_ctrl_c_while_writing_keeps_the_old_result(folder: Path, shot: Path) -> 
     (folder / "shot.shadowinv").write_text("old")
     slow_disk = """
         import time
-        from napari_shadowinv.io import writing
+        from napari_shadowinv.io import read_write
 
         def write_slowly(path, dataset):
             path.write_text("half")
             print("now")
             time.sleep(60)
 
-        writing.write_result = write_slowly
+        read_write.write_result = write_slowly
     """
     before = content(folder)
     code, errors = interrupted(folder, slow_disk, ["invert", "shot.npy", "--overwrite"])
@@ -1279,7 +1279,7 @@ def test_neither_result_nor_figure_is_left_on_a_full_disk(
 def test_a_second_ctrl_c_does_not_interrupt_the_clean_up(folder: Path, shot: Path) -> None:
     impatient = """
         import signal, time
-        from napari_shadowinv.io import writing, files
+        from napari_shadowinv.io import read_write, files
 
         class Room:
             def __enter__(self):
@@ -1294,7 +1294,7 @@ def test_a_second_ctrl_c_does_not_interrupt_the_clean_up(folder: Path, shot: Pat
             print("now")
             time.sleep(60)
 
-        writing.write_result = write_slowly
+        read_write.write_result = write_slowly
     """
     code, errors = interrupted(folder, impatient, ["invert", "shot.npy"])
     assert (code, errors.strip()) == (130, "Cancelled")

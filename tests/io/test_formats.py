@@ -75,7 +75,7 @@ def test_a_format_is_added_by_its_reader_and_its_entry(
     def read_new(path: Path) -> tuple[np.ndarray, dict[str, int]]:
         return np.frombuffer(path.read_bytes()[4:], "<u2").reshape(2, 3), {"bits": 12}
 
-    new = Format("new", (".new",), "New .new", ((0, b"NEW!"),), reader="camera:read_new")
+    new = Format("new", (".new",), "New .new", ((0, b"NEW!"),), reader="images:read_new")
     monkeypatch.setattr("napari_shadowinv.io.images.read_new", read_new, raising=False)
     monkeypatch.setattr(formats, "FORMATS", (new, *FORMATS))
     path = tmp_path / "shot.tif"  # the content counts

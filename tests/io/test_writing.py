@@ -76,7 +76,7 @@ def test_error_while_writing_leaves_the_old_result(
         temporary.write_text("half")
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("napari_shadowinv.io.writing.write_result", fail)
+    monkeypatch.setattr("napari_shadowinv.io.read_write.write_result", fail)
     with pytest.raises(OSError, match="no space left"):
         write(path, inversion, overwrite=True)
     assert path.read_bytes() == before

@@ -246,7 +246,7 @@ def test_a_failed_write_leaves_the_old_file_whole(
         path.write_bytes(b"half")
         raise OSError("no space left")
 
-    monkeypatch.setattr("napari_shadowinv.io.writing.write_result", break_off)
+    monkeypatch.setattr("napari_shadowinv.io.read_write.write_result", break_off)
     with pytest.raises(OSError, match="no space left"):
         viewer.layers.save(str(target), plugin=PLUGIN)
     assert target.read_bytes() == before

@@ -338,7 +338,7 @@ NAMED_IN = {
     "physics/beam.py": "an example in a docstring",
     "physics/setup.py": "where they are defined",
     "physics/phantoms.py": "a magnetic field deflects particles, a plasma wave is probed by light",
-    "cli/_demo.py": "the demonstration is a magnetic field",
+    "cli/_shot_commands.py": "the demonstration is a magnetic field",
     "film/pack.py": "stopping in film is that of protons",
     "film_doses.py": "stopping in film is that of protons",
 }

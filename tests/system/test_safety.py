@@ -19,7 +19,7 @@ from napari_shadowinv._system.safety import LIMIT_VARIABLE, as_file_errors, size
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
 from napari_shadowinv.film import Calibration
 from napari_shadowinv.io import read, read_toml
-from napari_shadowinv.io.reading import read_radiograph
+from napari_shadowinv.io.read_write import read_radiograph
 
 IMAGE = np.random.default_rng(0).poisson(300, (40, 50)).astype(np.uint16)
 

@@ -14,7 +14,7 @@ import numpy as np
 from napari_shadowinv._typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
-    from napari_shadowinv.io.results import AnyResult
+    from napari_shadowinv.io.read_write import AnyResult
     from napari_shadowinv.physics.setup import Setup
 
 Matrix = tuple[tuple[float, ...], ...]

@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.inversion.field import RetrievedField
-    from napari_shadowinv.io.results import AnyResult
+    from napari_shadowinv.inversion.result import RetrievedField
+    from napari_shadowinv.io.read_write import AnyResult
     from napari_shadowinv.physics.setup import Setup
 
 FullLayerData = tuple[Any, dict[str, Any], str]

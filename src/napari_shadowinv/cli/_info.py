@@ -174,7 +174,7 @@ def _film_rows(dataset: xarray.Dataset) -> _summary.Rows:
 
 
 def _field_rows(dataset: xarray.Dataset) -> _summary.Rows:
-    from napari_shadowinv.inversion.field import RetrievedField
+    from napari_shadowinv.inversion.result import RetrievedField
 
     field = RetrievedField.from_dataset(dataset)
     kind = "field retrieved by another program"

@@ -17,7 +17,7 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.formats import PNG, PRADFORMAT, RESULT
 
 if TYPE_CHECKING:
-    from napari_shadowinv.io.results import AnyResult
+    from napari_shadowinv.io.read_write import AnyResult
     from napari_shadowinv.options import InversionOptions
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.pipeline.static_checks import StaticChecks

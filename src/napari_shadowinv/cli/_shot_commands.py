@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cli import _flags, _inputs
+from napari_shadowinv.cli._summary import (
+    fact_rows,
+    headline_row,
+    setup_text,
+    two_columns,
+    written_rows,
+)
 from napari_shadowinv.cli._terminal import (
     exit_unless_converged,
     invert_shot,
@@ -19,9 +30,20 @@ from napari_shadowinv.cli._terminal import (
     say,
     warn_of_setups,
 )
-from napari_shadowinv.errors import InputError
+from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.options import InversionOptions
+
+if TYPE_CHECKING:
+    import xarray
+    from rich.table import Table
+
+    from napari_shadowinv._typing import AnyArray, FloatArray
+    from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.physics.setup import ProtonSetup, Setup
+    from napari_shadowinv.pipeline.rerun import Rerun, RerunInputs
+
+    Fields = Mapping[str, FloatArray]
 
 # Help of arguments, where it is longer than a line.
 HELP = {
@@ -171,7 +193,6 @@ def rerun(
 
     With the same files and version, the result is identical bit for bit.
     """
-    from napari_shadowinv.cli import _rerun
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, suffixes_for
     from napari_shadowinv.pipeline.rerun import collect_rerun
 
@@ -180,15 +201,15 @@ def rerun(
     suffixes = suffixes_for(ResultKind.INVERSION)
     _inputs.check_outputs({again_out: suffixes, figure: FIGURE_SUFFIXES}, overwrite)
     inputs = collect_rerun(result, image, source=source, other_folders=other_folders)
-    _rerun.check_rerun(inputs, result, again_out, figure, overwrite)
+    check_rerun(inputs, result, again_out, figure, overwrite)
     warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in inputs.shots)
     with nullcontext() if quiet else progress_bars() as show:
         again = inputs.run(show, is_interrupted)
     names = [str(file) for file in inputs.files[: len(inputs.shots)]] or [str(result)]
     _inputs.write_result(again.content, names, again_out, figure, overwrite, again.checks)
     if not quiet:
-        say(_rerun.rerun_table(again, names, [again_out, figure]))
-    _rerun.exit_unless_sound(again, again_out)
+        say(rerun_table(again, names, [again_out, figure]))
+    exit_unless_sound(again, again_out)
 
 
 FORWARD_EPILOG = """
@@ -230,7 +251,6 @@ def forward(
     Without --source, the result's own source is used if the setup is the same; otherwise
     the source is uniform.
     """
-    from napari_shadowinv.cli._forward import choose_setups, field_from, predict_image
     from napari_shadowinv.cli._summary import size_text
     from napari_shadowinv.io import read_radiograph, write
     from napari_shadowinv.io.formats import IMAGE_WRITERS, TIFF
@@ -308,14 +328,240 @@ def demo(
         {} if n_sites is None else {"n_sites": n_sites}, clip_negative=True
     )
     _inputs.make_folder(out)
-    from napari_shadowinv.cli import _demo
     from napari_shadowinv.physics.phantoms import paper_setup
     from napari_shadowinv.preprocessing import Radiograph, Recipe
 
     setup = paper_setup()
-    image, truth = _demo.simulate_shot(setup, dm, noise)
+    image, truth = simulate_shot(setup, dm, noise)
     inversion = invert_shot(Recipe(setup=setup, options=chosen), Radiograph(image))
-    fields = _demo.fields_to_compare(image, truth, inversion)
-    written = _demo.write_demo(out, f"toroid_{dm:g}", inversion, setup, fields)
-    say(_demo.demo_table(inversion, setup, fields, written))
+    fields = fields_to_compare(image, truth, inversion)
+    written = write_demo(out, f"toroid_{dm:g}", inversion, setup, fields)
+    say(demo_table(inversion, setup, fields, written))
     exit_unless_converged(inversion.report, written[0])
+
+
+def simulate_shot(setup: ProtonSetup, dm: float, noise: float) -> tuple[FloatArray, FloatArray]:
+    """Return an image with noise, and its true displacement."""
+    import numpy as np
+
+    from napari_shadowinv.physics.forward import synthetic_image
+    from napari_shadowinv.physics.phantoms import toroid
+
+    truth = toroid((200, 200), setup, peak=dm, sigma=30e-6).displacement
+    image = synthetic_image(truth)
+    grain = np.random.default_rng(0).normal(size=image.shape)
+    return image + noise * image.mean() * grain, truth
+
+
+def fields_to_compare(image: FloatArray, truth: FloatArray, inversion: Inversion) -> Fields:
+    """Return three displacements: the truth, the inversion, and a linear inversion."""
+    from napari_shadowinv.physics.poisson import poisson_invert
+    from napari_shadowinv.physics.setup import displacement_from_potential
+
+    poisson = displacement_from_potential(poisson_invert(image))
+    return {"True": truth, "Retrieved": inversion.displacement, "Poisson": poisson}
+
+
+def write_demo(
+    folder: Path, name: str, inversion: Inversion, setup: ProtonSetup, fields: Fields
+) -> list[Path]:
+    """Write the result, its figure, and the fields side by side."""
+    from napari_shadowinv.io import write
+    from napari_shadowinv.io.formats import PNG, RESULT
+    from napari_shadowinv.plotting import comparison_figure, report_figure, save_figure
+
+    caption = "Errors: " + "; ".join(
+        f"{name} {_errors_text(fields, name)}" for name in ("Retrieved", "Poisson")
+    )
+    comparison = comparison_figure(fields, setup, title="True and retrieved", caption=caption)
+    report = report_figure(inversion, setup, title=f"Demo {name}")
+    return [
+        write(folder / f"{name}{RESULT.suffix}", inversion, setup=setup, overwrite=True),
+        save_figure(folder / f"{name}{PNG.suffix}", report, overwrite=True),
+        save_figure(folder / f"{name}_comparison{PNG.suffix}", comparison, overwrite=True),
+    ]
+
+
+def demo_table(
+    inversion: Inversion, setup: ProtonSetup, fields: Fields, written: list[Path]
+) -> Table:
+    """Build the table of a demo: the quality of the inversion and its true error."""
+    rows = [
+        headline_row(inversion.headline_in(setup)),
+        ("setup", setup_text(setup, shape=inversion.image.shape)),
+        *fact_rows(inversion.facts_in(setup)),
+        ("error", _errors_text(fields, "Retrieved")),
+        ("error of Poisson", _errors_text(fields, "Poisson")),
+        *written_rows(written),
+    ]
+    return two_columns("Demo", rows)
+
+
+def _errors_text(fields: Fields, name: str) -> str:
+    import numpy as np
+
+    truth, estimate = fields["True"], fields[name]
+    true_peak, peak = (float(np.hypot(*field).max()) for field in (truth, estimate))
+    if not true_peak:
+        return f"peak {peak:.3g} px where the truth is zero"
+    distance = float(np.linalg.norm(estimate - truth) / np.linalg.norm(truth))
+    return f"peak {peak / true_peak - 1:+.1%}, L2 {distance:.1%}"
+
+
+@dataclass(frozen=True)
+class Field:
+    """A displacement in px, with its source and setup if the file contains them."""
+
+    displacement: FloatArray
+    source: FloatArray | None = None
+    setup: Setup | None = None
+
+
+def field_from(path: Path, variable: str | None = None) -> Field:
+    """Read a displacement from a result, or from an array in px or px²."""
+    from napari_shadowinv.io import read_dataset, read_radiograph
+    from napari_shadowinv.io.formats import kind_of
+    from napari_shadowinv.io.hdf5 import read_hdf5
+    from napari_shadowinv.io.images import read_npy
+
+    kind = kind_of(path)
+    if variable is not None and kind in ("hdf5", "shadowinv"):
+        return Field(_displacement(path, read_hdf5(path, variable)))
+    if variable is not None or kind == "mat":
+        return Field(_displacement(path, read_radiograph(path, variable=variable).image))
+    if kind in ("hdf5", "shadowinv"):
+        return _field_of_result(path, read_dataset(path))
+    if kind == "npy":
+        return Field(_displacement(path, read_npy(path)))
+    raise _no_field(path, f"a {kind.upper()} picture")
+
+
+@as_file_errors
+def _field_of_result(path: Path, dataset: xarray.Dataset) -> Field:
+    """Return the only field in the dataset of a result, with the beam of its first image."""
+    import numpy as np
+
+    from napari_shadowinv.inversion.variables import setup_from_dataset
+    from napari_shadowinv.io.read_write import result_from_dataset
+
+    result = result_from_dataset(dataset)
+    names = json.loads(dataset.attrs.get("fields", "[]"))
+    if len(names) > 1:
+        raise InputError(
+            f"{path} has the fields {', '.join(names)}: choose one with --variable "
+            f"displacement_{names[0]}"
+        )
+    if "displacement" not in dataset:
+        raise _no_field(path, f"a {result.kind.noun}")
+    displacement = _displacement(path, dataset["displacement"].values)
+    source = dataset["source"].values if "source" in dataset else None
+    if source is not None and source.ndim == 3:
+        source = np.asarray(source[0])
+    return Field(displacement, source, setup_from_dataset(dataset) or result.setup)
+
+
+def _displacement(path: Path, array: AnyArray) -> FloatArray:
+    from napari_shadowinv.physics.setup import displacement_from_potential
+
+    if array.ndim == 2:
+        return displacement_from_potential(array)
+    if array.ndim == 3 and array.shape[0] == 2:
+        return array.astype(float)
+    raise _no_field(path, f"an array of shape {array.shape}")
+
+
+def _no_field(path: Path, kind: str) -> FileFormatError:
+    return FileFormatError(
+        f"{path} is {kind}: expected a .shadowinv result, or NPY with a displacement "
+        "(2, height, width) in px or a potential (height, width) in px²"
+    )
+
+
+def choose_setups(
+    field: Field,
+    target: Setup | None,
+    recorded_with: Setup | None,
+    deflector: str | None,
+    dispersion: float,
+) -> tuple[Setup | None, Setup | None]:
+    """Return the setup that a field was measured with, and the one to predict it for."""
+    if recorded_with is not None and field.setup is not None and recorded_with != field.setup:
+        raise InputError(
+            "received --recorded-with, but the field's file contains its own setup, "
+            f"{setup_text(field.setup)}: leave it out"
+        )
+    original = recorded_with or field.setup or target
+    target = target or original
+    if (deflector is not None or dispersion != 1) and original == target:
+        raise InputError(
+            "received --deflector or --dispersion, but only one setup: expected a different one "
+            "with --setup, and for a field in px also --recorded-with"
+        )
+    return original, target
+
+
+def predict_image(
+    displacement: FloatArray,
+    source: FloatArray | None,
+    recorded_with: Setup | None,
+    target: Setup | None,
+    deflector: str | None,
+    dispersion: float,
+) -> tuple[FloatArray, str]:
+    """Return the image, and a sentence with the assumptions."""
+    from napari_shadowinv.physics.forward import synthetic_image
+    from napari_shadowinv.physics.projection import default_deflector, project
+
+    if recorded_with is None or target is None or recorded_with == target:
+        return synthetic_image(displacement, source), ""
+    # Names of two words have a hyphen on the command line.
+    name = deflector and deflector.replace("-", " ")
+    name = name or default_deflector(recorded_with, target)
+    image = project(
+        displacement, recorded_with, target, deflector=name, dispersion=dispersion, source=source
+    )
+    return image, (
+        f"From {setup_text(recorded_with)} to {setup_text(target)}, assuming that only a {name} "
+        "deflects the beam"
+    )
+
+
+def check_rerun(
+    inputs: RerunInputs, result: Path, out: Path, figure: Path, overwrite: bool
+) -> None:
+    """Refuse, before any work, outputs that cannot be written or would replace an input."""
+    from napari_shadowinv.cli._static_result import static_figures
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, suffixes_for
+
+    _inputs.check_outputs({out: suffixes_for(inputs.kind)}, overwrite)
+    figures = static_figures(figure, left_out=inputs.has_left_out, window=inputs.window)
+    _inputs.check_outputs(dict.fromkeys(figures, FIGURE_SUFFIXES), overwrite)
+    _inputs.protect([out, figure, *figures], [result, *inputs.files])
+
+
+def rerun_table(again: Rerun, names: Sequence[str], written: list[Path]) -> Table:
+    """Build the table of a repeated result: the changes since the first one, and its facts."""
+    rows = [
+        *[("file", name) for name in names],
+        *[("changed", text) for text in again.changes or ("nothing",)],
+        ("difference", again.difference),
+        headline_row(again.content.headline),
+        *fact_rows(again.content.facts),
+        *written_rows(written),
+    ]
+    return two_columns("Rerun", rows)
+
+
+def exit_unless_sound(again: Rerun, out: Path) -> None:
+    """Exit with an error code if an inversion did not converge or a fit is not determined."""
+    from napari_shadowinv.cli._fit_result import exit_unless_determined
+    from napari_shadowinv.cli._static_result import exit_unless_static
+
+    exit_unless_static(again.checks, out)
+    exits: dict[ResultKind, Callable[[Any, Path], None]] = {
+        ResultKind.INVERSION: lambda inversion, out: exit_unless_converged(inversion.report, out),
+        ResultKind.FIT: exit_unless_determined,
+    }
+    exit_unless = exits.get(again.content.kind)
+    if exit_unless is not None:
+        exit_unless(again.content, out)

@@ -1,4 +1,4 @@
-"""The result of an inversion: `Inversion`, with a `Report`."""
+"""The result of an inversion, `Inversion` with a `Report`, and a field alone, `RetrievedField`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from napari_shadowinv.facts import (
 )
 from napari_shadowinv.inversion.budget import Errors
 from napari_shadowinv.inversion.solution_checks import image_residual
-from napari_shadowinv.inversion.variables import VARIABLES, dataset_from_field
+from napari_shadowinv.inversion.variables import VARIABLES, dataset_from_field, setup_from_dataset
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.units import label, numbers_of, peak_facts, shown_fields
 from napari_shadowinv.provenance import Provenance
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["Inversion", "Report"]
+__all__ = ["Inversion", "Report", "RetrievedField"]
 
 
 @dataclass(frozen=True)
@@ -393,3 +393,57 @@ class Inversion:
 def _tuples(value: Any) -> Any:
     # JSON knows lists only.
     return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+@dataclass(frozen=True, eq=False)
+class RetrievedField:
+    """A displacement of another program, of a pradformat file, or of a shot of a store.
+
+    Attributes
+    ----------
+    dataset : xarray.Dataset
+        With at least ``displacement`` (px), shape (2, H, W).
+    """
+
+    kind: ClassVar = ResultKind.FIELD
+    cautions: ClassVar[tuple[Caution, ...]] = ()
+
+    dataset: xarray.Dataset
+
+    @property
+    def displacement(self) -> FloatArray:
+        """Displacement of the ray through each pixel in px, shape (2, H, W)."""
+        return np.asarray(self.dataset["displacement"].values)
+
+    @property
+    def setup(self) -> Setup | None:
+        """The experiment, if the dataset contains it."""
+        return setup_from_dataset(self.dataset)
+
+    @property
+    def provenance(self) -> Provenance | None:
+        """Provenance of the shot, if the dataset contains it."""
+        return Provenance.of(self.dataset.attrs)
+
+    @property
+    def headline(self) -> Headline:
+        """The peak of the field."""
+        return Headline(Level.SOUND, self.facts[0].text)
+
+    @property
+    def facts(self) -> tuple[Fact, ...]:
+        """The peak of the field in words."""
+        return tuple(peak_facts(self.displacement, self.setup))
+
+    def to_dataset(self, *, attributes: Mapping[str, str] | None = None) -> xarray.Dataset:
+        """Return the dataset with further attributes."""
+        return self.dataset.assign_attrs(attributes or {})
+
+    @classmethod
+    def from_dataset(cls, dataset: xarray.Dataset) -> RetrievedField:
+        """Return the field of a dataset; an `InputError` if it has no displacement."""
+        if "displacement" not in dataset:
+            raise InputError(
+                "dataset has no 'displacement': expected a field of shape (2, height, width) in px"
+            )
+        return cls(dataset)

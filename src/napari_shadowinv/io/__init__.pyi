@@ -1,8 +1,7 @@
 from .cpsa import read_tracks
 from .files import check_output, replacing
-from .reading import Radiograph, read, read_cpsa, read_dataset, read_radiograph, read_toml
+from .read_write import Radiograph, read, read_cpsa, read_dataset, read_radiograph, read_toml, write
 from .store import is_stack, read_stack
-from .writing import write
 
 __all__ = [
     "Radiograph",

@@ -96,8 +96,8 @@ MATLAB = Format(
 PCO = Format("b16", (".b16",), "PCO .b16", ((0, b"PCO-"), (0, b"pco-")), reader="images:read_b16")
 RESULT = Format(
     "shadowinv", (".shadowinv",), ".shadowinv", _HDF5, test="pradformat:is_result",
-    holds=("result",), reader="writing:read_result", named_reader="hdf5:read_plane",
-    result_writer="writing:write_result", results=tuple(ResultKind),
+    holds=("result",), reader="read_write:read_result", named_reader="hdf5:read_plane",
+    result_writer="read_write:write_result", results=tuple(ResultKind),
 )
 # The reader of all other HDF5 files: it says which array can be named.
 PRADFORMAT = Format(
@@ -116,7 +116,7 @@ SPE = Format(
     unmarked="binary", reader="images:read_spe",
 )
 SITES = Format(
-    "sites", (".csv",), holds=(), result_writer="writing:write_sites",
+    "sites", (".csv",), holds=(), result_writer="read_write:write_sites",
     results=(ResultKind.INVERSION,),
 )
 TEXT = Format(

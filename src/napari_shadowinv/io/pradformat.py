@@ -28,7 +28,7 @@ from napari_shadowinv.inversion.variables import (
     setup_from_dataset,
 )
 from napari_shadowinv.io.hdf5 import hdf5_in_memory, list_arrays, load_dataset, member
-from napari_shadowinv.io.writing import require
+from napari_shadowinv.io.read_write import require
 from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read_dataset
 from napari_shadowinv.io.files import sha256
-from napari_shadowinv.io.results import result_from_dataset
+from napari_shadowinv.io.read_write import result_from_dataset
 from napari_shadowinv.pipeline._film import run_film
 from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import FitShot, run_fit, run_refinement
@@ -39,7 +39,7 @@ from napari_shadowinv.provenance import MaskOrigin, Origin, Provenance
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.io.results import AnyResult
+    from napari_shadowinv.io.read_write import AnyResult
 
 __all__ = ["IDENTICAL", "Rerun", "RerunInputs", "collect_rerun", "provenance_of", "rerun"]
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.io.results import AnyResult
+    from napari_shadowinv.io.read_write import AnyResult
     from napari_shadowinv.physics.setup import Setup
 
 DOTS_PER_INCH = 160  # of a figure's file

@@ -32,7 +32,7 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order, sha256, text_of
 from napari_shadowinv.io.formats import PRADFORMAT, TEXT, kind_of
 from napari_shadowinv.io.images import read_tiff_page, tiff_pages
-from napari_shadowinv.io.reading import read_radiograph
+from napari_shadowinv.io.read_write import read_radiograph
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
 from napari_shadowinv.pipeline import FitShot
 from napari_shadowinv.pipeline.files import read_part

@@ -34,8 +34,7 @@ from napari_shadowinv.inversion import Inversion, compilation, invert
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.pipeline import Cache, run
-from napari_shadowinv.pipeline.cache import quick_source
-from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
+from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES, quick_source
 from napari_shadowinv.pipeline.run_options import RunOptions
 from napari_shadowinv.preprocessing import (
     BackgroundFilter,
