@@ -80,12 +80,22 @@ def notify_errors(
     return decorate
 
 
+def error_text(error: BaseException) -> str:
+    """Return the message of an error for the user; for a bug, its type and first line."""
+    text = window_text(str(error))
+    if isinstance(error, MemoryError) and not text:
+        text = "there is not enough memory for this"
+    elif not isinstance(error, USER_ERRORS):
+        first_line = text.partition("\n")[0]
+        text = f"internal error: {type(error).__name__}: {first_line} (see the notification)"
+    return text[:1].upper() + text[1:]
+
+
 def show_user_error(error: BaseException) -> None:
     """Show a user's error as a notification."""
     from napari.utils.notifications import show_error
 
-    text = window_text(str(error)) or "there is not enough memory for this"
-    show_error(text[:1].upper() + text[1:])
+    show_error(error_text(error))
 
 
 def show_caution(text: str) -> None:

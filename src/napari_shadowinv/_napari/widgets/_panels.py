@@ -18,7 +18,12 @@ from qtpy.QtCore import QObject, QSize, Qt, Signal
 
 from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import main_layers
-from napari_shadowinv._napari.viewer_sync import USER_ERRORS, window_text
+from napari_shadowinv._napari.viewer_sync import (
+    USER_ERRORS,
+    error_text,
+    show_user_error,
+    window_text,
+)
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._forms import (
     PROBLEM_COLOUR,
@@ -291,8 +296,8 @@ class RunPanel(QtWidgets.QWidget):
 
     def refuse(self, error: BaseException) -> None:
         """Report an error of the user; the text stays when the notification is gone."""
-        qt.report_error(error)
-        self.say(qt.error_text(error), problem=True)
+        show_user_error(error)
+        self.say(error_text(error), problem=True)
 
     def _on_start(self) -> None:
         if self._quiet:
@@ -334,14 +339,14 @@ class RunPanel(QtWidgets.QWidget):
         if outcome.error is None:
             return
         # A notification disappears after seconds: the error stays here until the next run.
-        self.say(qt.error_text(outcome.error), problem=True)
+        self.say(error_text(outcome.error), problem=True)
         if not isinstance(outcome.error, USER_ERRORS):
             from napari.utils.notifications import notification_manager
 
             error = outcome.error
             notification_manager.receive_error(type(error), error, error.__traceback__)
         elif not self._quiet:
-            qt.report_error(outcome.error)
+            show_user_error(outcome.error)
 
 
 def fact_rows(facts: Iterable[Fact], *, details: bool | None = False) -> list[tuple[str, str]]:

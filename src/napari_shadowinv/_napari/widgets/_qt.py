@@ -10,11 +10,10 @@ from itertools import groupby
 from typing import Any, TypeVar
 
 import numpy as np
-from napari.utils.notifications import show_error
 from qtpy.QtCore import QObject, QSettings, Qt, QTimer
 from qtpy.QtWidgets import QDockWidget, QHBoxLayout, QMainWindow, QSizePolicy, QVBoxLayout, QWidget
 
-from napari_shadowinv._napari.viewer_sync import USER_ERRORS, window_text
+from napari_shadowinv._napari.viewer_sync import USER_ERRORS, error_text, show_user_error
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -81,21 +80,6 @@ def while_alive(owner: QObject, emitter: Any, method: Callable[..., Any]) -> Non
     when_destroyed(owner, disconnect)
 
 
-def error_text(error: BaseException | str) -> str:
-    """Return the message of an error for the user; for a bug, its type and first line."""
-    text = window_text(str(error))
-    if isinstance(error, MemoryError) and not text:
-        text = "there is not enough memory for this"
-    elif not isinstance(error, (str, *USER_ERRORS)):
-        first_line = text.partition("\n")[0]
-        text = f"internal error: {type(error).__name__}: {first_line} (see the notification)"
-    return text[:1].upper() + text[1:]
-
-
-def report_error(error: BaseException | str) -> None:
-    show_error(error_text(error))
-
-
 def notify_errors(method: Method) -> Method:
     """Turn a user's error into a notification; the nearest widget with `show_problem` shows it."""
 
@@ -104,7 +88,7 @@ def notify_errors(method: Method) -> Method:
         try:
             return method(*args, **kwargs)
         except USER_ERRORS as error:
-            report_error(error)
+            show_user_error(error)
             widget = args[0]
             while widget is not None and not hasattr(widget, "show_problem"):
                 widget = widget.parent()

@@ -15,13 +15,14 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
 from napari_shadowinv._napari.layer_metadata import Frame, frame_for, frame_of
 from napari_shadowinv._napari.layers import FullLayerData
+from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
 from napari_shadowinv._napari.widgets._files import IMAGE_FORMATS, Savable, SaveButton
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, shown_plane
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
-from napari_shadowinv._napari.widgets._qt import error_text, side_by_side
+from napari_shadowinv._napari.widgets._qt import side_by_side
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import CheckedModel
