@@ -200,7 +200,7 @@ def proton_windows() -> None:
 
 def source_windows() -> None:
     """Tutorial: an estimated beam, and the field that it gives."""
-    viewer = new_window("no reference image")
+    viewer = new_window("no reference image", height=880)
     viewer.open_sample(PLUGIN, "four_toroids")
     estimate = open_widget(viewer, "Estimate source")
     estimate.method.set_kind("polynomial")
