@@ -55,9 +55,9 @@ __all__ = [
 
 _TRACKS_PER_BIN = 50
 _BINS_PER_SIDE = 300
-_MOST_BINS = 100_000_000
-_ON_THE_EDGE = 1e-9  # of a bin: rounding does not push a track out of the image
-_MICRONS = 1e6  # in a metre
+_MAX_BINS = 100_000_000
+_EDGE_TOLERANCE_BINS = 1e-9  # of a bin: rounding does not push a track out of the image
+_MICRONS_PER_M = 1e6  # in a metre
 
 
 class TrackImage(NamedTuple):
@@ -168,33 +168,33 @@ class Tracks:
                 "no track lies within the ranges: expected at least one; widen diameter, contrast "
                 "or eccentricity"
             )
-        side = self._usual_bin() if bin is None else bin / _MICRONS
-        if not (np.isfinite(side) and 0 < side <= min(self.size) / 2 * (1 + _ON_THE_EDGE)):
+        side = self._usual_bin() if bin is None else bin / _MICRONS_PER_M
+        if not (np.isfinite(side) and 0 < side <= min(self.size) / 2 * (1 + _EDGE_TOLERANCE_BINS)):
             raise InputError(
-                f"bin is {side * _MICRONS:g} µm: expected at most half of the scanned area's "
-                f"shorter side, {min(self.size) / 2 * _MICRONS:g} µm, and more than 0"
+                f"bin is {side * _MICRONS_PER_M:g} µm: expected at most half of the scanned area's "
+                f"shorter side, {min(self.size) / 2 * _MICRONS_PER_M:g} µm, and more than 0"
             )
-        if self.size[0] * self.size[1] > _MOST_BINS * side**2:
+        if self.size[0] * self.size[1] > _MAX_BINS * side**2:
             raise InputError(
-                f"bin is {side * _MICRONS:g} µm: expected at most {_MOST_BINS} bins, on an area of "
-                f"{self.size[0]:g} × {self.size[1]:g} m; choose larger bins"
+                f"bin is {side * _MICRONS_PER_M:g} µm: expected at most {_MAX_BINS} bins, on an "
+                f"area of {self.size[0]:g} × {self.size[1]:g} m; choose larger bins"
             )
-        height, width = (int(length / side + _ON_THE_EDGE) for length in self.size)
+        height, width = (int(length / side + _EDGE_TOLERANCE_BINS) for length in self.size)
         row, column = self.y / side, self.x / side
-        inside = (row >= -_ON_THE_EDGE) & (column >= -_ON_THE_EDGE)
-        inside &= (row <= height + _ON_THE_EDGE) & (column <= width + _ON_THE_EDGE)
+        inside = (row >= -_EDGE_TOLERANCE_BINS) & (column >= -_EDGE_TOLERANCE_BINS)
+        inside &= (row <= height + _EDGE_TOLERANCE_BINS) & (column <= width + _EDGE_TOLERANCE_BINS)
         rows = np.clip(row[inside].astype(np.int64), 0, height - 1)
         columns = np.clip(column[inside].astype(np.int64), 0, width - 1)
         hits = np.bincount(rows * width + columns, minlength=height * width)
         counts = hits.reshape(height, width).astype(np.uint32)
-        return TrackImage(counts, np.sqrt(np.maximum(counts, 1.0)), float(side * _MICRONS))
+        return TrackImage(counts, np.sqrt(np.maximum(counts, 1.0)), float(side * _MICRONS_PER_M))
 
     def _usual_bin(self) -> float:
         height, width = self.size
         filled = np.sqrt(_TRACKS_PER_BIN * height * width / len(self))
         target = max(filled, max(self.size) / _BINS_PER_SIDE)
         # A whole number of bins along the shorter side, so that little is cut off.
-        return min(self.size) / max(2, int(min(self.size) / target + _ON_THE_EDGE))
+        return min(self.size) / max(2, int(min(self.size) / target + _EDGE_TOLERANCE_BINS))
 
 
 def _within(values: AnyArray, name: str, limits: tuple[float | None, float | None]) -> BoolArray:
@@ -218,7 +218,7 @@ _FADING = {
     "TR": ((0.535, 23.812), (0.465, 3837.2)),
     "MP": ((0.565, 18.461), (0.435, 6117.5)),
 }
-_LONGEST = 4000.0  # min, to which the fit was made
+_MAX_FADING_MIN = 4000.0  # min, to which the fit was made
 
 
 class Luminescence(NamedTuple):
@@ -361,9 +361,9 @@ def fading(minutes: float, plate: str) -> float:
     """
     if plate not in _FADING:
         raise InputError(f"plate is {plate!r}: expected one of {', '.join(_FADING)}")
-    if not 0 <= minutes <= _LONGEST:
+    if not 0 <= minutes <= _MAX_FADING_MIN:
         raise InputError(
-            f"the plate was scanned after {minutes:g} min: expected 0 to {_LONGEST:g}, for which "
-            "its fading is known"
+            f"the plate was scanned after {minutes:g} min: expected 0 to {_MAX_FADING_MIN:g}, for "
+            "which its fading is known"
         )
     return float(sum(share * np.exp(-minutes / time) for share, time in _FADING[plate]))

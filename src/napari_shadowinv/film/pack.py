@@ -47,10 +47,10 @@ __all__ = [
 
 PROTON_MASS = 938.27209  # MeV
 _ELECTRON_MASS = 0.51099895  # MeV
-_BETHE = 0.307075  # MeV cm²/mol
+_BETHE_FACTOR = 0.307075  # MeV cm²/mol
 _MIN_ENERGY_MEV = 0.01
 _MAX_ENERGY_MEV = 300.0
-_ENERGIES = 4000
+_N_ENERGIES = 4000
 # Below, Bethe's formula is wrong: it goes on with its slope, then in proportion to the velocity.
 _MIN_BETHE_MEV = 0.5
 _MIN_SLOPE_MEV = 0.1
@@ -111,7 +111,7 @@ class Stopping:
         >>> float(aluminium.loss(10.0) / 2699 * 10)  # 33.8 MeV cm²/g by ICRU 49
         34.2...
         """
-        energies = np.geomspace(_MIN_ENERGY_MEV, _MAX_ENERGY_MEV, _ENERGIES)
+        energies = np.geomspace(_MIN_ENERGY_MEV, _MAX_ENERGY_MEV, _N_ENERGIES)
         fast = _mass_loss(np.maximum(energies, _MIN_BETHE_MEV), charge_per_mass, excitation)
         near = _mass_loss(_MIN_BETHE_MEV * np.array([1.0, 1.01]), charge_per_mass, excitation)
         slope = np.log(near[1] / near[0]) / np.log(1.01)
@@ -123,7 +123,7 @@ class Stopping:
     @cached_property
     def _depths(self) -> tuple[FloatArray, FloatArray]:
         """Closely spaced energies, and the range of protons at each."""
-        energies = np.geomspace(self.energies[0], self.energies[-1], _ENERGIES)
+        energies = np.geomspace(self.energies[0], self.energies[-1], _N_ENERGIES)
         per_loss = 1 / self.loss(energies)
         steps = 0.5 * (per_loss[1:] + per_loss[:-1]) * np.diff(energies)
         # Below the first energy the loss goes as the velocity.
@@ -168,7 +168,7 @@ def _mass_loss(energies: FloatArray, charge_per_mass: float, excitation: float) 
     ratio = _ELECTRON_MASS / PROTON_MASS
     most = 2 * _ELECTRON_MASS * squared * gamma**2 / (1 + 2 * gamma * ratio + ratio**2)
     inside = 2 * _ELECTRON_MASS * squared * gamma**2 * most / (1e-6 * excitation) ** 2
-    return np.asarray(_BETHE * charge_per_mass / squared * (0.5 * np.log(inside) - squared))
+    return np.asarray(_BETHE_FACTOR * charge_per_mass / squared * (0.5 * np.log(inside) - squared))
 
 
 @as_file_errors

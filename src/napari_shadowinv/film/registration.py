@@ -29,7 +29,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.scans import upright
 
 __all__ = [
-    "EDGES",
+    "EDGE_ERROR_PX",
     "Poses",
     "check_orientation",
     "move_corners",
@@ -37,28 +37,36 @@ __all__ = [
     "register",
 ]
 
-EDGES = 3.0  # px: what they tell of a film's place
-_FINE, _COARSE = 2.0, 12.0  # px: structure between these sizes is compared
-_EVERY = 2  # px: so fine that no structure is lost
-_MARGIN = 30  # px: edges are burnt, and belong to the film, not to the beam
-_REACH = 12  # of these: how far films may be from where their edges are
+EDGE_ERROR_PX = 3.0  # standard deviation of a film's place by its edges
+# Structure between these sizes is compared.
+_FINE_BLUR_PX = 2.0
+_COARSE_BLUR_PX = 12.0
+_SAMPLING_PX = 2  # so fine that no structure is lost
+_MARGIN_PX = 30  # edges are burnt, and belong to the film, not to the beam
+_MAX_SHIFT_SAMPLES = 12  # of films from where their edges are
 # Fields displace what films show by different amounts, too: of films with exact edges, by which
 # fields came out 4 to 6 % wrong, images shifted by less than this made it 10 to 17 %.
-_AS_EDGES = 1.5  # px
+_EDGE_AGREEMENT_PX = 1.5
 # How far a comparison may move the corners of two films against each other, over the error of their
 # edges: less if no third film of their kind confirms it, because what moves may be the beam.
-_MAX_MOVE, _MAX_UNCONFIRMED_MOVE = 4.0, 2.5
-_TURN = 0.005  # rad: error of a film's direction by its edges
-_MAX_TURN = 3.0  # times that of two films: sides of half a thousand pixels exclude more
-_CLOSING, _CLOSED_PX = 3.0, 1.0  # times its error, and at least so far, a triangle may stay open
+_MAX_MOVE_ERRORS = 4.0
+_MAX_LONE_MOVE_ERRORS = 2.5
+_TURN_ERROR_RAD = 0.005  # of a film's direction by its edges
+_MAX_TURN_ERRORS = 3.0  # times that of two films: sides of half a thousand pixels exclude more
+# A triangle of comparisons may stay open by the larger of these.
+_MAX_GAP_ERRORS = 3.0
+_MIN_GAP_PX = 1.0
 # A kink of the calibration table shows as a line of equal dose, which moves with the dose.
 _DOSE_STEPS = 24  # of the map from the dose of one film to that of another
-_STEPS, _CLOSE = 25, 1e-3
-_BLOCKS, _FILLED = (3, 5), 0.5  # parts of a film that must agree, if half of their pixels count
-_ALIKE, _AGREEING = 0.3, 0.6  # correlation, and share of the parts that have it
-_FAR = 5.0  # px: parts that are further away count as so far
-_LEAST_ERROR = 0.1  # px
-_NEXT = 2  # films before and behind that one is compared with
+_MAX_STEPS = 25
+_STEP_TOLERANCE = 1e-3  # samples
+_N_PARTS = (3, 5)  # along y and x; they must agree
+_MIN_USABLE_SHARE = 0.5  # of a part that counts
+_MIN_CORRELATION = 0.3
+_MIN_AGREEING_SHARE = 0.6  # of the parts
+_MAX_DISTANCE_PX = 5.0  # at which parts that are further away count
+_MIN_ERROR_PX = 0.1
+_N_NEIGHBOURS = 2  # films before and behind that one is compared with
 # Ways in which a film may lie, as flips of its rows and columns.
 _WAYS_AROUND = {
     (True, True): "upside down: give its layer turned = 180",
@@ -66,7 +74,9 @@ _WAYS_AROUND = {
     (True, False): "mirrored top to bottom: give its layer mirrored = true, turned = 180",
 }
 # Of large structure, for the way a film lies.
-_LARGE, _BEST, _BETTER = 8, 0.7, 0.35  # px, correlation, and share of what it lacks to 1
+_BLOCK_PX = 8
+_MIN_TURNED_CORRELATION = 0.7
+_MAX_DEFICIT_RATIO = 0.35  # of the deficits from a correlation of 1, turned over and as is
 
 
 class Poses(NamedTuple):
@@ -99,7 +109,7 @@ class Poses(NamedTuple):
         return cls(
             np.zeros((count, 2)),
             np.zeros(count),
-            np.full(count, EDGES),
+            np.full(count, EDGE_ERROR_PX),
             np.zeros(count, dtype=bool),
             float("nan"),
         )
@@ -126,7 +136,7 @@ def register(
     images: ArrayLike,
     usable: ArrayLike,
     *,
-    spread: float | ArrayLike = EDGES,
+    spread: float | ArrayLike = EDGE_ERROR_PX,
     kinds: Sequence[Hashable] | None = None,
     report: Reporter | None = None,
 ) -> Poses:
@@ -171,7 +181,7 @@ def register(
     compared = []
     for first in range(len(films)):
         report("register", first, len(films))
-        for second in range(first + 1, min(first + 1 + _NEXT, len(films))):
+        for second in range(first + 1, min(first + 1 + _N_NEIGHBOURS, len(films))):
             pair = _compare(first, second, films)
             if pair is not None:
                 compared.append(pair)
@@ -184,12 +194,12 @@ def register(
         if peers:
             errors[k] = max(errors[k], np.sqrt(np.mean(poses.shifts[peers] ** 2)))
     poses = poses._replace(errors=errors)
-    if not pairs or max(np.abs(pair.shift).max() for pair in pairs) > _AS_EDGES:
+    if not pairs or max(np.abs(pair.shift).max() for pair in pairs) > _EDGE_AGREEMENT_PX:
         return poses
     return poses._replace(
         shifts=np.zeros_like(poses.shifts),
         turns=np.zeros_like(poses.turns),
-        errors=np.where(poses.by_images, _AS_EDGES / 2, poses.errors),
+        errors=np.where(poses.by_images, _EDGE_AGREEMENT_PX / 2, poses.errors),
     )
 
 
@@ -220,7 +230,8 @@ def check_orientation(images: ArrayLike, usable: ArrayLike, names: Sequence[str]
         as_is = _greatest_correlation(before, film)
         turned = {flip: _greatest_correlation(before, _flip(film, flip)) for flip in _WAYS_AROUND}
         best = max(turned, key=lambda flip: turned[flip])
-        if turned[best] > _BEST and 1 - turned[best] < _BETTER * (1 - as_is):
+        is_better = 1 - turned[best] < _MAX_DEFICIT_RATIO * (1 - as_is)
+        if is_better and turned[best] > _MIN_TURNED_CORRELATION:
             clues[number] = f"correlation {as_is:.3f}, turned over {turned[best]:.3f}"
             rows, columns = flips[-1]
             flips.append((rows != best[0], columns != best[1]))
@@ -263,9 +274,9 @@ def _credible(
     to_corner = float(np.hypot(shape[0], shape[1])) / 2
     for pair in pairs:
         move = np.hypot(*pair.shift) + abs(pair.turn) * to_corner
-        factor = _MAX_MOVE if _is_confirmed(pair, pairs, kinds) else _MAX_UNCONFIRMED_MOVE
+        factor = _MAX_MOVE_ERRORS if _is_confirmed(pair, pairs, kinds) else _MAX_LONE_MOVE_ERRORS
         is_within = move < factor * np.hypot(edges[pair.first], edges[pair.second])
-        if is_within and abs(pair.turn) < _MAX_TURN * np.sqrt(2) * _TURN:
+        if is_within and abs(pair.turn) < _MAX_TURN_ERRORS * np.sqrt(2) * _TURN_ERROR_RAD:
             credible.append(pair)
     return credible
 
@@ -283,7 +294,7 @@ def _is_confirmed(pair: _Pair, pairs: list[_Pair], kinds: list[Hashable]) -> boo
             continue
         gap = np.abs(onwards[0] + back[0] - pair.shift).max()
         error = np.sqrt(onwards[1] ** 2 + back[1] ** 2 + pair.error**2)
-        if gap < max(_CLOSED_PX, _CLOSING * error):
+        if gap < max(_MIN_GAP_PX, _MAX_GAP_ERRORS * error):
             return True
     return False
 
@@ -325,12 +336,12 @@ def _texture(image: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArr
         share = ndimage.gaussian_filter(weight, size)
         return ndimage.gaussian_filter(filled, size) / np.maximum(share, 1e-6), share
 
-    (fine, share), (coarse, _) = smooth(_FINE), smooth(_COARSE)
+    (fine, share), (coarse, _) = smooth(_FINE_BLUR_PX), smooth(_COARSE_BLUR_PX)
     inner = np.zeros_like(usable)
-    margin = min(_MARGIN, min(image.shape) // 8)
+    margin = min(_MARGIN_PX, min(image.shape) // 8)
     inner[margin:-margin, margin:-margin] = True
     counts = inner & usable & (share > 0.9)
-    few = np.s_[_EVERY // 2 :: _EVERY, _EVERY // 2 :: _EVERY]
+    few = np.s_[_SAMPLING_PX // 2 :: _SAMPLING_PX, _SAMPLING_PX // 2 :: _SAMPLING_PX]
     return fine[few], np.where(counts, fine - coarse, 0.0)[few], counts[few]
 
 
@@ -339,12 +350,12 @@ def _compare(first: int, second: int, films: list[_Film]) -> _Pair | None:
     reference, reference_mask = films[first].texture, films[first].counts
     texture, mask = _with_dose_of(films[second], films[first])
     shift, correlation = _coarse_shift(reference, reference_mask, texture, mask)
-    if correlation < _ALIKE:
+    if correlation < _MIN_CORRELATION:
         return None
     pose = np.array([*shift, 0.0])
     slope_y, slope_x = (np.gradient(texture, axis=axis) for axis in (0, 1))
     y, x = _from_middle(reference.shape)
-    for _ in range(_STEPS):
+    for _ in range(_MAX_STEPS):
         moved, both, along_y, along_x = _move(pose, texture, reference_mask, mask, slope_y, slope_x)
         c, s = np.cos(pose[2]), np.sin(pose[2])
         turning = along_y * (-s * y - c * x) + along_x * (c * y - s * x)
@@ -358,19 +369,21 @@ def _compare(first: int, second: int, films: list[_Film]) -> _Pair | None:
         normal = gain * slopes.T @ (weight[:, None] * slopes)
         step = np.linalg.lstsq(normal, slopes.T @ (weight * residual), rcond=None)[0]
         pose += step
-        if np.abs(pose[:2]).max() > 2 * _REACH or abs(pose[2]) > 10 * _TURN:
+        if np.abs(pose[:2]).max() > 2 * _MAX_SHIFT_SAMPLES or abs(pose[2]) > 10 * _TURN_ERROR_RAD:
             return None
-        if np.abs(step[:2]).max() < _CLOSE:
+        if np.abs(step[:2]).max() < _STEP_TOLERANCE:
             break
     moved, both, along_y, along_x = _move(pose, texture, reference_mask, mask, slope_y, slope_x)
     error = _disagreement(reference, moved, both, along_y, along_x)
     if error is None:
         return None
-    shift_error = max(_LEAST_ERROR, error)
+    shift_error = max(_MIN_ERROR_PX, error)
     # How much worse a turn is told follows from where the structure is.
     spread = np.diag(np.linalg.inv(normal)).copy()
-    turn_error = shift_error / _EVERY * np.sqrt(spread[2] / spread[:2].mean())
-    return _Pair(first, second, _EVERY * pose[:2], float(pose[2]), shift_error, float(turn_error))
+    turn_error = shift_error / _SAMPLING_PX * np.sqrt(spread[2] / spread[:2].mean())
+    return _Pair(
+        first, second, _SAMPLING_PX * pose[:2], float(pose[2]), shift_error, float(turn_error)
+    )
 
 
 def _from_middle(shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
@@ -398,7 +411,9 @@ def _coarse_shift(
     reference: FloatArray, reference_mask: BoolArray, texture: FloatArray, mask: BoolArray
 ) -> tuple[FloatArray, float]:
     """Whole pixels by which the second film correlates best, each counting where it is known."""
-    shape = tuple(fft.next_fast_len(length + _REACH, real=True) for length in reference.shape)
+    shape = tuple(
+        fft.next_fast_len(length + _MAX_SHIFT_SAMPLES, real=True) for length in reference.shape
+    )
 
     def products(left: AnyArray, right: AnyArray) -> FloatArray:
         spectra = [fft.rfft2(plane.astype(np.float64), shape) for plane in (left, right)]
@@ -408,7 +423,7 @@ def _coarse_shift(
     powers = products(reference**2, mask) * products(reference_mask, texture**2)
     least = 0.05 * float((reference**2).sum() * (texture**2).sum())
     alike = common / np.sqrt(np.maximum(powers, max(least, 1e-300)))
-    near = np.arange(-_REACH, _REACH + 1)
+    near = np.arange(-_MAX_SHIFT_SAMPLES, _MAX_SHIFT_SAMPLES + 1)
     window = alike[np.ix_(near, near)]
     place = np.unravel_index(int(np.argmax(window)), window.shape)
     return near[list(place)].astype(np.float64), float(window[place])
@@ -423,24 +438,26 @@ def _disagreement(
 ) -> float | None:
     """Error of a shift by how far parts of the films are from it, or None if too few agree."""
     parts, away, weights, alike = 0, [], [], 0
-    for rows in np.array_split(np.arange(reference.shape[0]), _BLOCKS[0]):
-        for columns in np.array_split(np.arange(reference.shape[1]), _BLOCKS[1]):
+    for rows in np.array_split(np.arange(reference.shape[0]), _N_PARTS[0]):
+        for columns in np.array_split(np.arange(reference.shape[1]), _N_PARTS[1]):
             part = np.ix_(rows, columns)
             counts = both[part]
-            if counts.mean() < _FILLED:
+            if counts.mean() < _MIN_USABLE_SHARE:
                 continue
             parts += 1
             fixed_part, moved_part = reference[part][counts], moved[part][counts]
             size = np.sqrt((fixed_part @ fixed_part) * (moved_part @ moved_part))
-            if size == 0 or fixed_part @ moved_part < _ALIKE * size:
+            if size == 0 or fixed_part @ moved_part < _MIN_CORRELATION * size:
                 continue
             alike += 1
             gain = (fixed_part @ moved_part) / (moved_part @ moved_part)
             slopes = gain * np.stack([along_y[part][counts], along_x[part][counts]], axis=1)
             step = np.linalg.lstsq(slopes, fixed_part - gain * moved_part, rcond=None)[0]
-            away.append((np.clip(_EVERY * step, -_FAR, _FAR) ** 2).mean())
+            away.append(
+                (np.clip(_SAMPLING_PX * step, -_MAX_DISTANCE_PX, _MAX_DISTANCE_PX) ** 2).mean()
+            )
             weights.append((slopes**2).sum())
-    if alike < max(2, _AGREEING * parts):
+    if alike < max(2, _MIN_AGREEING_SHARE * parts):
         return None
     return float(np.sqrt(np.average(away, weights=weights) / alike))
 
@@ -449,7 +466,7 @@ def _fit_poses(pairs: list[_Pair], edges: FloatArray) -> Poses:
     """The poses that comparisons and edges together make likeliest."""
     count = len(edges)
     normal, sides = np.diag(1 / np.square(edges)), np.zeros((count, 2))
-    turns, turned = np.eye(count) / _TURN**2, np.zeros(count)
+    turns, turned = np.eye(count) / _TURN_ERROR_RAD**2, np.zeros(count)
     for pair in pairs:
         difference = np.zeros(count)
         difference[[pair.first, pair.second]] = -1.0, 1.0
@@ -479,15 +496,15 @@ def _fit_poses(pairs: list[_Pair], edges: FloatArray) -> Poses:
 def _large(image: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Large structure in few pixels, and how much of each of them is known."""
     planes = (usable.astype(np.float64), np.where(usable, image, 0.0))
-    counts, sums = (blocks_of(plane, _LARGE).sum(axis=(1, 3)) for plane in planes)
-    return np.asarray(sums / np.maximum(counts, 1.0)), np.asarray(counts / _LARGE**2)
+    counts, sums = (blocks_of(plane, _BLOCK_PX).sum(axis=(1, 3)) for plane in planes)
+    return np.asarray(sums / np.maximum(counts, 1.0)), np.asarray(counts / _BLOCK_PX**2)
 
 
 def _greatest_correlation(
     first: tuple[FloatArray, FloatArray], second: tuple[FloatArray, FloatArray]
 ) -> float:
     """Of two images, over shifts by the reach."""
-    steps = _REACH // _LARGE
+    steps = _MAX_SHIFT_SAMPLES // _BLOCK_PX
     greatest = -1.0
     for down in range(-steps, steps + 1):
         for right in range(-steps, steps + 1):
@@ -577,7 +594,9 @@ def poses_by_fiducials(
     every = np.concatenate(misfits)
     closure = float(np.sqrt((every**2).sum() / spare)) if spare > 0 else float("nan")
     error = float(np.fmax(_MIN_MARK_ERROR_PX, closure))
-    errors = np.array([error / np.sqrt(len(marks)) if marks else EDGES for marks in film_marks])
+    errors = np.array(
+        [error / np.sqrt(len(marks)) if marks else EDGE_ERROR_PX for marks in film_marks]
+    )
     return Poses(
         shifts / np.asarray(scales, np.float64)[:, None],
         turns,

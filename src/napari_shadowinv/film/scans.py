@@ -35,13 +35,13 @@ __all__ = [
     "write_corners",
 ]
 
-_DARKER = 0.75  # of the bed's brightness, in the film's darkest colour
-_BED = 99.0  # percentile of the brightness
-_SMALLEST = 0.02  # of the scan's area, or `least_side` squared
-_DUST = 2  # px
-_ENDS = 0.08  # of a side, at its ends, do not count for its place: corners are cut and bent
-_MAX_OFFSET = 0.04  # of the film's size, from a side to its border
-_ROUNDS = 8
+_MAX_FILM_BRIGHTNESS = 0.75  # of the bed's brightness, in the film's darkest colour
+_BED_PERCENTILE = 99.0  # percentile of the brightness
+_MIN_FILM_SHARE = 0.02  # of the scan's area, or `least_side` squared
+_DUST_PX = 2  # px
+_END_SHARE = 0.08  # of a side, at its ends, do not count for its place: corners are cut and bent
+_MAX_OFFSET_SHARE = 0.04  # of the film's size, from a side to its border
+_MAX_ROUNDS = 8
 _MAX_DEVIATIONS = 2.5  # of a point that is no outlier
 _REACH_PX = 6.0  # of the search from a side
 _BLUR_PX = 2.0  # of a side
@@ -91,7 +91,7 @@ def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[Floa
     values = checked_scan(scan)
     inside = _darker_than_bed(values)
     height, width = inside.shape
-    area = _SMALLEST * height * width if least_side is None else least_side**2
+    area = _MIN_FILM_SHARE * height * width if least_side is None else least_side**2
     labels, count = ndimage.label(inside)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     film_labels = [number for number in range(1, count + 1) if sizes[number] >= area]
@@ -176,9 +176,9 @@ def checked_corners(corners: ArrayLike) -> FloatArray:
 
 def _darker_than_bed(values: AnyArray) -> BoolArray:
     darkest = values.min(axis=-1)
-    bed = np.percentile(darkest, _BED)
-    dark = darkest < _DARKER * bed
-    return np.asarray(ndimage.binary_opening(dark, np.ones((3, 3)), iterations=_DUST))
+    bed = np.percentile(darkest, _BED_PERCENTILE)
+    dark = darkest < _MAX_FILM_BRIGHTNESS * bed
+    return np.asarray(ndimage.binary_opening(dark, np.ones((3, 3)), iterations=_DUST_PX))
 
 
 def _fit_rectangle(film: BoolArray) -> FloatArray:
@@ -223,8 +223,8 @@ def _fit_side(
     """Fit offset and slope of the line along most of a side's pixels."""
     size = (high - low)[1 - axis]
     along, across = turned[:, 1 - axis], turned[:, axis]
-    inner = np.abs(along - (low + high)[1 - axis] / 2) < (0.5 - _ENDS) * size
-    near = np.abs(across - edge) < _MAX_OFFSET * max(high - low)
+    inner = np.abs(along - (low + high)[1 - axis] / 2) < (0.5 - _END_SHARE) * size
+    near = np.abs(across - edge) < _MAX_OFFSET_SHARE * max(high - low)
     return _fit_line(along[inner & near], across[inner & near], 0.5)
 
 
@@ -232,7 +232,7 @@ def _fit_line(along: FloatArray, across: FloatArray, usual: float) -> _Line:
     """Fit a line to most points; points closer than `usual` are no outliers."""
     used = np.ones(along.size, bool)
     slope = offset = 0.0
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         slope, offset = np.polyfit(along[used], across[used], 1)
         away = np.abs(across - offset - slope * along)
         used = away <= max(_MAX_DEVIATIONS * 1.5 * np.median(away), usual)
@@ -259,7 +259,7 @@ def _sharpen_corners(scan: AnyArray, corners: FloatArray) -> FloatArray:
     lines = []
     for axis in (0, 1):
         half = size[axis] / 2
-        count = round((1 - 2 * _ENDS) * size[1 - axis])
+        count = round((1 - 2 * _END_SHARE) * size[1 - axis])
         along = np.arange(count) - (count - 1) / 2
         for sign in (-1, 1):
 
@@ -288,13 +288,13 @@ def _find_edge(
     bed, film = values[:, -1], values[:, 0]
     inside = values < ((bed + film) / 2)[:, None]
     last = inside.shape[1] - 1 - np.argmax(inside[:, ::-1], axis=1)
-    clear = (film < _DARKER * bed) & inside.any(axis=1) & (last < inside.shape[1] - 1)
+    clear = (film < _MAX_FILM_BRIGHTNESS * bed) & inside.any(axis=1) & (last < inside.shape[1] - 1)
     about = across[0, last] + _STEP_PX / 2
     # Pixels are means over their squares: their deficit against the bed gives the edge exactly.
     near = np.arange(-_BLUR_PX, _BLUR_PX + _STEP_PX, _STEP_PX)
     values = sample(about[:, None] + near)
     bed, film = values[:, -1:], values[:, :1]
-    clear &= film[:, 0] < _DARKER * bed[:, 0]
+    clear &= film[:, 0] < _MAX_FILM_BRIGHTNESS * bed[:, 0]
     shares = np.divide(bed - values, bed - film, out=np.zeros_like(values), where=clear[:, None])
     return about - _BLUR_PX + np.trapezoid(shares, dx=_STEP_PX, axis=1), clear
 

@@ -31,10 +31,10 @@ __all__ = [
     "unfold",
 ]
 
-_MEV = 1.602176634e-13  # J
+_JOULES_PER_MEV = 1.602176634e-13  # J
 _MIN_ENERGY_MEV = 0.5
 _MAX_ENERGY_MEV = 200.0
-_ENERGIES = 6000
+_N_ENERGIES = 6000
 _BAND_SHARE = 0.5  # of the peak
 
 
@@ -91,7 +91,7 @@ class Response:
         stoppings = pack.stoppings()
         last = min(_MAX_ENERGY_MEV, *(stopping.energies[-1] for stopping in stoppings.values()))
         inside = (
-            np.geomspace(_MIN_ENERGY_MEV, last, _ENERGIES)
+            np.geomspace(_MIN_ENERGY_MEV, last, _N_ENERGIES)
             if energies is None
             else np.asarray(energies)
         )
@@ -104,7 +104,7 @@ class Response:
             after = _behind(stoppings, (film.active,), before)
             mass = stoppings[film.active.material].density * film.active.thickness  # kg/m²
             deposits.append(before - after)
-            doses.append((before - after) * _MEV / mass)
+            doses.append((before - after) * _JOULES_PER_MEV / mass)
             now = _behind(stoppings, film.behind, after)
         return cls(first, np.stack(deposits), np.stack(doses))
 
@@ -165,7 +165,7 @@ _BLOCK_PX = 4096
 _START_SLOPE = 0.15
 _MIN_SLOPE = 0.02
 _MAX_SLOPE = 2.0
-_ROUNDS = 100
+_MAX_ROUNDS = 100
 _DISPLACEMENT_POWER = 0.75  # displacement falls with this power of the energy: 0.5 by B, 1 by E
 
 
@@ -312,7 +312,7 @@ def _usual_basis(mean: FloatArray, response: Response) -> _Basis:
     peaks = np.array([band.peak for band in response.bands])
     slope = _START_SLOPE * peaks[-1]
     basis = _Basis.of(response, np.exp(-peaks / slope), slope)
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         usual = _peel_spectrum(mean, basis.matrix / basis.usual)
         if len(usual) > 1:
             falls = max(np.log(usual[-2] / usual[-1]), 1e-9)

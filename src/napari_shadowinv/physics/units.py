@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.facts import Fact
 from napari_shadowinv.physics.setup import SETUPS, Setup
@@ -235,7 +236,6 @@ def intensity_limits(image: AnyArray) -> tuple[float, float]:
 PIXEL = "pixel"
 PIXEL_AREA = "pixel**2"
 FLUX_DENSITY = "1/pixel**2"
-PLANE = ("y", "x")
 
 
 def label(units: str, long_name: str) -> dict[str, str]:

@@ -39,7 +39,7 @@ from napari_shadowinv.film import (
     unfold,
     usable_pixels,
 )
-from napari_shadowinv.film.registration import EDGES
+from napari_shadowinv.film.registration import EDGE_ERROR_PX
 from napari_shadowinv.film.scans import common_shape, upright
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.fitting.measurements import estimated_noise
@@ -552,7 +552,7 @@ def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) 
         for film, film_doses in zip(films, doses, strict=True)
         if film_doses.too_dark > _MAX_DARK_SHARE
     ]
-    at_edges = poses.errors >= EDGES
+    at_edges = poses.errors >= EDGE_ERROR_PX
     if at_edges.any() and len(films) > 1:
         loose = [film.number for film, by_edges in zip(films, at_edges, strict=True) if by_edges]
         why = "share too little structure with their neighbours"

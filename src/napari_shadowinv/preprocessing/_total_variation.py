@@ -42,10 +42,10 @@ def least_variation(
 
 
 # Sums in any order, so that several pixels are dealt with at once.
-_FAST = {"reassoc", "contract", "nsz"}
+_FASTMATH = {"reassoc", "contract", "nsz"}
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=_FAST)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=_FASTMATH)
 def _step(image: FloatArray, dual_y: FloatArray, dual_x: FloatArray, weight: float) -> float:
     """Iterate once in place; return the energy before."""
     # A single pass: the two smooth rows come from rows that have not changed yet.
@@ -63,7 +63,7 @@ def _step(image: FloatArray, dual_y: FloatArray, dual_x: FloatArray, weight: flo
     return energy
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=_FAST)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=_FASTMATH)
 def _step_row(
     image: FloatArray,
     dual_y: FloatArray,

@@ -52,8 +52,8 @@ from napari_shadowinv.preprocessing.pixels import (
 )
 from napari_shadowinv.preprocessing.steps import Choice, degree_field, width_field
 
-_LEAST_SUPPORT = 1e-6
-_NARROWEST_WAVES = 2.0  # px; a Gaussian that is narrower has waves too short for the pixels
+_MIN_SUPPORT = 1e-6
+_MIN_WAVE_BLUR_PX = 2.0  # a Gaussian that is narrower has waves too short for the pixels
 
 
 class Estimate(Choice):
@@ -234,12 +234,12 @@ def _blur_masked(
     support = _blur(usable.astype(np.float64), width)
     report("source", 1, 2)
     blurred = _blur(np.where(usable, values, 0.0), width)
-    return blurred / np.maximum(support, _LEAST_SUPPORT), support >= _LEAST_SUPPORT
+    return blurred / np.maximum(support, _MIN_SUPPORT), support >= _MIN_SUPPORT
 
 
 def _blur(values: FloatArray, width: float) -> FloatArray:
     """Blur by a Gaussian with a mirrored border."""
-    if width < _NARROWEST_WAVES:
+    if width < _MIN_WAVE_BLUR_PX:
         return np.asarray(scipy.ndimage.gaussian_filter(values, width, mode="reflect"))
     # Its time does not depend on the width.
     return low_pass(values, width)
@@ -339,8 +339,8 @@ class InterpolatedEstimate(Estimate):
     )
 
 
-_MOST_FITTED_PIXELS = 2**16
-_MOST_FITS = 10
+_MAX_FITTED_PIXELS = 2**16
+_MAX_FITS = 10
 _NOTABLE_EXTRAPOLATION = 1.5  # times the brightest pixel seen
 # Of a fitted Gaussian: height over the image's mean, and sides from the image's middle.
 _MAX_HEIGHT = 1e3
@@ -405,7 +405,7 @@ def gaussian_source(
     beam = _gaussian(parameters, rows[:, None], columns)
     rise = float(beam.max() / sample.max())
     report_caution = on_caution or warn_of
-    if rise > pixels.MOST_EXTRAPOLATION:
+    if rise > pixels.MAX_EXTRAPOLATION:
         text = (
             "no Gaussian beam can be fitted to the unmasked pixels, so the source is assumed "
             "uniform: mask less, or choose another estimate"
@@ -425,7 +425,7 @@ def _block_samples(
     values: FloatArray, usable: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return positions y, x and means of blocks of usable pixels, few enough for a fit."""
-    block = int(np.ceil(np.sqrt(values.size / _MOST_FITTED_PIXELS)))
+    block = int(np.ceil(np.sqrt(values.size / _MAX_FITTED_PIXELS)))
     share = pixels.block_means(usable.astype(np.float64), block)
     means = pixels.block_means(np.where(usable, values, 0.0), block)
     # A block is used only if it is complete, since a part of it has another middle.
@@ -454,7 +454,7 @@ def _fit_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray, report: Repo
     # A plain fit first: the robust loss, from far away, would call the whole beam an outlier.
     parameters = fitted(np.clip(_guess_gaussian(y, x, sample), *bounds), "linear", 1.0)
     scale = 0.0
-    for _ in range(_MOST_FITS):
+    for _ in range(_MAX_FITS):
         residual = _gaussian(parameters, y, x) - sample
         previous, scale = scale, max(NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
         if abs(scale - previous) < 1e-2 * scale:
@@ -465,7 +465,7 @@ def _fit_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray, report: Repo
 
 def _bounds(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return bounds of the parameters of `_gaussian`, without which it may hide behind a mask."""
-    steepest = math.sqrt(_MOST_FITTED_PIXELS)  # one over the width of a block of pixels
+    steepest = math.sqrt(_MAX_FITTED_PIXELS)  # one over the width of a block of pixels
     ranges = [
         (0, _MAX_HEIGHT),
         (0, _MAX_HEIGHT),

@@ -357,8 +357,8 @@ def _apply_gain(values: FloatArray, gain: FloatArray) -> FloatArray:
 
 _NORMAL_MEAN = 1.2533  # standard deviation over mean absolute deviation, normal noise
 _PIXELS_PER_NOISE_BIN = 400
-_MOST_NOISE_BINS = 16
-_OUTSTANDING = 0.5  # share of the threshold by which a pixel differs from its nearest peers
+_MAX_NOISE_BINS = 16
+_MIN_PEER_SHARE = 0.5  # share of the threshold by which a pixel differs from its nearest peers
 
 
 class HotPixelFilter(Filter):
@@ -463,8 +463,8 @@ def remove_hot_pixels(
     local, bright, dark = _neighbours(values, size, Reporter(None, should_stop))
     difference = values - local
     limit = threshold * _noise(difference, local)
-    hot = (difference > limit) & (values - bright > _OUTSTANDING * limit)
-    dead = (difference < -limit) & (dark - values > _OUTSTANDING * limit)
+    hot = (difference > limit) & (values - bright > _MIN_PEER_SHARE * limit)
+    dead = (difference < -limit) & (dark - values > _MIN_PEER_SHARE * limit)
     return np.where(hot | dead, local, values), hot, dead
 
 
@@ -490,7 +490,7 @@ def _neighbours(
 
 def _noise(difference: FloatArray, brightness: FloatArray) -> FloatArray:
     """Return the standard deviation of each pixel's difference, by its brightness."""
-    n_bins = min(max(difference.size // _PIXELS_PER_NOISE_BIN, 1), _MOST_NOISE_BINS)
+    n_bins = min(max(difference.size // _PIXELS_PER_NOISE_BIN, 1), _MAX_NOISE_BINS)
     groups = np.array_split(np.argsort(brightness, axis=None, kind="stable"), n_bins)
     flat, positive = difference.ravel(), np.maximum(brightness, 0).ravel()
     variance = np.array([_deviation(flat[group]) ** 2 for group in groups])

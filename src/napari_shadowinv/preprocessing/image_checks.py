@@ -51,26 +51,26 @@ _PLATEAU_EXCESS = 4.0  # pixels at the maximum over those just below
 
 # Hot and dead pixels
 _STRAY_RATIO, _STRAY_DEVIATIONS = 1.5, 10.0
-_ALONE = 0.3  # of the surroundings' brightness, by which a neighbour may differ
+_MAX_NEIGHBOUR_DIFFERENCE = 0.3  # of the surroundings' brightness, by which a neighbour may differ
 _STRAY_STEP = 0.05  # of the mean, from the pixel on the left
 _NOISE_SAMPLES = 100_000
 
 # Reference
 _COARSE_SIDE_PX = 128
 _MIN_BLOCKS = 16
-_USABLE = 0.999  # share of a block's pixels
-_RING = 0.2  # of the side: there is rarely an object
+_MIN_USABLE_SHARE = 0.999  # share of a block's pixels
+_RING_SHARE = 0.2  # of the side: there is rarely an object
 _MAX_SHIFT = 0.2  # of the side
 # Share of the mismatch that may be left after a shift, by the blur (blocks) of both: a beam that
 # merely differs, smooth as it is, may match somewhere by chance to a quarter.
-_MATCH = {0.0: 0.5, 2.0: 0.15}
+_MAX_MATCH = {0.0: 0.5, 2.0: 0.15}
 _ABOVE_NOISE = 1.2  # of the median mismatch, so that a shift is detectable
 _MIN_SIDES = 3  # of the image, with enough blocks
 _MIN_OVERLAP = 0.4  # of the ring
 _MIN_CONTRAST = 0.01  # of the mean
 _NEGATIVE_CORRELATION = -0.4
-_DETAIL = 9  # coarse pixels
-_SWAPPED = 0.75  # see `is_swapped`
+_DETAIL_BLOCKS = 9  # coarse pixels
+_MIN_SWAPPED_RATIO = 0.75  # see `is_swapped`
 
 
 def image_warnings(
@@ -215,7 +215,8 @@ def stray_pixels(image: FloatArray, mask: BoolArray | None = None) -> BoolArray:
         (np.clip(rows + y, 0, height - 1), np.clip(columns + x, 0, width - 1)) for y, x in ring
     ]
     level = np.median([image[place] for place in inside], axis=0)
-    alone = np.abs(neighbours - level).max(axis=0) < limit / 3 + _ALONE * np.abs(level)
+    difference = np.abs(neighbours - level).max(axis=0)
+    alone = difference < limit / 3 + _MAX_NEIGHBOUR_DIFFERENCE * np.abs(level)
     stray[rows, columns] = (is_hot | is_dead) & alone
     if mask is not None and not mask.all():
         stray &= ndimage.binary_erosion(mask, np.ones((3, 3)))
@@ -262,7 +263,7 @@ class ReferencePair:
         size = _neighbour_covariance(difference, difference, usable)
         if size < _MIN_CONTRAST**2:
             return False
-        return -_neighbour_covariance(difference, beam, usable) > _SWAPPED * size
+        return -_neighbour_covariance(difference, beam, usable) > _MIN_SWAPPED_RATIO * size
 
     @cached_property
     def shift(self) -> tuple[float, float] | None:
@@ -272,7 +273,7 @@ class ReferencePair:
         """
         if not self._has_border:
             return None
-        return next(filter(None, map(self._shift_after_blur, _MATCH)), None)
+        return next(filter(None, map(self._shift_after_blur, _MAX_MATCH)), None)
 
     def _shift_after_blur(self, blur: float) -> tuple[float, float] | None:
         """Return the shift seen after a blur (blocks), which lifts a smooth beam above noise."""
@@ -291,7 +292,7 @@ class ReferencePair:
         if (np.abs(shift) == reach).any():
             return None
         if not shift.any() or not _fits_after(
-            shot, beam, ring, noise, (shift[0], shift[1]), _MATCH[blur]
+            shot, beam, ring, noise, (shift[0], shift[1]), _MAX_MATCH[blur]
         ):
             return None
         return float(shift[0] * step), float(shift[1] * step)
@@ -300,7 +301,7 @@ class ReferencePair:
     def _blocks(self) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Image and source in blocks of pixels, of mean 1, and the blocks that are usable."""
         step = _coarse_step(self.image.shape)
-        usable = blocks_of(self.mask, step).mean(axis=(1, 3)) > _USABLE
+        usable = blocks_of(self.mask, step).mean(axis=(1, 3)) > _MIN_USABLE_SHARE
         planes = []
         for plane in (self.image, self.source):
             blocks = blocks_of(plane, step).mean(axis=(1, 3))
@@ -311,7 +312,7 @@ class ReferencePair:
     def _ring(self) -> BoolArray:
         """Usable blocks near the border, where there is rarely an object."""
         usable = self._blocks[2]
-        depth = [max(2, round(_RING * side)) for side in usable.shape]
+        depth = [max(2, round(_RING_SHARE * side)) for side in usable.shape]
         ring = usable.copy()
         ring[depth[0] : -depth[0], depth[1] : -depth[1]] = False
         return ring
@@ -343,7 +344,7 @@ def _neighbour_covariance(first: FloatArray, second: FloatArray, usable: BoolArr
 
 
 def _details(values: FloatArray) -> FloatArray:
-    return np.asarray(values - ndimage.uniform_filter(values, _DETAIL))
+    return np.asarray(values - ndimage.uniform_filter(values, _DETAIL_BLOCKS))
 
 
 def _correlation(first: FloatArray, second: FloatArray) -> float:
@@ -406,19 +407,22 @@ def _fits_after(
     if gain(common) > match:
         return False
     y, x = np.ogrid[rows, columns]
-    y_top, x_left = height * _RING, width * _RING
+    y_top, x_left = height * _RING_SHARE, width * _RING_SHARE
     sides = (y < y_top, y >= height - y_top, x < x_left, x >= width - x_left)
     parts = [common & side for side in sides]
     better = [gain(part) < 1 for part in parts if part.sum() >= _MIN_BLOCKS]
     return len(better) >= _MIN_SIDES and sum(better) >= len(better) - 1
 
 
-_SAMPLES = 120_000
-_BINS = 20
+_MAX_NOISE_SAMPLES = 120_000
+_N_BRIGHTNESS_BINS = 20
 _BRIGHTEST_LEFT_OUT = 0.05  # share of the pixels: bright lines are not smooth
-_CLIPPED_AT, _CLIPPED_VARIANCE = 3.0, 0.9733  # standard deviations; variance of a clipped normal
+_CLIP_DEVIATIONS, _CLIPPED_VARIANCE = (
+    3.0,
+    0.9733,
+)  # standard deviations; variance of a clipped normal
 _MIN_PIXELS = 4000
-_INDEPENDENT = 1 / 3  # of the differences, which share pixels
+_INDEPENDENT_SHARE = 1 / 3  # of the differences, which share pixels
 _WIDE_RANGE, _MIN_RANGE = 2.0, 1.3  # brightest over dimmest bin
 _MIN_DARK = 0.05  # of the mean
 # Difference of χ² without and with an offset, over χ² per degree of freedom: of one image, of
@@ -473,7 +477,7 @@ class _NoisyPlane:
     def _local(self) -> tuple[FloatArray, FloatArray]:
         """Means of 3 × 3 usable pixels, and differences in which all but noise cancels."""
         image, mask = self.image, self.mask
-        rows = max(1, image.size // _SAMPLES)  # of long images, lines far apart
+        rows = max(1, image.size // _MAX_NOISE_SAMPLES)  # of long images, lines far apart
         starts = np.arange(0, image.shape[0] - 2, rows)
         above, middle, below = (image[starts + shift] for shift in range(3))
         column_sums, bends = above + middle + below, above - 2 * middle + below
@@ -498,10 +502,10 @@ class _NoisyPlane:
         brightness, differences = self._local
         order = order_by_value(brightness)
         order = order[: int((1 - _BRIGHTEST_LEFT_OUT) * order.size)]
-        parts = np.array_split(order, _BINS)
+        parts = np.array_split(order, _N_BRIGHTNESS_BINS)
         levels = np.array([brightness[part].mean() for part in parts])
         noise = np.sqrt([_clipped_variance(differences[part]) for part in parts])
-        counts = np.array([len(part) for part in parts]) * _INDEPENDENT
+        counts = np.array([len(part) for part in parts]) * _INDEPENDENT_SHARE
         return np.array([levels, noise, noise / np.sqrt(counts)])
 
     @cached_property
@@ -509,20 +513,20 @@ class _NoisyPlane:
         """Differences over the brightness, clipped."""
         brightness, differences = self._local
         values = differences / np.maximum(brightness, _MIN_DARK * abs(float(brightness.mean())))
-        limit = _CLIPPED_AT * NORMAL_MAD * float(np.median(np.abs(values)))
+        limit = _CLIP_DEVIATIONS * NORMAL_MAD * float(np.median(np.abs(values)))
         return np.clip(values, -limit, limit)
 
 
 def _clipped_variance(differences: FloatArray) -> float:
     sizes = np.abs(differences)
-    limit = _CLIPPED_AT * NORMAL_MAD * float(np.median(sizes))
+    limit = _CLIP_DEVIATIONS * NORMAL_MAD * float(np.median(sizes))
     return float((sizes[sizes <= limit] ** 2).mean()) / _CLIPPED_VARIANCE
 
 
 def _common_pattern(first: _NoisyPlane, second: _NoisyPlane) -> float:
     """Most relative variance that two images may have in common, as by uneven pixels."""
     product = first.relative * second.relative
-    error = float(product.std()) / math.sqrt(_INDEPENDENT * len(product))
+    error = float(product.std()) / math.sqrt(_INDEPENDENT_SHARE * len(product))
     return max(float(product.mean()), 0.0) + _PATTERN_DEVIATIONS * error
 
 

@@ -23,7 +23,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
 FILL_WIDTH = 5.0  # px
-_COARSEST_SIDE = 32
+_COARSEST_SIDE_PX = 32
 _TOLERANCE = 1e-6
 
 
@@ -133,7 +133,7 @@ def _coarse_spline(
     weighted: FloatArray, share: FloatArray, width: float, power: int, report: Reporter
 ) -> FloatArray:
     """Return a first guess of `_spline`, from pixels twice as large."""
-    if min(weighted.shape) < _COARSEST_SIDE:
+    if min(weighted.shape) < _COARSEST_SIDE_PX:
         return np.full(weighted.shape, weighted.sum() / share.sum())
     coarse = _spline(block_means(weighted, 2), block_means(share, 2), width / 2, power, report)
     height, length = weighted.shape
@@ -148,11 +148,11 @@ def _double_rows(coarse: FloatArray, side: int) -> FloatArray:
     return np.asarray(rows.reshape(-1, coarse.shape[1])[:side])
 
 
-_HIGHEST_DEGREE = 10
-_MOST_REWEIGHTINGS = 50
+_MAX_DEGREE = 10
+_MAX_REWEIGHTINGS = 50
 # As a share of the mean: the floor to which an inversion raises an image's dark pixels.
-_FLOOR = 1e-3
-MOST_EXTRAPOLATION = 10.0  # times the brightest pixel seen
+_MIN_BEAM_SHARE = 1e-3
+MAX_EXTRAPOLATION = 10.0  # times the brightest pixel seen
 
 
 def checked_pixels(
@@ -219,10 +219,10 @@ def beam_pixels(image: ArrayLike, mask: ArrayLike | None) -> tuple[FloatArray, B
 def with_flux_of(beam: FloatArray, values: FloatArray, usable: BoolArray) -> FloatArray:
     """Return a beam, positive and with the flux of an image over its usable pixels."""
     mean = values[usable].mean()
-    positive = np.maximum(beam, _FLOOR * mean)
+    positive = np.maximum(beam, _MIN_BEAM_SHARE * mean)
     source = np.asarray(positive * (mean / positive[usable].mean()))
     brightest = float(values[usable].max())
-    if not source.max() <= MOST_EXTRAPOLATION * brightest:
+    if not source.max() <= MAX_EXTRAPOLATION * brightest:
         raise InputError(
             f"the estimated source rises to {source.max():.3g} under the mask, while the image "
             f"is at most {brightest:.3g} elsewhere: mask less, or choose another estimate"
@@ -272,7 +272,7 @@ def fit_polynomial(
         If image, mask or degree cannot be used, or usable pixels are fewer than coefficients.
     """
     values, usable = checked_pixels(image, mask)
-    degree = checked_integer("degree", degree, least=0, most=_HIGHEST_DEGREE)
+    degree = checked_integer("degree", degree, least=0, most=_MAX_DEGREE)
     terms = (degree + 1) * (degree + 2) // 2
     if usable.sum() < terms:
         raise InputError(
@@ -285,7 +285,7 @@ def fit_polynomial(
     fit = _weighted_fit(values, usable.astype(np.float64), rows, columns)
     rounding = 1e-12 * float(np.abs(values).max())
     report = Reporter(None, should_stop)
-    for step in range(_MOST_REWEIGHTINGS):
+    for step in range(_MAX_REWEIGHTINGS):
         report("fit", step)
         residual = values - fit
         scale = NORMAL_MAD * float(np.median(np.abs(residual[usable])))

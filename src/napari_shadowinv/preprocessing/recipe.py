@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from napari_shadowinv.cautions import OnCaution
 
 
-_LEAST_VISIBLE = 0.1  # of an object under the source mask, for the inversion to see it
-_LEAST_OBJECT = 10  # pixels
-_MOST_FALL = 10.0  # times below the dimmest pixel seen
+_MIN_VISIBLE_SHARE = 0.1  # of an object under the source mask, for the inversion to see it
+_MIN_OBJECT_PIXELS = 10  # pixels
+_MAX_FALL = 10.0  # times below the dimmest pixel seen
 
 
 class MeasuredSource(Choice):
@@ -216,9 +216,9 @@ def check_masks(mask: BoolArray | None, bare: BoolArray | None) -> None:
     hidden = np.bincount(places.ravel(), minlength=count + 1)[1:]
     visible = np.bincount(places[mask], minlength=count + 1)[1:]
     # Stray pixels are no object, unless there is nothing else.
-    objects = hidden >= min(_LEAST_OBJECT, hidden.max())
+    objects = hidden >= min(_MIN_OBJECT_PIXELS, hidden.max())
     hidden, visible = hidden[objects], visible[objects]
-    if (visible < _LEAST_VISIBLE * hidden).all():
+    if (visible < _MIN_VISIBLE_SHARE * hidden).all():
         raise InputError(
             f"the mask hides {1 - visible.sum() / hidden.sum():.0%} of what the source mask "
             "hides, so the object would be excluded from the inversion: use the mask for "
@@ -266,7 +266,7 @@ def _check_fall(
     if bare is None:
         return
     surroundings, object_ = (bare, ~bare) if mask is None else (bare & mask, ~bare & mask)
-    if object_.any() and source[object_].min() < image[surroundings].min() / _MOST_FALL:
+    if object_.any() and source[object_].min() < image[surroundings].min() / _MAX_FALL:
         text = (
             f"the estimated source falls to {source[object_].min():.3g} under the source mask, "
             f"while the image is at least {image[surroundings].min():.3g} elsewhere: compare it "

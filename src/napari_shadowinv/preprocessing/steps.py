@@ -136,8 +136,8 @@ class Radiograph:
         return binned.add_notes(f"binned {factor} × {factor}{cut}")
 
 
-_SMALLEST_SIDE = 4  # px of a crop
-_MIN_SHARE = 0.999  # of a rotated pixel that must have data
+_MIN_SIDE_PX = 4  # px of a crop
+_MIN_DATA_SHARE = 0.999  # of a rotated pixel that must have data
 
 
 class Choice(CheckedModel):
@@ -362,11 +362,11 @@ class Rotate(Step):
     def _interpolate(self, shot: Radiograph) -> Radiograph:
         usable = shot.usable
         share = self._move(usable.astype(np.float64))
-        mask = share > _MIN_SHARE
+        mask = share > _MIN_DATA_SHARE
 
         def values(image: FloatArray) -> FloatArray:
             moved = self._move(np.where(usable, image, 0.0))
-            return np.where(mask, moved / np.maximum(share, _MIN_SHARE), 0.0)
+            return np.where(mask, moved / np.maximum(share, _MIN_DATA_SHARE), 0.0)
 
         rotated = shot.map_planes(values, lambda bare: self._move(bare.astype(float)) > 0.5)
         return replace(rotated, mask=mask)
@@ -444,10 +444,10 @@ class Crop(Step):
             for part, side in zip((self.y, self.x), shape, strict=True)
         )
         height, width = rows.stop - rows.start, columns.stop - columns.start
-        if min(height, width) < _SMALLEST_SIDE:
+        if min(height, width) < _MIN_SIDE_PX:
             raise InputError(
                 f"the crop contains {max(width, 0)} × {max(height, 0)} pixels of the image, "
-                f"expected at least {_SMALLEST_SIDE} × {_SMALLEST_SIDE}: choose a larger rectangle"
+                f"expected at least {_MIN_SIDE_PX} × {_MIN_SIDE_PX}: choose a larger rectangle"
             )
         return rows, columns
 
