@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
 import json
 import os
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 import tifffile
 from typer.testing import CliRunner
+from zarr.core.buffer import default_buffer_prototype
 
 from napari_shadowinv import InversionOptions, Recipe, run_stack
 from napari_shadowinv.cli import app
@@ -88,6 +90,29 @@ def test_a_pipe_or_a_device_in_a_shot_damages_the_shot(store, where):
         opened = StackStore(store)
         assert opened.statuses().tolist() == [DONE, DAMAGED]
         assert "is a" in opened.reports()[1]["reason"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs pipes")
+def test_a_pipe_in_a_store_without_checksums_is_refused(unsealed):
+    (unsealed / "name" / "c" / "0").unlink()
+    os.mkfifo(unsealed / "name" / "c" / "0")
+    with pytest.raises(FileFormatError, match="is a pipe"):
+        StackStore(unsealed)
+
+
+def test_a_chunk_beyond_the_limit_of_memory_is_not_unpacked(unsealed, monkeypatch):
+    monkeypatch.setenv("SHADOWINV_MAX_GB", "5e-6")
+    with pytest.raises(FileFormatError, match="expands to"):
+        StackStore(unsealed)
+
+
+def test_parts_of_files_are_checked_too(store):
+    (store / "zarr.json").write_text((store / "zarr.json").read_text().replace("100", "101"))
+    parts = CheckedStore(store).get_partial_values(
+        default_buffer_prototype(), [("zarr.json", None)]
+    )
+    with pytest.raises(FileFormatError, match="does not match its checksum"):
+        asyncio.run(parts)
 
 
 def test_the_copy_of_an_arrays_metadata_is_enough(store):

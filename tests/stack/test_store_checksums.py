@@ -7,6 +7,7 @@ import os
 import shutil
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import google_crc32c
 import numpy as np
@@ -16,7 +17,9 @@ import zarr
 from helpers.command_line import flat, shadowinv
 from helpers.store_content import content
 from napari_shadowinv import FileFormatError, read
+from napari_shadowinv.io import store_checksums
 from napari_shadowinv.io.store import DAMAGED, DONE, FAILED, PENDING, StackStore
+from napari_shadowinv.io.store_checksums import Layout, find_damage, note_shot, reseal
 from napari_shadowinv.io.store_writing import ShotWriter
 
 
@@ -65,7 +68,8 @@ def test_untouched_store_has_no_damage(store):
 def test_deleted_chunk_makes_its_shot_damaged(store, name):
     field(store, 3, name).unlink()
     assert read(store).status.values.tolist() == [DONE] * 3 + [DAMAGED] + [DONE] * 2
-    with pytest.raises(FileFormatError, match=rf"shot 3 \(shot_3.npy\): its {name} is missing"):
+    problem = rf"shot 3 \(shot_3.npy\): its {name} is missing; .* to invert it again"
+    with pytest.raises(FileFormatError, match=problem):
         read(store)[name].load()
     assert np.isfinite(read(store)[name][:3].values.astype(float)).all()
 
@@ -122,6 +126,56 @@ def test_flipped_bit_of_the_last_file_is_found_by_verify(store):
     damage = StackStore(store, every_byte=True).damage
     assert list(damage.shots) == [5]
     assert any(problem.startswith("noise_error/c/0 is damaged") for problem in damage.files)
+
+
+@pytest.mark.parametrize("change", ["longer", "without empty entries"])
+def test_equivalent_description_of_an_array_is_no_damage(store, change):
+    file = store / "potential" / "zarr.json"
+    description = json.loads(file.read_text())
+    if change == "longer":  # as left by a process that was killed while the store grew
+        description["shape"][0] += 3
+    else:
+        filled = {k: v for k, v in description.items() if v not in (None, {}, [])}
+        description = {**filled, "must_understand": None}
+    file.write_text(json.dumps(description))
+    assert StackStore(store, every_byte=True).damage.files == ()
+
+
+def test_shot_that_is_being_written_is_looked_at_again(store, monkeypatch):
+    read_checksum, looks = store_checksums.stored_checksum, []
+
+    def late_checksum(file: Path) -> str | None:
+        if file == field(store, 2):
+            looks.append(file)
+        return None if len(looks) == 1 and file == field(store, 2) else read_checksum(file)
+
+    monkeypatch.setattr(store_checksums, "stored_checksum", late_checksum)
+    assert StackStore(store).damage.shots == {}
+    assert len(looks) == 2
+
+
+def test_report_of_several_texts_is_damage(store):
+    file = store / "report" / "c" / "2"
+    raw = struct.pack("<I", 2) + file.read_bytes()[4:-4]
+    file.write_bytes(raw + struct.pack("<I", google_crc32c.value(raw)))
+    problem = StackStore(store).damage.shots[2]
+    assert problem.startswith("its report is damaged (its header implies")
+
+
+def test_files_beyond_the_limit_of_memory_are_not_read(store, monkeypatch):
+    layout = Layout.of(store, json.loads((store / "zarr.json").read_text()))
+    monkeypatch.setenv("SHADOWINV_MAX_GB", "1e-7")
+    shots = find_damage(layout).shots
+    assert list(shots) == list(range(6))
+    assert all("expands to" in problem for problem in shots.values())
+
+
+def test_store_without_checksums_gets_none():
+    assert reseal({"attributes": {}}) == {"attributes": {}}
+    codec = SimpleNamespace(to_dict=lambda: {"name": "bytes"})
+    metadata = SimpleNamespace(dimension_names=("shot",), codecs=[codec])
+    array = SimpleNamespace(metadata=metadata, chunks=(1,))
+    assert note_shot(Path(), "id", {"potential": array}, 0, {"name": "a"}) == {}
 
 
 def test_swapped_chunks_damage_both_shots(store):
