@@ -416,6 +416,21 @@ def test_correlated_noise_is_the_scatter_of_repeats(blur):
     assert np.median(lengths) == pytest.approx(blur, rel=0.3)
 
 
+@pytest.mark.parametrize("blur", [0.7, 1.0])
+def test_the_typical_noise_is_that_of_a_pixel_where_it_is_correlated(blur):
+    noise = gaussian_filter(np.random.default_rng(3).normal(size=(160, 160)), blur, mode="wrap")
+    image = 1 + 0.05 * noise / noise.std()
+    typical = ImageNoise(prepare(image, None, InversionOptions()).in_units()).typical
+    assert typical == pytest.approx(0.05, rel=0.1)
+
+
+def test_stated_counts_are_those_before_a_blur():
+    noise = gaussian_filter(np.random.default_rng(3).normal(size=(160, 160)), 1.0, mode="wrap")
+    prepared = prepare(1 + 0.05 * noise / noise.std(), None, InversionOptions()).in_units()
+    assert ImageNoise(prepared).clumping > 5
+    assert ImageNoise(prepared, InversionOptions(units_per_quantum=0.01)).clumping == 1
+
+
 @pytest.mark.parametrize("blur", [4.0, 6.0])
 def test_noise_correlated_over_many_pixels_is_named(blur):
     clean = synthetic_image(phantoms.gaussian_blob((160, 160), 60.0, 16.0, (70, 84)).displacement)

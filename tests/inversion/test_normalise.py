@@ -74,3 +74,10 @@ def test_a_mask_over_much_of_the_image_is_reported(rows, said):
     warnings = prepare(np.ones((20, 30)), None, InversionOptions(), mask).warnings
     assert [caution.code for caution in warnings] == (["mask"] if said else [])
     assert all("excludes 25.0% of the pixels" in caution.text for caution in warnings)
+
+
+@pytest.mark.parametrize(("factor", "codes"), [(0.9, ["flux"]), (1.0, []), (1.1, ["flux"])])
+def test_another_flux_than_the_sources_is_named(factor, codes):
+    image = np.random.default_rng(0).uniform(0.9, 1.1, (24, 30))
+    prepared = prepare(factor * image / image.mean(), np.ones(image.shape), InversionOptions())
+    assert [caution.code for caution in prepared.warnings] == codes

@@ -430,6 +430,18 @@ def test_a_mask_at_the_peak_is_reported(at_peak):
     assert ("masked-peak" in codes_of(invert(image, mask=mask))) == at_peak
 
 
+def test_a_mask_beside_the_peak_is_reported():
+    y, x = np.indices((96, 96)) - 48.0
+    potential = 40 * np.exp(-(y**2) / (2 * 14.0**2) - x**2 / (2 * 6.0**2))
+    image = synthetic_image(-np.array(np.gradient(potential)))
+    mask = np.ones(image.shape, bool)
+    mask[40:57, 56:61] = mask[40:57, 36:41] = False
+    inversion = invert(image, mask=mask)
+    length = np.hypot(*inversion.displacement)
+    assert length[~mask].max() < length[mask].max()
+    assert "masked-peak" in codes_of(inversion)
+
+
 def test_the_headline_and_errors_leave_masked_pixels_out():
     blob = phantoms.gaussian_blob((96, 96), 60.0, 9.0)
     image = synthetic_image(blob.displacement)

@@ -189,6 +189,11 @@ def test_setup_warnings_go_by_the_longer_side(shape):
     assert "field of view of 1.5 cm is wider than the 1 cm" in caution.text
 
 
+def test_setup_warnings_doubt_a_large_pixel_once():
+    cautions = setup_warnings(setup_from_dict({**SCAN, "detector_pixel_size": 0.145}))
+    assert ["a pixel is" in caution.text for caution in cautions] == [True]
+
+
 def test_geometry_text_shows_field_of_view_and_magnification():
     paper = ProtonSetup.example()
     assert geometry_text(paper, (100, 200)).startswith("300 × 150 µm at the object, M = 16.4, ")

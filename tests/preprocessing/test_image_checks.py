@@ -129,6 +129,15 @@ def test_saturation_leaves_uniform_images_alone():
     assert saturated_share(np.ones(SHAPE)) == 0
 
 
+def test_saturated_pixels_under_a_mask_do_not_count(shot):
+    image = shot[0].copy()
+    image[:20] = 10 * image.max()
+    mask = np.ones(SHAPE, bool)
+    mask[:20] = False
+    assert saturated_share(image) == 20 / SHAPE[0]
+    assert saturated_share(image, mask) == 0
+
+
 def test_stray_pixels_are_those_put_in(shot):
     image = shot[0].copy()
     rows, columns = np.array([[20, 21], [70, 5], [140, 150], [10, 120]]).T
@@ -187,6 +196,17 @@ def test_negative_and_swapped_are_named(shot, faint):
     assert named(shot[1], shot[0])[-1:] == ["swapped"]
 
 
+def test_an_object_that_is_dark_where_its_beam_is_bright_is_no_negative():
+    y, x = np.indices(SHAPE) - 80.0
+    smooth = np.exp(-(y**2 + x**2) / (2 * 60.0**2))
+    shadow = 1 - 0.95 * np.exp(-(y**2 + x**2) / (2 * 55.0**2))
+    image, source = (
+        np.random.default_rng(2).poisson(COUNTS * v) for v in (smooth * shadow, smooth)
+    )
+    assert np.corrcoef(image.ravel(), source.ravel())[0, 1] < -0.4
+    assert not ReferencePair(image, source, np.ones(SHAPE, bool)).is_negative
+
+
 def test_invert_reports_the_cautions_of_the_checks(shot):
     image, source = (plane[30:130, 30:130] for plane in shot)
     dark = 0.5 * image.mean()
@@ -240,6 +260,13 @@ def test_dark_is_a_number_or_a_file_in_every_notation():
 def test_dark_says_why_it_cannot_be_subtracted(level, message):
     with pytest.raises(InputError, match=message):
         Dark(level=level).apply(Radiograph(np.full((8, 8), 400.0)))
+
+
+def test_dark_is_compared_with_usable_pixels_only():
+    image, mask = np.full((8, 8), 400.0), np.ones((8, 8), bool)
+    image[0], mask[0] = 1e5, False
+    with pytest.raises(InputError, match="not below the image's mean of 400"):
+        Dark(level=500.0).apply(Radiograph(image, mask=mask))
 
 
 def test_dark_frame_of_another_size_is_refused(tmp_path):
