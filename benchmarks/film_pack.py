@@ -40,8 +40,9 @@ from napari_shadowinv import FitOptions, Recipe
 from napari_shadowinv.film import move_corners, straighten_film, write_corners
 from napari_shadowinv.film.scans import upright
 from napari_shadowinv.film_doses import FilmDoses
+from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.options import FitChoices
-from napari_shadowinv.pipeline import FitShot, read_pack, run_film, run_fit
+from napari_shadowinv.pipeline import read_pack, run_film, run_fit
 from napari_shadowinv.preprocessing import Bin
 from simulated_pack import Truth, simulate
 

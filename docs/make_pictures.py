@@ -17,9 +17,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from napari_shadowinv import InversionOptions, fit, invert, poisson_invert, read, synthetic_image
+from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
-from napari_shadowinv.pipeline import FitShot, run_windows
+from napari_shadowinv.pipeline import run_windows
 from napari_shadowinv.plotting import (
     comparison_figure,
     fit_figure,

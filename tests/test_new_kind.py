@@ -23,11 +23,12 @@ from napari_shadowinv import (
     stack_statistics,
 )
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.io import read, read_radiograph, write
 from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.pipeline import FitShot, read_recipe, run_fit, write_recipe
+from napari_shadowinv.pipeline import read_recipe, run_fit, write_recipe
 from napari_shadowinv.pipeline.files import setup_from
 from napari_shadowinv.pipeline.fit_run import compared_fields, refinement_choices, run_refinement
 from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table

@@ -40,7 +40,7 @@ TASKS: dict[str, tuple[str, ...]] = {
     "Repeat a result from its provenance": ("rerun", "Rerun"),
     "Describe the experiment, for SI units": ("ProtonSetup", "OpticalSetup"),
     "Estimate the error of a field": ("uncertainty", "Uncertainty"),
-    "Fit one or several images, also where rays cross": ("fit", "FitOptions", "Fit"),
+    "Fit one or several images, also where rays cross": ("fit", "FitShot", "FitOptions", "Fit"),
     "Invert many shots": (
         "run_stack",
         "RunOptions",

@@ -3,8 +3,8 @@
 - invert an image: `invert`, with `InversionOptions`; the answer is an `Inversion`
 - share sites between shots with one source: `plan_sites`
 - how far the image's noise moves its field: `uncertainty`
-- several images of one object, folds, an unknown beam: `fit`, with `FitOptions`; the answer is
-  a `Fit` with a verdict
+- several images of one object, folds, an unknown beam: `fit`, with `FitOptions`, of `FitShot`;
+  the answer is a `Fit` with a verdict
 - deflections in SI units: `ProtonSetup`, `OpticalSetup`
 - many shots, with dask: `invert_stack`, `run_stack`, `stack_statistics`; as they arrive in a
   folder: `watch_stack`

@@ -2,7 +2,7 @@ from ._napari.layers import add_inversion
 from ._system.progress import Progress
 from .cautions import Caution
 from .errors import FileFormatError, InputError, InversionCancelled
-from .fitting import Fit, FitOptions, fit
+from .fitting import Fit, FitOptions, FitShot, fit
 from .inversion import Inversion, Report, invert, plan_sites
 from .inversion.error_bars import Uncertainty, uncertainty
 from .io import Radiograph, read, write
@@ -24,6 +24,7 @@ __all__ = [
     "FileFormatError",
     "Fit",
     "FitOptions",
+    "FitShot",
     "InputError",
     "Inversion",
     "InversionCancelled",

@@ -15,6 +15,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from helpers.command_line import content, flat, interrupted, shadowinv
+from helpers.fit_images import of_each
 from napari_shadowinv.cli._flags import fit_recipe_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitOptions, LeaveOneOut, Verdict, point_spread
@@ -177,17 +178,15 @@ def test_images_setups_and_choices_reach_the_fit(fit_arguments: dict[str, Any]) 
         "--align", "shift", "--seed", 3,
     )  # fmt: skip
     assert result.exit_code == 0, result.output
-    np.testing.assert_array_equal(fit_arguments["images"][1], tifffile.imread("b.tif"))
-    assert fit_arguments["setups"] == (FIRST, SECOND)
-    assert "strengths" not in fit_arguments
+    images = fit_arguments["images"]
+    np.testing.assert_array_equal(images[1].image, tifffile.imread("b.tif"))
+    assert of_each(images, "setup") == [FIRST, SECOND]
+    assert of_each(images, "strength") == of_each(images, "mask") == [None, None]
     assert fit_arguments["fields"] == ("B", "E")
-    assert (fit_arguments["noise"], fit_arguments["psf"], fit_arguments["brightness"]) == (
-        "poisson",
-        [1.5, 1.5],
-        "free",
-    )
+    assert (fit_arguments["noise"], fit_arguments["brightness"]) == ("poisson", "free")
+    assert of_each(images, "psf") == [1.5, 1.5]
     assert fit_arguments["options"] == FitOptions(align="shift", seed=3)
-    assert not {"source", "mask", "fiducials"} & fit_arguments.keys()
+    assert of_each(images, "source") == of_each(images, "fiducials") == [None, None]
 
 
 def test_a_table_describes_each_image(folder: Path, fit_arguments: dict[str, Any]) -> None:
@@ -208,13 +207,15 @@ def test_a_table_describes_each_image(folder: Path, fit_arguments: dict[str, Any
     )
     result = shadowinv("fit", "night/shots.csv", "--psf", 2, "--noise", 30)
     assert result.exit_code == 0, result.output
-    assert fit_arguments["setups"] == (FIRST, SECOND)
+    images = fit_arguments["images"]
+    assert of_each(images, "setup") == [FIRST, SECOND]
     # Flags hold where a cell is empty.
-    assert fit_arguments["psf"] == [2.0, 0.5]
-    assert fit_arguments["noise"] == (20.0, 30.0)
-    assert fit_arguments["brightness"] == (1.0, 1.2)
-    np.testing.assert_array_equal(fit_arguments["source"], np.full((2, *SHAPE), 900))
-    np.testing.assert_array_equal(fit_arguments["mask"], [mask > 0, np.ones(SHAPE, bool)])
+    assert of_each(images, "psf") == [2.0, 0.5]
+    assert (of_each(images, "noise"), fit_arguments["noise"]) == ([20.0, None], 30.0)
+    assert of_each(images, "brightness") == [1.0, 1.2]
+    np.testing.assert_array_equal(of_each(images, "source"), np.full((2, *SHAPE), 900))
+    np.testing.assert_array_equal(images[0].mask, mask > 0)
+    assert images[1].mask is None
     provenance = provenance_in("a_fit.shadowinv")
     assert [image.file for image in provenance.images] == ["a.tif", "b.tif"]
     assert provenance.images[1].sha256 == sha256(night / "b.tif")
@@ -231,7 +232,7 @@ def test_a_table_of_numbers_is_an_image(fit_arguments: dict[str, Any]) -> None:
     image = np.random.default_rng(1).uniform(1, 2, SHAPE)
     np.savetxt("numbers.csv", image, delimiter=",", fmt="%.17g")
     assert shadowinv("fit", "numbers.csv").exit_code == 0
-    np.testing.assert_array_equal(fit_arguments["images"], image[None])
+    np.testing.assert_array_equal(of_each(fit_arguments["images"], "image"), image[None])
 
 
 def test_binning_sums_pixels_and_enlarges_the_pixel_size(
@@ -242,19 +243,19 @@ def test_binning_sums_pixels_and_enlarges_the_pixel_size(
     result = shadowinv(*PAIR, "--bin", 2, "--source", "beam.tif", *sizes)
     assert result.exit_code == 0, result.output
     blocks = tifffile.imread("a.tif").astype(float).reshape(24, 2, 28, 2).sum(axis=(1, 3))
-    np.testing.assert_allclose(fit_arguments["images"][0], blocks)
-    np.testing.assert_array_equal(fit_arguments["source"], np.full((2, 24, 28), 40))
+    np.testing.assert_allclose(fit_arguments["images"][0].image, blocks)
+    beams = of_each(fit_arguments["images"], "source")
+    np.testing.assert_array_equal(beams, np.full((2, 24, 28), 40))
     first = FIRST.model_copy(update={"pixel_size": 2e-5})
-    assert fit_arguments["setups"][0] == first
-    assert fit_arguments["psf"][0] == pytest.approx(point_spread(first, 1e-5, 4e-4))
+    assert fit_arguments["images"][0].setup == first
+    assert fit_arguments["images"][0].psf == pytest.approx(point_spread(first, 1e-5, 4e-4))
 
 
 def test_strengths_replace_energies_and_keep_units(
     fit_arguments: dict[str, Any],
 ) -> None:
     assert shadowinv(*PAIR, "--strengths", "1 1,1.7 2.9", "--fields", "B,E").exit_code == 0
-    assert fit_arguments["strengths"] == ((1.0, 1.0), (1.7, 2.9))
-    assert "setups" not in fit_arguments
+    assert of_each(fit_arguments["images"], "strength") == [(1.0, 1.0), (1.7, 2.9)]
     assert fit_in("a_fit.shadowinv")[0].setups == (FIRST, SECOND)
 
 
@@ -262,7 +263,7 @@ def test_known_displacements_come_from_a_table(fit_arguments: dict[str, Any]) ->
     Path("mesh.csv").write_text("x;y;dx;dy;sigma\n20;10;0.5;-0.25;0.1\n30;12;0.4;0;0.2\n")
     assert shadowinv("fit", "a.tif", "--fiducials", "mesh.csv").exit_code == 0
     rows = ((10, 20, -0.25, 0.5, 0.1), (12, 30, 0, 0.4, 0.2))
-    np.testing.assert_array_equal(fit_arguments["fiducials"], rows)
+    np.testing.assert_array_equal(fit_arguments["images"][0].fiducials, rows)
     provenance = provenance_in("a_fit.shadowinv")
     assert provenance.fiducials == Origin(file="mesh.csv", sha256=sha256("mesh.csv"))
     assert provenance.fiducial_rows == rows
@@ -505,8 +506,10 @@ def test_a_saved_recipe_gives_the_same_fit(fit_arguments: dict[str, Any]) -> Non
     )
     assert shadowinv(*PAIR, "--recipe", "r.toml", "--overwrite").exit_code == 0
     assert before.keys() == fit_arguments.keys()
-    for name in before.keys() - {"on_progress", "should_stop"}:
-        np.testing.assert_equal(fit_arguments[name], before[name], err_msg=name)
+    for name in before.keys() - {"images", "on_progress", "should_stop"}:
+        assert fit_arguments[name] == before[name]
+    for new, old in zip(fit_arguments["images"], before["images"], strict=True):
+        np.testing.assert_equal(vars(new), vars(old))
 
     # Flags override the recipe.
     overrides = (
@@ -523,9 +526,9 @@ def test_a_saved_recipe_gives_the_same_fit(fit_arguments: dict[str, Any]) -> Non
     )
     changed = shadowinv(*PAIR, "--recipe", "r.toml", *overrides, "--overwrite")
     assert changed.exit_code == 0, changed.output
-    assert fit_arguments["psf"] == [0.5, 0.5]
+    assert of_each(fit_arguments["images"], "psf") == [0.5, 0.5]
     assert fit_arguments["options"] == FitOptions(samples=3)
-    assert fit_arguments["source"].shape == (2, SHAPE[0] // 4, SHAPE[1] // 4)
+    assert fit_arguments["images"][1].source.shape == (SHAPE[0] // 4, SHAPE[1] // 4)
     assert (fit_arguments["brightness"], fit_arguments["fields"]) == ("free", ("B", "E"))
 
 
@@ -534,7 +537,7 @@ def test_the_setup_of_one_image_is_in_its_recipe(fit_arguments: dict[str, Any]) 
     assert shadowinv(*alone, "--save-recipe", "r.toml").exit_code == 0
     assert read_recipe(Path("r.toml")).setup == FIRST
     assert shadowinv("fit", "b.tif", "--recipe", "r.toml", "--energies", 5).exit_code == 0
-    assert fit_arguments["setups"] == (SECOND,)
+    assert of_each(fit_arguments["images"], "setup") == [SECOND]
     assert shadowinv(*PAIR, "--save-recipe", "both.toml", "--overwrite").exit_code == 0
     assert read_recipe(Path("both.toml")).setup is None
 
@@ -543,7 +546,7 @@ def test_the_source_can_be_estimated_by_the_recipe(fit_arguments: dict[str, Any]
     Path("r.toml").write_text('[source]\nmethod = "polynomial"\ndegree = 1\n')
     assert shadowinv("fit", "a.tif", "--recipe", "r.toml").exit_code == 0
     expected = polynomial_source(tifffile.imread("a.tif").astype(float), degree=1)
-    np.testing.assert_array_equal(fit_arguments["source"], expected[None])
+    np.testing.assert_array_equal(fit_arguments["images"][0].source, expected)
 
 
 RECIPES = {
@@ -571,8 +574,8 @@ def test_the_recipe_on_the_page_works(fit_arguments: dict[str, Any]) -> None:
     assert result.exit_code == 0, result.output
     assert (fit_arguments["noise"], fit_arguments["brightness"]) == ("poisson", "free")
     assert fit_arguments["options"] == FitOptions(samples=10)
-    assert fit_arguments["images"].shape == (2, 24, 28)
-    assert fit_arguments["psf"][0] > 0
+    assert fit_arguments["images"][1].image.shape == (24, 28)
+    assert fit_arguments["images"][0].psf > 0
     keys = tomllib.loads(text)["fit"].keys()
     assert set(FitChoices.model_fields) - keys == {"psf"}
 

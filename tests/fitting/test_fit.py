@@ -10,7 +10,7 @@ import pytest
 from helpers.fit_images import Displacement, bump, counted, distance, noisy, on_pixels, together
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, FitOptions, compare, fit
+from napari_shadowinv.fitting import Fit, FitOptions, FitShot, compare, fit
 from napari_shadowinv.fitting.measurements import strengths_of
 from napari_shadowinv.fitting.verdict import Verdict
 from napari_shadowinv.physics.setup import ProtonSetup
@@ -171,11 +171,11 @@ def test_a_start_at_the_truth_is_taken() -> None:
     image = noisy([counted(WEAK, SIZE)], 0.02)
     y, x = np.indices(SIZE) - np.array([22, 29])[:, None, None]
     truth = 0.4 * 8**2 * np.exp(-(y**2 + x**2) / 2 / 8**2)
-    result = fit(image, noise=0.02, start=truth, options=PLAIN)
+    result = fit(FitShot(image[0], start=truth), noise=0.02, options=PLAIN)
     assert distance(result.fields[0].displacement, on_pixels(WEAK, SIZE)) < 0.04
     for wrong in (truth[1:], np.full(SIZE, np.nan)):
         with pytest.raises(InputError, match="start has shape"):
-            fit(image, noise=0.02, start=wrong, options=PLAIN)
+            fit(FitShot(image[0], start=wrong), noise=0.02, options=PLAIN)
 
 
 def test_a_fit_that_runs_out_of_steps_says_so() -> None:

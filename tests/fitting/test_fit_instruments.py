@@ -11,7 +11,7 @@ from helpers.fit_images import bump, counted, distance, noisy, on_pixels, togeth
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InversionCancelled
-from napari_shadowinv.fitting import Fit, FitOptions, fit
+from napari_shadowinv.fitting import Fit, FitOptions, FitShot, fit
 from napari_shadowinv.fitting.verdict import Verdict
 
 SIZE = (48, 56)
@@ -219,7 +219,7 @@ def test_fiducials_hold_the_field_where_noise_does_not() -> None:
     displaced = truth[:, *places] + np.random.default_rng(6).normal(0, 0.03, (2, 25))
     fiducials = np.column_stack([*places, *displaced, np.full(25, 0.03)])
     fields = [
-        fitted(image, strengths=None, noise=0.3, fiducials=table).fields[0].displacement
+        fitted(FitShot(image[0], fiducials=table), strengths=None, noise=0.3).fields[0].displacement
         for table in (None, fiducials)
     ]
     missed = [np.sqrt(((field[:, *places] - displaced) ** 2).mean()) for field in fields]

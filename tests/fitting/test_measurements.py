@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.measurements import (
     FitData,
+    FitShot,
     collect_data,
     estimated_noise,
     point_spread,
@@ -19,6 +22,7 @@ from napari_shadowinv.fitting.measurements import (
 )
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+from napari_shadowinv.preprocessing import Radiograph
 
 SIZE = (40, 51)
 
@@ -32,18 +36,14 @@ def given(**changes: Any) -> FitData:
     usual: dict[str, Any] = {
         "images": images(),
         "strengths": [1, 0.6],
-        "setups": None,
-        "fields": ("B",),
-        "source": None,
         "noise": 0.1,
-        "psf": 0.0,
-        "mask": None,
-        "brightness": "known",
-        "fiducials": None,
         "options": FitOptions(),
     }
     usual |= changes
-    return collect_data(usual.pop("images"), **usual)
+    planes = usual.pop("images")
+    if "fiducials" in usual:
+        planes = [FitShot(planes[0], fiducials=usual.pop("fiducials")), *planes[1:]]
+    return collect_data(planes, **usual)
 
 
 def protons(energy: float, **changes: Any) -> ProtonSetup:
@@ -376,3 +376,85 @@ def test_noise_that_nobody_tells_is_estimated() -> None:
     data = given(images=stack, noise=None)
     noise = data.units[:, None] / np.sqrt(data.scene.weights[:, 0, :5])
     np.testing.assert_allclose(noise / np.array([[0.1], [0.3]]), 1, atol=0.05)
+
+
+def test_what_is_known_of_an_image_precedes_what_is_known_of_all() -> None:
+    first, second = images()
+    beam, mask = np.full(SIZE, 5.0), np.ones(SIZE, bool)
+    mask[3:6, 4:9] = False
+    shots = [
+        FitShot(first, strength=(1.0,), source=beam, brightness=1.0, mask=mask),
+        FitShot(second, strength=(0.6,), source=beam, brightness=2.0, psf=0.5, noise=0.3),
+    ]
+    data = collect_data(shots, noise=0.1, psf=0.2, options=FitOptions())
+    masks = [mask, np.ones(SIZE, bool)]
+    same = {"source": beam, "brightness": [1, 2], "mask": masks, "psf": [0.2, 0.5]}
+    expected = given(noise=[0.1, 0.3], **same).scene
+    for name in ("images", "weights", "beams", "strengths"):
+        np.testing.assert_array_equal(getattr(data.scene, name), getattr(expected, name))
+    assert data.scene.psf == expected.psf == [0.2, 0.5]
+    np.testing.assert_array_equal(data.brightness, [1, 2])
+    assert data.names is None
+
+
+def test_radiographs_have_setup_source_and_mask_and_a_dict_names() -> None:
+    setups = protons(14.7), protons(6)
+    beam, mask = np.full(SIZE, 5.0), np.eye(*SIZE) == 0
+    shots = [
+        Radiograph(image, setup, source=beam, mask=mask)
+        for image, setup in zip(images(), setups, strict=True)
+    ]
+    data = collect_data({"fast": shots[0], "slow": FitShot(shots[1])}, options=FitOptions())
+    assert data.names == ("fast", "slow")
+    assert data.setups == setups
+    np.testing.assert_array_equal(data.scene.weights[1, : SIZE[0], : SIZE[1]] > 0, mask)
+    plain = dict(zip("ab", images(), strict=True))
+    with pytest.raises(InputError, match="a and b are the same"):
+        collect_data({"a": plain["a"], "b": plain["a"]}, strengths=[1, 0.6], options=FitOptions())
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "message"),
+    [
+        ({"source": "unknown"}, {"source": np.ones(SIZE)}, "image 2 has no unknown source, other"),
+        ({"noise": 0.1}, {"noise": "poisson"}, "noise is 'poisson' in some images and a number in"),
+        (
+            {"brightness": 2},
+            {},
+            "image 2 has no brightness, other images have: expected it for all",
+        ),
+        ({}, {"fiducials": [[5, 5, 0, 0, 1]]}, "received fiducials of a later image"),
+        ({}, {"start": np.zeros(SIZE)}, "received start of a later image"),
+        ({"strength": (1,)}, {"strength": (1, 0.5)}, "strengths have 1, 2 numbers: expected one"),
+    ],
+)
+def test_images_that_are_known_differently_are_refused(
+    first: dict[str, Any], second: dict[str, Any], message: str
+) -> None:
+    keywords = {} if "strength" in first else {"strengths": [1, 0.6]}
+    shots = [
+        FitShot(image, **known) for image, known in zip(images(), (first, second), strict=True)
+    ]
+    with pytest.raises(InputError, match=re.escape(message)):
+        collect_data(shots, options=FitOptions(), **keywords)
+
+
+@pytest.mark.parametrize(
+    ("known", "keywords", "message"),
+    [
+        ({"brightness": 1.0}, {"brightness": "free"}, "of each image and brightness='free'"),
+        ({"strength": (1.0,)}, {"strengths": [1]}, "of each image and strengths: expected one of"),
+    ],
+)
+def test_what_is_known_of_each_and_of_all_is_refused(
+    known: dict[str, Any], keywords: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        collect_data(FitShot(images()[0], **known), options=FitOptions(), **keywords)
+
+
+def test_a_file_is_not_read() -> None:
+    with pytest.raises(
+        InputError, match=r"received the file a\.tif: read it first, or use run_fit"
+    ):
+        collect_data([FitShot(Path("a.tif"))], options=FitOptions())

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting import FitShot
 
-__all__ = ["Displacement", "bump", "counted", "distance", "noisy", "on_pixels", "together"]
+__all__ = [
+    "Displacement",
+    "bump",
+    "counted",
+    "distance",
+    "noisy",
+    "of_each",
+    "on_pixels",
+    "together",
+]
 
 _PARTS = 4  # of a pixel, each way, in which light is spread
 
@@ -89,3 +100,8 @@ def noisy(images: FloatArray | list[FloatArray], sigma: float, seed: int = 7) ->
 def distance(found: FloatArray, truth: FloatArray) -> float:
     """How far one displacement is from another, as a share of that."""
     return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
+
+
+def of_each(shots: Sequence[FitShot], attribute: str) -> list[Any]:
+    """What is known of each image."""
+    return [getattr(shot, attribute) for shot in shots]

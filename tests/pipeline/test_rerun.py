@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +15,13 @@ import tifffile
 from napari_shadowinv import FitOptions, InputError, InversionOptions, ProtonSetup, rerun, run_stack
 from napari_shadowinv.errors import FileFormatError, InversionCancelled
 from napari_shadowinv.film_doses import FilmDoses
+from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.io import read_dataset, write
 from napari_shadowinv.io.store import read_stack
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import (
-    FitShot,
     read_pack,
     run,
     run_film,
@@ -91,10 +91,9 @@ def inversion(folder: Path) -> Example:
 
 def fit(folder: Path) -> Example:
     paths = record(folder)[:2]
-    fiducials = [[5.0, 6.0, 0.1, 0.2, 0.5]]
-    return Example(
-        write(Path("a.shadowinv"), run_fit(FIT, fit_shots(paths), fiducials=fiducials)), paths[1]
-    )
+    first, *others = fit_shots(paths)
+    shots = [replace(first, fiducials=[[5.0, 6.0, 0.1, 0.2, 0.5]]), *others]
+    return Example(write(Path("a.shadowinv"), run_fit(FIT, shots)), paths[1])
 
 
 def refinement(folder: Path) -> Example:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
 
+from helpers.fit_images import of_each
 from napari_shadowinv import Fit, InputError, ProtonSetup, fit
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.io import read, write
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.pipeline import FitShot, read_recipe, run_fit, write_recipe
+from napari_shadowinv.pipeline import read_recipe, run_fit, write_recipe
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.preprocessing import (
     Bin,
@@ -94,7 +97,8 @@ def test_provenance_is_complete_and_survives_its_file(
         FitShot(paths[1], SETUPS[1], mask=mask, noise="poisson", brightness=1.5, psf=0.5),
     ]
     recipe = Recipe(steps=(Crop(y=(0, 40), x=(0, 48)),), fit=FitChoices(options=HASTY))
-    result = run_fit(recipe, shots, fiducials=[[5, 6, 0.1, 0.2, 0.5]])
+    shots[0] = replace(shots[0], fiducials=[[5, 6, 0.1, 0.2, 0.5]])
+    result = run_fit(recipe, shots)
     write(tmp_path / "fit.shadowinv", result)
     again = Fit.from_dataset(read(tmp_path / "fit.shadowinv"))  # type: ignore[arg-type]
     provenance = again.provenance
@@ -120,20 +124,21 @@ def test_provenance_too_large_for_an_attribute_is_omitted() -> None:
         for k in (1.0, 2.0, 3.0)
     ]
     rows = np.column_stack([rng.uniform(0, 390, (900, 2)), np.zeros((900, 2)), np.ones(900)])
-    inputs = collect_fit_inputs(Recipe(), shots, fiducials=rows)
+    shots[0] = replace(shots[0], fiducials=rows)
+    inputs = collect_fit_inputs(Recipe(), shots)
     provenance = inputs.provenance
     assert [mask.pixels is None for mask in provenance.masks] == [False, False, True]
     assert provenance.fiducial_rows is None
     assert provenance.fiducials == Origin()
     assert len(provenance.to_json()) < 60_000
-    np.testing.assert_array_equal(inputs.keywords["mask"], [shot.mask for shot in shots])
+    np.testing.assert_array_equal(of_each(inputs.images, "mask"), [shot.mask for shot in shots])
 
 
 def test_a_source_is_estimated_from_each_image_after_the_steps(images: list[FloatArray]) -> None:
     recipe = Recipe(steps=STEPS, source=LowPassEstimate(width=20))
     inputs = collect_fit_inputs(recipe, [FitShot(image, strength=(1.0,)) for image in images])
     expected = [low_pass_source(binned(image), width=20) for image in images]
-    np.testing.assert_allclose(inputs.keywords["source"], expected)
+    np.testing.assert_allclose(of_each(inputs.images, "source"), expected)
     assert inputs.provenance.recipe.source == LowPassEstimate(width=20)
 
 

@@ -9,12 +9,12 @@ import pytest
 
 from napari_shadowinv import FitOptions, InputError, ProtonSetup, fit
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting import Fit, FitWindows, Verdict
+from napari_shadowinv.fitting import Fit, FitShot, FitWindows, Verdict
 from napari_shadowinv.io import read, write
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.pipeline import FitShot, run_leave_one_out, run_windows
+from napari_shadowinv.pipeline import run_leave_one_out, run_windows
 from napari_shadowinv.preprocessing import Recipe
 
 SHAPE = (56, 64)

@@ -16,12 +16,13 @@ import xarray as xr
 from helpers.command_line import flat, shadowinv
 from helpers.store_content import content
 from napari_shadowinv import InputError, Recipe, RunOptions, run_stack, synthetic_image
+from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.io import read
 from napari_shadowinv.io.store import StackStore
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import ProtonSetup
-from napari_shadowinv.pipeline import FitShot, run_fit, write_recipe
+from napari_shadowinv.pipeline import run_fit, write_recipe
 from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import invert_stack
 

@@ -27,9 +27,9 @@ from napari_shadowinv import (
     uncertainty,
 )
 from napari_shadowinv._system.arrays import coordinate_spacing, order_by_value
+from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.fitting.measurements import collect_data
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.pipeline import FitShot
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.preprocessing.estimates import uniform_source
 
@@ -78,9 +78,7 @@ INVERT: dict[str, Callable[..., Any]] = {
 
 def _measured(images: Any, mask: Any = None, **keywords: Any) -> np.ndarray[Any, Any]:
     """Images and weights that a fit sees."""
-    inputs = {"strengths": None, "setups": None, "source": None, "noise": None, "psf": 0.0}
-    inputs |= {"brightness": "known", "fiducials": None, "fields": ("B",), "options": FitOptions()}
-    scene = collect_data(images, mask=mask, **(inputs | keywords)).scene
+    scene = collect_data(images, mask=mask, **{"options": FitOptions()} | keywords).scene
     return np.stack([scene.images, scene.weights])
 
 

@@ -28,10 +28,10 @@ from napari_shadowinv._napari.layers import FullLayerData, result_layers
 from napari_shadowinv._napari.shots import load_radiograph
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, FitOptions
+from napari_shadowinv.fitting import Fit, FitOptions, FitShot
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import FitChoices
-from napari_shadowinv.pipeline import Cache, FitShot, run_fit, run_refinement
+from napari_shadowinv.pipeline import Cache, run_fit, run_refinement
 from napari_shadowinv.pipeline.fit_run import refinement_choices
 from napari_shadowinv.pipeline.inversion_run import run
 from napari_shadowinv.preprocessing import Radiograph, Recipe
@@ -331,9 +331,7 @@ class FitJob(ImageJob):
         """Load the images, apply the recipe's steps, and fit."""
         names = [f"'{name}'" for name in self.names]
         shots = [_load(shot, name) for shot, name in zip(self.shots, names, strict=True)]
-        return run_fit(
-            self.recipe, shots, names=names, on_progress=on_progress, should_stop=should_stop
-        )
+        return run_fit(self.recipe, shots, on_progress=on_progress, should_stop=should_stop)
 
 
 def _load(shot: FitShot, name: str) -> FitShot:
@@ -342,7 +340,7 @@ def _load(shot: FitShot, name: str) -> FitShot:
         image = load_radiograph(image, name)
     if isinstance(source, Radiograph):
         source = load_radiograph(source, f"the source of {name}")
-    return replace(shot, image=image, source=source)
+    return replace(shot, image=image, source=source, name=name)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -142,19 +143,19 @@ def fit(
     )
     _inputs.protect_files_of(chosen, list(outputs))
     shots = read_row_images(rows, chosen, channel=channel, variable=variable)
+    shots = (replace(shots[0], fiducials=fiducials), *shots[1:])
     _inputs.check_setup(result, shots[0].setup, chosen.fit.fields if chosen.fit else None)
     warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)
     names = [str(row.file) for row in rows]
     short = _static_result.short_names(names)
     if compare:
-        result_fit = _fit_result.compare_fields(
-            chosen, shots, fiducials, quiet, written=flags.get("fields")
-        )
+        result_fit = _fit_result.compare_fields(chosen, shots, quiet, written=flags.get("fields"))
     else:
-        result_fit = _fit_result.fit_images(chosen, shots, fiducials, quiet)
+        result_fit = _fit_result.fit_images(chosen, shots, quiet)
     with nullcontext() if quiet else progress_bars() as show:
         callbacks: dict[str, Any] = {"on_progress": show, "should_stop": is_interrupted}
-        static = run_checks(chosen, shots, result_fit, names=short, **checks, **callbacks)
+        named = [replace(shot, name=name) for shot, name in zip(shots, short, strict=True)]
+        static = run_checks(chosen, named, result_fit, **checks, **callbacks)
     _inputs.write_result(result_fit, names, result, figure, overwrite, static)
     if save_recipe is not None:
         setups = {shot.setup for shot in shots}

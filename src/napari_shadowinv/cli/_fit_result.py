@@ -30,29 +30,22 @@ if TYPE_CHECKING:
     import xarray
     from rich.table import Table
 
-    from napari_shadowinv._typing import FloatArray
-    from napari_shadowinv.fitting import Fit
-    from napari_shadowinv.pipeline import FitShot
+    from napari_shadowinv.fitting import Fit, FitShot
     from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.provenance import Provenance
 
 
-def fit_images(
-    recipe: Recipe, shots: Sequence[FitShot], fiducials: FloatArray | Path | None, quiet: bool
-) -> Fit:
+def fit_images(recipe: Recipe, shots: Sequence[FitShot], quiet: bool) -> Fit:
     """Fit fields to images, with a bar for each stage."""
     from napari_shadowinv.pipeline import run_fit
 
     with nullcontext() if quiet else progress_bars() as show:
-        return run_fit(
-            recipe, shots, fiducials=fiducials, on_progress=show, should_stop=is_interrupted
-        )
+        return run_fit(recipe, shots, on_progress=show, should_stop=is_interrupted)
 
 
 def compare_fields(
     recipe: Recipe,
     shots: Sequence[FitShot],
-    fiducials: Path | None,
     quiet: bool,
     *,
     written: str | None,
@@ -71,9 +64,7 @@ def compare_fields(
             "these, or leave out --fields to write the likeliest"
         )
     with nullcontext() if quiet else progress_bars() as show:
-        fits = run_comparison(
-            recipe, shots, fiducials=fiducials, on_progress=show, should_stop=is_interrupted
-        )
+        fits = run_comparison(recipe, shots, on_progress=show, should_stop=is_interrupted)
     if not quiet:
         say(comparison_table(fits))
     if written is None:

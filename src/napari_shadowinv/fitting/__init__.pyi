@@ -1,6 +1,6 @@
 from ._fit import compare, fit
 from ._leave_one_out import leave_one_out
-from .measurements import FitOptions, point_spread
+from .measurements import FitOptions, FitShot, point_spread
 from .result import Basin, Fit, FitReport, FittedField
 from .verdict import Verdict
 from .windows import FitWindows, LeaveOneOut
@@ -10,6 +10,7 @@ __all__ = [
     "Fit",
     "FitOptions",
     "FitReport",
+    "FitShot",
     "FitWindows",
     "FittedField",
     "LeaveOneOut",

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
-from napari_shadowinv._system.arrays import SQUARE_PIXELS, as_numbers, plain_array
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import FloatArray
@@ -20,7 +19,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.measurements import FitData, collect_data
+from napari_shadowinv.fitting.measurements import FitData, Images, collect_data, list_shots
 from napari_shadowinv.fitting.pattern import (
     Pattern,
     find_pattern,
@@ -73,7 +72,7 @@ _SPACING_OF_SAMPLES = 1 / 3  # px
 
 
 def fit(
-    images: ArrayLike,
+    images: Images,
     *,
     strengths: ArrayLike | None = None,
     setups: Sequence[Setup] | None = None,
@@ -83,10 +82,7 @@ def fit(
     psf: Any = 0.0,
     mask: ArrayLike | None = None,
     brightness: ArrayLike | Literal["known", "free"] = "known",
-    fiducials: ArrayLike | None = None,
     options: FitOptions | None = None,
-    start: ArrayLike | None = None,
-    names: Sequence[str] | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Fit:
@@ -98,8 +94,11 @@ def fit(
 
     Parameters
     ----------
-    images : array_like, shape (L, H, W) or (H, W)
-        Images on one grid of pixels in the object plane.
+    images : array_like of shape (L, H, W) or (H, W), mapping, or sequence of FitShot
+        Images on one grid of pixels in the object plane: an array, a list of them, or a dict
+        whose keys name the images in messages. A `FitShot` is an image with all that is known of
+        it, such as its own noise, its name, fiducials, or a field to start from; a `Radiograph`
+        has its setup, source and mask.
     strengths : array_like, shape (L,) or (L, M), optional
         Displacement of each image by each field, relative to the first image.
     setups : sequence of Setup, optional
@@ -122,14 +121,8 @@ def fit(
         The pixels to use. Default: all.
     brightness : "known", "free" or array_like, default "known"
         Brightness of each image relative to the source: factors, or "free" to fit them.
-    fiducials : array_like, shape (n, 5), optional
-        Known displacements in the first image: rows of y, x, dy, dx and their σ, in px.
     options : FitOptions, optional
         Everything else.
-    start : array_like, shape (H, W), optional
-        A potential in px² to start from, too, of the first field in the first image.
-    names : sequence of str, optional
-        Names of the images in messages. Default: their numbers.
     on_progress, should_stop : callable, optional
         Receives a `Progress` after each step, with its objective; ends the work
         when it returns true.
@@ -170,9 +163,7 @@ def fit(
         psf=psf,
         mask=mask,
         brightness=brightness,
-        fiducials=fiducials,
         options=options,
-        names=names,
     )
     ensure_compiled(on_progress, should_stop)
     scene = data.scene_with(options.smoothness)
@@ -184,7 +175,7 @@ def fit(
         report("fit", steps, None, stage, objective)
 
     with _timed("starts", seconds):
-        minima = search(scene, collect_starts(data, start, on_step, should_stop), on_step)
+        minima = search(scene, collect_starts(data, on_step, should_stop), on_step)
     with _timed("smoothness", seconds):
         scene, best = estimate_smoothness(scene, minima[0], rng, on_step)
         if data.counted:
@@ -207,7 +198,7 @@ def fit(
         suspected = data.single or pattern.blur_score > _MIN_BLUR_SCORE
         blur_gain = gain_by_blur(scene, best, on_step) if suspected else 0.0
         if pattern.is_certain and pattern.chi2 < _MAX_RIVAL_CHI2:
-            cause = name_cause(scene, best, fields, setups, on_step)
+            cause = name_cause(scene, best, fields, data.setups, on_step)
             pattern = replace(pattern, cause=cause)
     with _timed("samples", seconds):
         count = options.samples if options.samples > 1 else 0
@@ -236,7 +227,6 @@ def fit(
         fine,
         unknowns,
         fields,
-        setups,
         options,
         basins,
         errors,
@@ -248,7 +238,7 @@ def fit(
 
 
 def compare(
-    images: ArrayLike,
+    images: Images,
     *,
     choices: Sequence[Sequence[str]] = (("B",), ("E",), ("B", "E")),
     options: FitOptions | None = None,
@@ -274,7 +264,10 @@ def compare(
     InputError
         As `fit`, and if no setups are given.
     """
-    if keywords.get("setups") is None or "fields" in keywords or "strengths" in keywords:
+    shots = list_shots(images)
+    has_setups = keywords.get("setups") is not None or any(shot.setup for shot in shots)
+    has_strengths = "strengths" in keywords or any(shot.strength for shot in shots)
+    if not has_setups or has_strengths or "fields" in keywords:
         raise InputError(
             "comparing fields needs the setup of each image, and neither fields nor strengths: "
             "how much each field displaces follows from the setups"
@@ -297,20 +290,12 @@ def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
     seconds[stage] = time.perf_counter() - begun
 
 
-def collect_starts(
-    data: FitData, start: ArrayLike | None, on_step: Any, should_stop: ShouldStop | None
-) -> list[Start]:
-    """Return the starting points: no field, the `start` field, and inversions by transport."""
+def collect_starts(data: FitData, on_step: Any, should_stop: ShouldStop | None) -> list[Start]:
+    """Return the starting points: no field, a field that is known, and inversions by transport."""
     scene = data.scene
     candidates = []
-    if start is not None:
-        potential = as_numbers("start", plain_array(start, "start", unit=SQUARE_PIXELS))
-        if potential.shape != data.size or not np.isfinite(potential).all():
-            raise InputError(
-                f"start has shape {potential.shape}: expected a finite potential in px² of the "
-                f"images' shape {data.size}"
-            )
-        candidates.append(Start("given", ((2, 1.0),), potential))
+    if data.start is not None:
+        candidates.append(Start("given", ((2, 1.0),), data.start))
     if not data.single:
         candidates.append(Start("from far", _FROM_FAR))
     candidates.append(Start("from near", _FROM_NEAR))
@@ -414,7 +399,6 @@ def _result(
     scene: Scene,
     unknowns: Unknowns,
     names: Sequence[str],
-    setups: Sequence[Setup] | None,
     options: FitOptions,
     basins: tuple[Basin, ...],
     errors: FloatArray | None,
@@ -465,7 +449,7 @@ def _result(
     rivals = [(basin.objective / basins[0].objective - 1, basin.distance) for basin in basins[1:]]
     verdict, explanation = assess_verdict(
         chi2=chi2,
-        names=_names(setups, len(images)),
+        names=_names(data.setups, len(images)),
         others=rivals,
         single=data.single,
         beam_unknown=scene.beam_modes > 0,
@@ -497,7 +481,7 @@ def _result(
         explanation=explanation,
         report=report,
         options=options,
-        setups=tuple(setups or ()),
+        setups=data.setups or (),
     )
 
 

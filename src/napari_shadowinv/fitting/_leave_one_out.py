@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting._fit import collect_starts, reweight_counts
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer, product, settle
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.measurements import FitData, collect_data
+from napari_shadowinv.fitting.measurements import FitData, Images, collect_data
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.rays import at_rest
 from napari_shadowinv.fitting.search import (
@@ -38,7 +38,6 @@ from napari_shadowinv.fitting.search import (
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.fitting.windows import LeaveOneOut, check_count, explanation_of
 from napari_shadowinv.options import FitOptions
-from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["leave_one_out"]
 
@@ -58,12 +57,9 @@ _FRAME_STEPS = 4
 
 
 def leave_one_out(
-    images: ArrayLike,
+    images: Images,
     *,
-    fields: Sequence[str] = ("B",),
-    setups: Sequence[Setup] | None = None,
     options: FitOptions | None = None,
-    names: Sequence[str] | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
     **keywords: Any,
@@ -77,8 +73,8 @@ def leave_one_out(
 
     Parameters
     ----------
-    images, fields, setups, options, names, **keywords
-        As for `fit`, with three images or more and without fiducials.
+    images, options, **keywords
+        As for `fit`, with three images or more, and without fiducials or a field to start from.
     on_progress, should_stop : callable, optional
         As for `fit`.
 
@@ -94,24 +90,13 @@ def leave_one_out(
         If `should_stop` returned true.
     """
     options = as_model(FitOptions, options, "options")
-    usual: dict[str, Any] = {
-        "strengths": None,
-        "source": None,
-        "noise": None,
-        "psf": 0.0,
-        "mask": None,
-        "brightness": "known",
-    }
-    data = collect_data(
-        images,
-        fields=fields,
-        setups=setups,
-        options=options,
-        names=names,
-        fiducials=None,
-        **{**usual, **keywords},
-    )
+    data = collect_data(images, options=options, **keywords)
     check_count(len(data.units))
+    if data.scene.fiducials is not None or data.start is not None:
+        raise InputError(
+            "received fiducials or a start, which belong to the first image: leave them out, "
+            "because that image is left out, too"
+        )
     ensure_compiled(on_progress, should_stop)
     report = Reporter(on_progress, should_stop)
     steps = 0
@@ -126,7 +111,7 @@ def leave_one_out(
     agreeing = work.find_agreeing(first)
     scene, common = work.estimate_smoothness(agreeing, first)
     predictions = work.predict_all(agreeing, scene, common)
-    return _result(data, predictions, setups, names)
+    return _result(data, predictions)
 
 
 @dataclass(frozen=True)
@@ -177,7 +162,7 @@ class _Work:
     def search_all(self, should_stop: ShouldStop | None) -> Minimum:
         """Where a search in all images ends, in pixels of two."""
         scene = self._data.scene_with(self._options.smoothness)
-        begun = collect_starts(self._data, None, self._on_step, should_stop)
+        begun = collect_starts(self._data, self._on_step, should_stop)
         return search(scene, begun, self._on_step)[0]
 
     def find_agreeing(self, begun: Minimum) -> list[int]:
@@ -392,8 +377,6 @@ def _chi2(made: FloatArray, data: FloatArray | float, weights: AnyArray) -> floa
 def _result(
     data: FitData,
     predictions: Sequence[_Prediction],
-    setups: Sequence[Setup] | None,
-    names: Sequence[str] | None,
 ) -> LeaveOneOut:
     height, width = data.size
     units = data.units[:, None, None]
@@ -417,5 +400,5 @@ def _result(
         alone=alone,
         limit=limit,
         rms=np.sqrt(squares) / level,
-        explanation=explanation_of(chi2, limit, setups, names),
+        explanation=explanation_of(chi2, limit, data.setups, data.names),
     )

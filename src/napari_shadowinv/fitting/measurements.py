@@ -1,5 +1,6 @@
 """The inputs of a fit, checked and in common units: `collect_data`.
 
+- one image and all that is known of it: `FitShot`
 - standard deviation of an image's noise: `estimated_noise`
 - displacement by each field in each image, from the setups: `strengths_of`
 - width of the point spread in px, from the beam's source and the detector: `point_spread`
@@ -7,8 +8,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -17,9 +19,11 @@ from scipy.ndimage import uniform_filter
 
 from napari_shadowinv._system.arrays import (
     NORMAL_MAD,
+    SQUARE_PIXELS,
     as_numbers,
     join_masks,
     mask_of_each,
+    plain_array,
     unpack_planes,
 )
 from napari_shadowinv._system.safety import check_memory
@@ -31,15 +35,21 @@ from napari_shadowinv.fitting.unknowns import Fiducials, additive_blocks
 from napari_shadowinv.options import KINDS_OF_NOISE, MAX_STRENGTH, FitOptions, KindOfNoise
 from napari_shadowinv.physics.projection import transferred_displacement
 from napari_shadowinv.physics.setup import BeamSetup, Setup, deflector_titles
+from napari_shadowinv.preprocessing import Radiograph
 
 __all__ = [
     "FitData",
     "FitOptions",
+    "FitShot",
+    "Images",
     "check_point_spread",
     "collect_data",
+    "common_values",
     "estimated_noise",
+    "list_shots",
     "point_spread",
     "strengths_of",
+    "value_of_first",
 ]
 
 _MIN_SIGMA_PX = 1e-6  # of a fiducial; the square of less overflows
@@ -52,6 +62,7 @@ _LEAST_COUNTS = 1.0
 _SMOOTHED = 5  # px, over which images are averaged for the standard deviation of their noise
 _DARKEST = 1e-3  # of an image's mean
 _SAME = _ALIKE = 1e-6
+_SAME_STRENGTH = 1.08  # images that differ by less add no information
 _OTHER_UNITS = 3.0  # an image's mean brightness over its source's
 _FREE_SHARE = 0.1  # of the shorter side
 _FREE_TIE = 0.3
@@ -81,6 +92,9 @@ class FitData:
     single: bool  # one image, or several with the same information
     assumed: bool
     common: bool
+    setups: tuple[Setup, ...] | None
+    names: tuple[str, ...] | None  # if the images have any
+    start: FloatArray | None  # potential in px² of the first field
 
     def scene_with(self, smoothness: float | None) -> Scene:
         """Return the scene with λ as it was given, or none yet, for each field."""
@@ -88,32 +102,242 @@ class FitData:
         return replace(self.scene, smoothness=np.tile((smoothness or 0.0, 0.0), (fields, 1)))
 
 
+@dataclass(frozen=True, eq=False)
+class FitShot:
+    """One image of a fit, and all that is known of it.
+
+    Values of None follow from those for all images; in `run_fit`, from the recipe or the file.
+
+    Attributes
+    ----------
+    image : Radiograph, array_like of shape (H, W), or path
+        As recorded. `fit` takes no path.
+    setup : Setup, optional
+        Its experiment.
+    source : as `image`, or "unknown", optional
+        The undisturbed beam; unknown in all images or in none.
+    mask, source_mask : array_like of bool or path, optional
+        True where a pixel can be used; where the object is not, for a source that `run_fit`
+        estimates. Files are 0 elsewhere.
+    strength : tuple of float, optional
+        Displacement by each field relative to the first image. Default: from the setups.
+    brightness : float, optional
+        How many times brighter than its source the image is.
+    psf : float, optional
+        Standard deviation of the point spread in px, after all steps.
+    noise : float, "poisson" or "proportional", optional
+        Standard deviation in a pixel after all steps, or Poisson noise, or a share of each pixel.
+    fiducials : array_like of shape (n, 5), or path of a table, optional
+        Known displacements, in the first image only: rows of y, x, dy, dx and their σ, in px after
+        all steps.
+    start : array_like of shape (H, W), optional
+        A potential in px² to start from, of the first field, in the first image only.
+    name : str, optional
+        Its name in messages. Default: its file or its number.
+
+    Examples
+    --------
+    >>> shot = FitShot(np.ones((64, 64)), strength=(0.6,), name="14.7 MeV")
+    """
+
+    image: Radiograph | ArrayLike | Path
+    setup: Setup | None = None
+    source: Radiograph | ArrayLike | Path | Literal["unknown"] | None = None
+    mask: ArrayLike | Path | None = None
+    source_mask: ArrayLike | Path | None = None
+    strength: tuple[float, ...] | None = None
+    brightness: float | None = None
+    psf: float | None = None
+    noise: KindOfNoise | float | None = None
+    fiducials: ArrayLike | Path | None = None
+    start: ArrayLike | None = None
+    name: str | None = None
+
+    @property
+    def beam_unknown(self) -> bool:
+        """Whether its beam is to be fitted."""
+        return isinstance(self.source, str) and self.source == "unknown"
+
+
+Images = ArrayLike | Mapping[str, ArrayLike] | FitShot | Sequence[FitShot | Radiograph | ArrayLike]
+# Attribute of a shot: the value for all images.
+_OF_ALL_IMAGES = {
+    "strength": "strengths",
+    "setup": "setups",
+    "source": "source",
+    "mask": "mask",
+    "brightness": "brightness",
+    "noise": "noise",
+    "psf": "psf",
+}
+
+
+def common_values(
+    names: Sequence[str], values: Sequence[Any], quantity: str
+) -> tuple[Any, ...] | None:
+    """Return the values of all images, or None if none has one.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names of the images.
+    values : sequence
+        A value for each image, or None.
+    quantity : str
+        Its name.
+
+    Raises
+    ------
+    InputError
+        If some images have a value and others have none.
+    """
+    without = [name for name, value in zip(names, values, strict=True) if value is None]
+    if len(without) == len(names):
+        return None
+    if without:
+        raise InputError(
+            f"{without[0]} has no {quantity}, other images have: expected it for all of them, or "
+            "none"
+        )
+    return tuple(values)
+
+
+def list_shots(images: Images) -> list[FitShot]:
+    """Return images with knowledge of their own; none if they are planes alone."""
+    if isinstance(images, Mapping):
+        images = [replace(_as_shot(image), name=str(name)) for name, image in images.items()]
+    planes = list(images) if isinstance(images, (list, tuple)) else [images]
+    if not any(isinstance(plane, (FitShot, Radiograph)) for plane in planes):
+        return []
+    return [_as_shot(plane) for plane in planes]
+
+
+def _as_shot(image: Any) -> FitShot:
+    shot = image if isinstance(image, FitShot) else FitShot(image)
+    recorded = shot.image
+    if isinstance(recorded, (str, Path)):
+        raise InputError(f"received the file {recorded}: read it first, or use run_fit")
+    if not isinstance(recorded, Radiograph):
+        return shot
+    return replace(
+        shot,
+        image=recorded.image,
+        setup=shot.setup or recorded.setup,
+        source=recorded.source if shot.source is None else shot.source,
+        mask=recorded.mask if shot.mask is None else shot.mask,
+    )
+
+
+def _names_of(shots: Sequence[FitShot]) -> tuple[str, ...]:
+    return tuple(shot.name or f"image {k + 1}" for k, shot in enumerate(shots))
+
+
+def _join_shots(shots: Sequence[FitShot], of_all: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values for all images, from the values of each and those `of_all`."""
+    names = _names_of(shots)
+    joined = dict(of_all)
+    for attribute, keyword in _OF_ALL_IMAGES.items():
+        values = [getattr(shot, attribute) for shot in shots]
+        if all(value is None for value in values):
+            continue
+        common = of_all[keyword]
+        if attribute in ("noise", "psf"):
+            values = [common if value is None else value for value in values]
+        elif not (common is None or _is(common, "known")):
+            text = f"{keyword}={common!r}" if isinstance(common, str) else keyword
+            raise InputError(
+                f"received the {attribute} of each image and {text}: expected one of them"
+            )
+        if attribute == "mask":
+            everywhere = np.ones(np.asarray(shots[0].image).shape, bool)
+            values = [everywhere if value is None else value for value in values]
+        if attribute == "source":
+            values = [beam.image if isinstance(beam, Radiograph) else beam for beam in values]
+        joined[keyword] = common_values(names, values, attribute)
+    if joined["strengths"] is not None and of_all["strengths"] is None:
+        joined["setups"] = of_all["setups"]  # the strengths of images precede their setups
+        _check_lengths(joined["strengths"])
+    if isinstance(joined["noise"], tuple):
+        joined["noise"] = _common_noise(joined["noise"])
+    if isinstance(joined["source"], tuple) and any(shot.beam_unknown for shot in shots):
+        flags = [shot.beam_unknown or None for shot in shots]
+        common_values(names, flags, "unknown source")
+        joined["source"] = "unknown"
+    return joined
+
+
+def _check_lengths(strengths: Sequence[Sequence[float]]) -> None:
+    if len(set(map(len, strengths))) > 1:
+        raise InputError(
+            f"strengths have {', '.join(str(len(row)) for row in strengths)} numbers: expected "
+            "one for each field in all images"
+        )
+
+
+def _common_noise(noises: Sequence[Any]) -> Any:
+    """Return the kind of noise of all images, or their standard deviations."""
+    kinds = {repr(noise) if isinstance(noise, str) else "a number" for noise in noises}
+    if len(kinds) > 1:
+        raise InputError(
+            f"noise is {' in some images and '.join(sorted(kinds))} in others: give the same "
+            "for all, or numbers"
+        )
+    return noises[0] if isinstance(noises[0], str) else noises
+
+
+def value_of_first(shots: Sequence[FitShot], attribute: str) -> Any:
+    """Return a value that only the first image may have.
+
+    Raises
+    ------
+    InputError
+        If a later image has one.
+    """
+    if any(getattr(shot, attribute) is not None for shot in shots[1:]):
+        raise InputError(
+            f"received {attribute} of a later image: expected them in the first image, whose "
+            "pixels are those of the fields"
+        )
+    return getattr(shots[0], attribute) if shots else None
+
+
 def collect_data(
-    images: ArrayLike,
+    images: Images,
     *,
-    strengths: ArrayLike | None,
-    setups: Sequence[Setup] | None,
-    fields: Sequence[str],
-    source: ArrayLike | Literal["unknown"] | None,
-    noise: ArrayLike | KindOfNoise | None,
-    psf: Any,
-    mask: ArrayLike | None,
-    brightness: ArrayLike | Literal["known", "free"],
-    fiducials: ArrayLike | None,
+    strengths: ArrayLike | None = None,
+    setups: Sequence[Setup] | None = None,
+    fields: Sequence[str] = ("B",),
+    source: ArrayLike | Literal["unknown"] | None = None,
+    noise: ArrayLike | KindOfNoise | None = None,
+    psf: Any = 0.0,
+    mask: ArrayLike | None = None,
+    brightness: ArrayLike | Literal["known", "free"] = "known",
     options: FitOptions,
-    names: Sequence[str] | None = None,
 ) -> FitData:
     """Check the inputs of a fit; see `fit` for their forms."""
-    images, exposed = unpack_planes(images, "images")
-    data = _checked_images(images)
+    shots = list_shots(images)
+    planes: Any = images
+    if shots:
+        of_all = {
+            "strengths": strengths,
+            "setups": setups,
+            "source": source,
+            "mask": mask,
+            "brightness": brightness,
+            "noise": noise,
+            "psf": psf,
+        }
+        joined = _join_shots(shots, of_all)
+        planes = [shot.image for shot in shots]
+        strengths, setups, source, mask, brightness, noise, psf = (joined[key] for key in of_all)
+    planes, exposed = unpack_planes(planes, "images")
+    data = _checked_images(planes)
     exposed = mask_of_each(exposed, data)
     if not isinstance(source, str):
         source, lit = unpack_planes(source, "source")
         exposed = join_masks(exposed, mask_of_each(lit, data))
     count, height, width = data.shape
-    names = names or [f"image {k + 1}" for k in range(count)]
-    if len(names) != count:
-        raise InputError(f"received {count} images and {len(names)} names: expected one each")
+    names = _names_of(shots) or tuple(f"image {k + 1}" for k in range(count))
     used = _checked_mask(mask, exposed, data, names)
     matrix = strengths_of(setups, fields, count, names) if strengths is None else strengths
     matrix = _checked_strengths(matrix, count)
@@ -155,7 +379,7 @@ def collect_data(
         free_brightness=free_brightness or unknown,
         free_frames=_ALIGNED[options.align],
         shift_spread=options.align_spread,
-        fiducials=_checked_fiducials(fiducials, (height, width)),
+        fiducials=_checked_fiducials(value_of_first(shots, "fiducials"), (height, width)),
         threads=options.threads,
         added=additive_blocks(options),
     )
@@ -170,10 +394,10 @@ def collect_data(
         single=single,
         assumed=source is None,
         common=all(np.array_equal(beam, shapes[0]) for beam in shapes[1:]),
+        setups=None if setups is None else tuple(setups),
+        names=names if any(shot.name for shot in shots) else None,
+        start=_checked_start(value_of_first(shots, "start"), (height, width)),
     )
-
-
-_SAME_STRENGTH = 1.08  # images that differ by less add no information
 
 
 def strengths_of(
@@ -486,6 +710,18 @@ def _shares(data: FloatArray, used: BoolArray, means: FloatArray) -> FloatArray:
             for image, mean, use in zip(data, means, used, strict=True)
         ]
     )
+
+
+def _checked_start(start: ArrayLike | None, size: tuple[int, int]) -> FloatArray | None:
+    if start is None:
+        return None
+    potential = as_numbers("start", plain_array(start, "start", unit=SQUARE_PIXELS))
+    if potential.shape != size or not np.isfinite(potential).all():
+        raise InputError(
+            f"start has shape {potential.shape}: expected a finite potential in px² of the "
+            f"images' shape {size}"
+        )
+    return potential
 
 
 def _checked_fiducials(fiducials: ArrayLike | None, size: tuple[int, int]) -> Fiducials | None:

@@ -2,8 +2,8 @@
 
 - apply a recipe to a shot: `run`; sites and sources that a window reuses: `Cache`
 - the same in two parts, for stacks: `collect_inputs`, `run_prepared`
-- fit several images of one object by a recipe: `run_fit`, of `FitShot`; find the fields that
-  explain them: `run_comparison`
+- fit several images of one object by a recipe: `run_fit`; find the fields that explain them:
+  `run_comparison`
 - test whether one static field explains them: `run_leave_one_out`; a movie of fields:
   `run_windows`
 - refine an inversion by a fit that starts from it: `run_refinement`

@@ -1,13 +1,12 @@
 from ._film import run_film
 from .files import read_recipe, write_recipe
 from .film_files import read_pack, write_layers
-from .fit_run import FitShot, run_comparison, run_fit, run_refinement
+from .fit_run import run_comparison, run_fit, run_refinement
 from .inversion_run import Cache, Inputs, collect_inputs, run, run_prepared
 from .static_checks import run_leave_one_out, run_windows
 
 __all__ = [
     "Cache",
-    "FitShot",
     "Inputs",
     "collect_inputs",
     "read_pack",

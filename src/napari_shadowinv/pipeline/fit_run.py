@@ -1,8 +1,7 @@
 """From several images of one object to its fields by a recipe: `run_fit`, `run_comparison`.
 
-- one image with its measurements: `FitShot`
-- images of a table's rows or of flags: `read_row_images`; their setup: `row_setup`
 - the complete inputs of a fit: `collect_fit_inputs`
+- images of a table's rows or of flags: `read_row_images`; their setup: `row_setup`
 - an inversion refined by a fit that starts from its field: `run_refinement`
 """
 
@@ -12,20 +11,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
-from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, compare, fit, point_spread
+from napari_shadowinv.fitting import Fit, FitShot, compare, fit, point_spread
+from napari_shadowinv.fitting.measurements import common_values, value_of_first
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.budget import ASSUMED_VARIATION
 from napari_shadowinv.io.files import sha256, text_of
-from napari_shadowinv.options import FitChoices, FitOptions, KindOfNoise
+from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.projection import default_deflector
 from napari_shadowinv.physics.setup import (
     Setup,
@@ -50,7 +50,6 @@ from napari_shadowinv.provenance import Origin, Provenance, index_masks
 
 __all__ = [
     "FitInputs",
-    "FitShot",
     "check_fit",
     "collect_fit_inputs",
     "compared_fields",
@@ -97,15 +96,18 @@ def run_refinement(
     InversionCancelled
         If `should_stop` returned true.
     """
-    result = fit(
+    image = FitShot(
         inversion.image,
-        setups=None if setup is None else [setup],
-        fields=choices.fields or usual_fields(None if setup is None else [setup]),
+        setup=setup,
         source=inversion.source,
-        noise=choices.noise,
-        psf=choices.psf or 0.0,
         mask=inversion.mask,
         start=inversion.potential,
+    )
+    result = fit(
+        [image],
+        fields=choices.fields or usual_fields(None if setup is None else [setup]),
+        noise=choices.noise,
+        psf=choices.psf or 0.0,
         options=_options(inversion, choices.options),
         on_progress=on_progress,
         should_stop=should_stop,
@@ -135,46 +137,6 @@ def _provenance(start: Provenance, setup: Setup | None, choices: FitChoices) -> 
     recipe = start.recipe.model_copy(update={"setup": None, "fit": choices})
     image = start.image.model_copy(update={"mask": None, "source_mask": None, "setup": setup})
     return Provenance(kind="fit", recipe=recipe, images=(image,), start=start)
-
-
-@dataclass(frozen=True, eq=False)
-class FitShot:
-    """One image of a fit; values of None follow from the recipe, or from the image's file.
-
-    Attributes
-    ----------
-    image : Radiograph, array_like of shape (H, W), or path
-        As recorded.
-    setup : Setup, optional
-        Its experiment.
-    source : as `image`, or "unknown", optional
-        The undisturbed beam; unknown in all images or in none.
-    mask, source_mask : array_like of bool or path, optional
-        True where a pixel can be used, and where the object is not; files are 0 elsewhere.
-    strength : tuple of float, optional
-        Displacement by each field relative to the first image. Default: from the setups.
-    brightness : float, optional
-        How many times brighter than its source the image is.
-    psf : float, optional
-        Standard deviation of the point spread in px after all steps.
-    noise : float, "poisson" or "proportional", optional
-        Standard deviation in a pixel after all steps, or Poisson noise, or a share of each pixel.
-    """
-
-    image: Shot
-    setup: Setup | None = None
-    source: Shot | Literal["unknown"] | None = None
-    mask: ArrayLike | Path | None = None
-    source_mask: ArrayLike | Path | None = None
-    strength: tuple[float, ...] | None = None
-    brightness: float | None = None
-    psf: float | None = None
-    noise: KindOfNoise | float | None = None
-
-    @property
-    def beam_unknown(self) -> bool:
-        """Whether its beam is to be fitted."""
-        return isinstance(self.source, str) and self.source == "unknown"
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +172,7 @@ class FitInputs:
     @cached_property
     def setups(self) -> tuple[Setup, ...] | None:
         """The setups of all images after the steps; None if there are none."""
-        return _common_values(self.names, [shot.setup for shot in self.shots], "setup")
+        return common_values(self.names, [shot.setup for shot in self.shots], "setup")
 
     def only(self, numbers: Sequence[int]) -> FitInputs:
         """Return the inputs of a fit of some of the images, in this order; no fiducials."""
@@ -233,37 +195,36 @@ class FitInputs:
         return options.model_copy(update={"beam_variation": ASSUMED_VARIATION})
 
     @property
+    def images(self) -> list[FitShot]:
+        """The images after the steps, with all that is known of them."""
+        is_known = self.choices.beam == "known"
+        images = [
+            FitShot(
+                shot.image,
+                setup=shot.setup,
+                source=shot.source if is_known else None,
+                mask=shot.mask,
+                strength=recorded.strength,
+                brightness=recorded.brightness,
+                psf=self._point_spread(k),
+                noise=recorded.noise,
+                name=self.names[k],
+            )
+            for k, (recorded, shot) in enumerate(zip(self.recorded, self.shots, strict=True))
+        ]
+        images[0] = replace(images[0], fiducials=self.fiducials, start=self.recorded[0].start)
+        return images
+
+    @property
     def keywords(self) -> dict[str, Any]:
-        """Keywords of `fit` and `compare`, except fields and options."""
-        strengths = _common_values(
-            self.names, [shot.strength for shot in self.recorded], "strength"
-        )
-        if strengths is not None and len(set(map(len, strengths))) > 1:
-            raise InputError(
-                f"strengths have {', '.join(str(len(row)) for row in strengths)} numbers: expected "
-                "one for each field in all images"
-            )
-        factors = _common_values(
-            self.names, [shot.brightness for shot in self.recorded], "brightness"
-        )
-        if factors is not None and self.choices.brightness == "free":
-            raise InputError(
-                "received the brightness of each image and brightness='free': expected one of them"
-            )
-        keywords = {
-            "images": np.stack([shot.image for shot in self.shots]),
-            "strengths": strengths,
-            # Strengths take precedence over setups.
-            "setups": self.setups if strengths is None else None,
-            "source": self._source(),
-            "noise": self._noise(),
-            "psf": [self._point_spread(k) for k in range(len(self.shots))],
-            "mask": self._mask(),
-            "brightness": self.choices.brightness if factors is None else factors,
-            "fiducials": self.fiducials,
-            "names": self.names,
+        """Keywords of `fit` and `compare`, except fields."""
+        return {
+            "images": self.images,
+            "source": "unknown" if self.choices.beam == "unknown" else None,
+            "noise": self.choices.noise,
+            "brightness": self.choices.brightness,
+            "options": self.options,
         }
-        return {name: value for name, value in keywords.items() if value is not None}
 
     def with_provenance(self, result: Fit) -> Fit:
         """Return a fit with its setups and its provenance; the recipe names its fields."""
@@ -272,26 +233,6 @@ class FitInputs:
         recipe = self.provenance.recipe.model_copy(update={"fit": choices})
         provenance = self.provenance.model_copy(update={"recipe": recipe})
         return replace(result, setups=self.setups or (), provenance=provenance)
-
-    def _source(self) -> Any:
-        if self.choices.beam == "unknown":
-            return "unknown"
-        beams = _common_values(self.names, [shot.source for shot in self.shots], "source")
-        return None if beams is None else np.stack(beams)
-
-    def _noise(self) -> Any:
-        default = self.choices.noise
-        of_images = [default if shot.noise is None else shot.noise for shot in self.recorded]
-        noises = _common_values(self.names, of_images, "noise")
-        if noises is None:
-            return None
-        kinds = {repr(noise) if isinstance(noise, str) else "a number" for noise in noises}
-        if len(kinds) > 1:
-            raise InputError(
-                f"noise is {' in some images and '.join(sorted(kinds))} in others: give the same "
-                "for all, or numbers"
-            )
-        return noises[0] if isinstance(noises[0], str) else noises
 
     def _point_spread(self, k: int) -> float:
         """Standard deviation of an image's point spread in px."""
@@ -305,20 +246,11 @@ class FitInputs:
             )
         return point_spread(setup, choices.source_size or 0.0, choices.resolution or 0.0)
 
-    def _mask(self) -> AnyArray | None:
-        masks = [shot.mask for shot in self.shots]
-        if all(mask is None for mask in masks):
-            return None
-        shape = self.shots[0].shape
-        return np.stack([np.ones(shape, bool) if mask is None else mask for mask in masks])
-
 
 def run_fit(
     recipe: Recipe,
     shots: Sequence[FitShot | Shot],
     *,
-    fiducials: ArrayLike | Path | None = None,
-    names: Sequence[str] | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Fit:
@@ -330,10 +262,6 @@ def run_fit(
         Steps and options; without a section `fit` the defaults apply.
     shots : sequence of FitShot, Radiograph, array_like or path
         The images, of one size after the steps.
-    fiducials : array_like of shape (n, 5), or path of a table, optional
-        As for `napari_shadowinv.fit`, in pixels after the steps.
-    names : sequence of str, optional
-        Names of the images in messages. Default: their files, or their numbers.
     on_progress, should_stop : callable, optional
         As for `napari_shadowinv.fit`.
 
@@ -351,13 +279,10 @@ def run_fit(
     InversionCancelled
         If `should_stop` returned true.
     """
-    inputs = collect_fit_inputs(
-        recipe, shots, fiducials=fiducials, names=names, should_stop=should_stop
-    )
+    inputs = collect_fit_inputs(recipe, shots, should_stop=should_stop)
     result = fit(
         **inputs.keywords,
         fields=inputs.choices.fields or ("B",),
-        options=inputs.options,
         on_progress=on_progress,
         should_stop=should_stop,
     )
@@ -368,16 +293,14 @@ def run_comparison(
     recipe: Recipe,
     shots: Sequence[FitShot | Shot],
     *,
-    fiducials: ArrayLike | Path | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> tuple[Fit, ...]:
     """Fit each of the `compared_fields`, otherwise as `run_fit`; the likeliest comes first."""
-    inputs = collect_fit_inputs(recipe, shots, fiducials=fiducials, should_stop=should_stop)
+    inputs = collect_fit_inputs(recipe, shots, should_stop=should_stop)
     fits = compare(
         **inputs.keywords,
         choices=compared_fields(inputs.setups),
-        options=inputs.options,
         on_progress=on_progress,
         should_stop=should_stop,
     )
@@ -388,8 +311,6 @@ def collect_fit_inputs(
     recipe: Recipe,
     shots: Sequence[FitShot | Shot],
     *,
-    fiducials: ArrayLike | Path | None = None,
-    names: Sequence[str] | None = None,
     should_stop: ShouldStop | None = None,
 ) -> FitInputs:
     """Collect the inputs of a fit: read files, apply the steps, and fill in defaults."""
@@ -398,7 +319,7 @@ def collect_fit_inputs(
         raise InputError("received no image: expected one or several of one object")
     choices = recipe.fit or FitChoices()
     check_fit(recipe)
-    names = names or tuple(_shot_name(image, k) for k, image in enumerate(recorded))
+    names = tuple(_shot_name(image, k) for k, image in enumerate(recorded))
     unknown = _beam_is_unknown(choices, recorded, names)
     collected = [
         _collect_image(recipe, image, name, unknown=unknown)
@@ -413,13 +334,13 @@ def collect_fit_inputs(
                 "one size, on the same pixels; crop or bin them first"
             )
         ready.append(shot)
-    setups = _common_values(names, [shot.setup for shot in ready], "setup")
+    setups = common_values(names, [shot.setup for shot in ready], "setup")
     fields = choices.fields or usual_fields(setups)
     beam = "unknown" if unknown else "known"
     resolved = choices.model_copy(update={"fields": fields, "beam": beam})
     source = recipe.estimate
     cleared = {"source": source, "mask": None, "source_mask": None, "setup": None, "fit": resolved}
-    table, origin = _read_fiducials(fiducials)
+    table, origin = _read_fiducials(value_of_first(recorded, "fiducials"))
     provenance = Provenance(
         kind="fit",
         recipe=_without_folder(recipe).model_copy(update=cleared),
@@ -427,7 +348,7 @@ def collect_fit_inputs(
         fiducials=origin,
         fiducial_rows=None if table is None else table.tolist(),
     )
-    return FitInputs(recorded, tuple(ready), tuple(names), provenance.shorten(), table)
+    return FitInputs(recorded, tuple(ready), names, provenance.shorten(), table)
 
 
 def check_fit(recipe: Recipe) -> None:
@@ -445,6 +366,8 @@ def check_fit(recipe: Recipe) -> None:
 
 
 def _shot_name(shot: FitShot, k: int) -> str:
+    if shot.name:
+        return shot.name
     image = shot.image
     path = image.path if isinstance(image, Radiograph) else image
     return str(path) if isinstance(path, (str, Path)) else f"image {k + 1}"
@@ -454,7 +377,7 @@ def _beam_is_unknown(choices: FitChoices, shots: Sequence[FitShot], names: Seque
     """Return whether the beam is fitted, by choice of all images or of the recipe."""
     by_default = choices.beam == "unknown"
     flags = [shot.beam_unknown or (by_default and shot.source is None) or None for shot in shots]
-    return _common_values(names, flags, "unknown source") is not None
+    return common_values(names, flags, "unknown source") is not None
 
 
 def _collect_image(recipe: Recipe, shot: FitShot, name: str, *, unknown: bool) -> Inputs:
@@ -556,21 +479,6 @@ def _image_origins(
         indices = before.image.mask, before.image.source_mask
         masks.append([before.mask_of(index) for index in indices])
     return index_masks(origins, masks)
-
-
-def _common_values(
-    names: Sequence[str], values: Sequence[Any], quantity: str
-) -> tuple[Any, ...] | None:
-    """Return the values of all images, or None if none has one."""
-    without = [name for name, value in zip(names, values, strict=True) if value is None]
-    if len(without) == len(names):
-        return None
-    if without:
-        raise InputError(
-            f"{without[0]} has no {quantity}, other images have: expected it for all of them, or "
-            "none"
-        )
-    return tuple(values)
 
 
 def read_row_images(

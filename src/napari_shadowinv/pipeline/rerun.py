@@ -21,7 +21,7 @@ from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
-from napari_shadowinv.fitting import Fit
+from napari_shadowinv.fitting import Fit, FitShot
 from napari_shadowinv.fitting.windows import PREFIX
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
@@ -30,7 +30,7 @@ from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.read_write import result_from_dataset
 from napari_shadowinv.pipeline._film import run_film
 from napari_shadowinv.pipeline.files import read_part
-from napari_shadowinv.pipeline.fit_run import FitShot, run_fit, run_refinement
+from napari_shadowinv.pipeline.fit_run import run_fit, run_refinement
 from napari_shadowinv.pipeline.inversion_run import Shot, picture_mask, radiograph_of, run
 from napari_shadowinv.pipeline.static_checks import StaticChecks, run_checks
 from napari_shadowinv.preprocessing import MeasuredSource, Radiograph, Recipe
@@ -91,8 +91,6 @@ class RerunInputs:
         The recipe, with the dark frame where it is now.
     shots : tuple of FitShot
         The images with source, masks and setup; empty for a film pack.
-    fiducials : ndarray, Path or None
-        Known displacements in the first image.
     files : tuple of Path
         All files that were read, the images first.
     masks : tuple of MaskOrigin
@@ -105,7 +103,6 @@ class RerunInputs:
     provenance: Provenance
     recipe: Recipe
     shots: tuple[FitShot, ...] = ()
-    fiducials: FloatArray | Path | None = None
     files: tuple[Path, ...] = ()
     masks: tuple[MaskOrigin, ...] = ()
     changes: tuple[str, ...] = ()
@@ -171,7 +168,7 @@ class RerunInputs:
             inversion = self._invert(_with_dark(start.recipe, self.recipe.dark_file), **callbacks)
             setup = self.provenance.image.setup
             return run_refinement(inversion, setup, choices, **callbacks), StaticChecks()
-        fit = run_fit(self.recipe, self.shots, fiducials=self.fiducials, **callbacks)
+        fit = run_fit(self.recipe, self.shots, **callbacks)
         checks = run_checks(
             self.recipe,
             self.shots,
@@ -369,12 +366,12 @@ class _Reader:
         shots = [self._shot(origins, k, images[k], numbered=numbered) for k in range(count)]
         dark = origins.image.dark
         path = None if dark is None else self._find(dark, "the dark frame")
+        shots[0] = replace(shots[0], fiducials=self._fiducials(provenance))
         return RerunInputs(
             dataset,
             provenance,
             _with_dark(provenance.recipe, path),
             tuple(shots),
-            self._fiducials(provenance),
             tuple(self.files if path is None else [*self.files, path]),
             tuple(self.masks.get(k, mask) for k, mask in enumerate(origins.masks)),
             tuple(self.changes),

@@ -15,11 +15,11 @@ import numpy as np
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, FitWindows, LeaveOneOut, fit, leave_one_out
-from napari_shadowinv.fitting.measurements import strengths_of
+from napari_shadowinv.fitting import Fit, FitShot, FitWindows, LeaveOneOut, fit, leave_one_out
+from napari_shadowinv.fitting.measurements import common_values, strengths_of
 from napari_shadowinv.fitting.windows import check_count
 from napari_shadowinv.options import FitChoices
-from napari_shadowinv.pipeline.fit_run import FitInputs, FitShot, collect_fit_inputs
+from napari_shadowinv.pipeline.fit_run import FitInputs, collect_fit_inputs
 from napari_shadowinv.pipeline.inversion_run import Shot
 from napari_shadowinv.preprocessing import Recipe
 
@@ -58,7 +58,6 @@ def run_checks(
     *,
     left_out: bool,
     window: int | None,
-    names: Sequence[str] | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> StaticChecks:
@@ -69,7 +68,7 @@ def run_checks(
     chosen = recipe.model_copy(update={"fit": choices})
     callbacks: dict[str, Any] = {"on_progress": on_progress, "should_stop": should_stop}
     return StaticChecks(
-        run_leave_one_out(chosen, shots, names=names, **callbacks) if left_out else None,
+        run_leave_one_out(chosen, shots, **callbacks) if left_out else None,
         None if window is None else run_windows(chosen, shots, window, **callbacks),
     )
 
@@ -78,7 +77,6 @@ def run_leave_one_out(
     recipe: Recipe,
     shots: Sequence[FitShot | Shot],
     *,
-    names: Sequence[str] | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> LeaveOneOut:
@@ -90,7 +88,7 @@ def run_leave_one_out(
         Steps and options; without a section `fit` the defaults apply.
     shots : sequence of FitShot, Radiograph, array_like or path
         Three images or more, of one size after the steps.
-    names, on_progress, should_stop
+    on_progress, should_stop
         As for `run_fit`.
 
     Returns
@@ -108,12 +106,11 @@ def run_leave_one_out(
         If `should_stop` returned true.
     """
     check_count(len(shots))
-    inputs = collect_fit_inputs(recipe, shots, names=names, should_stop=should_stop)
+    inputs = collect_fit_inputs(recipe, shots, should_stop=should_stop)
     order = _order_by_energy(inputs)
     left_out = leave_one_out(
         **inputs.only(order).keywords,
         fields=inputs.choices.fields or ("B",),
-        options=inputs.options,
         on_progress=on_progress,
         should_stop=should_stop,
     )
@@ -125,7 +122,6 @@ def run_windows(
     shots: Sequence[FitShot | Shot],
     size: int,
     *,
-    names: Sequence[str] | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> FitWindows:
@@ -135,7 +131,7 @@ def run_windows(
 
     Parameters
     ----------
-    recipe, shots, names, on_progress, should_stop
+    recipe, shots, on_progress, should_stop
         As for `run_fit`.
     size : int
         Number of images in a group.
@@ -155,7 +151,7 @@ def run_windows(
         If `should_stop` returned true.
     """
     check_window(size, len(shots))
-    inputs = collect_fit_inputs(recipe, shots, names=names, should_stop=should_stop)
+    inputs = collect_fit_inputs(recipe, shots, should_stop=should_stop)
     order = _order_by_energy(inputs)
     strengths = _strengths(inputs.only(order))[: len(order) - size + 1]
     groups = [order[first : first + size] for first in range(len(strengths))]
@@ -171,7 +167,6 @@ def run_windows(
         result = fit(
             **part.keywords,
             fields=part.choices.fields or ("B",),
-            options=part.options,
             on_progress=on_fit_progress,
             should_stop=should_stop,
         )
@@ -197,7 +192,8 @@ def _order_by_energy(inputs: FitInputs) -> list[int]:
 
 def _strengths(inputs: FitInputs) -> FloatArray:
     """Displacement of each image by each field, relative to the first image."""
-    strengths = inputs.keywords.get("strengths")
+    values = [shot.strength for shot in inputs.recorded]
+    strengths = common_values(inputs.names, values, "strength")
     if strengths is None:
         fields = inputs.choices.fields or ("B",)
         return strengths_of(inputs.setups, fields, len(inputs.shots), inputs.names)

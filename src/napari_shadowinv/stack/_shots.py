@@ -29,12 +29,12 @@ from napari_shadowinv._system.arrays import PLANE, unpack_array
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.io.files import in_counting_order, sha256, text_of
 from napari_shadowinv.io.formats import PRADFORMAT, TEXT, kind_of
 from napari_shadowinv.io.images import read_tiff_page, tiff_pages
 from napari_shadowinv.io.read_write import read_radiograph
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
-from napari_shadowinv.pipeline import FitShot
 from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import read_row_images, row_setup
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, rows_to_invert

@@ -17,6 +17,7 @@ from qtpy.QtCore import Qt
 from scipy.ndimage import zoom
 from typer.testing import CliRunner
 
+from helpers.fit_images import of_each
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read, write
 from napari_shadowinv._napari.fit_layers import fit_layers
 from napari_shadowinv._napari.jobs import Finished
@@ -34,13 +35,13 @@ from napari_shadowinv._napari.widgets import _fitting
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli import app
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, FitOptions, Verdict, compilation, fit
+from napari_shadowinv.fitting import Fit, FitOptions, FitShot, Verdict, compilation, fit
 from napari_shadowinv.fitting.rays import RayModel
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.projection import project, transferred_displacement
 from napari_shadowinv.physics.setup import OpticalSetup
-from napari_shadowinv.pipeline import FitShot, read_recipe
+from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.pipeline.fit_run import FitInputs, collect_fit_inputs
 
 Array = np.ndarray[Any, Any]
@@ -125,7 +126,7 @@ def layer_of(viewer: Any, role: str, word: str = "") -> Any:
 def inputs_of(tool: Any) -> FitInputs:
     """Return the inputs of the requested fit."""
     job = tool.request()
-    return collect_fit_inputs(job.recipe, job.shots, names=job.names)
+    return collect_fit_inputs(job.recipe, job.shots)
 
 
 def texts(tool: Any, column: int) -> list[str]:
@@ -159,10 +160,10 @@ def test_what_is_asked_for_is_what_the_controls_show(window: Any, tool: Any) -> 
     tool.noise.restore("poisson")
     inputs = inputs_of(tool)
     assert [setup.energy for setup in inputs.setups] == [14.7, 7.0]
-    assert inputs.keywords["brightness"] == (1.0, 1.2)
-    assert inputs.keywords["psf"] == [0.0, 0.8]
-    assert inputs.keywords["noise"] == "poisson"
-    assert "source" not in inputs.keywords
+    assert of_each(inputs.images, "brightness") == [1.0, 1.2]
+    assert of_each(inputs.images, "psf") == [0.0, 0.8]
+    assert of_each(inputs.images, "source") == [None, None]
+    assert (inputs.keywords["noise"], inputs.keywords["source"]) == ("poisson", None)
     assert inputs.choices.options == FitOptions(**QUICK)
     # The image's own setup stays; what was typed stays with its layer, not with the widget.
     assert setup_of(window.layers["6.0 MeV"]) == SETUPS[1]
@@ -281,7 +282,7 @@ def test_an_unknown_beam_is_fitted_and_shown(window: Any, tool: Any, run: Any) -
     assert "beam" in texts(tool, 0)
     tool.source.layers.layer = measured
     assert "beam" not in texts(tool, 0)
-    for source in inputs_of(tool).keywords["source"]:
+    for source in of_each(inputs_of(tool).images, "source"):
         np.testing.assert_array_equal(source, 300 * beam)
 
 
@@ -300,13 +301,15 @@ def test_steps_are_done_to_all_images_first(window: Any, tool: Any) -> None:
     tool.steps.add("bin")
     job = tool.request()
     inputs = inputs_of(tool)
-    keywords, planes = inputs.keywords, inputs.keywords["images"]
+    planes, masks, sources, setups = (
+        of_each(inputs.images, name) for name in ("image", "mask", "source", "setup")
+    )
     usable = np.ones((2, *SHAPE), bool)
     usable[:, :2, :3] = False
-    np.testing.assert_array_equal(keywords["mask"], usable)
-    np.testing.assert_allclose(planes[usable], np.stack(before)[usable])
-    np.testing.assert_allclose(keywords["source"][usable], np.stack([beam, beam])[usable])
-    assert [setup.object_pixel_size for setup in keywords["setups"]] == pytest.approx([3e-6, 3e-6])
+    np.testing.assert_array_equal(masks, usable)
+    np.testing.assert_allclose(np.stack(planes)[usable], np.stack(before)[usable])
+    np.testing.assert_allclose(np.stack(sources)[usable], np.stack([beam, beam])[usable])
+    assert [setup.object_pixel_size for setup in setups] == pytest.approx([3e-6, 3e-6])
     assert job.frame.scale == pytest.approx((3, 3))
     assert job.frame.translate == pytest.approx((0.75, 0.75))
     assert "bin" in dict(job.inputs)["Steps"].lower()
@@ -325,7 +328,7 @@ def test_a_stack_has_a_row_for_each_plane(window: Any, open_widget: Any) -> None
     tool.images.table.item(2, 0).setCheckState(Qt.CheckState.Unchecked)
     inputs = inputs_of(tool)
     assert inputs.setups == SETUPS
-    np.testing.assert_array_equal(inputs.keywords["images"], stack[:2])
+    np.testing.assert_array_equal(of_each(inputs.images, "image"), stack[:2])
     # Another reference: its own energy goes with it, and comes back.
     tool.images.table.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
     assert tool.setup.setup().energy == 6
@@ -1018,9 +1021,10 @@ def test_a_recipe_is_the_same_for_window_and_command(
     tool.recipes.load(tmp_path / "recipe.toml")
     after = inputs_of(tool)
     assert after.provenance.recipe == before.provenance.recipe
-    for name in ("images", "source", "mask"):
-        np.testing.assert_array_equal(after.keywords[name], before.keywords[name])
-    assert after.keywords["psf"] == before.keywords["psf"] == [0.6, 0.6]
+    for name in ("image", "source", "mask"):
+        old, new = (of_each(inputs.images, name) for inputs in (before, after))
+        np.testing.assert_array_equal(new, old)
+    assert of_each(after.images, "psf") == of_each(before.images, "psf") == [0.6, 0.6]
     assert after.setups == before.setups
 
 
@@ -1031,13 +1035,14 @@ def test_a_recipe_tells_noise_and_point_spread(
     choices = '[fit]\nfields = ["E", "B"]\nnoise = 3.5\nsource_size = 3e-6\nresolution = 4e-5\n'
     path.write_text(f"[[steps]]\nstep = 'bin'\nfactor = 2\n{choices}")
     tool.recipes.load(path)
-    assert inputs_of(tool).keywords["noise"] == (3.5, 3.5)
+    assert inputs_of(tool).keywords["noise"] == 3.5
     assert tool.fields.state() == "B and E"
     by_command = collect_fit_inputs(
         read_recipe(path), [FitShot(np.ones(SHAPE), setup) for setup in SETUPS]
     )
-    assert inputs_of(tool).keywords["psf"] == pytest.approx(by_command.keywords["psf"], rel=1e-12)
-    assert 1 < by_command.keywords["psf"][0] < 2
+    widths = of_each(by_command.images, "psf")
+    assert of_each(inputs_of(tool).images, "psf") == pytest.approx(widths, rel=1e-12)
+    assert 1 < widths[0] < 2
     tool.setup.picker.set_kind("none")
     tool.recipes.load(path)
     assert messages[-1].endswith("select the setup first, or give the point spread in px (psf)")

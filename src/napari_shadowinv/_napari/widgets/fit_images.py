@@ -40,10 +40,9 @@ from napari_shadowinv._napari.widgets._results import LastResults, result_frame
 from napari_shadowinv._napari.widgets._tables import ImageRow, ImageTable, beam_column
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import point_spread
+from napari_shadowinv.fitting import FitShot, point_spread
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.setup import SETUPS, Setup
-from napari_shadowinv.pipeline import FitShot
 from napari_shadowinv.preprocessing import FIT_STEPS, Radiograph, Recipe
 
 if TYPE_CHECKING:
