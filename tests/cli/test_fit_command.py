@@ -644,7 +644,7 @@ def test_left_out_images_and_windows_are_written(folder: Path) -> None:
     result = shadowinv(*FILMS, "--spacing", 0.2, "--leave-one-out", "--energy-window", 3)
     assert result.exit_code == 3, result.output
     output = flat(result.stdout)
-    for words in ("Left out", "c 14.7", "not explained", "Windows", "1, 2, 4", "2, 4, 3"):
+    for words in ("Left out", "c, 14.7 MeV", "not explained", "Windows", "1, 2, 4", "2, 4, 3"):
         assert words in output
     sentence = "the image at 14.7 MeV is not explained by one static field with the others"
     assert f"NOT STATIC: a_fit.shadowinv was written, but {sentence}" in flat(result.stderr)
@@ -658,7 +658,7 @@ def test_left_out_images_and_windows_are_written(folder: Path) -> None:
     np.testing.assert_allclose(dataset["window_energy"], [22 / 3, 31.7 / 3])
     description = flat(shadowinv("info", "a_fit.shadowinv").stdout)
     assert sentence in description
-    assert "window 2 images 2, 4, 3, χ²" in description
+    assert "window 2 images 2, 4, 3, mean energy 10.57 MeV, time of flight" in description
 
 
 def test_images_left_out_have_energies_without_a_setup(folder: Path) -> None:
@@ -668,7 +668,7 @@ def test_images_left_out_have_energies_without_a_setup(folder: Path) -> None:
     quick = ("--spacing", 0.3, "--max-iterations", 3, "--samples", 0)
     result = shadowinv("fit", "films.csv", "--noise", 20, *quick, "--leave-one-out")
     assert result.exit_code in (0, 3), result.output
-    for words in ("a 5 MeV", "b 7 MeV", "d 10 MeV"):
+    for words in ("a (5 MeV)", "b (7 MeV)", "d (10 MeV)"):
         assert words in flat(result.stdout)
     assert fit_in("a_fit.shadowinv")[0].setups == ()
 

@@ -14,12 +14,11 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.measurements import (
     FitData,
-    FitShot,
     collect_data,
     estimated_noise,
-    point_spread,
     strengths_of,
 )
+from napari_shadowinv.fitting.shots import FitShot, point_spread
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.preprocessing import Radiograph

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from napari.components import ViewerModel
 
-from napari_shadowinv import InputError, InversionOptions, ProtonSetup, add_inversion, fit, invert
+from napari_shadowinv import (
+    FitShot,
+    InputError,
+    InversionOptions,
+    ProtonSetup,
+    add_inversion,
+    fit,
+    invert,
+)
 from napari_shadowinv._napari import commands
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of
 from napari_shadowinv._napari.shots import shot_layer
@@ -106,13 +114,14 @@ def test_an_inversion_is_refined_from_any_of_its_layers(
         role_of(entries): (data, entries) for data, entries, _ in commands.refine(arrows, viewer)
     }
     data, keywords = by_role["field"]
-    expected = fit(
+    image = FitShot(
         inversion.image,
-        setups=[proton_setup],
+        setup=proton_setup,
         source=inversion.source,
         mask=inversion.mask,
         start=inversion.potential,
     )
+    expected = fit([image])
     field = proton_setup.path_integrated_b(expected.fields[0].displacement)
     np.testing.assert_allclose(data, 1e6 * np.hypot(*field), rtol=1e-6, atol=1e-6 * data.max())
     assert " – shot refined" in keywords["name"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 
 from napari_shadowinv import FitOptions, InputError, ProtonSetup, fit
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.facts import Level
 from napari_shadowinv.fitting import Fit, FitShot, FitWindows, Verdict
+from napari_shadowinv.fitting.windows import window_facts
 from napari_shadowinv.io import read, write
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.forward import synthetic_image
@@ -27,6 +30,8 @@ FACTORS = (1.0, 1.0, 1.0, 1.25, 1.25)
 HASTY = FitOptions(samples=0, max_iterations=3, spacing=0.5)
 PLAIN = FitOptions(samples=0, spacing=0.2)
 RECIPE = Recipe(fit=FitChoices(noise=NOISE, options=PLAIN))
+
+ONE = np.ones((1, 1))
 
 
 def shots_of(factors: tuple[float, ...], **changes: Any) -> list[FitShot]:
@@ -100,6 +105,13 @@ def test_windows_are_kept_in_the_file_of_a_fit(tmp_path: Any, windows: FitWindow
     content = windows.to_dataset()
     for name in ("displacement", "path_integrated_b", "chi2", "explanation", "energy"):
         np.testing.assert_array_equal(dataset[f"window_{name}"], content[name])  # type: ignore[index]
+    # The images of this file are those of the first window.
+    first = dataclasses.replace(windows, numbers=((0, 1),), fits=(first_fit,), strengths=ONE)
+    facts = window_facts(first.added_to(first_fit.to_dataset()))
+    assert facts == first.facts
+    assert [fact.key for fact in windows.facts] == [f"window_{w}" for w in range(1, 5)]
+    assert windows.facts[2].level is Level.DOUBTFUL
+    assert windows.facts[1].text.startswith("images 2, 3, mean energy ")
 
 
 def test_nothing_depends_on_the_order_of_images_or_on_threads() -> None:

@@ -317,6 +317,7 @@ def left_out_of(fit: Fit, limit: float) -> LeaveOneOut:
         limit=np.append(np.full(count - 1, 2.0), limit),
         rms=fit.chi2,
         explanation="a sentence",
+        setups=fit.setups,
     )
 
 
@@ -324,9 +325,10 @@ def left_out_of(fit: Fit, limit: float) -> LeaveOneOut:
 def test_each_image_left_out_has_its_prediction_and_its_residual(
     make_fit: MakeFit, proton_setup: ProtonSetup, count: int
 ) -> None:
-    fit = make_fit(strengths=tuple(np.linspace(1, 2, count)))
+    strengths = tuple(np.linspace(1, 2, count))
+    fit = make_fit(strengths=strengths, setups=setups_of(proton_setup, count))
     left_out = left_out_of(fit, limit=0.5)
-    figure = left_out_figure(left_out, setups_of(proton_setup, count))
+    figure = left_out_figure(left_out)
     panel_titles = titles(figure)
     assert len(panel_titles) == 3 * count
     assert panel_titles.count("Prediction") == count

@@ -115,7 +115,7 @@ def fit(
     Rays may cross, images may be blurred, and the beam may be unknown. Writes fields with error
     bars, re-projections, residuals and a verdict to one file, and a figure next to it.
     """
-    from napari_shadowinv.cli import _fit_result, _static_result
+    from napari_shadowinv.cli import _fit_result
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, suffixes_for
     from napari_shadowinv.pipeline import write_recipe
     from napari_shadowinv.pipeline.fit_run import read_row_images
@@ -130,8 +130,8 @@ def fit(
     target = Path(f"{first.stem}_fit{RESULT.suffix}") if out is None else out
     result, figure = _inputs.result_and_figure(first, target, figure)
     checks: dict[str, Any] = {"left_out": leave_one_out, "window": energy_window}
-    _static_result.check_requests(len(rows), **checks, fiducials=fiducials, result=result)
-    figures = [figure, *_static_result.static_figures(figure, **checks)]
+    _fit_result.check_requests(len(rows), **checks, fiducials=fiducials, result=result)
+    figures = [figure, *_fit_result.static_figures(figure, **checks)]
     outputs = {result: suffixes_for(ResultKind.FIT), **dict.fromkeys(figures, FIGURE_SUFFIXES)}
     if save_recipe is not None:
         outputs[save_recipe] = (".toml",)
@@ -147,7 +147,8 @@ def fit(
     _inputs.check_setup(result, shots[0].setup, chosen.fit.fields if chosen.fit else None)
     warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)
     names = [str(row.file) for row in rows]
-    short = _static_result.short_names(names)
+    beams = ["" if shot.setup else row.beam_text for row, shot in zip(rows, shots, strict=True)]
+    short = _fit_result.short_names(names, beams)
     if compare:
         result_fit = _fit_result.compare_fields(chosen, shots, quiet, written=flags.get("fields"))
     else:
@@ -162,10 +163,8 @@ def fit(
         (common,) = setups if len(setups) == 1 else (None,)
         write_recipe(save_recipe, chosen.model_copy(update={"setup": common}), overwrite=overwrite)
     if not quiet:
-        for table in _static_result.check_tables(
-            static, result_fit, short, [row.beam_text for row in rows]
-        ):
+        for table in _fit_result.check_tables(static):
             say(table)
         say(_fit_result.fit_table(result_fit, names, list(outputs)))
-    _static_result.exit_unless_static(static, result)
+    _fit_result.exit_unless_static(static, result)
     _fit_result.exit_unless_determined(result_fit, result)

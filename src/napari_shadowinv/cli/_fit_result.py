@@ -1,4 +1,4 @@
-"""Fits as the commands run, write and print them."""
+"""Fits, and their checks, as the commands run, write and print them."""
 
 from __future__ import annotations
 
@@ -25,12 +25,15 @@ from napari_shadowinv.cli._terminal import (
     say_on_stderr,
 )
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.formats import RESULT
 
 if TYPE_CHECKING:
     import xarray
+    from matplotlib.figure import Figure
     from rich.table import Table
 
     from napari_shadowinv.fitting import Fit, FitShot
+    from napari_shadowinv.pipeline.static_checks import StaticChecks
     from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.provenance import Provenance
 
@@ -107,16 +110,18 @@ def exit_unless_determined(fit: Fit, out: Path) -> None:
 
 def fit_file_rows(dataset: xarray.Dataset) -> Rows:
     """Describe the file of a fit."""
-    from napari_shadowinv.cli._static_result import static_file_rows
-    from napari_shadowinv.fitting import Fit
+    from napari_shadowinv.fitting import Fit, LeaveOneOut
+    from napari_shadowinv.fitting.windows import window_facts
 
     fit = Fit.from_dataset(dataset)
+    left_out = LeaveOneOut.from_dataset(dataset).facts if "left_out_chi2" in dataset else ()
     provenance = fit.provenance
     return [
         ("kind", f"fit of shadowinv {dataset.attrs['package_version']}"),
         ("created", str(dataset.attrs["created"])),
         *fit_rows(fit),
-        *static_file_rows(dataset),
+        *fact_rows(left_out),
+        *fact_rows(window_facts(dataset)),
         *([] if provenance is None else _provenance_rows(provenance)),
         ("options", options_text(fit.options.model_dump())),
     ]
@@ -147,3 +152,80 @@ def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:
         ("size", size_text(fit.images[0])),
         ("setup", setup_text(fit.setup, shape=fit.images[0].shape)),
     ]
+
+
+def check_requests(
+    count: int, *, left_out: bool, window: int | None, fiducials: Path | None, result: Path
+) -> None:
+    """Refuse, before any work, checks that the images or the result file do not allow."""
+    from napari_shadowinv.pipeline.static_checks import check_count, check_window
+
+    if left_out:
+        check_count(count)
+    if window is not None:
+        check_window(window, count)
+    flag = "--leave-one-out" if left_out else "--energy-window" if window is not None else None
+    if flag is None:
+        return
+    if fiducials is not None:
+        raise InputError(
+            f"received {flag} and --fiducials, which apply to the first image only: use one of them"
+        )
+    if result.suffix.lower() not in RESULT.suffixes:
+        raise InputError(
+            f"received {flag} and {result}, a format without it: write a {RESULT.suffix} file"
+        )
+
+
+def static_figures(report: Path, *, left_out: bool, window: int | None) -> list[Path]:
+    """Return the files of the checks' figures."""
+    requests = {"left_out": left_out, "windows": window is not None}
+    return [
+        report.with_name(f"{report.stem}_{name}{report.suffix}")
+        for name, is_requested in requests.items()
+        if is_requested
+    ]
+
+
+def check_figures(checks: StaticChecks, report: Path, title: str) -> dict[Path, Figure]:
+    """Return the figures of the checks by file."""
+    from napari_shadowinv.plotting import left_out_figure, windows_figure
+
+    left_out, windows = static_figures(report, left_out=True, window=1)
+    figures = {}
+    if checks.left_out is not None:
+        figures[left_out] = left_out_figure(checks.left_out, title=title)
+    if checks.windows is not None:
+        figures[windows] = windows_figure(checks.windows, title=title)
+    return figures
+
+
+def check_tables(checks: StaticChecks) -> list[Table]:
+    """Return a table for each check."""
+    tables = []
+    if checks.left_out is not None:
+        tables.append(two_columns("Left out", fact_rows(checks.left_out.facts)))
+    if checks.windows is not None:
+        tables.append(two_columns("Windows", fact_rows(checks.windows.facts)))
+    return tables
+
+
+def exit_unless_static(checks: StaticChecks, out: Path) -> None:
+    """Exit with an error code if a static field does not explain an image."""
+    if checks.left_out is not None and not checks.left_out.explained.all():
+        say_on_stderr(f"NOT STATIC: {out} was written, but {checks.left_out.explanation}")
+        raise typer.Exit(EXIT_NOT_CONVERGED)
+
+
+def short_names(names: Sequence[str], beams: Sequence[str]) -> list[str]:
+    """Return file names without folders and endings, unless two of them become equal.
+
+    The energy or wavelength of an image without a setup follows its name.
+
+    >>> short_names(["layers/layer_03.tif", "layers/layer_04.tif"], ["", "8 MeV"])
+    ['layer_03', 'layer_04 (8 MeV)']
+    """
+    stems = [Path(name).stem for name in names]
+    unique = stems if len(set(stems)) == len(stems) else names
+    pairs = zip(unique, beams, strict=True)
+    return [f"{name} ({beam})" if beam else name for name, beam in pairs]

@@ -107,7 +107,7 @@ def write_result(
     checks: StaticChecks | None = None,
 ) -> None:
     """Write a result and its figures, all or none; the names of its files are the title."""
-    from napari_shadowinv.cli._static_result import check_figures
+    from napari_shadowinv.cli._fit_result import check_figures
     from napari_shadowinv.io import replacing, write
     from napari_shadowinv.io.files import text_of
     from napari_shadowinv.plotting import result_figure
@@ -117,7 +117,7 @@ def write_result(
     dataset, figures = result.to_dataset(), {figure: result_figure(result, title=title)}
     if checks is not None:
         dataset = checks.add_to(dataset)
-        figures |= check_figures(checks, getattr(result, "setups", ()), figure, title)
+        figures |= check_figures(checks, figure, title)
     with ExitStack() as stack:
         for path, page in figures.items():
             temporary = stack.enter_context(replacing(path, overwrite))

@@ -530,7 +530,7 @@ def check_rerun(
     inputs: RerunInputs, result: Path, out: Path, figure: Path, overwrite: bool
 ) -> None:
     """Refuse, before any work, outputs that cannot be written or would replace an input."""
-    from napari_shadowinv.cli._static_result import static_figures
+    from napari_shadowinv.cli._fit_result import static_figures
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, suffixes_for
 
     _inputs.check_outputs({out: suffixes_for(inputs.kind)}, overwrite)
@@ -554,8 +554,7 @@ def rerun_table(again: Rerun, names: Sequence[str], written: list[Path]) -> Tabl
 
 def exit_unless_sound(again: Rerun, out: Path) -> None:
     """Exit with an error code if an inversion did not converge or a fit is not determined."""
-    from napari_shadowinv.cli._fit_result import exit_unless_determined
-    from napari_shadowinv.cli._static_result import exit_unless_static
+    from napari_shadowinv.cli._fit_result import exit_unless_determined, exit_unless_static
 
     exit_unless_static(again.checks, out)
     exits: dict[ResultKind, Callable[[Any, Path], None]] = {

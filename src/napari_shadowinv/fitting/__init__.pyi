@@ -1,7 +1,8 @@
 from ._fit import compare, fit
 from ._leave_one_out import leave_one_out
-from .measurements import FitOptions, FitShot, point_spread
+from .measurements import FitOptions
 from .result import Basin, Fit, FitReport, FittedField
+from .shots import FitShot, point_spread
 from .verdict import Verdict
 from .windows import FitWindows, LeaveOneOut
 

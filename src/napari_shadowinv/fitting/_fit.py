@@ -19,7 +19,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.measurements import FitData, Images, collect_data, list_shots
+from napari_shadowinv.fitting.measurements import FitData, collect_data
 from napari_shadowinv.fitting.pattern import (
     Pattern,
     find_pattern,
@@ -48,6 +48,7 @@ from napari_shadowinv.fitting.search import (
     search,
     settle_minimum,
 )
+from napari_shadowinv.fitting.shots import Images, list_shots
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.fitting.verdict import assess_verdict, hidden_contrast
 from napari_shadowinv.inversion import invert

@@ -20,7 +20,7 @@ from napari_shadowinv.fitting._fit import collect_starts, reweight_counts
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer, product, settle
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.measurements import FitData, Images, collect_data
+from napari_shadowinv.fitting.measurements import FitData, collect_data
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.rays import at_rest
 from napari_shadowinv.fitting.search import (
@@ -35,6 +35,7 @@ from napari_shadowinv.fitting.search import (
     search,
     settle_minimum,
 )
+from napari_shadowinv.fitting.shots import Images
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.fitting.windows import LeaveOneOut, check_count, explanation_of
 from napari_shadowinv.options import FitOptions
@@ -401,4 +402,6 @@ def _result(
         limit=limit,
         rms=np.sqrt(squares) / level,
         explanation=explanation_of(chi2, limit, data.setups, data.names),
+        setups=data.setups or (),
+        names=data.names or (),
     )

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -14,15 +15,32 @@ import numpy as np
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.fitting.result import Fit
+from napari_shadowinv.fitting.verdict import Verdict
 from napari_shadowinv.inversion.variables import UNCERTAINTY, belongs, dataset_from_field
-from napari_shadowinv.physics.setup import BeamQuantity, Setup, beam_values
-from napari_shadowinv.physics.units import PIXEL, label
+from napari_shadowinv.physics.setup import (
+    BeamQuantity,
+    Setup,
+    beam_values,
+    deflector_titles,
+    setup_from_dict,
+)
+from napari_shadowinv.physics.units import PIXEL, label, shown_fields
+from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["PREFIX", "FitWindows", "LeaveOneOut", "check_count", "explanation_of"]
+__all__ = [
+    "PREFIX",
+    "FitWindows",
+    "LeaveOneOut",
+    "check_count",
+    "explanation_of",
+    "image_numbers",
+    "window_facts",
+]
 
 
 _PLANES = ("image", "y", "x")
@@ -73,6 +91,10 @@ class LeaveOneOut:
         R.m.s. residual, relative to the image's mean.
     explanation : str
         Which images one static field does not explain, in a sentence.
+    setups : tuple of Setup
+        The experiment of each image, if they are known.
+    names : tuple of str
+        The names of the images, if they have any.
     """
 
     images: FloatArray
@@ -85,6 +107,8 @@ class LeaveOneOut:
     limit: FloatArray
     rms: FloatArray
     explanation: str
+    setups: tuple[Setup, ...] = ()
+    names: tuple[str, ...] = ()
 
     @property
     def explained(self) -> BoolArray:
@@ -95,7 +119,32 @@ class LeaveOneOut:
         """Return some of the images, in this order."""
         chosen = list(numbers)
         arrays = {name: getattr(self, name)[chosen] for name in _VARIABLES}
-        return LeaveOneOut(**arrays, explanation=self.explanation)
+        return LeaveOneOut(
+            **arrays,
+            explanation=self.explanation,
+            setups=tuple(self.setups[k] for k in chosen if self.setups),
+            names=tuple(self.names[k] for k in chosen if self.names),
+        )
+
+    @property
+    def facts(self) -> tuple[Fact, ...]:
+        """The result in words: the sentence, then each image."""
+        is_static = bool(self.explained.all())
+        title, level = ("Left out", Level.SOUND) if is_static else ("Warning", Level.DOUBTFUL)
+        sentence = Fact("left_out", title, self.explanation, level)
+        return (sentence, *(self._image_fact(k) for k in range(len(self.chi2))))
+
+    def _image_fact(self, k: int) -> Fact:
+        is_explained = bool(self.explained[k])
+        verdict = "explained" if is_explained else "not explained"
+        chi2 = f"χ² {self.chi2[k]:.3g}"
+        parts = [self.names[k]] if self.names else []
+        parts += [self.setups[k].probe] if self.setups else []
+        parts += [chi2, f"alone {self.alone[k]:.3g}", f"limit {self.limit[k]:.3g}"]
+        text = f"{', '.join(parts)}, r.m.s. {self.rms[k]:.2%}: {verdict}"
+        level = Level.SOUND if is_explained else Level.DOUBTFUL
+        short = chi2 if is_explained else f"{chi2}, {verdict}"
+        return Fact(f"left_out_{k + 1}", f"Left out {k + 1}", text, level, short=short)
 
     def to_dataset(self) -> xarray.Dataset:
         """Return everything as one labelled dataset, whose variables can join those of a fit."""
@@ -126,7 +175,14 @@ class LeaveOneOut:
             name: np.ascontiguousarray(dataset[variable].values)
             for name, (variable, *_) in _VARIABLES.items()
         }
-        return cls(**arrays, explanation=str(dataset.attrs[_SENTENCE]))
+        provenance = Provenance.of(dataset.attrs)
+        names = () if provenance is None else tuple(each.file for each in provenance.images)
+        return cls(
+            **arrays,
+            explanation=str(dataset.attrs[_SENTENCE]),
+            setups=_setups_of(dataset),
+            names=names if all(names) else (),
+        )
 
 
 def check_count(count: int) -> None:
@@ -195,8 +251,85 @@ def _listed(texts: Sequence[str]) -> str:
     return f"{', '.join(most)} and {last}" if most else last
 
 
+def _setups_of(dataset: xarray.Dataset) -> tuple[Setup, ...]:
+    """Setups of the images in the dataset of a fit."""
+    setups = json.loads(dataset.attrs.get("setups", "[]"))
+    return tuple(setup_from_dict(values, "the dataset's setups") for values in setups)
+
+
 PREFIX = "window_"
 """What the variables begin with in the dataset of a fit."""
+
+
+def window_facts(dataset: xarray.Dataset) -> tuple[Fact, ...]:
+    """Return the windows in the dataset of a fit in words; none if it has none.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        As from `FitWindows.added_to`.
+    """
+    if f"{PREFIX}chi2" not in dataset:
+        return ()
+    numbers = dataset[f"{PREFIX}image_number"].values - 1
+    setups, fields = _setups_of(dataset), [str(name) for name in dataset["field"].values]
+    beams = beam_values(setups)
+    means, times = (
+        dataset[variable].values if variable in dataset.variables else None
+        for variable in (f"{PREFIX}{beams[0].name}" if beams else "", f"{PREFIX}time_of_flight")
+    )
+    endings = [f"_{name}" if len(fields) > 1 else "" for name in fields]
+    return _describe_windows(
+        numbers,
+        dataset[f"{PREFIX}chi2"].values,
+        [str(verdict) for verdict in dataset[f"{PREFIX}verdict"].values],
+        {
+            name: dataset[f"{PREFIX}displacement{ending}"].values
+            for name, ending in zip(fields, endings, strict=True)
+        },
+        np.array([dataset["mask"].values[group].any(axis=0) for group in numbers]),
+        setups[numbers[0][0]] if setups else None,
+        None if beams is None else beams[0],
+        means,
+        times,
+    )
+
+
+def _describe_windows(
+    numbers: Sequence[Sequence[int]] | AnyArray,
+    chi2: Sequence[FloatArray] | FloatArray,
+    verdicts: Sequence[str],
+    displacements: Mapping[str, FloatArray],
+    used: BoolArray,
+    setup: Setup | None,
+    quantity: BeamQuantity | None,
+    means: FloatArray | None,
+    times: FloatArray | None,
+) -> tuple[Fact, ...]:
+    """A fact for each group: its images, energy, time, χ², the peaks of its fields, its verdict."""
+    peaks = {}
+    for name, planes in displacements.items():
+        unmasked = list(np.where(used[:, None], planes, np.nan))
+        shown = shown_fields(unmasked, setup, deflector_titles()[name])
+        peaks[name] = [field.peak_text() for field in shown]
+    facts = []
+    for w, verdict in enumerate(verdicts):
+        parts = [image_numbers(numbers[w])]
+        if quantity is not None and means is not None:
+            parts.append(f"mean {quantity.noun} {quantity.text(means[w])}")
+        if times is not None:
+            parts.append(f"time of flight {times[w] * 1e12:.4g} ps")
+        parts.append(f"χ² {', '.join(f'{value:.3g}' for value in chi2[w])}")
+        parts += [f"{name} {texts[w]}" for name, texts in peaks.items()]
+        level = Level.SOUND if verdict == Verdict.DETERMINED else Level.DOUBTFUL
+        text = f"{', '.join(parts)}: {verdict}"
+        facts.append(Fact(f"window_{w + 1}", f"Window {w + 1}", text, level, short=verdict))
+    return tuple(facts)
+
+
+def image_numbers(indices: Sequence[int] | AnyArray) -> str:
+    """Return the numbers of images, counted from 1, such as "images 2, 3"."""
+    return f"image{'s' * (len(indices) > 1)} {', '.join(str(k + 1) for k in indices)}"
 
 
 @dataclass(frozen=True)
@@ -216,6 +349,22 @@ class FitWindows:
     numbers: tuple[tuple[int, ...], ...]
     fits: tuple[Fit, ...]
     strengths: FloatArray
+
+    @property
+    def facts(self) -> tuple[Fact, ...]:
+        """The result in words: each group with the peaks of its fields and its verdict."""
+        names = [field.name for field in self.fits[0].fields]
+        return _describe_windows(
+            self.numbers,
+            [fit.chi2 for fit in self.fits],
+            [str(fit.verdict) for fit in self.fits],
+            dict(zip(names, self.displacement.swapaxes(0, 1), strict=True)),
+            np.stack([fit.used for fit in self.fits]),
+            self.setup,
+            self.beam_quantity,
+            self.beam_means,
+            self.times_of_flight,
+        )
 
     @property
     def setup(self) -> Setup | None:

@@ -16,7 +16,8 @@ from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitShot, FitWindows, LeaveOneOut, fit, leave_one_out
-from napari_shadowinv.fitting.measurements import common_values, strengths_of
+from napari_shadowinv.fitting.measurements import strengths_of
+from napari_shadowinv.fitting.shots import common_values
 from napari_shadowinv.fitting.windows import check_count
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline.fit_run import FitInputs, collect_fit_inputs
@@ -114,7 +115,8 @@ def run_leave_one_out(
         on_progress=on_progress,
         should_stop=should_stop,
     )
-    return left_out.only([int(place) for place in np.argsort(order)])
+    left_out = left_out.only([int(place) for place in np.argsort(order)])
+    return replace(left_out, setups=inputs.setups or (), names=inputs.names)
 
 
 def run_windows(

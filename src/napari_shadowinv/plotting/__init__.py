@@ -11,9 +11,8 @@ disturb the figures of a notebook.
 """
 
 from napari_shadowinv.plotting._film_figure import pack_figure
-from napari_shadowinv.plotting._fit_figure import fit_figure
+from napari_shadowinv.plotting._fit_figure import fit_figure, left_out_figure, windows_figure
 from napari_shadowinv.plotting._movie import in_few_colours, stack_frames, write_film
-from napari_shadowinv.plotting._static_figure import left_out_figure, windows_figure
 from napari_shadowinv.plotting.figures import (
     comparison_figure,
     report_figure,

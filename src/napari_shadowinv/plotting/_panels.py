@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import CAUTION_CODES
+from napari_shadowinv.facts import Level
 from napari_shadowinv.physics.units import ShownField, prefix_for, shown_potential
 
 if TYPE_CHECKING:
@@ -290,6 +291,11 @@ def new_page(grid: Grid, scale: Scale, title: str | None) -> tuple[Figure, list[
         figure.text(0.2 / width, 1 - 0.26 / height, title, size=13, weight="bold", va="center")
     boxes = [grid.box(index) for index in range(grid.rows * grid.columns)]
     return figure, [Panel(figure.add_axes(box), scale, grid) for box in boxes]
+
+
+def level_colour(level: Level) -> str:
+    """Return the colour of sentences of a level."""
+    return GOOD_COLOUR if level is Level.SOUND else ALARM_COLOUR
 
 
 def write_header(

@@ -20,8 +20,6 @@ from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._film_figure import pack_figure
 from napari_shadowinv.plotting._fit_figure import fit_figure
 from napari_shadowinv.plotting._panels import (
-    ALARM_COLOUR,
-    GOOD_COLOUR,
     QUIET_COLOUR,
     Panel,
     draw_cuts,
@@ -30,6 +28,7 @@ from napari_shadowinv.plotting._panels import (
     draw_intensity,
     draw_potential,
     draw_side_by_side,
+    level_colour,
     outline_caustics,
 )
 
@@ -189,7 +188,7 @@ def save_figure(path: str | Path, figure: Figure, overwrite: bool = False) -> Pa
 def _header(inversion: Inversion, setup: Setup | None, columns: int) -> list[tuple[str, str]]:
     """Lines of the headline, each with its colour, wrapped to a number of letters."""
     headline = inversion.headline_in(setup)
-    colour = GOOD_COLOUR if headline.level == "sound" else ALARM_COLOUR
+    colour = level_colour(headline.level)
     return [(line, colour) for line in textwrap.wrap(headline.text, columns)]
 
 

@@ -26,7 +26,7 @@ from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.fitting import Fit
+from napari_shadowinv.fitting import Fit, FitShot
 from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.variables import dataset_from_field, fit_labels, variable_labels
 from napari_shadowinv.io.store import DONE, FAILED
@@ -36,7 +36,6 @@ from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import (
     Cache,
-    FitShot,
     Inputs,
     collect_inputs,
     run_fit,

@@ -642,14 +642,15 @@ def test_refine_starts_from_the_last_inversion(
     assert tool.panel.button.text() == "Cancel"
     qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
     result = answers[0].value.content
-    expected = fit(
+    shot = FitShot(
         inversion.image,
-        setups=[SETUPS[0]],
+        setup=SETUPS[0],
         source=inversion.source,
         mask=inversion.mask,
         psf=0.5,
         start=inversion.potential,
     )
+    expected = fit([shot])
     np.testing.assert_allclose(result.fields[0].potential, expected.fields[0].potential)
     assert any(basin.start == "given" for basin in result.basins)
     qtbot.waitUntil(lambda: "Verdict" in tool.fit_view.verdict.text(), timeout=PATIENCE)
