@@ -642,7 +642,7 @@ def test_refine_starts_from_the_last_inversion(
     assert tool.panel.button.text() == "Cancel"
     qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
     result = answers[0].value.content
-    shot = FitShot(
+    refined_shot = FitShot(
         inversion.image,
         setup=SETUPS[0],
         source=inversion.source,
@@ -650,7 +650,7 @@ def test_refine_starts_from_the_last_inversion(
         psf=0.5,
         start=inversion.potential,
     )
-    expected = fit([shot])
+    expected = fit([refined_shot])
     np.testing.assert_allclose(result.fields[0].potential, expected.fields[0].potential)
     assert any(basin.start == "given" for basin in result.basins)
     qtbot.waitUntil(lambda: "Verdict" in tool.fit_view.verdict.text(), timeout=PATIENCE)
