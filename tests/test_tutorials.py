@@ -187,7 +187,7 @@ def test_the_pictures_and_pages_of_a_tutorial_exist(page):
 
 
 def test_the_table_of_sources_is_as_the_inversions_say():
-    from napari_shadowinv._napari.shots import four_toroids
+    from napari_shadowinv._napari.samples import four_toroids
     from napari_shadowinv.physics import phantoms
     from napari_shadowinv.preprocessing import ESTIMATES
 
