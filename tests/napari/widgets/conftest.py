@@ -69,6 +69,22 @@ def open_widget(window: Any) -> Callable[[str], Any]:
 
 
 @pytest.fixture
+def opened(viewer: Any, qtbot: Any) -> Iterator[Callable[[Any], Any]]:
+    """Make a widget of a class, as a session does when its menu is used first."""
+    widgets: list[Any] = []
+
+    def make(kind: Any) -> Any:
+        widgets.append(kind(viewer))
+        qtbot.addWidget(widgets[-1])
+        return widgets[-1]
+
+    yield make
+    # None writes into the settings of the next test.
+    for widget in widgets:
+        widget._keeper._timer.stop()
+
+
+@pytest.fixture
 def assert_it_fits(window: Any, qtbot: Any) -> Callable[[Any], None]:
     """Check that a widget needs no sideways scrolling in a small and in a large window."""
 

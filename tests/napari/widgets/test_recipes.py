@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -52,19 +52,15 @@ PATIENCE = 60_000  # ms
 
 
 @pytest.fixture
-def opened(viewer: ViewerModel, qtbot: Any) -> Iterator[Callable[..., Any]]:
+def opened(opened: Callable[[Any], Any]) -> Callable[..., Any]:
     """Make a widget of a class, with few sites."""
-    widgets: list[Any] = []
 
     def make(kind: Any = InvertShot) -> Any:
-        widgets.append(kind(viewer))
-        qtbot.addWidget(widgets[-1])
-        widgets[-1].options.set_values({"n_sites": 300})
-        return widgets[-1]
+        widget = opened(kind)
+        widget.options.set_values({"n_sites": 300})
+        return widget
 
-    yield make
-    for widget in widgets:
-        widget._keeper._timer.stop()
+    return make
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,22 +36,6 @@ from napari_shadowinv.preprocessing import Crop, PolynomialEstimate, Radiograph,
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms
 PLUGIN = "napari-shadowinv"
-
-
-@pytest.fixture
-def opened(viewer: ViewerModel, qtbot: Any) -> Iterator[Any]:
-    """Make a widget of a class, as a session does when its menu is used first."""
-    widgets: list[Any] = []
-
-    def make(kind: Any) -> Any:
-        widgets.append(kind(viewer))
-        qtbot.addWidget(widgets[-1])
-        return widgets[-1]
-
-    yield make
-    # None writes into the settings of the next test.
-    for widget in widgets:
-        widget._keeper._timer.stop()
 
 
 @pytest.fixture
