@@ -1,6 +1,7 @@
 """Shadowgrams and proton radiographs to deflection potentials and line-integrated fields.
 
 - invert an image: `invert`, with `InversionOptions`; the answer is an `Inversion`
+- how well beam, detector and alignment are known, for its errors: `Instrument`, `BeamPrior`
 - share sites between shots with one source: `plan_sites`
 - how far the image's noise moves its field: `uncertainty`
 - several images of one object, folds, an unknown beam: `fit`, with `FitOptions`, of `FitShot`;

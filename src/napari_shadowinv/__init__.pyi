@@ -6,7 +6,7 @@ from .fitting import Fit, FitOptions, FitShot, fit
 from .inversion import Inversion, Report, invert, plan_sites
 from .inversion.error_bars import Uncertainty, uncertainty
 from .io import Radiograph, read, write
-from .options import InversionOptions
+from .options import BeamPrior, Instrument, InversionOptions
 from .physics.forward import synthetic_image
 from .physics.poisson import poisson_invert
 from .physics.projection import project, project_potential
@@ -20,12 +20,14 @@ from .stack import invert_stack, run_stack, stack_statistics, watch_stack
 __version__: str
 
 __all__ = [
+    "BeamPrior",
     "Caution",
     "FileFormatError",
     "Fit",
     "FitOptions",
     "FitShot",
     "InputError",
+    "Instrument",
     "Inversion",
     "InversionCancelled",
     "InversionOptions",

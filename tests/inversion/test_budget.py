@@ -11,7 +11,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv import (
+    BeamPrior,
     InputError,
+    Instrument,
     InversionOptions,
     ProtonSetup,
     invert,
@@ -149,8 +151,10 @@ def test_the_solvers_part_is_the_change_by_a_better_solution(image):
 
 def test_the_error_by_an_unmeasured_beam_is_that_by_other_beams(image):
     """Beams that are drawn here, in another way, with the same spectrum."""
-    options = InversionOptions(n_sites=900, beam_variation=0.02, beam_scale=0.2)
-    unchanged = invert(image, options=options)
+    options = InversionOptions(n_sites=900)
+    unchanged = invert(
+        image, options=options, instrument=Instrument(beam=BeamPrior(rms=0.02, length=0.2))
+    )
     rng = np.random.default_rng(4)
     length = 0.2 * min(image.shape)
     moved = []
@@ -185,9 +189,9 @@ def test_the_total_adds_all_errors_in_squares(image):
 
 @pytest.mark.parametrize("measured", [False, True])
 def test_a_stated_beam_variation_enters_the_total(image, measured):
-    options = InversionOptions(n_sites=900, beam_variation=0.03)
+    options = InversionOptions(n_sites=900)
     plan = plan_sites(np.ones(image.shape), options, measured=measured)
-    errors = invert(image, plan=plan, options=options).errors
+    errors = invert(image, plan=plan, options=options, instrument={"beam_rms": 0.03}).errors
     assert errors.beam.rms == pytest.approx(3 * errors.beam_sensitivity.rms)
     assert errors.of_peak.cause == "beam stated, 3 %"
 
@@ -276,9 +280,10 @@ def test_the_larger_difference_of_beams_counts(stated, recorded, basis):
     """What is seen, 3 %, unless more is stated, or assumed where nothing is stated."""
     shape = (128, 128)
     shot = np.random.default_rng(3).poisson(1000 * smooth_beam(shape, 0.03, 3)).astype(float)
-    options = InversionOptions(n_sites=400, beam_variation=stated)
+    options = InversionOptions(n_sites=400)
     plan = plan_sites(np.ones(shape), options, measured=recorded)
-    errors = invert(shot, plan=plan, options=options).errors
+    instrument = Instrument(beam_rms=stated)
+    errors = invert(shot, plan=plan, options=options, instrument=instrument).errors
     expected = {"seen": 0.03, "assumed": 0.05, "stated": stated}[basis]
     assert errors.beam_basis == basis
     assert errors.beam_variation == pytest.approx(expected, rel=0.4 if basis == "seen" else 1e-9)
@@ -302,7 +307,8 @@ def test_sites_needed_follow_from_the_fall_of_the_error(monkeypatch, image, powe
     """An error 4 times too large that falls as n⁻ᵖ needs 1.3 · 4^(1/p) times the sites."""
     options = InversionOptions(accuracy=0.01)
     prepared = prepare(image, None, options)
-    budget = Budget(plan_sites(np.ones(image.shape)), prepared, ImageNoise(prepared), options)
+    plan, noise = plan_sites(np.ones(image.shape)), ImageNoise(prepared)
+    budget = Budget(plan, prepared, noise, options, Instrument())
     move = np.full((2, 9), np.sqrt(0.5))  # 1 px
     monkeypatch.setattr(budget, "_move", lambda solution: move)
     monkeypatch.setattr(budget, "_change", lambda solved: (np.full(9, 0.04**2), power))
@@ -382,7 +388,7 @@ def test_errors_that_are_not_known_are_said_to_be(image):
     assert "discretisation was not estimated, as only one level was solved" in rows["errors"]
     rows = dict(invert(image, options=InversionOptions(n_sites=900)).error_rows)
     assert "not estimated" not in rows["errors"]
-    assert rows["errors"].endswith("blur and crossing rays are not in it")
+    assert rows["errors"].endswith("crossing rays are not in it")
 
 
 def test_noise_that_was_smoothed_is_not_passed_off_as_measured():

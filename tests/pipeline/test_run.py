@@ -17,6 +17,7 @@ from scipy.io import savemat
 
 from napari_shadowinv import (
     InputError,
+    Instrument,
     InversionOptions,
     OpticalSetup,
     invert,
@@ -201,6 +202,7 @@ def test_a_recipe_survives_its_file(tmp_path: Path, source: Any, setup: Any) -> 
         source=chosen if source is MeasuredSource else changed(source),
         mask=tmp_path / "below" / "mask.png",
         setup=setup,
+        instrument=Instrument(beam_rms=0.02, gamma=0.1),
         options=InversionOptions(n_sites=7, boundary="free", flux="known"),
     )
     path = tmp_path / "recipe.toml"
@@ -216,9 +218,11 @@ def test_every_parameter_has_a_flag() -> None:
         raise AssertionError(flags)
 
     flags = set(inspect.signature(command).parameters)
-    for name in InversionOptions.model_fields:
+    for name in [*InversionOptions.model_fields, *Instrument.model_fields]:
         assert name in flags
         flags.discard(name)
+    flagged = recipe_of({"gamma": 0.1}, Recipe(instrument=Instrument(blur=2)), {})
+    assert flagged.instrument == Instrument(blur=2, gamma=0.1)
     for step in (changed(model) for model in STEPS.values()):
         assert isinstance(step, Step)
         values = {
@@ -240,7 +244,7 @@ OTHER = {
     "readout": "centroid", "integration": "y", "solver": "lbfgs", "stages": "single",
     "max_iterations": 9, "negative": "clip", "boundary": "free", "margin": 9, "decay_length": 3.0,
     "flux": "known", "caustic_jacobian": 0.5, "seed": 4, "threads": 1, "accuracy": 0.3,
-    "noise_level": 0.1, "units_per_quantum": 2.0, "beam_variation": 0.1, "beam_scale": 0.5,
+    "noise_level": 0.1, "units_per_quantum": 2.0,
 }  # fmt: skip
 
 

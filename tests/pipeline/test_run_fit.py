@@ -10,7 +10,7 @@ import pytest
 import tifffile
 
 from helpers.fit_images import of_each
-from napari_shadowinv import Fit, InputError, ProtonSetup, fit
+from napari_shadowinv import Fit, InputError, Instrument, ProtonSetup, fit
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.io import read, write
@@ -183,3 +183,9 @@ def test_fit_warns_of_broken_pixels_in_an_image(images: list[FloatArray], tmp_pa
     path = tmp_path / "fit.shadowinv"
     write(path, result)
     assert Fit.from_dataset(read(path)).warnings == result.warnings
+
+
+def test_a_fit_refuses_a_recipe_with_an_instrument() -> None:
+    recipe = Recipe(instrument=Instrument(gamma=0.1), fit=FitChoices())
+    with pytest.raises(InputError, match=r"instrument.*not those of fits.*beam_variation"):
+        run_fit(recipe, [np.ones((32, 32))])

@@ -25,7 +25,7 @@ from typer.core import TyperCommand, TyperGroup
 from napari_shadowinv._system.validation import Model, suggestion, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import IMAGE_TITLES
-from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
+from napari_shadowinv.options import FitChoices, FitOptions, Instrument, InversionOptions
 from napari_shadowinv.preprocessing import ESTIMATES, FIT_STEPS, STEPS, Recipe, Step
 
 HELP_NAMES = ("-h", "--help", "--help-all")
@@ -224,6 +224,7 @@ def _table(rows: Iterable[tuple[str, str]], width: int) -> Iterator[str]:
 
 _STEPS = "Steps before the inversion, in this order"
 _ESTIMATES = "Source estimated from the image (docs/sources.md)"
+_INSTRUMENT = "How well the instrument is known (docs/uncertainty.md)"
 _OPTIONS = "Options of the inversion"
 _FIT_STEPS = "Steps before the fit, in this order"
 _FIT_CHOICES = "Unknowns and data of the fit"
@@ -384,6 +385,7 @@ def _recipe_flags() -> Flags:
         text = " ".join(f"For {key}: {_lower_first(_field_help(f))}" for key, f in fields.items())
         field = next(iter(fields.values()))
         flags.append(_flag(f"source-{name.replace('_', '-')}", field, _ESTIMATES, text))
+    flags += _option_flags(Instrument, _INSTRUMENT)
     return flags + _option_flags(InversionOptions, _OPTIONS)
 
 
@@ -477,7 +479,12 @@ def recipe_of(
         raise InputError("received --margin: it needs --boundary free")
     steps, source = _steps(flags, base.steps), _estimate(flags, base)
     inversion_options = validate(InversionOptions, chosen, where)
-    changes = {"steps": steps, "source": source, "options": inversion_options}
+    changes = {
+        "steps": steps,
+        "source": source,
+        "instrument": _instrument(flags, base),
+        "options": inversion_options,
+    }
     return base.model_copy(update=changes)
 
 
@@ -499,6 +506,13 @@ def fit_recipe_of(
     values = {name: value for name, value in values.items() if name not in replaced}
     choices = validate(FitChoices, {**values, **changes, "options": fit_options}, "fit")
     return base.model_copy(update={"steps": _steps(flags, base.steps), "fit": choices})
+
+
+def _instrument(flags: Mapping[str, Any], base: Recipe) -> Instrument:
+    """Return the recipe's instrument with the numbers that flags state."""
+    changes = {name: flags[name] for name in Instrument.model_fields if name in flags}
+    stated = base.instrument.model_dump(exclude_unset=True)
+    return validate(Instrument, {**stated, **changes}, "instrument")
 
 
 def _steps(flags: Mapping[str, Any], steps: tuple[Step, ...]) -> tuple[Step, ...]:

@@ -25,8 +25,7 @@ from napari_shadowinv.fitting.descent import Preconditioner, finer, product, sol
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import FitData
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.inversion.budget import ASSUMED_VARIATION
-from napari_shadowinv.options import FitOptions
+from napari_shadowinv.options import ASSUMED_BEAM, FitOptions
 
 __all__ = [
     "BeamError",
@@ -409,7 +408,7 @@ def shifts_by_beam(
         return None
     variation = options.beam_variation
     if variation is None:
-        variation = ASSUMED_VARIATION if data.assumed else 0.0
+        variation = ASSUMED_BEAM.rms if data.assumed else 0.0
     middle = posterior.scene
     rng = np.random.default_rng([options.seed, _BEAM_SEED])
     length = options.beam_scale * min(data.size)

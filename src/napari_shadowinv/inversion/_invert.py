@@ -32,7 +32,7 @@ from napari_shadowinv.inversion.solution_checks import (
     is_coarse,
     mark_caustics,
 )
-from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
+from napari_shadowinv.options import MAX_DEFAULT_SITES, Instrument, InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.preprocessing.image_checks import image_warnings
@@ -167,6 +167,7 @@ def invert(
     source: ArrayLike | None = None,
     mask: ArrayLike | None = None,
     options: InversionOptions | None = None,
+    instrument: Instrument | None = None,
     plan: SitePlan | None = None,
     start: Inversion | None = None,
     on_progress: OnProgress | None = None,
@@ -187,6 +188,9 @@ def invert(
         to zero in `source` instead: their shadows move with the rays.
     options : InversionOptions, optional
         The defaults suit most images.
+    instrument : Instrument, optional
+        How well beam, detector and alignment are known, for the error budget. Default: exact, but
+        for a source that was not recorded.
     plan : SitePlan, optional
         Sites prepared by `plan_sites`, instead of `source` and `mask`. If it was made with a number
         of sites, this number overrides the options.
@@ -226,6 +230,7 @@ def invert(
     0.0
     """
     options = as_model(InversionOptions, options, "options")
+    instrument = as_model(Instrument, instrument, "instrument")
     check_instance(plan, SitePlan, "plan")
     check_instance(start, Inversion, "start")
     report = Reporter(on_progress, should_stop)
@@ -257,7 +262,7 @@ def invert(
             scale = prepared.flux_scale / image_flux
             prepared = prepare(image, source, options, mask, flux_scale=scale)
         noise = ImageNoise(prepared.in_units(), options)
-        budget = Budget(plan, prepared, noise, options)
+        budget = Budget(plan, prepared, noise, options, instrument)
         if not options.is_adaptive and not levels.is_complete:
             levels = levels.up_to(_site_domain(plan.source, options, plan.mask).n_sites)
         if start is not None:
@@ -324,6 +329,7 @@ def invert(
             errors=errors,
         ),
         options=options,
+        instrument=instrument,
     )
 
 

@@ -24,16 +24,17 @@ from scipy.spatial import KDTree
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
+from napari_shadowinv.inversion.imperfections import IMPERFECTIONS, SolvedShot, random_waves
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.inversion.readout import LinearResponse
-from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.options import ASSUMED_BEAM, BeamPrior, Instrument, InversionOptions
 from napari_shadowinv.physics.units import PeakError
 from napari_shadowinv.transport.minimise import Solution, with_full_cells
 from napari_shadowinv.transport.sites import RATIO, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
 
-__all__ = ["ASSUMED_VARIATION", "FLUX_ERRORS", "Budget", "ErrorEstimate", "Errors"]
+__all__ = ["FLUX_ERRORS", "Budget", "ErrorEstimate", "Errors"]
 
 _PLACES = 48  # along the longer side, where levels are compared
 _USUAL_RATE, _RATES = 0.35, (0.25, 0.7)  # of the change between levels to the one before
@@ -46,12 +47,10 @@ _MAX_BEAM_AT_PEAK = 0.1  # of the displacement, without a warning
 _MAX_BEAM_RMS = 0.25  # of the displacement, without a warning
 
 _MAX_RESPONSE_SITES = 4500  # of a level whose linear response is computed
-_NOISE_SAMPLES, _BEAM_SAMPLES, _WAVES = 16, 8, 16
+_NOISE_SAMPLES, _BEAM_SAMPLES = 16, 8
 _NEAR = 2.5  # site spacings
 _LEAST_NOISE = 0.1  # of the mean square, where correlation takes waves away
 
-ASSUMED_VARIATION = 0.05
-"""Relative r.m.s. difference between the true beam and a source that was not recorded."""
 _TESTED_VARIATION = 0.01  # of a beam, r.m.s.
 _BEAM_TEXTS = {
     "assumed": "beam assumed, {:.2g} %",
@@ -83,14 +82,20 @@ class Errors:
     noise : ErrorEstimate
         Scatter by the noise of image and source.
     effects : dict of str to ErrorEstimate
-        Effects of errors of the flux in the cells, by their causes in `FLUX_ERRORS`.
+        Effects of errors of the flux in the cells, by their causes in `FLUX_ERRORS`, and of the
+        instrument's imperfections.
     beam : ErrorEstimate or None
         Effect of a beam that differs from the source by `beam_variation`; None if the source was
         recorded, no variation was stated, and none was seen.
     beam_sensitivity : ErrorEstimate or None
         Effect of a beam that differs from the source by 1 %; None in reports of older versions.
+    sensitivities : dict of str to ErrorEstimate
+        Effects of imperfections of the instrument, by their names with a size, such as
+        "background, 5 %".
     beam_variation : float
         Relative r.m.s. difference of beam and source that `beam` stands for.
+    beam_scale : float
+        Length over which they differ, as a share of the image's shorter side.
     beam_basis : str
         Origin of that number: 'assumed' for an estimated source, 'stated' by the user, 'seen' in
         the image outside the object.
@@ -106,14 +111,16 @@ class Errors:
     effects: dict[str, ErrorEstimate]
     beam: ErrorEstimate | None = None
     beam_sensitivity: ErrorEstimate | None = None
-    beam_variation: float = ASSUMED_VARIATION
+    sensitivities: dict[str, ErrorEstimate] = dataclasses.field(default_factory=dict)
+    beam_variation: float = 0.0
+    beam_scale: float = ASSUMED_BEAM.length
     beam_basis: str = "assumed"
     noise_correlation: float = 0.0
 
     @property
     def total(self) -> ErrorEstimate:
         """Sum of all contributions in squares."""
-        parts = np.array(list(self._contributions.values()))
+        parts = np.array(list(self.parts.values()))
         return _roots(*(parts**2).sum(axis=0))
 
     @property
@@ -124,20 +131,21 @@ class Errors:
         """
         if not self.peak > 0:
             return None
-        parts = self._contributions
+        parts = self.parts
         cause = max(parts, key=lambda name: parts[name].at_peak)
         return PeakError(self.total.at_peak / self.peak, cause)
 
     @property
-    def _contributions(self) -> dict[str, ErrorEstimate]:
-        """Known errors by their causes."""
+    def parts(self) -> dict[str, ErrorEstimate]:
+        """Known errors by their causes, the largest first."""
         noise = "noise"
         if self.noise_correlation:
             noise = f"noise, correlated over {self.noise_correlation:.2g} px"
         parts = {noise: self.noise, "discretisation": self.discretisation, **self.effects}
         if self.beam is not None:
             parts[_BEAM_TEXTS[self.beam_basis].format(100 * self.beam_variation)] = self.beam
-        return {name: error for name, error in parts.items() if not math.isnan(error.rms)}
+        known = {name: error for name, error in parts.items() if not math.isnan(error.rms)}
+        return dict(sorted(known.items(), key=lambda part: -part[1].rms))
 
     def accuracy_caution(self, accuracy: float, why: str) -> Caution | None:
         """Warn if the discretisation error exceeds the accuracy and is not hidden by noise."""
@@ -153,29 +161,30 @@ class Errors:
 
     def times(self, factor: float) -> Errors:
         """Return the budget in another unit; 1 px of displacement is `factor` of it."""
-        lengths = {
+        lengths: dict[str, Any] = {
             field.name: _scale_error(getattr(self, field.name), factor)
             for field in dataclasses.fields(self)
             if field.name in ("peak", "rms") or isinstance(getattr(self, field.name), ErrorEstimate)
         }
-        effects = {cause: _scale_error(error, factor) for cause, error in self.effects.items()}
-        return dataclasses.replace(self, effects=effects, **lengths)
+        for name in ("effects", "sensitivities"):
+            table = getattr(self, name)
+            lengths[name] = {cause: _scale_error(error, factor) for cause, error in table.items()}
+        return dataclasses.replace(self, **lengths)
 
-    def rows(self, options: InversionOptions) -> list[tuple[str, str]]:
+    def rows(self) -> list[tuple[str, str]]:
         """Describe the budget in words: names and texts."""
         parts = ", ".join(
-            f"{_percent(error.rms, self.rms)} ({cause})"
-            for cause, error in self._contributions.items()
+            f"{_percent(error.rms, self.rms)} ({cause})" for cause, error in self.parts.items()
         )
         text = (
-            f"{_percent(self.total.rms, self.rms)} of the displacement (r.m.s.): {parts}; blur and "
-            "crossing rays are not in it"
+            f"{_percent(self.total.rms, self.rms)} of the displacement (r.m.s.): {parts}; crossing "
+            "rays are not in it"
         )
         if math.isnan(self.discretisation.rms):
             text += "; discretisation was not estimated, as only one level was solved"
         rows = [("errors", text)]
         if self.beam_sensitivity is not None:
-            length = {0.25: "a quarter"}.get(options.beam_scale, f"{options.beam_scale:.2g}")
+            length = {0.25: "a quarter"}.get(self.beam_scale, f"{self.beam_scale:.2g}")
             basis = "recorded"
             if self.beam is not None:
                 basis = _BEAM_TEXTS[self.beam_basis].format(100 * self.beam_variation)
@@ -189,6 +198,12 @@ class Errors:
                     f"{_percent(self.beam_sensitivity.at_peak, self.peak)}",
                 )
             )
+        if self.sensitivities:
+            effects = ", ".join(
+                f"{name}: {_percent(error.rms, self.rms)}"
+                for name, error in self.sensitivities.items()
+            )
+            rows.append(("instrument", f"effect on the displacement (r.m.s.) of {effects}"))
         return rows
 
     def beam_caution(self) -> Caution | None:
@@ -213,8 +228,11 @@ class Errors:
             name: ErrorEstimate(*value) if isinstance(value, list | tuple) else value
             for name, value in content.items()
         }
-        effects = {cause: ErrorEstimate(*value) for cause, value in content["effects"].items()}
-        return cls(**{**values, "effects": effects})
+        tables = {
+            name: {cause: ErrorEstimate(*value) for cause, value in content.get(name, {}).items()}
+            for name in ("effects", "sensitivities")
+        }
+        return cls(**{**values, **tables})
 
 
 class Budget:
@@ -226,9 +244,10 @@ class Budget:
         prepared: Prepared,
         noise: ImageNoise,
         options: InversionOptions,
+        instrument: Instrument,
     ) -> None:
         self._plan, self._prepared = plan, prepared
-        self._noise, self.options = noise, options
+        self._noise, self.options, self.instrument = noise, options, instrument
         self._places = _places(prepared)
         self._moves: dict[LevelSolution, FloatArray] = {}
         self._responses: dict[LevelSolution, LinearResponse] = {}
@@ -295,20 +314,35 @@ class Budget:
             spacing = max(solved[-2].level.spacing, _stride(mask.shape))
             weights = _near(peak, self._places.T, spacing)
             discretisation = _roots(squares.mean(), (squares * weights).sum() / 2)
+        whole = ErrorEstimate(float(np.sqrt(np.mean(length[mask] ** 2))), float(length.max()))
+        shot = SolvedShot(self._prepared.in_units(), displacement, response, self.options.seed)
+        effects: dict[str, ErrorEstimate] = {}
+        sensitivities: dict[str, ErrorEstimate] = {}
+        for imperfection in IMPERFECTIONS:
+            sizes = imperfection.tested, imperfection.stated(self.instrument)
+            for size, errors in zip(sizes, (sensitivities, effects), strict=True):
+                if size:
+                    pattern = imperfection.pattern(shot, size)
+                    errors[imperfection.name(size)] = estimate(response.to(pattern))
+        if share := self.instrument.other_field:
+            effects[f"other field, {100 * share:.2g} %"] = _scale_error(whole, share)
         by_percent = estimate(_TESTED_VARIATION * response.to(self._beams(response)))
         times = variation / _TESTED_VARIATION
         return Errors(
-            peak=float(length.max()),
-            rms=float(np.sqrt(np.mean(length[mask] ** 2))),
+            peak=whole.at_peak,
+            rms=whole.rms,
             discretisation=discretisation,
             noise=estimate(*self._noisy_moves(response, solved[-1].level.spacing)),
-            effects={
+            effects=effects
+            | {
                 cause: estimate(response.to(samples))
                 for cause, samples in self._flux_errors(response, solved[-1])
             },
             beam=_scale_error(by_percent, times) if variation else None,
             beam_sensitivity=by_percent,
+            sensitivities=sensitivities,
             beam_variation=variation,
+            beam_scale=self._beam.length,
             beam_basis=basis,
             noise_correlation=self._noise.correlation_length,
         )
@@ -321,12 +355,14 @@ class Budget:
     @cached_property
     def _beam_variation(self) -> tuple[float, str]:
         """Relative difference of beam and source, and its origin."""
-        stated = self.options.beam_variation
-        expected = 0.0 if self._plan.measured else ASSUMED_VARIATION
         observed = self.beam_difference
-        if observed > (expected if stated is None else stated):
+        if observed > self._beam.rms:
             return observed, "seen"
-        return (expected, "assumed") if stated is None else (stated, "stated")
+        return self._beam.rms, "assumed" if self.instrument.beam_rms is None else "stated"
+
+    @property
+    def _beam(self) -> BeamPrior:
+        return self.instrument.beam_of(measured=self._plan.measured)
 
     def _move(self, solution: LevelSolution) -> FloatArray:
         """Return the displacement at the places, shape (2, n), as in the read-out."""
@@ -398,13 +434,10 @@ class Budget:
     def _beams(self, response: LinearResponse) -> FloatArray:
         """Return the flux that cells gain from beams that differ from the source by 1 (r.m.s.)."""
         rng = np.random.default_rng(self.options.seed)
-        mass, sites = response.level.mass, response.level.sites
-        length = self.options.beam_scale * min(self._prepared.mask.shape)
-        samples = np.empty((_BEAM_SAMPLES, len(mass)))
+        mass = response.level.mass
+        length = self._beam.length * min(self._prepared.mask.shape)
+        samples = random_waves(response.level.sites, length, _BEAM_SAMPLES, rng)
         for sample in samples:
-            waves = rng.normal(size=(2, _WAVES)) / length
-            phases = rng.uniform(0, 2 * np.pi, _WAVES)
-            sample[:] = np.cos((sites @ waves + phases).astype(np.float32)).sum(axis=1)
             sample -= (mass * sample).sum() / mass.sum()
             sample /= np.sqrt((mass * sample**2).sum() / mass.sum())
         return mass * samples

@@ -152,6 +152,7 @@ class LinearReadout:
 
 
 _RESOLUTION = 2.5  # spacing over the finest wave that a level resolves within 5 %
+_DIMMEST = 1e-3  # of the mean, for a logarithm
 _MIN_ROUNDNESS = 0.3  # double area by the longest side's square; of an equilateral triangle 0.87
 
 
@@ -174,10 +175,36 @@ class LinearResponse:
         objective = target.objective(solution.level)
         diagram = objective.diagram(solution.weights)
         self.flux = diagram.masses
-        ones = Density.from_image(np.ones(solution.level.shape), threads=solution.threads)
-        self.area = PowerDiagram(objective.triangulation, ones, threads=solution.threads).masses
+        self._triangulation, self._threads = objective.triangulation, solution.threads
+        self.area = self._masses(np.ones(solution.level.shape))
         ground = objective.ground(solution.weights)
-        self._factors = FactorisedLaplacian(diagram.laplacian(), ground)
+        self._network = diagram.laplacian()
+        self._factors = FactorisedLaplacian(self._network, ground)
+
+    @property
+    def sites(self) -> FloatArray:
+        """Positions of the sites, px of the image, shape (n, 2)."""
+        return np.asarray(self.level.sites - self._plan.margin_width)
+
+    def diffusion(self) -> FloatArray:
+        """Return the flux that cells gain where the image diffuses for a time of 1 px², (n,)."""
+        # Between cells a network link carries flux by half the gradient of the weights.
+        brightness = self.flux / np.maximum(self.area, 1e-300)
+        dimmest = _DIMMEST * self.flux.sum() / self.area.sum()
+        return np.asarray(-2 * (self._network @ np.log(np.maximum(brightness, dimmest))))
+
+    def flux_of(self, changes: FloatArray) -> FloatArray:
+        """Return the flux that changes of the image, (k, H, W), bring to the cells, (k, n)."""
+        flux = np.empty((len(changes), len(self.flux)))
+        padded = np.zeros(self.level.shape)
+        for row, change in zip(flux, changes, strict=True):
+            self._plan.within(padded)[:] = change
+            row[:] = self._masses(padded)
+        return flux
+
+    def _masses(self, image: FloatArray) -> FloatArray:
+        density = Density.from_image(image, threads=self._threads)
+        return PowerDiagram(self._triangulation, density, threads=self._threads).masses
 
     def to(self, changes: FloatArray) -> FloatArray:
         """Return each triangle's displacement (t, k, 2), px, by flux changes of cells (k, n)."""

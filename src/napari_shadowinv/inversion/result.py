@@ -29,7 +29,7 @@ from napari_shadowinv.facts import (
 from napari_shadowinv.inversion.budget import Errors
 from napari_shadowinv.inversion.solution_checks import image_residual
 from napari_shadowinv.inversion.variables import VARIABLES, dataset_from_field, setup_from_dataset
-from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.options import Instrument, InversionOptions
 from napari_shadowinv.physics.units import label, numbers_of, peak_facts, shown_fields
 from napari_shadowinv.provenance import Provenance
 
@@ -144,6 +144,8 @@ class Inversion:
         Convergence, timing and warnings.
     options : InversionOptions
         The options used.
+    instrument : Instrument
+        How well the experiment is known, which the errors hold.
     provenance : Provenance or None
         Recipe and input files, if it was made by a recipe.
     """
@@ -165,6 +167,7 @@ class Inversion:
     mask: BoolArray
     report: Report
     options: InversionOptions
+    instrument: Instrument = field(default_factory=Instrument)
     provenance: Provenance | None = None
 
     @property
@@ -182,7 +185,7 @@ class Inversion:
         """Error budget in words: names and texts."""
         if self.errors is None:
             return []
-        rows = self.errors.rows(self.options)
+        rows = self.errors.rows()
         steps = () if self.provenance is None else self.provenance.recipe.steps
         smoothing = [step.title for step in steps if step.smooths]
         is_stated = (self.options.noise_level, self.options.units_per_quantum) != (None, None)
@@ -328,6 +331,7 @@ class Inversion:
         history = {
             "format": self.kind.value,
             "options": self.options.model_dump_json(),
+            "instrument": self.instrument.model_dump_json(),
             "report": json.dumps(dataclasses.asdict(self.report)),
             "image_residual": self.report.image_residual,
         }
@@ -386,6 +390,7 @@ class Inversion:
             **arrays,
             report=report,
             options=InversionOptions.model_validate_json(dataset.attrs["options"]),
+            instrument=Instrument.model_validate_json(dataset.attrs.get("instrument", "{}")),
             provenance=Provenance.of(dataset.attrs),
         )
 

@@ -7,7 +7,6 @@ from typing import Any, Literal, Self
 from pydantic import ConfigDict, Field, model_validator
 
 from napari_shadowinv._system.validation import CheckedModel
-from napari_shadowinv.options._beam import BeamScale, BeamVariation
 
 __all__ = ["MAX_DEFAULT_SITES", "InversionOptions"]
 
@@ -211,8 +210,6 @@ class InversionOptions(CheckedModel):
         ),
         json_schema_extra=_BUDGET,
     )
-    beam_variation: BeamVariation = Field(default=None, json_schema_extra=_BUDGET)
-    beam_scale: BeamScale = Field(default=0.25, json_schema_extra=_BUDGET)
     seed: int = Field(
         default=0,
         ge=0,

@@ -23,9 +23,8 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitShot, compare, fit, point_spread
 from napari_shadowinv.fitting.shots import common_values, value_of_first
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.inversion.budget import ASSUMED_VARIATION
 from napari_shadowinv.io.files import sha256, text_of
-from napari_shadowinv.options import FitChoices, FitOptions
+from napari_shadowinv.options import ASSUMED_BEAM, FitChoices, FitOptions, Instrument
 from napari_shadowinv.physics.projection import default_deflector
 from napari_shadowinv.physics.setup import (
     Setup,
@@ -134,7 +133,8 @@ def refinement_choices(inversion: Inversion, setup: Setup | None, psf: float = 0
 
 
 def _provenance(start: Provenance, setup: Setup | None, choices: FitChoices) -> Provenance:
-    recipe = start.recipe.model_copy(update={"setup": None, "fit": choices})
+    changes = {"setup": None, "instrument": Instrument(), "fit": choices}
+    recipe = start.recipe.model_copy(update=changes)
     image = start.image.model_copy(update={"mask": None, "source_mask": None, "setup": setup})
     return Provenance(kind="fit", recipe=recipe, images=(image,), start=start)
 
@@ -192,7 +192,7 @@ class FitInputs:
         is_estimated = estimate is not None and self.choices.beam == "known"
         if options.beam_variation is not None or not is_estimated:
             return options
-        return options.model_copy(update={"beam_variation": ASSUMED_VARIATION})
+        return options.model_copy(update={"beam_variation": ASSUMED_BEAM.rms})
 
     @property
     def images(self) -> list[FitShot]:
@@ -359,6 +359,12 @@ def check_fit(recipe: Recipe) -> None:
                 f"the recipe has the step {step.summary}, which changes what the forward model "
                 f"is fitted to: leave it out; expected some of {', '.join(FIT_STEPS)}"
             )
+    if recipe.instrument != Instrument():
+        raise InputError(
+            "the recipe states how well the instrument is known (instrument), which the errors of "
+            "inversions take into account, but not those of fits: leave it out, and state "
+            "beam_variation in fit.options for the beam"
+        )
     if recipe.fit is not None and recipe.fit.beam == "unknown" and recipe.source is not None:
         raise InputError(
             "the recipe has a source and a fit with an unknown beam: expected one of them"

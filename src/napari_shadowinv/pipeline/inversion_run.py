@@ -343,6 +343,7 @@ def run_prepared(
         shot.image,
         plan=plan,
         options=options,
+        instrument=inputs.recipe.instrument,
         # The final result must not depend on earlier previews.
         start=cache.last_inversion(plan) if preview else start,
         on_progress=on_progress,

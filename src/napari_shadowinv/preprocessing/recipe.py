@@ -19,7 +19,7 @@ from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution, warn_of
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.options import FitChoices, InversionOptions
+from napari_shadowinv.options import FitChoices, Instrument, InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing.estimates import Estimate
 from napari_shadowinv.preprocessing.filters import Filter, HotPixelFilter
@@ -105,6 +105,11 @@ class Recipe(CheckedModel):
         default=None,
         title="Setup",
         description="The experimental geometry, for results in SI units.",
+    )
+    instrument: Instrument = Field(
+        default=Instrument(),
+        title="Instrument",
+        description="How well beam, detector and alignment are known, for the errors.",
     )
     options: InversionOptions = Field(
         default=InversionOptions(), title="Options", description="Options of the inversion."

@@ -184,6 +184,7 @@ class RecipeButton(QPushButton):
         source = _usable_source(recipe, image, path)
         tool.steps.show_steps(steps)
         tool.source.show(source)
+        tool.instrument.set_values(recipe.instrument.model_dump())
         tool.options.set_values(recipe.options.model_dump())
         if recipe.setup is not None:
             tool.setup.load(recipe.setup.model_dump(exclude_none=True), str(path))

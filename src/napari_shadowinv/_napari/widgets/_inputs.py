@@ -25,7 +25,7 @@ from napari_shadowinv._napari.widgets._results import Origins
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.options import Instrument, InversionOptions
 from napari_shadowinv.physics.setup import (
     SETUPS,
     Setup,
@@ -476,13 +476,15 @@ class InversionInputs:
         )
         self.setup = SetupPicker()
         self.steps = StepsSection()
+        self.instrument = forms.ModelForm(Instrument)
         self.options = OptionsForm()
         self.recipes = RecipeButton(self)
         self.chosen_image = image
         self.beam = (self.source, self.source_masks, self.masks)
         options = forms.section("Options", self.options)
-        self.settings = (self.setup, self.steps, options, self.recipes)
-        self.inputs = (*self.beam, self.setup, self.steps, self.options)
+        instrument = forms.section("Instrument", self.instrument)
+        self.settings = (self.setup, self.steps, instrument, options, self.recipes)
+        self.inputs = (*self.beam, self.setup, self.steps, self.instrument, self.options)
         self.source.changed.connect(self._show_source_mask)
         self._show_source_mask()
 
@@ -494,6 +496,7 @@ class InversionInputs:
             "source": self.source,
             "setup": self.setup,
             "steps": self.steps,
+            "instrument": self.instrument,
             "options": self.options,
             "painted_is_unusable": self.masks,
             "painted_is_object": self.source_masks,
@@ -518,6 +521,7 @@ class InversionInputs:
             steps=self.all_steps(),
             source=self.source.chosen(),
             setup=self.setup.setup(),
+            instrument=self.instrument.model(),
             options=self.options.model(),
         )
 
