@@ -25,10 +25,11 @@ import numpy as np
 from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.facts import Fact
-from napari_shadowinv.physics.setup import SETUPS, Setup
 
 if TYPE_CHECKING:
     import xarray
+
+    from napari_shadowinv.physics.setup import Setup
 
 __all__ = [
     "PeakError",
@@ -57,6 +58,8 @@ _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 
 def takes_prefix(unit: str) -> bool:
     """Return whether a unit of a field in SI units may have a prefix."""
+    from napari_shadowinv.physics.setup import SETUPS  # imports scipy
+
     # The prefix of a power, such as m⁻², would be raised to that power.
     units = {field.unit for kind in SETUPS.values() for field in kind.si_fields}
     return unit in units and unit.replace(" ", "").isalpha()

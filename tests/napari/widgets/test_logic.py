@@ -151,7 +151,7 @@ def test_a_preview_starts_from_the_one_before_and_a_run_does_not() -> None:
     np.testing.assert_allclose(cold.displacement, alone.displacement, atol=1e-11)
     assert cold.report.iterations == alone.report.iterations
     plan = cache.plan(2 + np.eye(*shot.shape), None, FEW)
-    assert cache.solved(plan) is None
+    assert cache.last_inversion(plan) is None
 
 
 def test_a_step_does_the_same_to_image_and_source_as_alone(shot: Array) -> None:
