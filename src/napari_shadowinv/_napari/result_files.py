@@ -46,7 +46,7 @@ _LOOKS, _NAME = "napari_layers", "napari_name"
 
 # Attributes that are recomputed when a result is saved.
 _COMPUTED_ATTRIBUTES = {_LOOKS, _NAME, "format", "options", "report", "image_residual", "errors_si"}
-_COMPUTED_ATTRIBUTES |= {"setup", "provenance", "package_version", "created"}
+_COMPUTED_ATTRIBUTES |= {"instrument", "setup", "provenance", "package_version", "created"}
 _COMPUTED_ATTRIBUTES |= {"verdict", "explanation", "folded", "fields", "setups"}
 _COMPUTED_ATTRIBUTES |= {"warnings", "seen_from", "scan_pixel_size"}
 

@@ -340,7 +340,7 @@ def running(recipe: Recipe) -> Any:
             StackJob(
                 LARGE[None],
                 tmp_path / "a.shadowinv.zarr",
-                Recipe(source=TotalVariationEstimate()),
+                Recipe(source=TotalVariationEstimate(iterations=20_000)),  # longer than 12 looks
             ).run
         ),
     ],

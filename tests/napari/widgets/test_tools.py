@@ -92,7 +92,7 @@ def test_nothing_is_orange_before_something_is_typed(
         assert orange_texts(tools["Invert shot"]) == [], setup.choice.currentText()
     setup.set_kind("proton")
     setup.form.editors["energy"].set_value(14.7)
-    assert any("source" in text for text in orange_texts(tools["Invert shot"]))
+    assert any("Source" in text for text in orange_texts(tools["Invert shot"]))
 
 
 def test_an_estimate_becomes_a_layer_after_its_preview(

@@ -329,7 +329,7 @@ def test_no_reference_is_clicked_to_its_end(
         assert float(fields[-1].data.max()) == pytest.approx(peaks[title], abs=0.06)
         warned = "reaches the closed edge" in tool.verdict.text()
         assert warned == title.startswith("estimate")
-        assert ("43" in report_of(tool)) == title.startswith("estimate")
+        assert ("43 %" in report_of(tool)) == title.startswith("estimate")
     assert len({layer.name for layer in fields}) == 3
     save_reload(window, tool, tmp_path / "four.shadowinv", press, answer_dialogs)
     again = float(layer_of(window, "field").data.max())
