@@ -26,7 +26,12 @@ def make_shots(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 def grouped(choices: dict[str, Any], model: type[BaseModel] | None = RunOptions) -> dict[str, Any]:
     """Group choices into the arguments of `run_stack`, `watch_stack` or `invert_stack`."""
-    fields = {"options": "options", "setup": "setup", "filters": "steps"}
+    fields = {
+        "options": "options",
+        "setup": "setup",
+        "filters": "steps",
+        "instrument": "instrument",
+    }
     parts = {fields[name]: value for name, value in choices.items() if name in fields}
     names = set() if model is None else set(model.model_fields)
     arguments = {k: v for k, v in choices.items() if k not in names and k not in fields}

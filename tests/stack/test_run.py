@@ -16,6 +16,7 @@ from helpers.store_content import content
 from napari_shadowinv import (
     FileFormatError,
     InputError,
+    Instrument,
     InversionCancelled,
     InversionOptions,
     Recipe,
@@ -236,6 +237,10 @@ class TestRefusals:
     def test_other_options(self, night, out):
         with pytest.raises(InputError, match=r"different options \(n_sites: 100 there, 50 now\)"):
             night.run(out, options=InversionOptions(n_sites=50))
+
+    def test_another_instrument(self, night, out):
+        with pytest.raises(InputError, match=r"different instrument \(.*gamma.*0.1"):
+            night.run(out, instrument=Instrument(gamma=0.1))
 
     def test_threads_are_no_other_option(self, night, out):
         night.run(out, options=OPTIONS.model_copy(update={"threads": 1}))
