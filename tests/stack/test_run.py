@@ -239,7 +239,9 @@ class TestRefusals:
             night.run(out, options=InversionOptions(n_sites=50))
 
     def test_another_instrument(self, night, out):
-        with pytest.raises(InputError, match=r"different instrument \(.*gamma.*0.1"):
+        with pytest.raises(
+            InputError, match=r"different instrument \(gamma: default there, 0.1 now\)"
+        ):
             night.run(out, instrument=Instrument(gamma=0.1))
 
     def test_threads_are_no_other_option(self, night, out):

@@ -572,9 +572,10 @@ def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:
 
 def _difference(before: str, now: str) -> str:
     try:
-        old, new = json.loads(before), json.loads(now)
+        old, new = json.loads(before or "{}"), json.loads(now or "{}")
         names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
-        return ", ".join(f"{name}: {old.get(name)} there, {new.get(name)} now" for name in names)
+        pairs = [(name, old.get(name, "default"), new.get(name, "default")) for name in names]
+        return ", ".join(f"{name}: {there} there, {here} now" for name, there, here in pairs)
     except (ValueError, AttributeError, TypeError):
         return f"{shorten(before or 'none', 80)} there, {shorten(now or 'none', 80)} now"
 

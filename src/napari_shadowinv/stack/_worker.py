@@ -32,7 +32,7 @@ from napari_shadowinv.inversion.variables import dataset_from_field, fit_labels,
 from napari_shadowinv.io.store import DONE, FAILED
 from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, column_values
 from napari_shadowinv.io.store_writing import GrowingStore, ShotWriter
-from napari_shadowinv.options import FitChoices, Instrument, InversionOptions
+from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import (
     Cache,
@@ -218,11 +218,11 @@ class InvertTask(Task):
         options = self.recipe.options
         if self.sites_chosen:
             options = options.model_copy(update={"n_sites": None})
-        instrument = self.recipe.instrument
+        instrument = self.recipe.instrument.model_dump_json(exclude_defaults=True)
         return {
             "fit": "",
             "options": options.model_dump_json(exclude={"threads"}),
-            "instrument": "" if instrument == Instrument() else instrument.model_dump_json(),
+            "instrument": instrument.removeprefix("{}"),
         }
 
     def with_sites(self, n_sites: int) -> InvertTask:
