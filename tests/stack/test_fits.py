@@ -121,7 +121,7 @@ def test_a_shot_fails_alone_and_the_rest_is_resumed(images: Any, out: Path) -> N
     assert again["verdict"].values[1] == ""
     assert content(out) == before
     other_recipe = Recipe(fit=CHOICES.model_copy(update={"psf": 1.0}))
-    with pytest.raises(InputError, match=r"different fit \(psf: None there, 1.0 now\)"):
+    with pytest.raises(InputError, match=r"different fit \(psf: default there, 1.0 now\)"):
         run_stack(spoilt, out, other_recipe, scheduler="synchronous")
     with pytest.raises(InputError, match="different fit"):
         run_stack(
