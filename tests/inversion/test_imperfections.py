@@ -62,6 +62,22 @@ def uneven_source():
     return 1 + 0.1 * smooth / smooth.std()
 
 
+@pytest.mark.parametrize(("key", "size"), [("background", 0.05), ("gamma", 0.05)])
+def test_a_detector_changes_image_and_recorded_source_alike(key, size):
+    """A beam that is bright in the middle, with a contrast far above the object's."""
+    y, x = (np.indices((SIDE, SIDE)) - SIDE / 2) / SIDE
+    source = np.exp(-4 * (y**2 + x**2))
+    blob = phantoms.gaussian_blob((SIDE, SIDE), 0.006 * SIDE**2, 0.1 * SIDE)
+    image = synthetic_image(blob.displacement, source)
+    stated = invert(image, source=source, options=OPTIONS, instrument={key: size})
+    change = CHANGES[key]
+    changed = invert(change(image, size), source=change(source, size), options=OPTIONS)
+    (effect,) = (error for name, error in stated.errors.effects.items() if name.startswith(key))
+    moved = rms(changed.displacement - stated.displacement)
+    assert effect.rms == pytest.approx(moved, rel=0.2)
+    assert moved < 0.2 * stated.errors.rms
+
+
 def test_the_effect_of_a_reference_out_of_register_is_that_of_shifts_and_turns():
     """In the mean over shifts along both axes, a turn and a change of scale."""
     source = uneven_source()

@@ -56,15 +56,13 @@ class SolvedShot:
         return float(self.prepared.source[self.prepared.mask].mean())
 
     @cached_property
-    def even_flux(self) -> FloatArray:
-        """Flux of each cell if the image had its mean everywhere, shape (n,)."""
-        mask = self.prepared.mask
-        area = (
-            self.response.area
-            if mask.all()
-            else self.response.flux_of(mask[None].astype(np.float64))[0]
+    def fluxes(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
+        """Flux of each cell in the image and in the source, and what it were if both were even."""
+        fluxes = self.response.flux, self.response.level.mass
+        areas = self.response.areas(self.prepared.mask)
+        return tuple(
+            (flux, area * flux.sum() / area.sum()) for flux, area in zip(fluxes, areas, strict=True)
         )
-        return np.asarray(area * self.response.flux.sum() / area.sum())
 
     def flux_of(self, changes: FloatArray) -> FloatArray:
         """Return the flux that cells gain by changes of the image, (k, H, W) to (k, n)."""
@@ -130,13 +128,19 @@ def random_waves(
 
 
 def _background(shot: SolvedShot, share: float) -> FloatArray:
-    return shot.balance(share * (shot.even_flux - shot.response.flux)[None])
+    """A constant under the image and its source: one detector has recorded both."""
+    of_image, of_source = (even - flux for flux, even in shot.fluxes)
+    return shot.balance(share * (of_image - of_source)[None])
 
 
 def _response(shot: SolvedShot, gamma: float) -> FloatArray:
-    flux = shot.response.flux
-    brightness = flux / np.maximum(shot.even_flux, _LEAST_BRIGHTNESS * flux.mean())
-    return shot.balance(gamma * (flux * np.log(np.maximum(brightness, _LEAST_BRIGHTNESS)))[None])
+    """An exponent of the image and of its source: one detector has recorded both."""
+    changes = []
+    for flux, even in shot.fluxes:
+        brightness = flux / np.maximum(even, _LEAST_BRIGHTNESS * flux.mean())
+        changes.append(flux * np.log(np.maximum(brightness, _LEAST_BRIGHTNESS)))
+    of_image, of_source = changes
+    return shot.balance(gamma * (of_image - of_source)[None])
 
 
 def _blur(shot: SolvedShot, width: float) -> FloatArray:

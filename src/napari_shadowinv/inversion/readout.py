@@ -176,7 +176,7 @@ class LinearResponse:
         diagram = objective.diagram(solution.weights)
         self.flux = diagram.masses
         self._triangulation, self._threads = objective.triangulation, solution.threads
-        self.area = self._masses(np.ones(solution.level.shape))
+        self.area = self._masses(np.ones(solution.level.shape), self._triangulation)
         ground = objective.ground(solution.weights)
         self._network = diagram.laplacian()
         self._factors = FactorisedLaplacian(self._network, ground)
@@ -199,12 +199,20 @@ class LinearResponse:
         padded = np.zeros(self.level.shape)
         for row, change in zip(flux, changes, strict=True):
             self._plan.within(padded)[:] = change
-            row[:] = self._masses(padded)
+            row[:] = self._masses(padded, self._triangulation)
         return flux
 
-    def _masses(self, image: FloatArray) -> FloatArray:
+    def areas(self, mask: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Return the used area of each cell in the image and in the source, pixels, (n,) each."""
+        used = np.ones(self.level.shape)
+        self._plan.within(used)[:] = mask
+        # Without weights the cells are those of the source.
+        of_source = self._masses(used, self.level.triangulation)
+        return (self.area if mask.all() else self._masses(used, self._triangulation)), of_source
+
+    def _masses(self, image: FloatArray, triangulation: RegularTriangulation) -> FloatArray:
         density = Density.from_image(image, threads=self._threads)
-        return PowerDiagram(self._triangulation, density, threads=self._threads).masses
+        return PowerDiagram(triangulation, density, threads=self._threads).masses
 
     def to(self, changes: FloatArray) -> FloatArray:
         """Return each triangle's displacement (t, k, 2), px, by flux changes of cells (k, n)."""

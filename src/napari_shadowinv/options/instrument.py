@@ -89,7 +89,9 @@ class Instrument(CheckedModel):
         ge=0,
         lt=1,
         title="Background",
-        description="Stray light, fog or dark level left in the image, as a share of its mean.",
+        description=(
+            "Stray light, fog or dark level left in image and source, as a share of the mean."
+        ),
     )
     gamma: float = Field(
         default=0.0,
