@@ -200,10 +200,10 @@ class Errors:
             )
         if self.sensitivities:
             effects = ", ".join(
-                f"{name}: {_percent(error.rms, self.rms)}"
+                f"{_percent(error.rms, self.rms)} ({name})"
                 for name, error in self.sensitivities.items()
             )
-            rows.append(("instrument", f"effect on the displacement (r.m.s.) of {effects}"))
+            rows.append(("instrument", f"the displacement would move by (r.m.s.): {effects}"))
         return rows
 
     def beam_caution(self) -> Caution | None:
@@ -314,7 +314,7 @@ class Budget:
             spacing = max(solved[-2].level.spacing, _stride(mask.shape))
             weights = _near(peak, self._places.T, spacing)
             discretisation = _roots(squares.mean(), (squares * weights).sum() / 2)
-        whole = ErrorEstimate(float(np.sqrt(np.mean(length[mask] ** 2))), float(length.max()))
+        lengths = ErrorEstimate(float(np.sqrt(np.mean(length[mask] ** 2))), float(length.max()))
         shot = SolvedShot(self._prepared.in_units(), displacement, response, self.options.seed)
         effects: dict[str, ErrorEstimate] = {}
         sensitivities: dict[str, ErrorEstimate] = {}
@@ -325,12 +325,12 @@ class Budget:
                     pattern = imperfection.pattern(shot, size)
                     errors[imperfection.name(size)] = estimate(response.to(pattern))
         if share := self.instrument.other_field:
-            effects[f"other field, {100 * share:.2g} %"] = _scale_error(whole, share)
+            effects[f"other field, {100 * share:.2g} %"] = _scale_error(lengths, share)
         by_percent = estimate(_TESTED_VARIATION * response.to(self._beams(response)))
         times = variation / _TESTED_VARIATION
         return Errors(
-            peak=whole.at_peak,
-            rms=whole.rms,
+            peak=lengths.at_peak,
+            rms=lengths.rms,
             discretisation=discretisation,
             noise=estimate(*self._noisy_moves(response, solved[-1].level.spacing)),
             effects=effects

@@ -57,16 +57,16 @@ class SolvedShot:
 
     @cached_property
     def fluxes(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
-        """Flux of each cell in the image and in the source, and what it were if both were even."""
+        """Flux of each cell in the image and in the source, each with its flux in an even one."""
         fluxes = self.response.flux, self.response.level.mass
         areas = self.response.areas(self.prepared.mask)
         return tuple(
             (flux, area * flux.sum() / area.sum()) for flux, area in zip(fluxes, areas, strict=True)
         )
 
-    def flux_of(self, changes: FloatArray) -> FloatArray:
-        """Return the flux that cells gain by changes of the image, (k, H, W) to (k, n)."""
-        return self.balance(self.response.flux_of(np.where(self.prepared.mask, changes, 0.0)))
+    def flux_of_source(self, changes: FloatArray) -> FloatArray:
+        """Return the flux that cells gain by changes of the source, (k, H, W) to (k, n)."""
+        return self.balance(self.response.flux_of_source(changes * self.prepared.mask))
 
     def balance(self, gains: FloatArray) -> FloatArray:
         """Return gains of cells, (k, n), less their sum in proportion to the flux of the cells.
@@ -158,7 +158,7 @@ def _registration(shot: SolvedShot, shift: float) -> FloatArray:
         for indices, side in zip(np.indices(source.shape), source.shape, strict=True)
     )
     patterns = [along_y, along_x, along_y * x - along_x * y, along_y * y + along_x * x]
-    return shot.flux_of(2 * shift * np.stack(patterns))
+    return shot.flux_of_source(2 * shift * np.stack(patterns))
 
 
 def _absorption(shot: SolvedShot, rms: float) -> FloatArray:

@@ -193,20 +193,20 @@ class LinearResponse:
         dimmest = _DIMMEST * self.flux.sum() / self.area.sum()
         return np.asarray(-2 * (self._network @ np.log(np.maximum(brightness, dimmest))))
 
-    def flux_of(self, changes: FloatArray) -> FloatArray:
-        """Return the flux that changes of the image, (k, H, W), bring to the cells, (k, n)."""
+    def flux_of_source(self, changes: FloatArray) -> FloatArray:
+        """Return the flux that changes of the source, (k, H, W), bring to its cells, (k, n)."""
         flux = np.empty((len(changes), len(self.flux)))
         padded = np.zeros(self.level.shape)
         for row, change in zip(flux, changes, strict=True):
             self._plan.within(padded)[:] = change
-            row[:] = self._masses(padded, self._triangulation)
+            # Without weights the cells are those of the source.
+            row[:] = self._masses(padded, self.level.triangulation)
         return flux
 
     def areas(self, mask: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Return the used area of each cell in the image and in the source, pixels, (n,) each."""
         used = np.ones(self.level.shape)
         self._plan.within(used)[:] = mask
-        # Without weights the cells are those of the source.
         of_source = self._masses(used, self.level.triangulation)
         return (self.area if mask.all() else self._masses(used, self._triangulation)), of_source
 

@@ -140,13 +140,13 @@ class Instrument(CheckedModel):
     def _expand_beam(cls, values: Any) -> Any:
         if not isinstance(values, dict) or "beam" not in values:
             return values
-        rest = {name: value for name, value in values.items() if name != "beam"}
-        if twice := {"beam_rms", "beam_length"} & rest.keys():
+        numbers = {name: value for name, value in values.items() if name != "beam"}
+        if twice := {"beam_rms", "beam_length"} & numbers.keys():
             raise ValueError(f"received beam and {min(twice)}, expected one of them")
         if not isinstance(values["beam"], BeamPrior | dict):
             raise ValueError(f"beam is {values['beam']!r}, expected a BeamPrior")
         beam = BeamPrior.model_validate(values["beam"])
-        return {**rest, "beam_rms": beam.rms, "beam_length": beam.length}
+        return {**numbers, "beam_rms": beam.rms, "beam_length": beam.length}
 
     def beam_of(self, *, measured: bool) -> BeamPrior:
         """Return the prior of the beam, assumed unless stated.

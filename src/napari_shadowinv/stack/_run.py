@@ -575,7 +575,7 @@ def _difference(before: str, now: str) -> str:
         old, new = json.loads(before or "{}"), json.loads(now or "{}")
         names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
         pairs = [(name, old.get(name, "default"), new.get(name, "default")) for name in names]
-        return ", ".join(f"{name}: {there} there, {here} now" for name, there, here in pairs)
+        return ", ".join(f"{name}: {stored} there, {asked} now" for name, stored, asked in pairs)
     except (ValueError, AttributeError, TypeError):
         return f"{shorten(before or 'none', 80)} there, {shorten(now or 'none', 80)} now"
 
