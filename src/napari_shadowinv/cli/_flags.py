@@ -511,8 +511,7 @@ def fit_recipe_of(
 def _instrument(flags: Mapping[str, Any], base: Recipe) -> Instrument:
     """Return the recipe's instrument with the numbers that flags state."""
     changes = {name: flags[name] for name in Instrument.model_fields if name in flags}
-    stated = base.instrument.model_dump(exclude_unset=True)
-    return validate(Instrument, {**stated, **changes}, "instrument")
+    return validate(Instrument, {**base.instrument.stated, **changes}, "instrument")
 
 
 def _steps(flags: Mapping[str, Any], steps: tuple[Step, ...]) -> tuple[Step, ...]:

@@ -15,11 +15,19 @@ from napari_shadowinv.options.fitting import (
     KindOfNoise,
     Noise,
 )
-from napari_shadowinv.options.instrument import ASSUMED_BEAM, BeamPrior, Instrument
+from napari_shadowinv.options.instrument import (
+    ASSUMED_BEAM,
+    BEAM_SOURCES,
+    DETECTORS,
+    BeamPrior,
+    Instrument,
+)
 from napari_shadowinv.options.inversion import MAX_DEFAULT_SITES, InversionOptions
 
 __all__ = [
     "ASSUMED_BEAM",
+    "BEAM_SOURCES",
+    "DETECTORS",
     "KINDS_OF_NOISE",
     "MAX_DEFAULT_SITES",
     "MAX_STRENGTH",

@@ -2,17 +2,21 @@
 
 Each number is a standard deviation in an experimenter's units; 0 takes the quantity as exact. An
 inversion and a fit propagate them into the error of the field.
+
+- defaults of detectors and of beam sources: `DETECTORS`, `BEAM_SOURCES`; docs/uncertainty.md has
+  the reason for each number
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Literal, Self, get_args
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from napari_shadowinv._system.validation import CheckedModel
 
-__all__ = ["ASSUMED_BEAM", "BeamPrior", "Instrument"]
+__all__ = ["ASSUMED_BEAM", "BEAM_SOURCES", "DETECTORS", "BeamPrior", "Instrument"]
 
 _CONFIG = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -43,11 +47,33 @@ ASSUMED_BEAM = BeamPrior(rms=0.05, length=0.25)
 """Prior of a beam that nobody measured, unless another one is stated."""
 
 
+Detector = Literal["film", "image plate", "CR-39", "scintillator", "camera"]
+BeamSource = Literal["TNSA", "implosion", "X-ray tube", "laser"]
+
+DETECTORS: Mapping[Detector, Mapping[str, float]] = {
+    "film": {"background": 0.03, "gamma": 0.03, "blur": 0.5, "registration": 1.0},
+    "image plate": {"background": 0.03, "gamma": 0.02, "blur": 1.5, "registration": 1.0},
+    "CR-39": {"background": 0.02, "gamma": 0.03, "blur": 0.0, "registration": 1.0},
+    "scintillator": {"background": 0.05, "gamma": 0.02, "blur": 1.5, "registration": 0.2},
+    "camera": {"background": 0.01, "gamma": 0.01, "blur": 0.7, "registration": 0.2},
+}
+"""Numbers of an `Instrument` with a detector, unless others are stated."""
+
+BEAM_SOURCES: Mapping[BeamSource, Mapping[str, float]] = {
+    "TNSA": {"beam_rms": 0.10, "beam_length": 0.25},
+    "implosion": {"beam_rms": 0.05, "beam_length": 0.5},
+    "X-ray tube": {"beam_rms": 0.02, "beam_length": 0.5},
+    "laser": {"beam_rms": 0.05, "beam_length": 0.1},
+}
+"""Numbers of an `Instrument` with a source of its beam, unless others are stated."""
+
+
 class Instrument(CheckedModel):
     """How well beam, detector and alignment are known, as standard deviations.
 
-    What is not stated counts as exact, except for a beam that nobody measured: `ASSUMED_BEAM`. The
-    beam may be given as `beam`, a `BeamPrior`, in place of its numbers.
+    What is not stated has the default of the detector or of the beam source. Without these it
+    counts as exact, except for a beam that nobody measured: `ASSUMED_BEAM`. The beam may be given
+    as `beam`, a `BeamPrior`, in place of its numbers.
 
     Raises
     ------
@@ -59,10 +85,23 @@ class Instrument(CheckedModel):
     >>> instrument = Instrument(beam=BeamPrior(rms=0.02), background=0.05)
     >>> instrument.beam_rms, instrument.beam_length
     (0.02, 0.25)
+    >>> film = Instrument.of("film", source="TNSA", background=0.1)
+    >>> film.beam_rms, film.gamma, film.background
+    (0.1, 0.03, 0.1)
     """
 
     model_config = _CONFIG
 
+    detector: Detector | None = Field(
+        default=None,
+        title="Detector",
+        description="Kind of detector, for the numbers that are not stated.",
+    )
+    beam_source: BeamSource | None = Field(
+        default=None,
+        title="Beam source",
+        description="Origin of the beam, for its numbers that are not stated.",
+    )
     beam_rms: float | None = Field(
         default=None,
         ge=0,
@@ -135,6 +174,59 @@ class Instrument(CheckedModel):
         ),
     )
 
+    @classmethod
+    def of(cls, detector: str | None = None, source: str | None = None, **numbers: Any) -> Self:
+        """Return the instrument with the defaults of a detector and of a source of the beam.
+
+        Parameters
+        ----------
+        detector : str, optional
+            Such as "film"; all are in `DETECTORS`.
+        source : str, optional
+            Origin of the beam, such as "TNSA"; all are in `BEAM_SOURCES`.
+        **numbers
+            Numbers that differ from the defaults.
+
+        Raises
+        ------
+        InputError
+            If the detector or the source is unknown, or a number is out of range.
+        """
+        return cls(detector=detector, beam_source=source, **numbers)
+
+    @field_validator("detector", "beam_source", mode="before")
+    @classmethod
+    def _spell(cls, value: Any, info: ValidationInfo) -> Any:
+        """Find a name in other capitals, or with hyphens for spaces."""
+        names = get_args(Detector if info.field_name == "detector" else BeamSource)
+        spellings = {_simplify(name): name for name in names}
+        return spellings.get(_simplify(value), value) if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _fill_in(self) -> Self:
+        """Take numbers that are not stated from the detector and the source of the beam."""
+        for name, value in self.defaults.items():
+            if name not in self.model_fields_set or getattr(self, name) is None:
+                self.__dict__[name] = value
+        return self
+
+    @property
+    def defaults(self) -> dict[str, float]:
+        """Numbers of the detector and of the source of the beam, as far as they are stated."""
+        of_detector = {} if self.detector is None else DETECTORS[self.detector]
+        of_source = {} if self.beam_source is None else BEAM_SOURCES[self.beam_source]
+        return {**of_detector, **of_source}
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """Values that differ from the defaults, from which the instrument can be made again."""
+        kinds = {"detector": self.detector, "beam_source": self.beam_source}
+        usual = Instrument(**kinds).model_dump()
+        stated = {name: kind for name, kind in kinds.items() if kind is not None}
+        return stated | {
+            name: value for name, value in self.model_dump().items() if value != usual[name]
+        }
+
     @model_validator(mode="before")
     @classmethod
     def _expand_beam(cls, values: Any) -> Any:
@@ -159,3 +251,7 @@ class Instrument(CheckedModel):
         default = 0.0 if measured else ASSUMED_BEAM.rms
         rms = default if self.beam_rms is None else self.beam_rms
         return BeamPrior(rms=rms, length=self.beam_length)
+
+
+def _simplify(name: str) -> str:
+    return name.lower().replace("-", " ").replace("_", " ").strip()

@@ -79,8 +79,8 @@ def _kind_of(entries: Mapping[str, Any]) -> str:
 def _without_defaults(recipe: Recipe) -> dict[str, Any]:
     """Return the content of a recipe without options at their defaults."""
     content = recipe.model_dump(exclude_none=True)
-    for name in ("instrument", "options"):
-        content[name] = getattr(recipe, name).model_dump(exclude_defaults=True) or ()
+    content["instrument"] = recipe.instrument.stated or ()
+    content["options"] = recipe.options.model_dump(exclude_defaults=True) or ()
     if recipe.fit is not None:  # an empty section still requests a fit
         content["fit"] = recipe.fit.model_dump(exclude_defaults=True)
     return {name: _to_toml(value) for name, value in content.items() if value != ()}

@@ -218,11 +218,11 @@ class InvertTask(Task):
         options = self.recipe.options
         if self.sites_chosen:
             options = options.model_copy(update={"n_sites": None})
-        instrument = self.recipe.instrument.model_dump_json(exclude_defaults=True)
+        instrument = self.recipe.instrument.stated
         return {
             "fit": "",
             "options": options.model_dump_json(exclude={"threads"}),
-            "instrument": instrument.removeprefix("{}"),
+            "instrument": json.dumps(instrument) if instrument else "",
         }
 
     def with_sites(self, n_sites: int) -> InvertTask:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from napari.utils import progress
 
-from napari_shadowinv import InversionOptions, ProtonSetup, invert, read
+from napari_shadowinv import Instrument, InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari import jobs
 from napari_shadowinv._napari.layer_metadata import (
     frame_of,
@@ -643,3 +643,16 @@ def test_window_texts_have_labels_in_place_of_flags() -> None:
     text = "try a free boundary (--boundary free), or give the noise_level; see --max-shots"
     in_window = window_text(text)
     assert in_window == "try a free boundary, or give the 'Noise level'; see --max-shots"
+
+
+def test_a_detector_sets_the_numbers_of_the_instrument(tool: Any) -> None:
+    form = tool.instrument
+    form.editors["detector"].set_value("film")
+    form.editors["beam_source"].set_value("laser")
+    assert form.model() == Instrument.of("film", source="laser")
+    form.editors["gamma"].set_value(0.2)
+    saved = form.model()
+    assert saved == Instrument.of("film", source="laser", gamma=0.2)
+    form.editors["detector"].set_value("camera")
+    form.set_values(saved.model_dump())
+    assert form.model() == saved

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -25,7 +26,7 @@ from napari_shadowinv._napari.widgets._results import Origins
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.options import Instrument, InversionOptions
+from napari_shadowinv.options import BEAM_SOURCES, DETECTORS, Instrument, InversionOptions
 from napari_shadowinv.physics.setup import (
     SETUPS,
     Setup,
@@ -454,6 +455,19 @@ class OptionsForm(forms.ModelForm):
         self.set_values(values)
 
 
+class InstrumentForm(forms.ModelForm):
+    """A form of an instrument, in which a detector and a source of the beam set their numbers."""
+
+    def __init__(self) -> None:
+        super().__init__(Instrument)
+        for kind, table in (("detector", DETECTORS), ("beam_source", BEAM_SOURCES)):
+            self.editors[kind].changed.connect(partial(self._set_numbers, kind, table))
+
+    def _set_numbers(self, kind: str, table: Mapping[Any, Mapping[str, float]]) -> None:
+        for name, value in table.get(self.editors[kind].value(), {}).items():
+            self.editors[name].set_value(value)
+
+
 class InversionInputs:
     """The controls that the panels for a shot and for a stack share."""
 
@@ -476,7 +490,7 @@ class InversionInputs:
         )
         self.setup = SetupPicker()
         self.steps = StepsSection()
-        self.instrument = forms.ModelForm(Instrument)
+        self.instrument = InstrumentForm()
         self.options = OptionsForm()
         self.recipes = RecipeButton(self)
         self.chosen_image = image
