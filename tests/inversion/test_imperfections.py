@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift, zoom
 
-from napari_shadowinv import BeamPrior, InputError, Instrument, InversionOptions, invert
+from napari_shadowinv import (
+    BeamPrior,
+    InputError,
+    Instrument,
+    InversionOptions,
+    OpticalSetup,
+    invert,
+)
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
@@ -245,3 +252,21 @@ def test_a_wrong_instrument_is_refused_in_a_sentence(values, text):
     with pytest.raises(InputError, match=text) as error:
         invert(np.ones((20, 20)), instrument=values)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("setup", "power"),
+    [
+        (phantoms.paper_setup(), 0.5),
+        (OpticalSetup(wavelength=8e-7, object_image_distance=0.1, pixel_size=1e-6), 0.0),
+    ],
+)
+def test_an_error_of_the_energy_scales_the_field_not_the_displacement(setup, power):
+    image = lens(0.006)
+    result = invert(image, source=np.ones(image.shape), instrument={"energy": 0.1})
+    exact = invert(image, source=np.ones(image.shape))
+    assert result.errors == exact.errors
+    in_si = result.errors_in(setup)
+    added = np.sqrt(in_si.total.rms**2 - result.errors.total.rms**2)
+    assert added == pytest.approx(0.1 * power * result.errors.rms, rel=0.02, abs=1e-9)
+    assert (result.facts_in(setup)[0] == exact.facts_in(setup)[0]) == (power == 0)

@@ -17,9 +17,10 @@ def test_a_detector_fills_in_what_is_not_stated():
 
 def test_a_source_of_the_beam_fills_in_the_beam():
     laser = Instrument.of(source="laser")
-    usual = BeamPrior(rms=BEAM_SOURCES["laser"]["beam_rms"], length=0.1)
+    usual = BeamPrior(rms=BEAM_SOURCES["laser"]["beam_rms"], length=0.1, between=0.05)
     assert laser.beam_of(measured=True) == laser.beam_of(measured=False) == usual
-    assert Instrument.of(source="laser", beam=BeamPrior(rms=0.01)).beam_rms == 0.01
+    stated = Instrument.of(source="laser", beam=BeamPrior(rms=0.01))
+    assert (stated.beam_rms, stated.beam_length) == (0.01, 0.1)
 
 
 @pytest.mark.parametrize("name", ["image-plate", "Image Plate", "image_plate"])

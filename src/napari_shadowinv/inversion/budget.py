@@ -171,13 +171,18 @@ class Errors:
             lengths[name] = {cause: _scale_error(error, factor) for cause, error in table.items()}
         return dataclasses.replace(self, **lengths)
 
-    def rows(self) -> list[tuple[str, str]]:
-        """Describe the budget in words: names and texts."""
+    def with_scale(self, cause: str, share: float) -> Errors:
+        """Return the budget of a quantity whose scale has a relative error."""
+        size = ErrorEstimate(self.rms, self.peak)
+        return dataclasses.replace(self, effects={**self.effects, cause: _scale_error(size, share)})
+
+    def rows(self, subject: str = "displacement") -> list[tuple[str, str]]:
+        """Describe the budget of a subject in words: names and texts."""
         parts = ", ".join(
             f"{_percent(error.rms, self.rms)} ({cause})" for cause, error in self.parts.items()
         )
         text = (
-            f"{_percent(self.total.rms, self.rms)} of the displacement (r.m.s.): {parts}; crossing "
+            f"{_percent(self.total.rms, self.rms)} of the {subject} (r.m.s.): {parts}; crossing "
             "rays are not in it"
         )
         if math.isnan(self.discretisation.rms):

@@ -175,6 +175,24 @@ class Inversion:
         """Error budget of the displacement; see `Report`."""
         return self.report.errors
 
+    def errors_in(self, setup: Setup | None) -> Errors | None:
+        """Return the error budget of the main field of a setup, px of displacement.
+
+        Parameters
+        ----------
+        setup : Setup or None
+            Its beam's energy scales the field, whose error adds to the others. None: the budget of
+            the displacement.
+        """
+        error = self.instrument.energy
+        if self.errors is None or setup is None or not error:
+            return self.errors
+        share = error * abs(setup.sensitivity_to_beam(setup.main_field.name))
+        if not share:
+            return self.errors
+        noun = setup.beam_quantity().noun
+        return self.errors.with_scale(f"{noun}, {100 * error:.2g} %", share)
+
     @property
     def cautions(self) -> tuple[Caution, ...]:
         """Reasons to doubt the result."""
@@ -182,14 +200,18 @@ class Inversion:
 
     @property
     def error_rows(self) -> list[tuple[str, str]]:
-        """Error budget in words: names and texts."""
-        if self.errors is None:
+        """Error budget of the displacement in words: names and texts."""
+        return self._error_rows(self.errors)
+
+    def _error_rows(self, errors: Errors | None) -> list[tuple[str, str]]:
+        """Describe an error budget in words: names and texts."""
+        if errors is None:
             return []
-        rows = self.errors.rows()
+        rows = errors.rows("displacement" if errors is self.errors else "field")
         steps = () if self.provenance is None else self.provenance.recipe.steps
         smoothing = [step.title for step in steps if step.smooths]
         is_stated = (self.options.noise_level, self.options.units_per_quantum) != (None, None)
-        if smoothing and not is_stated and not self.errors.noise_correlation:
+        if smoothing and not is_stated and not errors.noise_correlation:
             caveat = (
                 f"measured after {', '.join(smoothing)}, where most of it cannot be seen: its "
                 "error is larger than stated; give the noise_level or units_per_quantum of the "
@@ -216,7 +238,8 @@ class Inversion:
         setup : Setup or None
             Gives the main field in SI units; None the displacement in px.
         """
-        error = None if self.errors is None else self.errors.of_peak
+        errors = self.errors_in(setup)
+        error = None if errors is None else errors.of_peak
         (field,) = shown_fields([self.displacement], setup, mask=self.mask)
         cautions = self.report.warnings
         texts = in_headline(each for each in cautions if each.code != "not-converged")
@@ -239,7 +262,7 @@ class Inversion:
         setup : Setup or None
             Gives the main field in SI units; None the displacement in px.
         """
-        report = self.report
+        report, errors = self.report, self.errors_in(setup)
         flows = {
             "flux_left": ("Flux left", report.flux_left),
             "flux_entered": ("Flux entered", report.flux_entered),
@@ -251,7 +274,7 @@ class Inversion:
                 self.displacement,
                 setup,
                 mask=self.mask,
-                error=None if self.errors is None else self.errors.of_peak,
+                error=None if errors is None else errors.of_peak,
             ),
             Fact(
                 "image_residual",
@@ -259,7 +282,7 @@ class Inversion:
                 f"{100 * report.image_residual:.3g} % of the mean (r.m.s.)",
                 short=f"residual {100 * report.image_residual:.3g} %",
             ),
-            *(error_fact(name, text) for name, text in self.error_rows),
+            *(error_fact(name, text) for name, text in self._error_rows(errors)),
             Fact("caustics", "Caustics", f"{self.caustic.mean():.2%} of the pixels"),
             *masked_fact(self.mask),
             *(
@@ -338,11 +361,12 @@ class Inversion:
         if self.provenance is not None:
             history["provenance"] = self.provenance.to_json()
             setup = self.setup if setup is None else setup
-        if self.errors is not None and setup is not None:
+        errors = self.errors_in(setup)
+        if errors is not None and setup is not None:
             field = setup.main_field
             (unit,) = (si_field.unit for si_field in setup.si_fields if si_field.name == field.name)
             factor = np.abs(setup.field_in_si(field.name, np.ones((2, 1, 1)))).max()
-            in_si = dataclasses.asdict(self.errors.times(float(factor)))
+            in_si = dataclasses.asdict(errors.times(float(factor)))
             history["errors_si"] = json.dumps({"field": field.name, "unit": unit, **in_si})
         dataset = dataset_from_field(
             self.displacement, self.potential, setup, attributes=history | dict(attributes or {})

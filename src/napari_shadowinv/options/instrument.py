@@ -30,6 +30,8 @@ class BeamPrior(CheckedModel):
         Relative r.m.s. difference.
     length : float
         Length over which it varies, as a share of the image's shorter side.
+    between : float
+        Relative r.m.s. difference of the beams of two energies of one shot.
 
     Raises
     ------
@@ -41,6 +43,7 @@ class BeamPrior(CheckedModel):
 
     rms: float = Field(default=0.0, ge=0, lt=1)
     length: float = Field(default=0.25, gt=0, le=1)
+    between: float = Field(default=0.0, ge=0, lt=1)
 
 
 ASSUMED_BEAM = BeamPrior(rms=0.05, length=0.25)
@@ -60,10 +63,10 @@ DETECTORS: Mapping[Detector, Mapping[str, float]] = {
 """Numbers of an `Instrument` with a detector, unless others are stated."""
 
 BEAM_SOURCES: Mapping[BeamSource, Mapping[str, float]] = {
-    "TNSA": {"beam_rms": 0.10, "beam_length": 0.25},
-    "implosion": {"beam_rms": 0.05, "beam_length": 0.5},
-    "X-ray tube": {"beam_rms": 0.02, "beam_length": 0.5},
-    "laser": {"beam_rms": 0.05, "beam_length": 0.1},
+    "TNSA": {"beam_rms": 0.10, "beam_length": 0.25, "beam_between": 0.05, "energy": 0.05},
+    "implosion": {"beam_rms": 0.05, "beam_length": 0.5, "beam_between": 0.05, "energy": 0.03},
+    "X-ray tube": {"beam_rms": 0.02, "beam_length": 0.5, "beam_between": 0.02, "energy": 0.1},
+    "laser": {"beam_rms": 0.05, "beam_length": 0.1, "beam_between": 0.05, "energy": 0.0},
 }
 """Numbers of an `Instrument` with a source of its beam, unless others are stated."""
 
@@ -121,6 +124,26 @@ class Instrument(CheckedModel):
         description=(
             "Length over which the true beam differs from the source, as a share of the image's "
             "shorter side."
+        ),
+    )
+    beam_between: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        title="Beam between energies",
+        description=(
+            "Relative r.m.s. difference between the beams of two energies of one shot, over the "
+            "same length."
+        ),
+    )
+    energy: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        title="Energy",
+        description=(
+            "Relative error of the beam's energy, or of its wavelength. It scales the field in SI "
+            "units, not the displacement."
         ),
     )
     background: float = Field(
@@ -233,12 +256,13 @@ class Instrument(CheckedModel):
         if not isinstance(values, dict) or "beam" not in values:
             return values
         numbers = {name: value for name, value in values.items() if name != "beam"}
-        if twice := {"beam_rms", "beam_length"} & numbers.keys():
+        if twice := {f"beam_{name}" for name in BeamPrior.model_fields} & numbers.keys():
             raise ValueError(f"received beam and {min(twice)}, expected one of them")
         if not isinstance(values["beam"], BeamPrior | dict):
             raise ValueError(f"beam is {values['beam']!r}, expected a BeamPrior")
         beam = BeamPrior.model_validate(values["beam"])
-        return {**numbers, "beam_rms": beam.rms, "beam_length": beam.length}
+        stated = beam.model_dump(exclude_unset=True)
+        return numbers | {f"beam_{name}": value for name, value in stated.items()}
 
     def beam_of(self, *, measured: bool) -> BeamPrior:
         """Return the prior of the beam, assumed unless stated.
@@ -250,7 +274,7 @@ class Instrument(CheckedModel):
         """
         default = 0.0 if measured else ASSUMED_BEAM.rms
         rms = default if self.beam_rms is None else self.beam_rms
-        return BeamPrior(rms=rms, length=self.beam_length)
+        return BeamPrior(rms=rms, length=self.beam_length, between=self.beam_between)
 
 
 def _simplify(name: str) -> str:

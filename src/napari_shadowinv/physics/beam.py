@@ -54,6 +54,7 @@ _UNIT_IN_TITLE = re.compile(r"\(([^()]+)\)$")
 _POWERS = {"f": -15, "p": -12, "n": -9, "µ": -6, "μ": -6, "u": -6, "m": -3, "c": -2, "": 0}
 _POWERS |= {"k": 3, "M": 6, "G": 9, "T": 12}
 _BASES = ("eV", "m")
+_BEAM_STEP = 1e-3  # relative, for a derivative
 _EXAMPLES = {"m": "1.3 mm", "MeV": "14.7 MeV"}
 
 
@@ -357,6 +358,17 @@ class BeamSetup(CheckedModel):
         """Value of the quantity that differs between images of one object."""
         value: float = getattr(self, self.beam_field)
         return value
+
+    def sensitivity_to_beam(self, name: str) -> float:
+        """Return the relative change of one of `si_fields` by that of the `beam_field`."""
+        low, high = (
+            math.log(np.abs(setup.field_in_si(name, np.ones((2, 1, 1)))).max())
+            for setup in (self._with_beam(1 - _BEAM_STEP), self._with_beam(1 + _BEAM_STEP))
+        )
+        return (high - low) / math.log((1 + _BEAM_STEP) / (1 - _BEAM_STEP))
+
+    def _with_beam(self, factor: float) -> Self:
+        return self.model_copy(update={self.beam_field: factor * self.beam_value})
 
     @classmethod
     def deflector_titles(cls) -> tuple[str, ...]:
