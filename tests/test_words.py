@@ -12,9 +12,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel
+
+from napari_shadowinv.film.pack import Pack
+from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
+from napari_shadowinv.physics.setup import SETUPS
+from napari_shadowinv.preprocessing import Recipe
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
+FACES = {"cli", "_napari"}
+BELOW_THE_FACES = [path for path in SOURCES if not FACES & set(path.parts)]
 FILES = [*SOURCES, *sorted((ROOT / "tests").rglob("*.py"))]
 TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -111,6 +119,26 @@ def test_messages_help_and_windows_use_no_idiom(idiom):
         if re.search(idiom, text)
     ]
     assert not wrong, f"write {IDIOMS[idiom]}"
+
+
+def model_keys() -> set[str]:
+    """The keys of options, setups, recipes and packs that are no words of a sentence."""
+    models: list[type[BaseModel]] = [InversionOptions, FitOptions, FitChoices, Recipe, Pack]
+    models += SETUPS.values()
+    return {key for model in models for key in model.model_fields if "_" in key}
+
+
+def test_messages_below_the_faces_suit_each_of_them():
+    """A window has no flags, a command no keywords; words such as a free boundary suit both."""
+    keys = "|".join(model_keys() | {"warm_start", "max_shots", "other_folders"})
+    options = "|".join([*InversionOptions.model_fields, *FitOptions.model_fields])
+    of_one_face = re.compile(rf"--[a-z]{{2}}|\b(?:{keys})\b|\b(?:{options})='")
+    assert not [
+        f"{path.relative_to(ROOT)}:{line}"
+        for path in BELOW_THE_FACES
+        for line, text in messages(path)
+        if of_one_face.search(text) and not re.fullmatch(r"[\s\w]+", text)  # nor a list of keys
+    ]
 
 
 @pytest.mark.parametrize("idiom", IDIOMS)

@@ -310,7 +310,7 @@ def test_synthetic_image_refuses_wrong_input() -> None:
         synthetic_image(good, np.zeros((6, 7)))
     with pytest.raises(InputError, match="source has 42 values that are NaN"):
         synthetic_image(good, np.full((6, 7), np.inf))
-    with pytest.raises(InputError, match="rays_per_pixel is 0"):
+    with pytest.raises(InputError, match="rays per pixel are 0"):
         synthetic_image(good, rays_per_pixel=0)
     with pytest.raises(InputError, match="threads is 0"):
         synthetic_image(good, threads=0)

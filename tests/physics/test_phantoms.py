@@ -281,7 +281,7 @@ def test_paper_structures_refuse_wrong_input() -> None:
         coaxial_line((9, 9), setup, radii=(2e-6, 1e-6, 3e-6))
     with pytest.raises(InputError, match="width is -1: it must be positive, in m"):
         wakefield((9, 9), wakefield_setup(), width=-1)
-    with pytest.raises(InputError, match="curvature_radius is 0: it must not be 0"):
+    with pytest.raises(InputError, match="radius of curvature is 0: it must not be 0"):
         wakefield((9, 9), wakefield_setup(), curvature_radius=0)
     with pytest.raises(InputError, match="density is 0: it must be positive"):
         plasma_wavelength(0)

@@ -276,7 +276,7 @@ def test_films_seen_from_the_detector_are_mirrored(truth: Truth, doses, changed)
 
 def test_the_side_of_the_films_is_asked_for(truth: Truth, changed) -> None:
     result = run_film(read_pack(changed(('seen_from = "source"\n', ""))))
-    assert "B has the wrong sign; give seen_from" in sentences_of(result)
+    assert "B has the wrong sign; state the side" in sentences_of(result)
     assert result.pack.seen_from_text == "the source (assumed)"
 
 

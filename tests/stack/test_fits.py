@@ -289,8 +289,6 @@ def test_fit_mistakes_give_one_sentence(refused: Callable[..., None]) -> None:
     Path("shots.csv").write_text("shot,file\n1,low0.tif\n1,high0.tif\n2,low1.tif\n")
     single = shadowinv("fit", "shots.csv")
     assert single.exit_code == 2
-    assert "several shots, expected one object: fit each with shadowinv batch --fit" in flat(
-        single.stderr
-    )
+    assert "several shots, expected one object: fit them as a stack" in flat(single.stderr)
     Path("shots.csv").write_text("shot,file\n1,gone.tif\n")
     refused("shots.csv", "--fit", names=("none of 1 shots can be read", "gone.tif"))

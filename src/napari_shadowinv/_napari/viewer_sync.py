@@ -7,7 +7,6 @@ a user's error.
 from __future__ import annotations
 
 import functools
-import re
 import sys
 import weakref
 from collections.abc import Callable, Sequence
@@ -21,32 +20,6 @@ USER_ERRORS = (InputError, OSError, MemoryError)
 """Errors that a user can resolve; all others are bugs, whose traceback is needed."""
 
 ReturnValue = TypeVar("ReturnValue")
-
-# Hints for the command line or Python, and names of options elsewhere.
-_HINT = re.compile(r"\s*\([^()]*(?:--[a-z]|\b[a-z_]+=)[^()]*\)")
-_OPTION = re.compile(r"--([a-z][a-z-]*)|\b([a-z]+(?:_[a-z]+)+)\b")
-
-
-def window_text(text: str) -> str:
-    """Replace flags and keys of options by their labels in the forms, and remove hints on them."""
-
-    def label(match: re.Match[str]) -> str:
-        key = (match[1] or match[2]).replace("-", "_")
-        return f"'{_labels()[key]}'" if key in _labels() else match[0]
-
-    return _OPTION.sub(label, _HINT.sub("", text))
-
-
-@functools.cache
-def _labels() -> dict[str, str]:
-    from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
-
-    return {
-        name: str(field.title).partition(" (")[0]
-        for model in (FitChoices, FitOptions, InversionOptions)
-        for name, field in model.model_fields.items()
-        if field.title
-    }
 
 
 def in_event_loop() -> bool:
@@ -82,7 +55,7 @@ def notify_errors(
 
 def error_text(error: BaseException) -> str:
     """Return the message of an error for the user; for a bug, its type and first line."""
-    text = window_text(str(error))
+    text = str(error)
     if isinstance(error, MemoryError) and not text:
         text = "there is not enough memory for this"
     elif not isinstance(error, USER_ERRORS):
@@ -102,7 +75,7 @@ def show_caution(text: str) -> None:
     """Show a warning as a notification."""
     from napari.utils.notifications import show_warning
 
-    show_warning(window_text(text))
+    show_warning(text)
 
 
 # Longer names would be cut off next to the colour bar of a narrow window.

@@ -159,7 +159,7 @@ class Calibration:
         if len(used) < 2:
             raise InputError(
                 f"{path} has {len(used)} films between {dose_range[0]:g} and {dose_range[1]:g} "
-                "Gy: expected at least two; widen dose_range"
+                "Gy: expected at least two; widen the range of doses"
             )
         empty = np.empty(0) if background is None else np.asarray(background, float)
         spreads = used[:, 4:] if used.shape[1] == 7 else np.empty(0)

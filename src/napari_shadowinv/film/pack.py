@@ -224,9 +224,9 @@ class Material(CheckedModel):
     def _is_known(self) -> Material:
         formula = (self.density, self.charge_per_mass, self.excitation)
         if (self.table is None) == all(value is None for value in formula):
-            raise ValueError("expected a table, or density, charge_per_mass and excitation")
+            raise ValueError("expected a table, or density, charge per mass and excitation")
         if self.table is None and None in formula:
-            raise ValueError("expected density, charge_per_mass and excitation, all three")
+            raise ValueError("expected density, charge per mass and excitation, all three")
         return self
 
     def stopping(self) -> Stopping:
@@ -373,8 +373,8 @@ class Pack(CheckedModel):
     setup: Mapping[str, Any] | None = Field(
         default=None,
         title="Setup",
-        description="Distances, object_image_distance to the first film. The scans give the size "
-        "of pixels, the pack the energies.",
+        description="Distances, that of the image to the first film. The scans give the size of "
+        "pixels, the pack the energies.",
     )
     scan: Path | None = Field(
         default=None,

@@ -352,8 +352,8 @@ def _refuse_what_one_image_cannot_tell(
     if len(matrix) == 1 and isinstance(source, str) and not options.ambiguous:
         raise InputError(
             "received one image and an unknown source: one image cannot tell the beam from the "
-            "object; give the source or an image of another energy, or ask for one of the many "
-            "answers (ambiguous=True, --ambiguous)"
+            "object; give the source or an image of another energy, or allow an ambiguous fit, "
+            "one of many"
         )
 
 

@@ -400,18 +400,18 @@ def _rivals(
         shifted = replace(scene, free_frames=_SHIFT)
         cause = (
             "the images are not in register: a shift between them explains them better; align "
-            "them (align='shift', --align shift)"
+            "them by a shift"
         )
         yield _Rival(shifted, best.unknowns, 2 * (len(scene.images) - 1), cause)
     if several and not scene.free_brightness:
         cause = (
             "the brightness of an image differs from its source's: a factor for each image "
-            "explains them better; free the brightness (brightness='free', --brightness free)"
+            "explains them better; free the brightness"
         )
         yield _Rival(replace(scene, free_brightness=True), best.unknowns, len(scene.images), cause)
     if several and setups and set(names) == {"B"}:
         yield from _with_electric_field(scene, best, setups)
-    cause = "the images are blurred by more than the point spread that was given (psf, --psf)"
+    cause = "the images are blurred by more than the point spread that was given"
     for width in (_WIDER_PX, _MUCH_WIDER_PX):
         yield _Rival(_wider(scene, width), best.unknowns, 0, cause)
     cause = (
@@ -424,7 +424,7 @@ def _rivals(
 
 def _with_free_beam(scene: Scene, best: Minimum) -> Iterator[_Rival]:
     """Beams that differ from the assumed one on long waves, or also on the object's scale."""
-    advice = "give a reference of this shot, or fit the beam (source='unknown', --source unknown)"
+    advice = "give a reference of this shot, or fit the beam, as a source that is unknown"
     causes = {
         _BEAM_MODES: f"the beam differs from its source, smoothly over the image; {advice}",
         _FINE_BEAM_MODES: (
@@ -452,10 +452,7 @@ def _with_electric_field(scene: Scene, best: Minimum, setups: Sequence[Setup]) -
     potentials = np.concatenate([best.unknowns.potentials, 0 * best.unknowns.potentials])
     # Of an added field the smoothness lets through about as many numbers as waves of 16 px.
     free_numbers = scene.images[0].size // 64
-    cause = (
-        "an electric field deflects beside the magnetic one; fit both (fields=('B', 'E'), "
-        "--fields B,E)"
-    )
+    cause = "an electric field deflects beside the magnetic one; fit both fields, B and E"
     yield _Rival(both, best.unknowns._replace(potentials=potentials), free_numbers, cause)
 
 

@@ -402,7 +402,7 @@ class Fit:
         if self.report.converged:
             yield Fact("converged", "Converged", f"in {self.report.iterations} iterations")
         else:
-            text = f"NO, not in {self.report.iterations} iterations: allow more (--max-iterations)"
+            text = f"NO, not in {self.report.iterations} iterations: allow more"
             yield Fact("converged", "Converged", text, Level.FAILED, short="NOT converged")
 
     def to_dataset(self, *, attributes: Mapping[str, str] | None = None) -> xarray.Dataset:

@@ -182,8 +182,8 @@ def assess_verdict(
     if gain_by_blur > _BLURRED:
         return Verdict.MISFIT, (
             "a wider point spread explains the image better: it is blurred by more than the "
-            "given one, by source or detector; give the point spread (psf, or source size and "
-            "resolution)"
+            "given one, by source or detector; give the point spread, or source size and "
+            "resolution"
         )
     if single and (lost := _share_lost(displacement)) > _LOST:
         return Verdict.AMBIGUOUS, (
@@ -206,8 +206,8 @@ def assess_verdict(
         return Verdict.UNCERTAIN, (
             f"the noise is {share} smaller than that of as many counts: a dark level of about "
             f"{share} seems to be left in the images, or the detector's response is not linear, "
-            "and either weakens the field; subtract the dark level from images and source (step "
-            "'dark', --dark), linearise the images, or, if the counts were averaged, scaled or "
+            "and either weakens the field; subtract the dark level from images and source by the "
+            "step 'dark', linearise the images, or, if the counts were averaged, scaled or "
             "smoothed, give their noise"
         )
     rivals = [away for worse, away in others if worse < _AS_GOOD and away > _OTHER_FIELD]
@@ -228,13 +228,12 @@ def assess_verdict(
         return Verdict.UNCERTAIN, (
             f"the beam {origin}: if it differs by {beam.variation:.1%} (r.m.s.) over "
             f"{beam.scale:.2g} of the image, the displacement is off by {beam.share:.0%} (r.m.s.); "
-            f"measure the beam to {allowed:.1g} % (source, --source), state how uniform it is "
-            "(--beam-variation), or fit it with several energies (source='unknown')"
+            f"measure the beam to {allowed:.1g} % and give it as the source, state its variation, "
+            "or fit it with several energies, as a source that is unknown"
         )
     if not ended:
         return Verdict.UNCERTAIN, (
-            "the search reached its maximum number of iterations before it ended: allow more "
-            "(max_iterations, --max-iterations)"
+            "the search reached its maximum number of iterations before it ended: allow more"
         )
     if hidden > _HIDDEN_STRUCTURE:
         return Verdict.UNCERTAIN, (
@@ -297,7 +296,7 @@ def _edge_text(displacement: FloatArray, used: BoolArray, free: bool) -> str:
             f"by {turned:.0%} of its r.m.s. displacement"
         )
     return f"{sign}: what lies beyond bends the field everywhere; record a larger field of view" + (
-        "" if free else ", or try a free boundary (boundary='free', --boundary free)"
+        "" if free else ", or try a free boundary"
     )
 
 

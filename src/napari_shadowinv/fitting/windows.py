@@ -168,8 +168,8 @@ class LeaveOneOut:
         missing = [variable for variable, *_ in _VARIABLES.values() if variable not in dataset]
         if missing or _SENTENCE not in dataset.attrs:
             raise InputError(
-                f"dataset has no {', '.join(missing) or _SENTENCE}: expected the result of "
-                "shadowinv fit --leave-one-out"
+                f"dataset has no {', '.join(missing) or _SENTENCE}: expected the result of leaving "
+                "each image out in turn"
             )
         arrays: dict[str, AnyArray] = {
             name: np.ascontiguousarray(dataset[variable].values)

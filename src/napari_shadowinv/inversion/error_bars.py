@@ -105,8 +105,8 @@ def noise_of(
         return _poisson(values, units_per_quantum)
     if units_per_quantum is not None:
         raise InputError(
-            f"units_per_quantum is {units_per_quantum!r} and noise a standard deviation: "
-            "units_per_quantum belongs to noise='poisson'"
+            f"units per quantum are {units_per_quantum!r} and noise a standard deviation: "
+            "they belong to Poisson noise"
         )
     return _gaussian(values, np.asarray(plain_array(noise, "noise")), usable)
 
@@ -116,19 +116,19 @@ def _poisson(values: FloatArray, units_per_quantum: float | None) -> tuple[Draw,
         if np.any(values != np.rint(values)):
             raise InputError(
                 "image has values that are not whole numbers, so they are not counts: give the "
-                "units_per_quantum (image units per detected quantum), or the noise as a standard "
-                "deviation"
+                "image units per detected quantum, or the noise as a standard deviation"
             )
         units_per_quantum = 1.0
     if not (np.isreal(units_per_quantum) and 0 < units_per_quantum < np.inf):
         raise InputError(
-            f"units_per_quantum is {units_per_quantum!r}, expected a positive number: image units"
+            f"units per quantum are {units_per_quantum!r}, expected a positive number: image units"
         )
     quanta = np.maximum(values, 0) / units_per_quantum
     if quanta.max(initial=0) > _MOST_QUANTA:
         raise InputError(
-            f"units_per_quantum is {units_per_quantum:g} and the brightest pixel {values.max():g}: "
-            f"that is more than {_MOST_QUANTA:g} quanta in a pixel, expected fewer: check the unit"
+            f"units per quantum are {units_per_quantum:g} and the brightest pixel is "
+            f"{values.max():g}: that is more than {_MOST_QUANTA:g} quanta in a pixel, expected "
+            "fewer: check the unit"
         )
     # A blur leaves the counting noise of many pixels as it was.
     text = f"Poisson, {units_per_quantum:g} per quantum"
@@ -554,7 +554,7 @@ def uncertainty(
     if off > _LINEAR_ENOUGH:
         text = (
             f"the response to noise is not linear: samples that were solved differ by "
-            f"{off:.0%} of what the noise changes; use method='resolve'"
+            f"{off:.0%} of what the noise changes; use the method 'resolve'"
         )
         warnings = (Caution("samples", text), *warnings)
     iterations, residuals, converged = zip(*outcomes, strict=True)

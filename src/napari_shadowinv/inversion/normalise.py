@@ -70,8 +70,7 @@ def prepare(
     if negative and options.negative == "refuse":
         raise InputError(
             f"image has {negative} negative pixels (lowest {values.min():.4g}), expected none: "
-            "if they result from background subtraction, clip them (negative='clip', or "
-            "--clip-negative on the command line)"
+            "if they result from background subtraction, clip them"
         )
     values = _clip_negative(values)
     _check_range(values, "image")
@@ -174,8 +173,8 @@ def _warnings(
     if abs(ratio - 1) > _NOTABLE_FLUX_CHANGE:
         text = (
             f"the image's flux is {ratio:.3g} times the source's; it was scaled to match, which is "
-            "right after another exposure, and wrong if a dark level was left in one of them "
-            "(--dark), if one is a negative, or if light was lost in the object or past the edge"
+            "right after another exposure, and wrong if a dark level was left in one of them, if "
+            "one is a negative, or if light was lost in the object or past the edge"
         )
         cautions.append(Caution("flux", text))
     if clipped > _NOTABLE_RAISED * size:

@@ -214,7 +214,7 @@ class Inversion:
         if smoothing and not is_stated and not errors.noise_correlation:
             caveat = (
                 f"measured after {', '.join(smoothing)}, where most of it cannot be seen: its "
-                "error is larger than stated; give the noise_level or units_per_quantum of the "
+                "error is larger than stated; give the noise level, or units per quantum, of the "
                 "recorded image"
             )
             rows.append(("noise", caveat))

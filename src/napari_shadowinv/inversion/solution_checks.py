@@ -401,8 +401,8 @@ def _cut_off(displacement: FloatArray, mask: BoolArray, noise: ImageNoise, rms: 
         return ""
     return (
         f"the field reaches the image's edge, which is closed: {how}, and truncating it there "
-        "distorts the field everywhere; try a free boundary (--boundary free), see "
-        "docs/boundary.md, or record a larger field of view"
+        "distorts the field everywhere; try a free boundary, see docs/boundary.md, or record a "
+        "larger field of view"
     )
 
 
@@ -445,8 +445,7 @@ def _cut_by_edge(prepared: Prepared, noise: ImageNoise, beam_difference: float) 
                     f"the {side} edge of the image seems to cut the object: the image's contrast "
                     "is strong there and weak at the opposite edge, and what lies beyond is "
                     "missing, which makes the field wrong, by 7 to 73 % in tests; use a wider crop "
-                    "or field of view, or try a free boundary (--boundary free), see "
-                    "docs/boundary.md"
+                    "or field of view, or try a free boundary, see docs/boundary.md"
                 )
     return ""
 

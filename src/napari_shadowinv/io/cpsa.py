@@ -86,8 +86,8 @@ def read_image(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[
     if not chosen:
         text = (
             f"all {counts.sum()} tracks are counted, whatever their diameter, contrast and "
-            "eccentricity, and not all need be of the beam: choose ranges with variable, such as "
-            "'diameter=4:12 contrast=:40'"
+            "eccentricity, and not all need be of the beam: choose ranges as its variable, such "
+            "as 'diameter=4:12 contrast=:40'"
         )
         warnings = (*warnings, Caution("tracks", text))
     metadata: dict[str, Any] = {

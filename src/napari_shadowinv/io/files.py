@@ -95,10 +95,7 @@ def check_output(
     if path.is_dir():
         raise FileFormatError(f"{path} is a folder: give a file name")
     if path.exists() and not overwrite:
-        raise FileFormatError(
-            f"{path} exists: choose another name or allow overwriting (overwrite=True, or "
-            "--overwrite on the command line)"
-        )
+        raise FileFormatError(f"{path} exists: choose another name, or allow to overwrite it")
     return path
 
 

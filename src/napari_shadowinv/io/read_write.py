@@ -177,8 +177,7 @@ def read_radiograph(
     if not isinstance(content, Radiograph):
         if ResultKind.of(content.attrs) is ResultKind.FILM_DOSES:
             raise FileFormatError(
-                f"{path} is a film pack: expected one image; write its layers with shadowinv film "
-                "--layers"
+                f"{path} is a film pack: expected one image; write its layers to files first"
             )
         raise FileFormatError(
             f"{path} is the result of an inversion: expected an image; give the original image"

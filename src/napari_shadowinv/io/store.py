@@ -218,8 +218,8 @@ def check_files(store: StackStore) -> None:
     """Refuse a store with damage to files that belong to no single shot."""
     if store.damage.files:
         raise FileFormatError(
-            f"{store.path} is damaged: {store.damage.files[0]}; repeat the run with --resume, or "
-            "copy the store again"
+            f"{store.path} is damaged: {store.damage.files[0]}; resume its run, or copy the store "
+            "again"
         )
 
 

@@ -418,10 +418,10 @@ def check_content(layout: Layout, key: str, name: str, index: int, raw: bytes) -
 
 
 def _damage_error(layout: Layout, name: str, index: int, problem: str) -> FileFormatError:
-    advice = "repeat the run with --resume, or copy the store again"
+    advice = "resume its run, or copy the store again"
     if name in layout.of_each_shot:
         problem = f"{_label(layout, index)}: {problem}"
-        advice = "repeat the run with --resume to invert it again"
+        advice = "resume its run to invert it again"
     return FileFormatError(f"{layout.root} is damaged: {problem}; {advice}")
 
 

@@ -229,17 +229,17 @@ class InversionOptions(CheckedModel):
         if self.boundary == "closed" and self.flux != "conserve":
             raise ValueError(
                 f"flux is '{self.flux}' and boundary 'closed', expected 'conserve': a closed "
-                "boundary conserves the source's flux; use boundary='free'"
+                "boundary conserves the source's flux; use a free one"
             )
         if self.boundary == "free" and self.solver != "newton":
             raise ValueError(
-                f"solver is '{self.solver}' and boundary 'free', expected solver='newton': the "
-                "other solvers support closed boundaries only"
+                f"solver is '{self.solver}' and boundary 'free', expected the solver 'newton': "
+                "the others support closed boundaries only"
             )
         if self.noise_level is not None and self.units_per_quantum is not None:
             raise ValueError(
-                f"noise_level is {self.noise_level:g} and units_per_quantum "
-                f"{self.units_per_quantum:g}, expected one of them: units_per_quantum implies "
+                f"the noise level is {self.noise_level:g} and the units per quantum are "
+                f"{self.units_per_quantum:g}, expected one of them: units per quantum imply "
                 "Poisson noise"
             )
         return self

@@ -250,28 +250,24 @@ class BeamSetup(CheckedModel):
         if sum(is_set) != 1:
             received = "both" if all(is_set) else "neither"
             raise ValueError(
-                "give either 'pixel_size' (m, in the object plane) or 'detector_pixel_size' "
-                f"(m, in the detector plane), received {received}"
+                f"received {received} of pixel size (m, in the object plane) and detector pixel "
+                "size (m, in the detector plane): expected one of them"
             )
         return self
 
-    @model_validator(mode="after")
-    def _lengths_in_range(self) -> BeamSetup:
-        for name in self.model_fields_set:
-            is_length = unit_in_title(type(self).model_fields[name].title) == "m"
-            length = getattr(self, name) if is_length else None
-            if length is not None and length < _MIN_LENGTH_M:
-                raise ValueError(
-                    f"'{name}' is {length:g} m, expected at least {_MIN_LENGTH_M:g} m: check its "
-                    "unit"
-                )
-        distance = self.source_object_distance
-        if math.isfinite(distance) and distance > _MAX_DISTANCE_M:
+    @field_validator("*")
+    @classmethod
+    def _lengths_in_range(cls, value: Any, field: ValidationInfo) -> Any:
+        name = str(field.field_name)
+        if value is None or unit_in_title(cls.model_fields[name].title) != "m":
+            return value
+        if value < _MIN_LENGTH_M:
+            raise ValueError(f"expected at least {_MIN_LENGTH_M:g} m: check its unit")
+        if name == "source_object_distance" and _MAX_DISTANCE_M < value < math.inf:
             raise ValueError(
-                f"'source_object_distance' is {distance:g} m, expected at most "
-                f"{_MAX_DISTANCE_M:g} m, or inf for a collimated beam"
+                f"expected at most {_MAX_DISTANCE_M:g} m, or inf for a collimated beam"
             )
-        return self
+        return value
 
     @model_serializer(mode="wrap")
     def _without_none(self, dump: Callable[[BeamSetup], dict[str, Any]]) -> dict[str, Any]:
@@ -556,7 +552,7 @@ def _pixel_doubts(setup: BeamSetup) -> Iterator[str]:
     elif setup.projects and at_detector < _MIN_PARTICLE_DETECTOR_PIXEL_M:
         yield (
             f"a pixel is {length_text(at_detector)} at the detector, finer than films and plates "
-            "are scanned: give a pixel size at the object as 'pixel_size'"
+            "are scanned: if this is its size at the object, give it as such"
         )
 
 

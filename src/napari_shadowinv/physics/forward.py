@@ -415,7 +415,7 @@ def synthetic_image(
     shape = (field.shape[1], field.shape[2])
     flux = _checked_source(source, shape)
     if rays_per_pixel < 1:
-        raise InputError(f"rays_per_pixel is {rays_per_pixel}: expected 1 or more")
+        raise InputError(f"rays per pixel are {rays_per_pixel}: expected 1 or more")
     if threads is not None and threads < 1:
         raise InputError(f"threads is {threads}: expected 1 or more, or None for all cores")
     tiles = math.isqrt(rays_per_pixel - 1) + 1

@@ -455,7 +455,7 @@ def wakefield(
     _require_positive("width", width, "m")
     _require_positive("length", length, "m")
     if curvature_radius == 0 or math.isnan(curvature_radius):
-        raise InputError(f"curvature_radius is {curvature_radius}: it must not be 0, in m")
+        raise InputError(f"radius of curvature is {curvature_radius}: it must not be 0, in m")
     wave_number = 2 * math.pi / plasma_wavelength(density)
     y, xi = (setup.object_pixel_size * offset for offset in offsets(shape, center))
     s = complex(1 / (2 * width**2), wave_number / (2 * curvature_radius))

@@ -417,8 +417,8 @@ def _pixel_size(pack: Pack, scans: list[Scan]) -> float | None:
     if len(sizes) < len(scans):
         if pack.setup is not None:
             raise InputError(
-                "the scans do not contain the size of their pixels: give pixel_size, in m (25.4 mm "
-                "over the dots per inch)"
+                "the scans do not contain the size of their pixels: give the pack's pixel size, in "
+                "m (25.4 mm over the dots per inch)"
             )
         return None
     if max(sizes) > (1 + _MAX_PIXEL_DEVIATION) * min(sizes):
@@ -581,7 +581,7 @@ def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) 
     if pack.setup is not None and pack.seen_from is None:
         text = (
             "the pack does not say from which side its films are seen, and the source was assumed: "
-            "if they are seen from the detector, B has the wrong sign; give seen_from"
+            "if they are seen from the detector, B has the wrong sign; state the side in the pack"
         )
         cautions.append(Caution("film-side", text))
     return cautions

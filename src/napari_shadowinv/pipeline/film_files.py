@@ -245,7 +245,7 @@ def missing_entries(entries: Mapping[str, Any]) -> list[str]:
         if "calibration" not in entries["films"].get(kind, {}):
             missing.append(f"calibration of {kind}: a table (.csv) of doses and pixels")
     if "seen_from" not in entries:
-        missing.append("seen_from: source or detector, which decides the sign of B")
+        missing.append("seen from: source or detector, which decides the sign of B")
     if "setup" not in entries:
         missing.append("setup: distances, without which results are in px")
     return missing

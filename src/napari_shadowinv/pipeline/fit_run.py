@@ -242,7 +242,7 @@ class FitInputs:
         if setup is None:
             raise InputError(
                 f"{self.names[k]} has no setup, and source size and resolution are in m: give the "
-                "setup (--setup), or the point spread in px (--psf)"
+                "setup, or the point spread in px"
             )
         return point_spread(setup, choices.source_size or 0.0, choices.resolution or 0.0)
 
@@ -361,9 +361,9 @@ def check_fit(recipe: Recipe) -> None:
             )
     if recipe.instrument != Instrument():
         raise InputError(
-            "the recipe states how well the instrument is known (instrument), which the errors of "
-            "inversions take into account, but not those of fits: leave it out, and state "
-            "beam_variation in fit.options for the beam"
+            "the recipe states how well the instrument is known, which the errors of inversions "
+            "take into account, but not those of fits: leave it out, and state the variation of "
+            "the beam in the options of the fit"
         )
     if recipe.fit is not None and recipe.fit.beam == "unknown" and recipe.source is not None:
         raise InputError(
@@ -449,9 +449,7 @@ def usual_fields(setups: Sequence[Setup] | None) -> tuple[str, ...]:
     try:
         (usual,) = {names[default_deflector(setups[0], setup)] for setup in setups}
     except InputError as error:
-        raise InputError(
-            f"{error}; name it with --fields, of {', '.join(names.values())}"
-        ) from error
+        raise InputError(f"{error}; choose the fields, of {', '.join(names.values())}") from error
     return (usual,)
 
 
@@ -543,5 +541,5 @@ def row_setup(row: ShotRow, shot: Radiograph, recipe: Recipe) -> Setup | None:
     article = "an" if nouns[0] in "aeiou" else "a"
     raise InputError(
         f"{row.file} has {article} {nouns} of {row.beam_text} and no setup: give the rest of the "
-        "geometry with --setup"
+        "geometry as a setup"
     )

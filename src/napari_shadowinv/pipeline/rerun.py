@@ -284,8 +284,7 @@ def _checked_provenance(dataset: xarray.Dataset, name: str) -> Provenance:
     """Return the provenance of a dataset, or raise an `InputError` that says what is wrong."""
     if "shot" in dataset.dims:
         raise InputError(
-            f"{name} is a stack: expected one result; export a shot with shadowinv export, or "
-            "choose one in Python, as in read_stack(path).isel(shot=3)"
+            f"{name} is a stack: expected one result, such as that of one of its shots"
         )
     if "report" in dataset.attrs:  # not of a shot of a stack, a film pack or a field alone
         as_file_errors(lambda _: result_from_dataset(dataset))(name)
@@ -344,8 +343,7 @@ class _Reader:
         if not (self.other_folders or is_inside):
             raise InputError(
                 f"{self.result} names {name} {file}, which is in another folder: name the file to "
-                "use, or allow other folders if you trust the result (--other-folders, "
-                "other_folders=True)"
+                "use, or allow other folders if you trust the result"
             )
 
     def inputs(self, dataset: xarray.Dataset, provenance: Provenance) -> RerunInputs:

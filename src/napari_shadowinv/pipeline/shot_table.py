@@ -76,7 +76,7 @@ class ShotRow(CheckedModel):
         default=None,
         ge=0,
         title="Point spread",
-        description="Standard deviation in px, after --bin.",
+        description="Standard deviation in px, after the step 'bin'.",
     )
     mask: Path | None = Field(
         default=None, title="Mask", description="Image of the same size, 0 at unusable pixels."
@@ -90,7 +90,7 @@ class ShotRow(CheckedModel):
         default=None,
         title="Noise",
         description="poisson for counts, proportional for a share of each pixel, or the standard "
-        "deviation in a pixel, after --bin.",
+        "deviation in a pixel, after the step 'bin'.",
     )
     shot: str | None = Field(
         default=None,
@@ -181,8 +181,8 @@ def shot_rows(
         rows = list(_used_rows(images[0], shared).values())
         if len({row.shot for row in rows}) > 1:
             raise InputError(
-                f"{images[0]} has the images of several shots, expected one object: fit each with "
-                "shadowinv batch --fit"
+                f"{images[0]} has the images of several shots, expected one object: fit them as a "
+                "stack"
             )
         return rows
     columns = {name: [part.strip() for part in text.split(",")] for name, text in texts.items()}

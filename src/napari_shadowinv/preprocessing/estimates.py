@@ -680,9 +680,9 @@ def point_distance(setup: Setup) -> float:
     """Return the distance from the point source to the detector, in px of the detector."""
     if setup.is_collimated:
         raise InputError(
-            "got the source 'isotropic' and a setup with a collimated beam "
-            "(source_object_distance is inf): give the distance of the point source, or choose "
-            "the source 'uniform'"
+            "got the source 'isotropic' and a setup with a collimated beam (the distance from "
+            "source to object is inf): give the distance of the point source, or choose the source "
+            "'uniform'"
         )
     # The magnification enlarges distance and pixel alike.
     return setup.source_object_distance / setup.object_pixel_size

@@ -314,7 +314,7 @@ def remove_background(
         raise InputError(
             f"background of degree {degree} falls to {background.min():.4g} for an image of mean "
             f"{values.mean():.4g}, expected both to be positive for division: use a lower "
-            "degree, or kind='subtract'"
+            "degree, or the kind 'subtract'"
         )
     flat = values / background
     return np.asarray(flat * (values.mean() / flat.mean()))

@@ -107,8 +107,7 @@ def _warnings(image: FloatArray, source: FloatArray | None, usable: BoolArray) -
             "dark-level",
             f"dark level: the noise of the image vanishes at {dark:.0%} of its mean instead of at "
             "zero, so the detector's dark level seems to be left in it: the field comes out too "
-            "weak, by this share or more; subtract it from image and source (step 'dark', "
-            "--dark)",
+            "weak, by this share or more; subtract it from image and source by the step 'dark'",
         )
     strays = np.zeros(image.shape, bool)
     for name, plane in (("image", image), ("source", source)):
@@ -128,7 +127,7 @@ def _warnings(image: FloatArray, source: FloatArray | None, usable: BoolArray) -
                 "hot-pixels",
                 f"hot pixels: {count} pixel{'s' * (count > 1)} of the {name} differ"
                 f"{'s' * (count == 1)} from all neighbours by far more than the noise, and each "
-                "bends the field around it; replace them (step 'hot-pixels', --hot-pixels)",
+                "bends the field around it; replace them by the step 'hot-pixels'",
             )
     if source is None:
         return

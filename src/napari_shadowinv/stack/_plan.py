@@ -237,7 +237,7 @@ def describe_stack(
     """Describe a stack, and check everything that can be checked before a shot is read."""
     if warm_start < 1:
         raise InputError(
-            f"warm_start is {warm_start}: expected a number of shots, or 1 to disable it"
+            f"warm start is {warm_start}: expected a number of shots, or 1 to disable it"
         )
     check_instance(recipe, Recipe, "recipe")
     resolved = Recipe() if recipe is None else recipe
@@ -300,8 +300,8 @@ def _plan_inversion(
     beam = None if per_shot else _shared_beam(inputs, source)
     if beam is None and warm_start > 1:
         raise InputError(
-            f"warm_start is {warm_start} and each shot has its own source or mask: the previous "
-            "solution belongs to different sites; leave warm_start out, or give one source and "
+            f"warm start is {warm_start} and each shot has its own source or mask: the previous "
+            "solution belongs to different sites; leave the warm start out, or give one source and "
             "mask for all shots"
         )
     options = inputs.recipe.options
@@ -323,7 +323,7 @@ def _plan_fit(
     check_fit(recipe)
     task = FitTask(inputs=inputs, variables=(), requested=recipe)
     if warm_start > 1:
-        raise InputError(f"warm_start is {warm_start}: fits start on their own; leave it out")
+        raise InputError(f"warm start is {warm_start}: fits start on their own; leave it out")
     fields = task.choices.fields
     if fields is not None and len(fields) > 1:
         raise InputError(

@@ -1046,7 +1046,7 @@ def test_a_recipe_tells_noise_and_point_spread(
     assert 1 < widths[0] < 2
     tool.setup.picker.set_kind("none")
     tool.recipes.load(path)
-    assert messages[-1].endswith("select the setup first, or give the point spread in px (psf)")
+    assert messages[-1].endswith("select the setup first, or give the point spread in px")
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,6 @@ from napari_shadowinv._napari.layer_metadata import (
     role_of,
     unit_of,
 )
-from napari_shadowinv._napari.viewer_sync import window_text
 from napari_shadowinv._napari.widgets import _panels
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.cautions import Caution
@@ -637,12 +636,6 @@ def test_camera_fits_after_units_change(
     zoom = window.camera.zoom
     window.reset_view()
     assert window.camera.zoom == pytest.approx(zoom)
-
-
-def test_window_texts_have_labels_in_place_of_flags() -> None:
-    text = "try a free boundary (--boundary free), or give the noise_level; see --max-shots"
-    in_window = window_text(text)
-    assert in_window == "try a free boundary, or give the 'Noise level'; see --max-shots"
 
 
 def test_a_detector_sets_the_numbers_of_the_instrument(tool: Any) -> None:

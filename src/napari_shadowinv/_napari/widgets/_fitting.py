@@ -17,7 +17,6 @@ from napari_shadowinv._napari.fit_layers import (
 )
 from napari_shadowinv._napari.jobs import Finished, FitJob
 from napari_shadowinv._napari.layer_metadata import Result, main_layers, result_of
-from napari_shadowinv._napari.viewer_sync import window_text
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import (
     PROBLEM_STYLE,
@@ -100,11 +99,11 @@ class FitView(QWidget):
         moved = place_inputs(self._viewer, job)
         self._show_verdict(fit)
         if fit.verdict is not Verdict.DETERMINED:
-            text = window_text(fit.cautions[0].text)
+            text = fit.cautions[0].text
             show_warning(text[:1].upper() + text[1:])
         input_warnings = {text for name, text in job.inputs if name == "Warning"}
         texts = [caution.text for caution in fit.warnings]
-        rows = [("Warning", window_text(text)) for text in texts if text not in input_warnings]
+        rows = [("Warning", text) for text in texts if text not in input_warnings]
         self.report.show_rows(
             [*rows, *job.inputs, *fact_rows(fit.facts_with_names(job.names), details=None)]
         )
@@ -126,13 +125,12 @@ class FitView(QWidget):
             self.empty()
             self._result = result
             self._show_verdict(result.content)
-            rows = [("Warning", window_text(caution.text)) for caution in result.content.warnings]
+            rows = [("Warning", caution.text) for caution in result.content.warnings]
             self.report.show_rows([*rows, *fact_rows(result.content.facts, details=None)])
 
     def _show_verdict(self, fit: Fit) -> None:
         is_determined = fit.verdict is Verdict.DETERMINED
-        explanation = window_text(fit.explanation)
-        sentence = f"{explanation[:1].upper()}{explanation[1:]}."
+        sentence = f"{fit.explanation[:1].upper()}{fit.explanation[1:]}."
         self.verdict.setText(
             f"<b>Verdict: {html.escape(fit.verdict.value)}</b><br>{html.escape(sentence)}"
         )

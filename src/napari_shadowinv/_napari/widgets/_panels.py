@@ -22,7 +22,6 @@ from napari_shadowinv._napari.viewer_sync import (
     USER_ERRORS,
     error_text,
     show_user_error,
-    window_text,
 )
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._forms import (
@@ -355,7 +354,7 @@ def fact_rows(facts: Iterable[Fact], *, details: bool | None = False) -> list[tu
     Warnings have rows of their own.
     """
     return [
-        (fact.title, window_text(fact.text))
+        (fact.title, fact.text)
         for fact in facts
         if details in (fact.is_detail, None) and fact.key not in CAUTION_CODES
     ]
@@ -455,7 +454,7 @@ class VerdictLine(QtWidgets.QLabel):
     def show_headline(self, headline: Headline, prefix: str = "") -> None:
         """Show a headline after a prefix, such as ``"Preview: "``."""
         level = headline.level.value.capitalize()
-        text = html.escape(window_text(headline.text))
+        text = html.escape(headline.text)
         self.setText(f"<b>{html.escape(prefix)}{level}</b><br>{text[:1].upper()}{text[1:]}")
         self.setStyleSheet(_LEVEL_STYLES[headline.level])
         self.setVisible(True)

@@ -26,7 +26,7 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.packs import PackJob
 from napari_shadowinv._napari.result_files import dataset_of_layers
-from napari_shadowinv._napari.viewer_sync import plane_in_view, window_text
+from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._forms import (
     ModelForm,
@@ -624,7 +624,7 @@ class FilmPack(ToolPanel):
 
 def _rows(doses: FilmDoses) -> list[tuple[str, str]]:
     """Return the report of a pack as rows; warnings come last."""
-    cautions = [("Warning", window_text(caution.text)) for caution in doses.cautions]
+    cautions = [("Warning", caution.text) for caution in doses.cautions]
     return [*fact_rows(doses.facts), *cautions]
 
 

@@ -215,7 +215,7 @@ class FitImages(ToolPanel):
         if in_metres and setup is None and self._shown_setup() is None:
             raise InputError(
                 f"{path} gives source size or resolution in m, which require a setup: select the "
-                "setup first, or give the point spread in px (psf)"
+                "setup first, or give the point spread in px"
             )
         if fields is not None and field_key(fields) not in available:
             raise InputError(

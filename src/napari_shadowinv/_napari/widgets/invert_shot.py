@@ -28,7 +28,7 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.shots import load_radiograph, radiograph_of
-from napari_shadowinv._napari.viewer_sync import show_caution, window_text
+from napari_shadowinv._napari.viewer_sync import show_caution
 from napari_shadowinv._napari.widgets._files import (
     MoreLayersButton,
     SaveButton,
@@ -310,7 +310,7 @@ class InvertShot(InversionInputs, LivePanel):
     ) -> None:
         self.verdict.show_headline(inversion.headline_in(setup))
         facts = inversion.facts_in(setup)
-        warnings = [("Warning", window_text(caution.text)) for caution in inversion.cautions]
+        warnings = [("Warning", caution.text) for caution in inversion.cautions]
         rows = [*warnings, *input_rows, *fact_rows(facts)]
         self.report.show_rows(rows, fact_rows(facts, details=True))
 
