@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -45,6 +45,8 @@ from napari_shadowinv.io.store import (
 )
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
@@ -76,11 +78,10 @@ def _remaining_text(status: RunStatus) -> str:
 def run_batch(
     shots: list[str],
     out: Path,
-    recipe: Recipe,
     run: RunOptions,
     *,
-    channel: str | None,
-    variable: str | None,
+    recipe: Recipe,
+    reader: Callable[..., ArrayLike],
     resume: bool,
     quiet: bool,
     scheduler: str,
@@ -95,7 +96,7 @@ def run_batch(
                 shots[0] if len(shots) == 1 else shots,
                 out,
                 recipe,
-                reader=shot_reader(channel, variable),
+                reader=reader,
                 run=run,
                 scheduler=scheduler,
                 on_progress=bar.update,
@@ -119,7 +120,7 @@ def exit_unless_reliable(store: StackStore) -> None:
         raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
-def shot_reader(channel: str | None, variable: str | None) -> Any:
+def shot_reader(channel: str | None, variable: str | None) -> Callable[..., ArrayLike]:
     """Return the reader of the shots' files."""
     from napari_shadowinv.stack import read_shot
 
@@ -492,11 +493,10 @@ def _shot_summary(result: Inversion | Fit) -> tuple[str, str]:
 def run_watch(
     folder: Path,
     out: Path,
-    recipe: Recipe,
     watch: WatchOptions,
     *,
-    channel: str | None,
-    variable: str | None,
+    recipe: Recipe,
+    reader: Callable[..., ArrayLike],
     quiet: bool,
 ) -> None:
     """Watch a folder; print a line for each shot and a summary."""
@@ -508,7 +508,7 @@ def run_watch(
             folder,
             out,
             recipe,
-            reader=shot_reader(channel, variable),
+            reader=reader,
             watch=watch,
             on_progress=printer.update,
             should_stop=is_interrupted,

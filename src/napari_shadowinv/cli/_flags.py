@@ -22,7 +22,7 @@ from pydantic.fields import FieldInfo
 from typer import Argument, Option
 from typer.core import TyperCommand, TyperGroup
 
-from napari_shadowinv._system.validation import Model, suggestion, validate
+from napari_shadowinv._system.validation import suggestion, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import IMAGE_TITLES
 from napari_shadowinv.options import FitChoices, FitOptions, Instrument, InversionOptions
@@ -430,16 +430,30 @@ def takes_recipe(command: Callable[..., None]) -> Callable[..., None]:
     return _with_flags(command, dict(_recipe_flags()))
 
 
-def takes_run(model: type[BaseModel]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Add a flag for each parameter of a recipe, and for each choice of a run, to a command."""
-    flags = {**dict(_option_flags(model, None)), **dict(_recipe_flags())}
-    return lambda command: _with_flags(command, flags)
+def takes_run(
+    model: type[BaseModel], inputs: Callable[..., dict[str, Any]]
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Add flags of a run and a recipe, and the parameters of `inputs`, to a command.
 
+    The command receives the choices of the run as `run`, a `model`, and what `inputs` returns.
+    """
+    of_run = dict(_option_flags(model, None))
+    shared = _command_parameters(inputs)
 
-def run_options(model: type[Model], flags: dict[str, Any]) -> Model:
-    """Return the choices of a run from the flags of `takes_run`, and remove these."""
-    chosen = {name: flags.pop(name) for name in model.model_fields if name in flags}
-    return validate(model, chosen, "flags")
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def with_inputs(*, flags: dict[str, Any], **arguments: Any) -> None:
+            chosen = {name: flags.pop(name) for name in of_run if name in flags}
+            run = validate(model, chosen, "flags")
+            files = {parameter.name: arguments.pop(parameter.name) for parameter in shared}
+            command(**arguments, run=run, **inputs(**files, run=run, flags=flags))
+
+        with_inputs.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+            [*_command_parameters(command), *shared]
+        )
+        return _with_flags(with_inputs, {**of_run, **dict(_recipe_flags())})
+
+    return decorate
 
 
 def takes_fit(command: Callable[..., None]) -> Callable[..., None]:
@@ -450,23 +464,25 @@ def takes_fit(command: Callable[..., None]) -> Callable[..., None]:
 def _with_flags(
     command: Callable[..., None], additions: Mapping[str, inspect.Parameter]
 ) -> Callable[..., None]:
-    signature = inspect.signature(command, eval_str=True)
-    parameters = [
-        parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-        for parameter in signature.parameters.values()
-        if parameter.name != "flags"
-    ]
-
     @functools.wraps(command)
     def with_flags(**arguments: Any) -> None:
         flags = {name: arguments.pop(name) for name in additions}
         command(**arguments, flags={name: x for name, x in flags.items() if x is not None})
 
-    with_flags.__signature__ = signature.replace(  # type: ignore[attr-defined]
-        parameters=[*parameters, *additions.values()]
+    with_flags.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [*_command_parameters(command), *additions.values()]
     )
     with_flags.__annotations__ = {}
     return with_flags
+
+
+def _command_parameters(command: Callable[..., Any]) -> list[inspect.Parameter]:
+    """Return the parameters of a command that are arguments and flags, as keywords."""
+    return [
+        parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for parameter in inspect.signature(command, eval_str=True).parameters.values()
+        if get_origin(parameter.annotation) is Annotated
+    ]
 
 
 def recipe_of(

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._system.safety import resolved_path
-from napari_shadowinv.cli._terminal import warn_of_setups
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.formats import PNG, PRADFORMAT, RESULT
 
@@ -213,34 +212,6 @@ def fit_recipe(
             "fit in the recipe's section [fit.options]"
         )
     return recipe.model_copy(update={"fit": recipe.fit or FitChoices()})
-
-
-def recipe_for_shots(
-    flags: Mapping[str, Any],
-    recipe: Path | None,
-    options: Path | None,
-    setup: Path | None,
-    *,
-    fit: bool,
-    clip_negative: bool,
-    save_to: Path | None,
-    overwrite: bool,
-    quiet: bool,
-    **files: Path | None,
-) -> Recipe:
-    """Return, and save, the recipe for many shots to invert or fit; `files` as `recipe_from`."""
-    from napari_shadowinv.pipeline.files import setup_from
-
-    chosen = recipe_from(flags, recipe, options, clip_negative=clip_negative, **files)  # type: ignore[arg-type]
-    if fit or chosen.fit is not None:
-        chosen = fit_recipe(chosen, flags, options, clip_negative=clip_negative)
-    if setup is not None:
-        chosen = chosen.model_copy(update={"setup": setup_from(setup)})
-    if save_to is not None:
-        save_recipe(save_to, chosen, [recipe, setup, options], overwrite)
-    if not quiet:
-        warn_of_setups([(chosen.setup, None)])
-    return chosen
 
 
 def source_from(recipe: Recipe, image: Path, channel: str | None) -> Radiograph | None:

@@ -7,15 +7,14 @@ from typing import Annotated, Any
 
 import typer
 
-from napari_shadowinv.cli import _flags
-from napari_shadowinv.cli._inputs import recipe_for_shots
-from napari_shadowinv.cli._terminal import notify_errors, say
+from napari_shadowinv.cli import _flags, _inputs
+from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 
 # Help of options, where it is longer than a line.
 HELP = {
-    "source": "Undisturbed beam: one image, or a glob matching one image per shot. Default: "
-    "uniform.",
+    "source": "Image of the undisturbed beam; batch also takes a glob matching one image per "
+    "shot. Default: uniform.",
     "scheduler": "Address of a dask scheduler (tcp://host:8786), threads, or processes (default).",
     "format": "tiff (float32, one file per shot and component), pradformat (one file per shot), or "
     "csv (a table with one row per shot).",
@@ -23,8 +22,6 @@ HELP = {
     "(.csv) with one row per shot.",
     "fit": "Fit the forward model to each shot instead of inverting it, with the recipe's section "
     "[fit]; table rows with the same shot are images of one object.",
-    "fit each": "Fit the forward model to each shot instead of inverting it, with the recipe's "
-    "section [fit].",
     "out": "Output folder, or file for csv. Default: the store's name, in the current folder.",
 }
 BATCH_EPILOG = """
@@ -67,15 +64,8 @@ by Ctrl-C while files were waiting.
 """
 
 
-@notify_errors
-@_flags.takes_run(RunOptions)
-def batch(
-    shots: Annotated[
-        list[str],
-        typer.Argument(help=HELP["shots"], show_default=False),
-    ],
-    out: Annotated[Path, typer.Option(help="Output store: name.shadowinv.zarr.")],
-    source: Annotated[str | None, typer.Option("--source", help=HELP["source"])] = None,
+def _stack_inputs(
+    source: Annotated[Path | None, typer.Option("--source", help=HELP["source"])] = None,
     mask: _flags.MaskFile = None,
     source_mask: _flags.SourceMask = None,
     recipe: _flags.RecipeFile = None,
@@ -86,86 +76,66 @@ def batch(
     channel: _flags.Channel = None,
     variable: _flags.Variable = None,
     clip_negative: _flags.ClipNegative = False,
+    quiet: _flags.Quiet = False,
+    *,
+    run: RunOptions | WatchOptions,
+    flags: dict[str, Any],
+) -> dict[str, Any]:
+    """Return the inputs of `batch` and `watch`, and save their recipe."""
+    from napari_shadowinv.cli._batch import shot_reader
+    from napari_shadowinv.pipeline.files import setup_from
+
+    files: dict[str, Any] = {"source": source, "mask": mask, "source_mask": source_mask}
+    chosen = _inputs.recipe_from(flags, recipe, options, clip_negative=clip_negative, **files)
+    if fit or chosen.fit is not None:
+        chosen = _inputs.fit_recipe(chosen, flags, options, clip_negative=clip_negative)
+    if setup is not None:
+        chosen = chosen.model_copy(update={"setup": setup_from(setup)})
+    if save_recipe is not None:
+        _inputs.save_recipe(save_recipe, chosen, [recipe, setup, options], run.overwrite)
+    if not quiet:
+        warn_of_setups([(chosen.setup, None)])
+    return {"recipe": chosen, "reader": shot_reader(channel, variable), "quiet": quiet}
+
+
+@notify_errors
+@_flags.takes_run(RunOptions, _stack_inputs)
+def batch(
+    shots: Annotated[
+        list[str],
+        typer.Argument(help=HELP["shots"], show_default=False),
+    ],
+    out: Annotated[Path, typer.Option(help="Output store: name.shadowinv.zarr.")],
     scheduler: Annotated[str | None, typer.Option(help=HELP["scheduler"])] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Resume an interrupted run and append new shots.")
     ] = False,
-    quiet: _flags.Quiet = False,
     *,
-    flags: dict[str, Any],
+    run: RunOptions,
+    **inputs: Any,
 ) -> None:
     """Invert or fit many shots into one store; an interrupted run can be resumed."""
     from napari_shadowinv.cli._batch import run_batch
 
-    run = _flags.run_options(RunOptions, flags)
-    chosen = recipe_for_shots(
-        flags,
-        recipe,
-        options,
-        setup,
-        fit=fit,
-        clip_negative=clip_negative,
-        source=None if source is None else Path(source),
-        mask=mask,
-        source_mask=source_mask,
-        save_to=save_recipe,
-        overwrite=run.overwrite,
-        quiet=quiet,
-    )
-    run_batch(
-        shots,
-        out,
-        chosen,
-        run,
-        channel=channel,
-        variable=variable,
-        resume=resume or run.redo_failed,
-        quiet=quiet,
-        scheduler=scheduler or "processes",
-    )
+    resume = resume or run.redo_failed
+    run_batch(shots, out, run, resume=resume, scheduler=scheduler or "processes", **inputs)
 
 
 @notify_errors
-@_flags.takes_run(WatchOptions)
+@_flags.takes_run(WatchOptions, _stack_inputs)
 def watch(
     folder: Annotated[
         Path, typer.Argument(help="Folder in which the shots appear.", show_default=False)
     ],
     out: Annotated[Path, typer.Option(help="Output store: name.shadowinv.zarr.")],
-    source: _flags.SourceFile = None,
-    mask: _flags.MaskFile = None,
-    source_mask: _flags.SourceMask = None,
-    recipe: _flags.RecipeFile = None,
-    save_recipe: _flags.SaveRecipe = None,
-    setup: _flags.SetupFile = None,
-    options: _flags.OptionsFile = None,
-    fit: Annotated[bool, typer.Option("--fit", help=HELP["fit each"])] = False,
-    channel: _flags.Channel = None,
-    variable: _flags.Variable = None,
-    clip_negative: _flags.ClipNegative = False,
-    quiet: _flags.Quiet = False,
     *,
-    flags: dict[str, Any],
+    run: WatchOptions,
+    **inputs: Any,
 ) -> None:
     """Invert or fit each new shot in a folder, and append it to a store."""
     from napari_shadowinv.cli._batch import run_watch
 
-    run = _flags.run_options(WatchOptions, flags)
-    chosen = recipe_for_shots(
-        flags,
-        recipe,
-        options,
-        setup,
-        fit=fit,
-        clip_negative=clip_negative,
-        source=source,
-        mask=mask,
-        source_mask=source_mask,
-        save_to=save_recipe,
-        overwrite=run.overwrite,
-        quiet=quiet,
-    )
-    run_watch(folder, out, chosen, run, channel=channel, variable=variable, quiet=quiet)
+    run_watch(folder, out, run, **inputs)
 
 
 @notify_errors
