@@ -17,7 +17,8 @@ import pytest
 from hypothesis import settings
 
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.fitting import Basin, Fit, FitOptions, FitReport, FittedField, Verdict
+from napari_shadowinv.facts import Verdict
+from napari_shadowinv.fitting import Basin, Fit, FitOptions, FitReport, FittedField
 from napari_shadowinv.inversion import Inversion, Report
 from napari_shadowinv.inversion.budget import ErrorEstimate, Errors
 from napari_shadowinv.inversion.solution_checks import image_residual

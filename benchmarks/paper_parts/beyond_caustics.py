@@ -13,7 +13,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from fit import counted, pixels, toroid
-from napari_shadowinv.fitting import Verdict, fit
+from napari_shadowinv.facts import Verdict
+from napari_shadowinv.fitting import fit
 from paper_parts.drawing import (
     BLUE,
     FIELD_LABEL,

@@ -1,4 +1,4 @@
-"""A result in words, for every face: `Fact`, `Headline`, `Level`; its kind: `ResultKind`.
+"""A result in words, for every face: `Fact`, `Headline`, `Level`, `Verdict`; its `ResultKind`.
 
 Results describe themselves once, as facts. The command prints them as a table, a window shows them
 as a report, a figure writes them below its panels; none of them words or rounds anything itself.
@@ -23,11 +23,13 @@ __all__ = [
     "Headline",
     "Level",
     "ResultKind",
+    "Verdict",
     "caution_facts",
     "error_fact",
     "in_headline",
     "masked_fact",
     "time_fact",
+    "verdict_facts",
 ]
 
 
@@ -68,6 +70,17 @@ class Level(StrEnum):
     FAILED = "failed"
 
 
+class Verdict(StrEnum):
+    """Whether the field of an inversion or a fit is known, and why not."""
+
+    DETERMINED = "determined"
+    SEVERAL = "one of several"
+    AMBIGUOUS = "one image cannot tell"
+    UNCERTAIN = "too uncertain"
+    EDGE = "reaches the edge"
+    MISFIT = "does not fit"
+
+
 @dataclass(frozen=True)
 class Headline:
     """A result in one line.
@@ -75,9 +88,11 @@ class Headline:
     Attributes
     ----------
     level : Level
-        Sound without warnings, doubtful with warnings, failed if the solver did not converge.
+        Sound if the field is determined and there are no warnings, failed if the solver did not
+        converge, else doubtful.
     text : str
-        The warnings in a few words, then the peak of the main field with its error.
+        The verdict and its reason, the warnings in a few words, the peak of the main field with
+        its error.
     """
 
     level: Level
@@ -116,6 +131,16 @@ class Fact:
 def in_headline(cautions: Iterable[Caution]) -> list[str]:
     """Return cautions in a few words, each once; their facts have the sentences."""
     return list(dict.fromkeys(caution.short for caution in cautions))
+
+
+def verdict_facts(verdict: Verdict, reason: str) -> list[Fact]:
+    """Return a verdict, and its reason unless it is empty."""
+    is_determined = verdict is Verdict.DETERMINED
+    level = Level.SOUND if is_determined else Level.DOUBTFUL
+    facts = [Fact("verdict", "Verdict", str(verdict), level, short=str(verdict))]
+    if reason:
+        facts.append(Fact("verdict", "Reason" if is_determined else "Warning", reason, level))
+    return facts
 
 
 def caution_facts(cautions: Iterable[Caution]) -> list[Fact]:

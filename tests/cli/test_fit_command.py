@@ -18,7 +18,8 @@ from helpers.command_line import content, flat, interrupted, shadowinv
 from helpers.fit_images import of_each
 from napari_shadowinv.cli._flags import fit_recipe_of
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, FitOptions, LeaveOneOut, Verdict, point_spread
+from napari_shadowinv.facts import Verdict
+from napari_shadowinv.fitting import Fit, FitOptions, LeaveOneOut, point_spread
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read, write
 from napari_shadowinv.io.files import sha256

@@ -10,9 +10,9 @@ import pytest
 from helpers.fit_images import Displacement, bump, counted, distance, noisy, on_pixels, together
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Fit, FitOptions, FitShot, compare, fit
 from napari_shadowinv.fitting.measurements import strengths_of
-from napari_shadowinv.fitting.verdict import Verdict
 from napari_shadowinv.physics.setup import ProtonSetup
 
 SIZE = (48, 56)

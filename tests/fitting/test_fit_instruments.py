@@ -11,8 +11,8 @@ from helpers.fit_images import bump, counted, distance, noisy, on_pixels, togeth
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InversionCancelled
+from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Fit, FitOptions, FitShot, fit
-from napari_shadowinv.fitting.verdict import Verdict
 
 SIZE = (48, 56)
 STRENGTHS = [1, 0.6]

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting.pattern import Pattern
 from napari_shadowinv.fitting.posterior import BeamError
-from napari_shadowinv.fitting.verdict import Verdict, assess_verdict
+from napari_shadowinv.fitting.verdict import assess_verdict
 
 
 def blob(middle: tuple[int, int]) -> FloatArray:

@@ -11,7 +11,8 @@ import pytest
 import xarray as xr
 
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.fitting import Fit, Verdict
+from napari_shadowinv.facts import Verdict
+from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read, write
 from napari_shadowinv.io.formats import kind_of

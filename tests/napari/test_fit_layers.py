@@ -25,7 +25,8 @@ from napari_shadowinv._napari.layer_metadata import (
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.result_files import missing_layers
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.fitting import Fit, FitOptions, Verdict, fit
+from napari_shadowinv.facts import Verdict
+from napari_shadowinv.fitting import Fit, FitOptions, fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob

@@ -10,8 +10,8 @@ import pytest
 
 from napari_shadowinv import FitOptions, InputError, ProtonSetup, fit
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.facts import Level
-from napari_shadowinv.fitting import Fit, FitShot, FitWindows, Verdict
+from napari_shadowinv.facts import Level, Verdict
+from napari_shadowinv.fitting import Fit, FitShot, FitWindows
 from napari_shadowinv.fitting.windows import window_facts
 from napari_shadowinv.io import read, write
 from napari_shadowinv.options import FitChoices

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.fitting import Fit, FitWindows, LeaveOneOut, Verdict
+from napari_shadowinv.facts import Verdict
+from napari_shadowinv.fitting import Fit, FitWindows, LeaveOneOut
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.physics.units import shown_fields

@@ -97,7 +97,7 @@ def start_name(basin: Basin) -> str:
 
 def verdict_suffix(fit: Fit) -> str:
     """Return the verdict as a suffix of names; empty if the fields are determined."""
-    from napari_shadowinv.fitting import Verdict
+    from napari_shadowinv.facts import Verdict
 
     return "" if fit.verdict is Verdict.DETERMINED else f" ({fit.verdict.value})"
 

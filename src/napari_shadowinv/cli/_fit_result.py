@@ -101,7 +101,7 @@ def fit_table(fit: Fit, names: Sequence[str], written: Sequence[Path]) -> Table:
 
 def exit_unless_determined(fit: Fit, out: Path) -> None:
     """Exit with an error code unless the verdict is 'determined'."""
-    from napari_shadowinv.fitting import Verdict
+    from napari_shadowinv.facts import Verdict
 
     if fit.verdict is not Verdict.DETERMINED:
         say_on_stderr(f"{fit.verdict.upper()}: {out} was written, but {fit.explanation}")

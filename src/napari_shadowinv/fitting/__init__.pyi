@@ -3,7 +3,6 @@ from ._leave_one_out import leave_one_out
 from .measurements import FitOptions
 from .result import Basin, Fit, FitReport, FittedField
 from .shots import FitShot, point_spread
-from .verdict import Verdict
 from .windows import FitWindows, LeaveOneOut
 
 __all__ = [
@@ -15,7 +14,6 @@ __all__ = [
     "FitWindows",
     "FittedField",
     "LeaveOneOut",
-    "Verdict",
     "compare",
     "fit",
     "leave_one_out",

@@ -19,14 +19,15 @@ from napari_shadowinv.facts import (
     Headline,
     Level,
     ResultKind,
+    Verdict,
     caution_facts,
     error_fact,
     in_headline,
     masked_fact,
     time_fact,
+    verdict_facts,
 )
 from napari_shadowinv.fitting.posterior import BeamError
-from napari_shadowinv.fitting.verdict import Verdict
 from napari_shadowinv.inversion.variables import (
     BEAM_UNCERTAINTY,
     UNCERTAINTY,
@@ -336,11 +337,8 @@ class Fit:
         names : sequence of str
             A name for each image, or none.
         """
-        is_determined = self.verdict is Verdict.DETERMINED
-        level = Level.SOUND if is_determined else Level.DOUBTFUL
         return (
-            Fact("verdict", "Verdict", str(self.verdict), level, short=str(self.verdict)),
-            Fact("verdict", "Reason" if is_determined else "Warning", self.explanation, level),
+            *verdict_facts(self.verdict, self.explanation),
             *caution_facts(self.warnings),
             *self._image_facts(names),
             *(self._field_fact(field) for field in self.fields),

@@ -1,4 +1,4 @@
-"""Whether a fit's field may be believed: `Verdict`, `assess_verdict`.
+"""Whether a fit's field may be believed: `assess_verdict` returns its `Verdict`.
 
 χ² alone does not show whether a field is right: one image, or several that the object displaces
 alike, can be explained perfectly by a wrong field. The test is whether other fields explain them
@@ -8,13 +8,13 @@ as well. `hidden_contrast` finds masks that hide the structure that determines a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import StrEnum
 
 import numpy as np
 from scipy import ndimage
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
 from napari_shadowinv.fitting.posterior import BeamError
 from napari_shadowinv.inversion.solution_checks import (
@@ -23,11 +23,7 @@ from napari_shadowinv.inversion.solution_checks import (
     turning_displacement,
 )
 
-__all__ = [
-    "Verdict",
-    "assess_verdict",
-    "hidden_contrast",
-]
+__all__ = ["assess_verdict", "hidden_contrast"]
 
 
 _MIN_HOLE_RADIUS_PX = 6.0
@@ -93,17 +89,6 @@ _AT_EDGE, _AT_FREE_EDGE = 0.3, 0.7
 _BENT, _BENT_AT_FREE_EDGE = 0.15, 0.3
 _HIDDEN_STRUCTURE = 0.5  # of the strongest contrast
 _SMOOTHED, _FROM_EDGE = 2.0, 2  # px
-
-
-class Verdict(StrEnum):
-    """How far the field of a fit can be trusted."""
-
-    DETERMINED = "determined"
-    SEVERAL = "one of several"
-    AMBIGUOUS = "one image cannot tell"
-    UNCERTAIN = "too uncertain"
-    EDGE = "reaches the edge"
-    MISFIT = "does not fit"
 
 
 def assess_verdict(

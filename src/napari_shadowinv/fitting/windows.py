@@ -15,9 +15,8 @@ import numpy as np
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Level
+from napari_shadowinv.facts import Fact, Level, Verdict
 from napari_shadowinv.fitting.result import Fit
-from napari_shadowinv.fitting.verdict import Verdict
 from napari_shadowinv.inversion.variables import UNCERTAINTY, belongs, dataset_from_field
 from napari_shadowinv.physics.setup import (
     BeamQuantity,

@@ -27,7 +27,8 @@ from napari_shadowinv._napari.widgets._forms import (
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, fact_rows
 from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
-from napari_shadowinv.fitting import Fit, Verdict
+from napari_shadowinv.facts import Verdict
+from napari_shadowinv.fitting import Fit
 
 _REDRAW_MS = 500
 _MIN_REDRAW_RATIO = 10  # interval over the time of a drawing
