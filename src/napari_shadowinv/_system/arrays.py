@@ -5,7 +5,7 @@
 - image, source and mask of one shot: `unpack_shot`; several planes: `unpack_planes`
 - numbers as floats: `as_numbers`; a plane of them: `check_plane`; a mask: `check_mask`
 - two masks together: `join_masks`; size of a pixel by the coordinates: `coordinate_spacing`
-- places of values in their order: `order_by_value`
+- blocks of a plane: `blocks_of`, `block_means`; places of values in their order: `order_by_value`
 
 Everything else, dask arrays included, passes through untouched.
 """
@@ -253,6 +253,15 @@ def blocks_of(plane: AnyArray, side: int) -> AnyArray:
     """Return a plane as blocks, shape (rows, side, columns, side), cut where none is complete."""
     rows, columns = (length // side for length in plane.shape)
     return plane[: rows * side, : columns * side].reshape(rows, side, columns, side)
+
+
+def block_means(values: FloatArray, block: int) -> FloatArray:
+    """Return means over square blocks; incomplete ones at the far edges are mirrored."""
+    padding = [(0, -side % block) for side in values.shape]
+    padded = np.pad(values, padding, mode="symmetric")
+    height, width = padded.shape
+    blocks = padded.reshape(height // block, block, width // block, block)
+    return np.asarray(blocks.mean(axis=(1, 3)))
 
 
 def order_by_value(values: FloatArray) -> AnyArray:

@@ -20,6 +20,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial import KDTree
 
 from napari_shadowinv._typing import FloatArray
@@ -28,7 +29,13 @@ from napari_shadowinv.inversion.imperfections import IMPERFECTIONS, SolvedShot, 
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.inversion.readout import LinearResponse
-from napari_shadowinv.options import ASSUMED_BEAM, BeamPrior, Instrument, InversionOptions
+from napari_shadowinv.options import (
+    ASSUMED_BEAM,
+    BeamComponents,
+    BeamPrior,
+    Instrument,
+    InversionOptions,
+)
 from napari_shadowinv.physics.units import PeakError
 from napari_shadowinv.transport.minimise import Solution, with_full_cells
 from napari_shadowinv.transport.sites import RATIO, SitePlan
@@ -44,6 +51,7 @@ _MAX_RESIDUAL = 0.1  # of a level, for its error to be estimated
 _SHARE_OF_NOISE = 0.2
 _MAX_SHARE_OF_NOISE = 0.8  # above it, an estimate of the noise suffices
 _MAX_BEAM_AT_PEAK = 0.1  # of the displacement, without a warning
+_MAX_BEAM_DEVIATIONS = 3.0  # of a beam from its measured prior
 _MAX_BEAM_RMS = 0.25  # of the displacement, without a warning
 
 _MAX_RESPONSE_SITES = 4500  # of a level whose linear response is computed
@@ -56,6 +64,8 @@ _BEAM_TEXTS = {
     "assumed": "beam assumed, {:.2g} %",
     "stated": "beam stated, {:.2g} %",
     "seen": "image and source differ by {:.2g} %",
+    "references": "beam by its references, {:.2g} %",
+    "outside": "beam measured outside the object, {:.2g} %",
 }
 
 
@@ -97,8 +107,9 @@ class Errors:
     beam_scale : float
         Length over which they differ, as a share of the image's shorter side.
     beam_basis : str
-        Origin of that number: 'assumed' for an estimated source, 'stated' by the user, 'seen' in
-        the image outside the object.
+        Origin of that number: 'assumed' for an estimated source, 'stated' by the user, 'seen' as a
+        difference of image and source outside the object, 'references' for a prior from them,
+        'outside' for a source estimated from the image outside the object, with its variance.
     noise_correlation : float
         Standard deviation of the Gaussian blur with the measured correlation of the noise, px; 0
         for white noise.
@@ -253,6 +264,8 @@ class Budget:
     ) -> None:
         self._plan, self._prepared = plan, prepared
         self._noise, self.options, self.instrument = noise, options, instrument
+        if self._beam.components is not None:
+            self._beam.components.check_shape(prepared.mask.shape)
         self._places = _places(prepared)
         self._moves: dict[LevelSolution, FloatArray] = {}
         self._responses: dict[LevelSolution, LinearResponse] = {}
@@ -332,7 +345,10 @@ class Budget:
         if share := self.instrument.other_field:
             effects[f"other field, {100 * share:.2g} %"] = _scale_error(lengths, share)
         by_percent = estimate(_TESTED_VARIATION * response.to(self._beams(response)))
-        times = variation / _TESTED_VARIATION
+        beam = _scale_error(by_percent, variation / _TESTED_VARIATION) if variation else None
+        components = self._beam.components
+        if components is not None and basis == components.basis:
+            beam = estimate(response.to(self._beams_of(response, components)))
         return Errors(
             peak=lengths.at_peak,
             rms=lengths.rms,
@@ -343,7 +359,7 @@ class Budget:
                 cause: estimate(response.to(samples))
                 for cause, samples in self._flux_errors(response, solved[-1])
             },
-            beam=_scale_error(by_percent, times) if variation else None,
+            beam=beam,
             beam_sensitivity=by_percent,
             sensitivities=sensitivities,
             beam_variation=variation,
@@ -361,6 +377,10 @@ class Budget:
     def _beam_variation(self) -> tuple[float, str]:
         """Relative difference of beam and source, and its origin."""
         observed = self.beam_difference
+        if (components := self._beam.components) is not None:
+            # Their r.m.s. was measured, so that a larger difference may be chance.
+            is_within = observed < _MAX_BEAM_DEVIATIONS * self._beam.rms
+            return (self._beam.rms, components.basis) if is_within else (observed, "seen")
         if observed > self._beam.rms:
             return observed, "seen"
         return self._beam.rms, "assumed" if self.instrument.beam_rms is None else "stated"
@@ -446,6 +466,19 @@ class Budget:
             sample -= (mass * sample).sum() / mass.sum()
             sample /= np.sqrt((mass * sample**2).sum() / mass.sum())
         return mass * samples
+
+    def _beams_of(self, response: LinearResponse, components: BeamComponents) -> FloatArray:
+        """Return the flux that cells gain from beams that vary in certain shapes."""
+        mass, block = response.level.mass, components.block
+        places = (response.sites.T + 0.5) / block - 0.5
+        width = max(response.spacing / block, 1.0) / 3  # a cell is a mean
+        smooth = [gaussian_filter(pattern, width) for pattern in components.patterns]
+        shapes = [mass * map_coordinates(p, places, order=1, mode="nearest") for p in smooth]
+        waves = components.rest * self._beams(response)
+        samples = np.sqrt(len(shapes) + len(waves)) * np.stack(
+            [*shapes, *waves / np.sqrt(len(waves))]
+        )
+        return np.asarray(samples - samples.sum(axis=1, keepdims=True) * mass / mass.sum())
 
 
 def _solver_gap(

@@ -7,6 +7,7 @@ window, and is saved with each result: there is no second list of defaults.
 - unknowns of a fit and knowledge about its images: `FitChoices`
 """
 
+from napari_shadowinv.options.beam_prior import ASSUMED_BEAM, BeamComponents, BeamPrior
 from napari_shadowinv.options.fitting import (
     KINDS_OF_NOISE,
     MAX_STRENGTH,
@@ -15,13 +16,7 @@ from napari_shadowinv.options.fitting import (
     KindOfNoise,
     Noise,
 )
-from napari_shadowinv.options.instrument import (
-    ASSUMED_BEAM,
-    BEAM_SOURCES,
-    DETECTORS,
-    BeamPrior,
-    Instrument,
-)
+from napari_shadowinv.options.instrument import BEAM_SOURCES, DETECTORS, Instrument
 from napari_shadowinv.options.inversion import MAX_DEFAULT_SITES, InversionOptions
 
 __all__ = [
@@ -31,6 +26,7 @@ __all__ = [
     "KINDS_OF_NOISE",
     "MAX_DEFAULT_SITES",
     "MAX_STRENGTH",
+    "BeamComponents",
     "BeamPrior",
     "FitChoices",
     "FitOptions",

@@ -1,4 +1,4 @@
-"""How well an experiment is known: `Instrument`, with the `BeamPrior` of its beam.
+"""How well an experiment is known: `Instrument`.
 
 Each number is a standard deviation in an experimenter's units; 0 takes the quantity as exact. An
 inversion and a fit propagate them into the error of the field.
@@ -12,42 +12,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal, Self, get_args
 
-from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from napari_shadowinv._system.validation import CheckedModel
+from napari_shadowinv.options.beam_prior import ASSUMED_BEAM, BeamComponents, BeamPrior
 
-__all__ = ["ASSUMED_BEAM", "BEAM_SOURCES", "DETECTORS", "BeamPrior", "Instrument"]
+__all__ = ["BEAM_SOURCES", "DETECTORS", "Instrument"]
 
 _CONFIG = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class BeamPrior(CheckedModel):
-    """Expected difference between the true beam and the source of an image.
-
-    Attributes
-    ----------
-    rms : float
-        Relative r.m.s. difference.
-    length : float
-        Length over which it varies, as a share of the image's shorter side.
-    between : float
-        Relative r.m.s. difference of the beams of two energies of one shot.
-
-    Raises
-    ------
-    InputError
-        If a value is out of range.
-    """
-
-    model_config = _CONFIG
-
-    rms: float = Field(default=0.0, ge=0, lt=1)
-    length: float = Field(default=0.25, gt=0, le=1)
-    between: float = Field(default=0.0, ge=0, lt=1)
-
-
-ASSUMED_BEAM = BeamPrior(rms=0.05, length=0.25)
-"""Prior of a beam that nobody measured, unless another one is stated."""
 
 
 Detector = Literal["film", "image plate", "CR-39", "scintillator", "camera"]
@@ -76,7 +56,7 @@ class Instrument(CheckedModel):
 
     What is not stated has the default of the detector or of the beam source. Without these it
     counts as exact, except for a beam that nobody measured: `ASSUMED_BEAM`. The beam may be given
-    as `beam`, a `BeamPrior`, in place of its numbers.
+    as `beam`, a `BeamPrior`, in place of its numbers; only so it has components.
 
     Raises
     ------
@@ -94,6 +74,9 @@ class Instrument(CheckedModel):
     """
 
     model_config = _CONFIG
+
+    # Arrays are no text: a recipe names the files of the references.
+    _components: BeamComponents | None = PrivateAttr(default=None)
 
     detector: Detector | None = Field(
         default=None,
@@ -217,6 +200,15 @@ class Instrument(CheckedModel):
         """
         return cls(detector=detector, beam_source=source, **numbers)
 
+    @model_validator(mode="wrap")
+    @classmethod
+    def _keep_components(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        instrument = handler(values)
+        beam = values.get("beam") if isinstance(values, dict) else None
+        if isinstance(beam, BeamPrior):
+            instrument._components = beam.components
+        return instrument
+
     @field_validator("detector", "beam_source", mode="before")
     @classmethod
     def _spell(cls, value: Any, info: ValidationInfo) -> Any:
@@ -274,7 +266,8 @@ class Instrument(CheckedModel):
         """
         default = 0.0 if measured else ASSUMED_BEAM.rms
         rms = default if self.beam_rms is None else self.beam_rms
-        return BeamPrior(rms=rms, length=self.beam_length, between=self.beam_between)
+        beam = BeamPrior(rms=rms, length=self.beam_length, between=self.beam_between)
+        return beam if self._components is None else beam.with_components(self._components)
 
 
 def _simplify(name: str) -> str:

@@ -36,7 +36,7 @@ import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field, PrivateAttr
 
-from napari_shadowinv._system.arrays import NORMAL_MAD
+from napari_shadowinv._system.arrays import NORMAL_MAD, block_means
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution, OnCaution, warn_of
@@ -426,8 +426,8 @@ def _block_samples(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return positions y, x and means of blocks of usable pixels, few enough for a fit."""
     block = int(np.ceil(np.sqrt(values.size / _MAX_FITTED_PIXELS)))
-    share = pixels.block_means(usable.astype(np.float64), block)
-    means = pixels.block_means(np.where(usable, values, 0.0), block)
+    share = block_means(usable.astype(np.float64), block)
+    means = block_means(np.where(usable, values, 0.0), block)
     # A block is used only if it is complete, since a part of it has another middle.
     # Under a mask so fine that no block is complete, the fullest are used.
     y, x = np.nonzero(share >= share.max())

@@ -17,7 +17,13 @@ import scipy
 from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import NORMAL_MAD, check_mask, check_plane, unpack_shot
+from napari_shadowinv._system.arrays import (
+    NORMAL_MAD,
+    block_means,
+    check_mask,
+    check_plane,
+    unpack_shot,
+)
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -228,15 +234,6 @@ def with_flux_of(beam: FloatArray, values: FloatArray, usable: BoolArray) -> Flo
             f"is at most {brightest:.3g} elsewhere: mask less, or choose another estimate"
         )
     return source
-
-
-def block_means(values: FloatArray, block: int) -> FloatArray:
-    """Return means over square blocks; incomplete ones at the far edges are mirrored."""
-    padding = [(0, -side % block) for side in values.shape]
-    padded = np.pad(values, padding, mode="symmetric")
-    height, width = padded.shape
-    blocks = padded.reshape(height // block, block, width // block, block)
-    return np.asarray(blocks.mean(axis=(1, 3)))
 
 
 def fit_polynomial(
