@@ -10,15 +10,15 @@ from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import WIDTH, CloughTocher, with_gradients
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
-from napari_shadowinv.inversion import error_bars
-from napari_shadowinv.inversion.error_bars import (
+from napari_shadowinv.inversion import samples as sampling
+from napari_shadowinv.inversion.normalise import prepare
+from napari_shadowinv.inversion.readout import read_dual
+from napari_shadowinv.inversion.samples import (
     FullResampling,
     LinearResampling,
     Scatter,
     noise_of,
 )
-from napari_shadowinv.inversion.normalise import prepare
-from napari_shadowinv.inversion.readout import read_dual
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.transport.linear import SimilarSystems
@@ -98,7 +98,7 @@ def test_a_sample_is_the_same_in_any_block(case):
 def test_too_many_sites_for_factors_are_left_to_the_multigrid(monkeypatch, image):
     options = InversionOptions(n_sites=1000, negative="clip")
     factorised = uncertainty(image, WIDTH + 2, noise=NOISE, options=options)
-    monkeypatch.setattr(error_bars, "_MOST_FACTORISED", 0)
+    monkeypatch.setattr(sampling, "_MOST_FACTORISED", 0)
     iterative = uncertainty(image, WIDTH + 2, noise=NOISE, options=options)
     assert not np.array_equal(iterative.potential_std, factorised.potential_std)
     for name in ("potential_std", "displacement_std"):

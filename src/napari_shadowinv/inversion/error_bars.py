@@ -1,12 +1,10 @@
-"""Error bars: how image noise affects the retrieved field.
+"""Error bars: how image noise and an instrument that is not exact affect the retrieved field.
 
 - error bars for the potential and the displacement at every pixel: `uncertainty`
-- result: `Uncertainty`
-- random samples of an image with noise: `noise_of`
-- inversion of each sample, by a new solution of its transport: `FullResampling`; by the linear
-  response of the image's own transport: `LinearResampling`
+- result: `Uncertainty`, with a `Quantity` for each number that is derived from the field
 
-Each sample is the image with another draw of noise, and is inverted on the same sites. The
+Each sample is the image with another draw of noise, and, where an instrument is stated, with its
+imperfections drawn and added to image and source; it is inverted on the same sites. The
 scatter of the samples is the scatter of repeated shots of the same object (the parametric
 bootstrap). The linear response of the solved transport to a small change of the image costs one
 linear system with a matrix that all samples share; to solve the transport again costs a few, each
@@ -21,312 +19,117 @@ chapter 6.
 from __future__ import annotations
 
 import json
-import math
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, reduce
+from functools import partial, reduce
 from operator import add
+from statistics import NormalDist
 from threading import Event
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import ndimage
 
-from napari_shadowinv._system.arrays import plain_array, unpack_array, unpack_shot
+from napari_shadowinv._system.arrays import unpack_array, unpack_shot
 from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
-from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import WIDTH
-from napari_shadowinv.geometry.power_diagram import pixel_shares
 from napari_shadowinv.inversion._invert import invert, plan_sites
-from napari_shadowinv.inversion.normalise import bytes_per_pixel, flooring_for, prepare
-from napari_shadowinv.inversion.readout import LinearReadout, read_out
+from napari_shadowinv.inversion.imperfections import InstrumentDraws, RecordedShot, Scene
+from napari_shadowinv.inversion.normalise import bytes_per_pixel, prepare
 from napari_shadowinv.inversion.result import Inversion
+from napari_shadowinv.inversion.samples import (
+    FullResampling,
+    LinearResampling,
+    Scatter,
+    Seed,
+    noise_of,
+)
 from napari_shadowinv.inversion.variables import dataset_from_field
-from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.physics.poisson import border_mean
+from napari_shadowinv.options import BeamPrior, Instrument, InversionOptions
 from napari_shadowinv.physics.units import label
-from napari_shadowinv.transport.linear import FactorisedLaplacian, LaplacianSolver
-from napari_shadowinv.transport.minimise import TransportObjective
 from napari_shadowinv.transport.sites import SitePlan
-from napari_shadowinv.transport.solvers import LevelSolution, Target, solve
 
 if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = [
-    "Draw",
-    "FullResampling",
-    "LinearResampling",
-    "Sample",
-    "Scatter",
-    "Seed",
-    "Uncertainty",
-    "noise_of",
-    "uncertainty",
-]
-
-
-Draw = Callable[[np.random.Generator, float], FloatArray]
-"""Returns a noisy image, with noise that a Gaussian of some standard deviation (px) correlates."""
-
-_BLUR_REACH = 4.0  # standard deviations
-_MOST_QUANTA = 1e18  # numpy draws no larger Poisson numbers
-
-
-def noise_of(
-    image: ArrayLike, noise: object, units_per_quantum: float | None, mask: ArrayLike | None
-) -> tuple[Draw, str]:
-    """Return a function that draws a noisy image, and a text that describes the noise."""
-    values = np.asarray(unpack_array(image, "image")[0])
-    if values.dtype.kind not in "buif":
-        raise InputError(f"image has values of type {values.dtype}, expected real numbers")
-    usable = np.isfinite(values)
-    if mask is not None and np.shape(mask) == values.shape:
-        usable &= np.asarray(mask, dtype=bool)
-    values = np.where(usable, values, 0.0)
-    if isinstance(noise, str):
-        if noise != "poisson":
-            raise InputError(
-                f"noise is {noise!r}, expected 'poisson', a standard deviation or an array of them"
-            )
-        return _poisson(values, units_per_quantum)
-    if units_per_quantum is not None:
-        raise InputError(
-            f"units per quantum are {units_per_quantum!r} and noise a standard deviation: "
-            "they belong to Poisson noise"
-        )
-    return _gaussian(values, np.asarray(plain_array(noise, "noise")), usable)
-
-
-def _poisson(values: FloatArray, units_per_quantum: float | None) -> tuple[Draw, str]:
-    if units_per_quantum is None:
-        if np.any(values != np.rint(values)):
-            raise InputError(
-                "image has values that are not whole numbers, so they are not counts: give the "
-                "image units per detected quantum, or the noise as a standard deviation"
-            )
-        units_per_quantum = 1.0
-    if not (np.isreal(units_per_quantum) and 0 < units_per_quantum < np.inf):
-        raise InputError(
-            f"units per quantum are {units_per_quantum!r}, expected a positive number: image units"
-        )
-    quanta = np.maximum(values, 0) / units_per_quantum
-    if quanta.max(initial=0) > _MOST_QUANTA:
-        raise InputError(
-            f"units per quantum are {units_per_quantum:g} and the brightest pixel is "
-            f"{values.max():g}: that is more than {_MOST_QUANTA:g} quanta in a pixel, expected "
-            "fewer: check the unit"
-        )
-    # A blur leaves the counting noise of many pixels as it was.
-    text = f"Poisson, {units_per_quantum:g} per quantum"
-    return lambda rng, blur: units_per_quantum * rng.poisson(quanta), text
-
-
-def _gaussian(values: FloatArray, sigma: AnyArray, usable: BoolArray) -> tuple[Draw, str]:
-    if sigma.dtype.kind not in "uif":
-        raise InputError(
-            f"noise has values of type {sigma.dtype}, expected 'poisson', a standard deviation "
-            "or an array of them"
-        )
-    if sigma.ndim > 0 and sigma.shape != values.shape:
-        raise InputError(
-            f"noise has shape {sigma.shape}, image {values.shape}: they must match, or give one "
-            "number for all pixels"
-        )
-    deviation = np.where(usable, sigma, 0.0)
-    if not (np.isfinite(deviation).all() and (deviation >= 0).all() and deviation.any()):
-        raise InputError(
-            "noise is zero everywhere, or somewhere negative or not finite: expected standard "
-            "deviations in the image's units"
-        )
-    described = f"Gaussian, {sigma:g}" if sigma.ndim == 0 else "Gaussian, pixel by pixel"
-    return lambda rng, blur: values + deviation * _normal(rng, values.shape, blur), described
-
-
-def _normal(rng: np.random.Generator, shape: tuple[int, ...], blur: float) -> FloatArray:
-    """Normal noise of deviation 1, correlated as by a Gaussian blur (px)."""
-    if not blur > 0:
-        return rng.normal(size=shape)
-    reach = math.ceil(_BLUR_REACH * blur)
-    kernel = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * blur**2))
-    kernel /= np.sqrt((kernel**2).sum())
-    noise: FloatArray = rng.normal(size=[side + 2 * reach for side in shape])
-    for axis in (0, 1):
-        noise = ndimage.correlate1d(noise, kernel, axis)
-    return noise[reach:-reach, reach:-reach]
-
-
-Seed = np.random.SeedSequence
-
-_SAMPLE_SHARE = 0.2  # of the noise's flux errors that a sample may leave unsolved
-_LOOSEST_TOLERANCE = 0.1
-_MOST_FACTORISED = 300_000  # sites; their factors take 0.2 GB and two seconds
-_LINEAR_TOLERANCE = 0.02
-_ROWS = 64  # read out between two calls of `should_stop`
-
-
-class Sample(NamedTuple):
-    """One noisy image, inverted."""
-
-    field: FloatArray  # potential and displacement, (3, H, W)
-    solution: LevelSolution
-
-
-@dataclass(frozen=True)
-class FullResampling:
-    """Solution of the transport of each sample on a plan's finest level, from start weights."""
-
-    plan: SitePlan
-    start: FloatArray
-    draw: Callable[[np.random.Generator], FloatArray]
-    options: InversionOptions
-
-    def sample(self, seeds: list[Seed], report: Reporter) -> Sample:
-        """Invert the noisy image of one seed, without caustics and other results."""
-        (seed,) = seeds
-        image = self.image(seed)
-        plan = self.plan
-        solution = solve(
-            plan.levels, image, self.options, report, start=self.start, margin=plan.margin
-        )[-1]
-        potential, displacement = (
-            plan.within(values) for values in read_out(solution, self.options)
-        )
-        return Sample(np.stack([potential - border_mean(potential), *displacement]), solution)
-
-    def to_tolerance_of_noise(self, seed: Seed) -> FullResampling:
-        """Loosen the tolerance to a share of the flux errors by noise."""
-        # The remaining error is white, and moves the field far less than the flux that the solver
-        # has moved: where a fifth remains in the worst cell, a sample's field is within 3 % of
-        # its change, and the deviation of many within 0.2 %.
-        level = self.plan.levels[-1]
-        objective = TransportObjective(
-            level.triangulation.copy(),
-            level.mass,
-            Density.from_image(self.image(seed)),
-            threads=self.options.threads,
-        )
-        by_noise = objective.residual(objective.diagram(self.start))
-        loosest = min(_SAMPLE_SHARE * by_noise, _LOOSEST_TOLERANCE)
-        tolerance = max(loosest, self.options.tolerance)
-        return replace(self, options=self.options.model_copy(update={"tolerance": tolerance}))
-
-    def image(self, seed: Seed) -> FloatArray:
-        """Draw a noisy image, as the transport sees it."""
-        return self._apply_floor(self.draw(np.random.default_rng(seed)))
-
-    @cached_property
-    def _apply_floor(self) -> Callable[[FloatArray], FloatArray]:
-        return flooring_for(self.plan.source, self.options, self.plan.mask)
-
-
-@dataclass(frozen=True)
-class Scatter:
-    """Sums over samples of changes of (potential, displacement), (3, H, W)."""
-
-    # Changes are relative to the image's field, so sums of squares lose no digits.
-    count: int
-    sums: FloatArray
-    squares: FloatArray
-
-    @classmethod
-    def of(cls, change: FloatArray) -> Scatter:
-        return cls(1, change, change**2)
-
-    def __add__(self, other: Scatter) -> Scatter:
-        return Scatter(
-            self.count + other.count, self.sums + other.sums, self.squares + other.squares
-        )
-
-    @property
-    def mean(self) -> FloatArray:
-        return self.sums / self.count
-
-    @property
-    def std(self) -> FloatArray:
-        variance = (self.squares - self.sums * self.mean) / (self.count - 1)
-        return np.sqrt(np.maximum(variance, 0))
-
-
-class LinearResampling:
-    """Linear response of an inversion to the changes of the image in its samples."""
-
-    def __init__(self, samples: FullResampling, image: FloatArray, threads: int | None) -> None:
-        self._samples, self._image = samples, image
-        plan, level = samples.plan, samples.plan.levels[-1]
-        objective = Target.of(image, plan.margin, samples.options).objective(level)
-        diagram = objective.diagram(samples.start)
-        self._shares = pixel_shares(diagram, level.shape, threads=threads)
-        self._network = diagram.laplacian(), objective.ground(samples.start)
-        self._factors = None
-        if len(level.sites) <= _MOST_FACTORISED:
-            with suppress(RuntimeError):  # the multigrid reports it if it fails as well
-                self._factors = FactorisedLaplacian(*self._network)
-        self._readout = LinearReadout(plan, level, threads)
-        self._solvers = threading.local()  # each has vectors of its own
-
-    def scatter(self, seeds: list[Seed], report: Reporter) -> Scatter:
-        """Sum the changes by up to `WIDTH` noisy images, in order."""
-        values = self._at_sites(seeds, report)
-        sums, squares = np.zeros((2, 3, *self._image.shape))
-        for start in range(0, len(self._image), _ROWS):
-            report("samples", 0)
-            self._readout.add(values, sums, squares, start, _ROWS)
-        return Scatter(len(seeds), sums, squares)
-
-    def changes(self, seeds: list[Seed]) -> FloatArray:
-        """Return changes of potential and displacement by up to `WIDTH` images, (k, 3, H, W)."""
-        values = self._at_sites(seeds, Reporter())
-        return np.array([self._readout.field(values[..., k]) for k in range(len(seeds))])
-
-    def _at_sites(self, seeds: list[Seed], report: Reporter) -> FloatArray:
-        plan = self._samples.plan
-        change = np.zeros(plan.levels[-1].shape)
-        lacking = np.zeros((self._shares.shape[0], WIDTH))
-        for sample, seed in enumerate(seeds):
-            report("samples", 0)
-            plan.within(change)[:] = self._image - self._samples.image(seed)
-            lacking[:, sample] = self._shares @ change.ravel()
-        return self._readout.at_sites(self._solve(lacking, report))
-
-    def _solve(self, right: FloatArray, report: Reporter) -> FloatArray:
-        if self._factors is not None:
-            return self._factors.solve(right)
-        if not hasattr(self._solvers, "multigrid"):
-            self._solvers.multigrid = LaplacianSolver(*self._network)
-        weights = np.zeros_like(right)
-        for sample in np.flatnonzero(right.any(axis=0)):
-            report("samples", 0)
-            weights[:, sample], _, _ = self._solvers.multigrid.solve(
-                right[:, sample].copy(), _LINEAR_TOLERANCE
-            )
-        return weights
+__all__ = ["Quantity", "Uncertainty", "uncertainty"]
 
 
 Result = TypeVar("Result")
 
 _CHECKED = 3  # linear samples that are solved, too
 _LINEAR_ENOUGH = 0.3  # of their change
+_SPREAD_ENOUGH = 0.15  # of the size of the changes
+_MEAN_ENOUGH = 0.3  # of the standard deviation
+_MAX_BEAM_RMS = 0.9
 _POLL_SECONDS = 0.1
 _BYTES_PER_SITE, _BYTES_PER_PIXEL = 700, 150  # measured peaks of one sample, rounded up
 
 
+QuantityOf = Callable[[FloatArray, FloatArray], ArrayLike]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number, or an array of them, that is derived from the field.
+
+    Attributes
+    ----------
+    value : ndarray
+        Of the inversion.
+    samples : ndarray, shape (n, ...)
+        Of each sample.
+    """
+
+    value: FloatArray
+    samples: FloatArray
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviation of the samples."""
+        return np.asarray(self.samples.std(axis=0, ddof=1))
+
+    @property
+    def bias(self) -> FloatArray:
+        """Mean of the samples less the value: what noise and instrument add on average."""
+        return np.asarray(self.samples.mean(axis=0) - self.value)
+
+    def band(self, share: float = 0.68) -> tuple[FloatArray, FloatArray]:
+        """Return the lower and the upper end of the interval with a share of probability.
+
+        Samples stray from the inversion as the inversion does from the truth, so the interval is
+        that of the samples, mirrored at the value (the basic bootstrap). It corrects a bias, such
+        as that of a maximum, which noise raises.
+
+        Raises
+        ------
+        InputError
+            If the share is not between 0 and 1.
+        """
+        tails = (1 + _checked_share(share)) / 2, (1 - share) / 2
+        high, low = np.quantile(self.samples, tails, axis=0)
+        return np.asarray(2 * self.value - high), np.asarray(2 * self.value - low)
+
+
+def _checked_share(share: float) -> float:
+    if not 0 < share < 1:
+        raise InputError(f"share is {share!r}, expected a number between 0 and 1, such as 0.95")
+    return share
+
+
 @dataclass(frozen=True)
 class Uncertainty:
-    """An inversion with its scatter due to image noise.
+    """An inversion with its scatter due to image noise, and to its instrument if stated.
 
     Attributes
     ----------
@@ -346,6 +149,16 @@ class Uncertainty:
     nonlinearity : float
         Deviation of linear samples from solved ones, as a share of the change by noise (r.m.s. over
         the image); 0 where all were solved.
+    spread_ratio : float
+        Size of the changes in those solved samples relative to the linear ones (r.m.s.); 1 where
+        all were solved.
+    mean_shift : float
+        Difference of their means, relative to the r.m.s. standard deviation; 0 where all were
+        solved.
+    imperfections : tuple of str
+        What the samples draw of the instrument besides the noise, such as "background, 5 %".
+    quantities : dict of str to Quantity
+        Numbers derived from the field, by their names.
     tolerance : float
         Largest relative flux error of a cell that was allowed in a sample that was solved.
     iterations, residuals, converged : tuple of int, of float, of bool
@@ -364,11 +177,33 @@ class Uncertainty:
     noise: str
     method: str
     nonlinearity: float
+    spread_ratio: float
+    mean_shift: float
+    imperfections: tuple[str, ...]
+    quantities: dict[str, Quantity]
     tolerance: float
     iterations: tuple[int, ...]
     residuals: tuple[float, ...]
     converged: tuple[bool, ...]
     warnings: tuple[Caution, ...]
+
+    def band(self, share: float = 0.68) -> tuple[FloatArray, FloatArray]:
+        """Return the displacement's lower and upper end at every pixel, (2, H, W) each, px.
+
+        The interval of normal errors with a share of probability around the inversion less its
+        bias.
+
+        Raises
+        ------
+        InputError
+            If the share is not between 0 and 1.
+        """
+        field = self.inversion.displacement
+        return _band(field, self.displacement_mean, self.displacement_std, share)
+
+    def potential_band(self, share: float = 0.68) -> tuple[FloatArray, FloatArray]:
+        """Return the same for the potential, (H, W) each, px²."""
+        return _band(self.inversion.potential, self.potential_mean, self.potential_std, share)
 
     def to_dataset(
         self, setup: Setup | None = None, *, attributes: Mapping[str, str] | None = None
@@ -388,6 +223,7 @@ class Uncertainty:
             JSON text in the attribute ``uncertainty``.
         """
         samples: tuple[str, ...] = ("n", "noise", "method", "nonlinearity", "tolerance")
+        samples += ("spread_ratio", "mean_shift", "imperfections")
         samples += ("iterations", "residuals", "converged")
         values = {name: getattr(self, name) for name in samples}
         values["warnings"] = [asdict(caution) for caution in self.warnings]
@@ -414,6 +250,13 @@ class Uncertainty:
         )
 
 
+def _band(
+    value: FloatArray, mean: FloatArray, std: FloatArray, share: float
+) -> tuple[FloatArray, FloatArray]:
+    middle, width = 2 * value - mean, NormalDist().inv_cdf((1 + _checked_share(share)) / 2) * std
+    return middle - width, middle + width
+
+
 def uncertainty(
     image: ArrayLike,
     n: int = 200,
@@ -424,16 +267,20 @@ def uncertainty(
     units_per_quantum: float | None = None,
     method: Literal["linear", "resolve"] = "linear",
     options: InversionOptions | None = None,
+    instrument: Instrument | None = None,
+    quantities: Mapping[str, QuantityOf] | None = None,
     plan: SitePlan | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Uncertainty:
-    """Estimate the uncertainty of potential and displacement due to image noise.
+    """Estimate the uncertainty of potential and displacement due to noise and instrument.
 
     Each sample is the image with fresh noise on top, inverted like the image. All share the image's
     own noise, so their scatter is the effect of one dose of noise: the standard deviation that
-    shots of the same object would show. It is no distance from the truth: it does not include
-    errors without noise (an unknown source, an object at the edge, folds behind caustics).
+    shots of the same object would show. With an instrument, each sample also draws its
+    imperfections (beam, background, gamma, blur, absorption, registration, another field) and adds
+    them to image and source. Other errors are not included (an object at the edge, folds behind
+    caustics).
 
     Parameters
     ----------
@@ -458,6 +305,13 @@ def uncertainty(
         ``"linear"``: by the linear response of the transport, which a few samples that are solved
         as well check. ``"resolve"``: solve the transport of each sample, which takes many times as
         long; for caustics and strong noise.
+    instrument : Instrument, optional
+        How well beam, detector and alignment are known. If it states no beam, a source that was not
+        recorded is taken to be off as in the error budget. Default: samples draw noise alone.
+    quantities : dict of str to callable, optional
+        Numbers whose error bars are needed: functions of potential, (H, W), and displacement,
+        (2, H, W), that return a number or an array: a line profile, the mean of a region, an
+        integral, a peak. Several threads may call them at once.
 
     Returns
     -------
@@ -466,8 +320,8 @@ def uncertainty(
     Raises
     ------
     InputError
-        If the image cannot be inverted, or `n`, `noise`, `units_per_quantum` or `method` make no
-        sense.
+        If the image cannot be inverted, or `n`, `noise`, `units_per_quantum`, `method`,
+        `instrument` or `quantities` make no sense.
     InversionCancelled
         If `should_stop` returned true.
 
@@ -477,9 +331,19 @@ def uncertainty(
     >>> result = uncertainty(counts, n=4)
     >>> result.potential_std.shape, result.n, result.converged
     ((24, 24), 4, (True, True, True))
+    >>> peak = {"peak": lambda potential, displacement: np.hypot(*displacement).max()}
+    >>> result = uncertainty(counts, n=20, instrument={"blur": 1.0}, quantities=peak)
+    >>> result.imperfections
+    ('beam, 5 %', 'blur, 1 px')
+    >>> low, high = result.quantities["peak"].band(0.95)
+    >>> bool(low < high)
+    True
     """
     options = as_model(InversionOptions, options, "options")
+    if instrument is not None:
+        instrument = as_model(Instrument, instrument, "instrument")
     check_instance(plan, SitePlan, "plan")
+    quantities = _checked_quantities(quantities)
     if not isinstance(n, int | np.integer) or isinstance(n, bool) or n < 2:
         raise InputError(f"n is {n!r}, expected a whole number of samples, at least 2")
     if method not in ("linear", "resolve"):
@@ -506,6 +370,7 @@ def uncertainty(
         source=source,
         mask=mask,
         options=options,
+        instrument=instrument,
         plan=plan,
         on_progress=on_progress,
         should_stop=should_stop,
@@ -526,8 +391,12 @@ def uncertainty(
         clipping,
     )
     resampling = resampling.to_tolerance_of_noise(seeds[0])
+    draws = None if instrument is None else _draws(image, inversion, instrument, plan)
+    resampling = replace(resampling, instrument=draws)
     report = Reporter(on_progress, should_stop)
     image_fields = np.stack([inversion.potential, *inversion.displacement])
+    measure = partial(_measure, quantities, image_fields)
+    asked = measure if quantities else None
     outcomes: list[tuple[int, float, bool]] = []
 
     def solve_samples(seeds: list[Seed], report: Reporter) -> Iterator[FloatArray]:
@@ -536,27 +405,28 @@ def uncertainty(
             outcomes.append((solution.iterations, solution.residual, solution.converged))
             yield sample.field - image_fields
 
-    off = 0.0
+    check = _LinearCheck(0.0, 1.0, 0.0)
     if method == "resolve":
-        scatter = reduce(add, map(Scatter.of, solve_samples(seeds, report)))
+        scatter = reduce(
+            add, (Scatter.of(change, asked) for change in solve_samples(seeds, report))
+        )
     else:
         quietly = Reporter(None, should_stop)
-        checked = np.array(list(solve_samples(seeds[:_CHECKED], quietly)))
+        few = seeds[: _CHECKED if draws is None else WIDTH]
+        checked = np.array(list(solve_samples(few, quietly)))
         clean = prepare(image, plan.source, clipping, plan.mask).floored_image
-        response = _in_thread(lambda: LinearResampling(resampling, clean, options.threads), quietly)
-        linear = _in_thread(lambda: response.changes(seeds[:_CHECKED]), quietly)
-        off = _relative_length(linear[:, 1:] - checked[:, 1:], checked[:, 1:])
+        response = _in_thread(
+            lambda: LinearResampling(resampling, clean, options.threads, asked), quietly
+        )
+        linear = _in_thread(lambda: response.changes(few), quietly)
+        check = _LinearCheck.of(linear[:, 1:], checked[:, 1:])
         del checked, linear
         blocks = [seeds[start : start + WIDTH] for start in range(0, len(seeds), WIDTH)]
         scatter = reduce(add, _in_order(response.scatter, blocks, workers, report))
     mean, std = image_fields + scatter.mean, scatter.std
     warnings = inversion.report.warnings
-    if off > _LINEAR_ENOUGH:
-        text = (
-            f"the response to noise is not linear: samples that were solved differ by "
-            f"{off:.0%} of what the noise changes; use the method 'resolve'"
-        )
-        warnings = (Caution("samples", text), *warnings)
+    if (caution := check.caution(with_instrument=draws is not None)) is not None:
+        warnings = (caution, *warnings)
     iterations, residuals, converged = zip(*outcomes, strict=True)
     if failed := converged.count(False):
         text = (
@@ -564,6 +434,7 @@ def uncertainty(
             "deviations are unreliable where the samples scatter most"
         )
         warnings = (Caution("samples", text), *warnings)
+    values = measure(np.zeros_like(image_fields))
     return Uncertainty(
         inversion=inversion,
         potential_mean=mean[0],
@@ -573,13 +444,95 @@ def uncertainty(
         n=int(n),
         noise=noise_text,
         method=method,
-        nonlinearity=off,
+        nonlinearity=check.nonlinearity,
+        spread_ratio=check.spread_ratio,
+        mean_shift=check.mean_shift,
+        imperfections=() if draws is None else draws.names,
+        quantities={
+            name: Quantity(value, np.array([sample[name] for sample in scatter.quantities]))
+            for name, value in values.items()
+        },
         tolerance=resampling.options.tolerance,
         iterations=iterations,
         residuals=residuals,
         converged=converged,
         warnings=warnings,
     )
+
+
+def _checked_quantities(quantities: Mapping[str, QuantityOf] | None) -> Mapping[str, QuantityOf]:
+    if quantities is None:
+        return {}
+    if not isinstance(quantities, Mapping) or not all(map(callable, quantities.values())):
+        raise InputError(
+            f"quantities is {quantities!r}, expected a dictionary of functions of potential and "
+            "displacement"
+        )
+    return quantities
+
+
+def _measure(
+    quantities: Mapping[str, QuantityOf], fields: FloatArray, change: FloatArray
+) -> dict[str, FloatArray]:
+    """Return the quantities of fields with a change, (potential, displacement) each."""
+    potential, *displacement = fields + change
+    moves = np.array(displacement)
+    return {name: np.asarray(of(potential, moves)) for name, of in quantities.items()}
+
+
+def _draws(
+    image: ArrayLike, inversion: Inversion, instrument: Instrument, plan: SitePlan
+) -> InstrumentDraws | None:
+    """Return the imperfections to be drawn; None if the instrument is exact."""
+    mask = inversion.mask
+    beam, errors = instrument.beam_of(measured=plan.measured), inversion.errors
+    if errors is not None and errors.beam_variation != beam.rms:  # more was seen
+        beam = BeamPrior(rms=min(errors.beam_variation, _MAX_BEAM_RMS), length=beam.length)
+    shot = RecordedShot(
+        image=np.where(mask, unpack_array(image, "image")[0], 0.0),
+        source=inversion.source,
+        scene=Scene(inversion.displacement, inversion.source, mask),
+    )
+    draws = InstrumentDraws(shot, instrument, beam)
+    return draws if draws.names else None
+
+
+@dataclass(frozen=True)
+class _LinearCheck:
+    """Linear samples against the same ones solved."""
+
+    nonlinearity: float
+    spread_ratio: float
+    mean_shift: float
+
+    @classmethod
+    def of(cls, linear: FloatArray, solved: FloatArray) -> _LinearCheck:
+        count = len(solved)
+        spread = float(np.linalg.norm(solved - solved.mean(axis=0))) / (count - 1) ** 0.5
+        shift = float(np.linalg.norm((linear - solved).mean(axis=0)))
+        return cls(
+            _relative_length(linear - solved, solved),
+            _relative_length(solved, linear),
+            shift / spread if spread > 0 else 0.0,
+        )
+
+    def caution(self, *, with_instrument: bool) -> Caution | None:
+        """Warn if the linear answer is not enough."""
+        if not with_instrument:
+            text = (
+                f"the response to noise is not linear: samples that were solved differ by "
+                f"{self.nonlinearity:.0%} of what the noise changes; use the method 'resolve'"
+            )
+            return Caution("samples", text) if self.nonlinearity > _LINEAR_ENOUGH else None
+        is_spread = abs(self.spread_ratio - 1) > _SPREAD_ENOUGH
+        if not is_spread and self.mean_shift < _MEAN_ENOUGH:
+            return None
+        text = (
+            f"the response to noise and instrument is not linear: samples that were solved scatter "
+            f"{self.spread_ratio:.2g} times as far, and their mean differs by "
+            f"{self.mean_shift:.2g} of an error bar; use the method 'resolve'"
+        )
+        return Caution("samples", text)
 
 
 def _relative_length(part: FloatArray, reference: FloatArray) -> float:

@@ -2,24 +2,34 @@
 
 An imperfection changes the flux of the image, or of its source, by a pattern whose size is a
 standard deviation of the `Instrument`. The field follows by the linear response of the solved
-transport.
+transport. For random samples (`InstrumentDraws`) each imperfection is made in the pixels of the
+image and of its source, by independent normal numbers; smooth fields by `SmoothField`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.inversion.readout import LinearResponse
-from napari_shadowinv.options.instrument import Instrument
+from napari_shadowinv.options import BeamPrior, Instrument
 
-__all__ = ["IMPERFECTIONS", "Imperfection", "SolvedShot", "random_waves"]
+__all__ = [
+    "IMPERFECTIONS",
+    "Imperfection",
+    "InstrumentDraws",
+    "RecordedShot",
+    "Scene",
+    "SmoothField",
+    "SolvedShot",
+    "random_waves",
+]
 
 _WAVES = 16
 _SAMPLES = 8
@@ -27,6 +37,11 @@ _STEPS = 96  # along the shorter side, where the object is looked for
 _OBJECT = 0.1  # of the largest displacement
 _LEAST_BRIGHTNESS = 1e-3  # of the mean, for a logarithm
 _SQUARE = np.sqrt(3)  # r.m.s. square of a normal number: blur acts by the square of its width
+_VARIANCE = 0.999  # of a smooth field, in its modes
+_MAX_MODE_PLACES = 256  # along an axis
+_LEAST_TRANSMISSION = 0.05
+_LEAST_EXPONENT = 0.05
+_STEP = 1e-3  # of a normal number, for a derivative
 
 
 @dataclass(frozen=True)
@@ -77,7 +92,103 @@ class SolvedShot:
         return np.asarray(gains - gains.sum(axis=1, keepdims=True) * flux / flux.sum())
 
 
+class SmoothField:
+    """Random field on the pixels, whose correlation falls with distance as a Gaussian.
+
+    It is the sum of a few smooth modes times independent normal numbers: 99.9 % of the variance.
+
+    Parameters
+    ----------
+    length : float
+        Standard deviation of the Gaussian, px.
+    weights : ndarray, shape (H, W)
+        Weights of the pixels. The weighted mean of each field is 0, its expected square 1.
+
+    Attributes
+    ----------
+    count : int
+        Number of modes.
+    """
+
+    def __init__(self, length: float, weights: FloatArray) -> None:
+        self._modes = [_line_modes(size, length) for size in weights.shape]
+        weights = weights / weights.sum()
+        along_y, along_x = self._modes
+        means = along_y @ weights @ along_x.T
+        squares = along_y**2 @ weights @ (along_x**2).T - means**2
+        order = np.argsort(squares, axis=None)[::-1]
+        share = np.cumsum(squares.ravel()[order]) / squares.sum()
+        self.count = int(np.searchsorted(share, _VARIANCE)) + 1
+        self._chosen = order[: self.count]
+        self._means = means.ravel()[self._chosen]
+        self._size = 1 / np.sqrt(squares.ravel()[self._chosen].sum())
+
+    def of(self, numbers: FloatArray) -> FloatArray:
+        """Return the field of `count` numbers, shape (H, W)."""
+        along_y, along_x = self._modes
+        strengths = np.zeros((len(along_y), len(along_x)))
+        strengths.ravel()[self._chosen] = numbers
+        field = along_y.T @ strengths @ along_x - self._means @ numbers
+        return np.asarray(self._size * field)
+
+
+def _line_modes(size: int, length: float) -> FloatArray:
+    """Return principal components of a random field along a line of pixels, (k, size)."""
+    places = np.linspace(0, size - 1, min(size, _MAX_MODE_PLACES))
+    squares = (places[:, None] - places) ** 2
+    variances, vectors = np.linalg.eigh(np.exp(-squares / (2 * length**2)))
+    variances, vectors = np.maximum(variances[::-1], 0), vectors[:, ::-1]
+    share = np.cumsum(variances) / variances.sum()
+    count = int(np.searchsorted(share, 1 - (1 - _VARIANCE) / 10)) + 1
+    modes = (np.sqrt(variances) * vectors).T[:count]
+    return np.array([np.interp(np.arange(size), places, mode) for mode in modes])
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The retrieved object of a shot.
+
+    Attributes
+    ----------
+    displacement : ndarray, shape (2, H, W)
+        Of the ray through each pixel, px.
+    source : ndarray, shape (H, W)
+        0 where masked.
+    mask : ndarray of bool, shape (H, W)
+        Pixels that are used.
+    """
+
+    displacement: FloatArray
+    source: FloatArray
+    mask: BoolArray
+
+    @cached_property
+    def object_region(self) -> tuple[FloatArray, float]:
+        """Smooth mask of the object, (H, W), and the radius of a disc of its area, px."""
+        return _object_region(self.displacement, self.mask, 1)
+
+    @cached_property
+    def transmission(self) -> SmoothField:
+        """Field with structure of the object's size."""
+        _, radius = self.object_region
+        return SmoothField(radius, self.source)
+
+
+@dataclass(frozen=True)
+class RecordedShot:
+    """An image and its source in the units of their files, (H, W) each, 0 where masked."""
+
+    image: FloatArray
+    source: FloatArray
+    scene: Scene
+
+    def mean(self, values: FloatArray) -> float:
+        """Return the mean of image or source over the used pixels."""
+        return float(values[self.scene.mask].mean())
+
+
 Pattern = Callable[[SolvedShot, float], FloatArray]
+Change = Callable[[RecordedShot, float, FloatArray], RecordedShot]
 
 
 @dataclass(frozen=True)
@@ -97,6 +208,13 @@ class Imperfection:
     pattern : callable
         Returns k independent changes of the cells' flux, (k, n), for a solved shot and a standard
         deviation; their mean square is that of the imperfection.
+    change : callable
+        Returns a recorded shot with the imperfection of a standard deviation, drawn by independent
+        normal numbers.
+    count : callable
+        Returns how many numbers that takes.
+    is_even : bool
+        Whether the imperfection grows with the square of its number.
     """
 
     key: str
@@ -104,6 +222,9 @@ class Imperfection:
     size_text: str
     tested: float
     pattern: Pattern
+    change: Change
+    count: Callable[[Scene], int] = lambda scene: 1
+    is_even: bool = False
 
     def name(self, size: float) -> str:
         """Return the title with the size, such as "background, 5 %"."""
@@ -165,10 +286,7 @@ def _absorption(shot: SolvedShot, rms: float) -> FloatArray:
     """Smooth variations of the transmission where the object displaces rays."""
     response, sites = shot.response, shot.response.sites
     step = max(min(shot.prepared.mask.shape) // _STEPS, 1)
-    length = np.hypot(*shot.displacement[:, ::step, ::step])
-    inside = (length > _OBJECT * length.max()) & shot.prepared.mask[::step, ::step]
-    radius = max(step * np.sqrt(inside.sum() / np.pi), 1.0)
-    envelope = gaussian_filter(inside.astype(np.float64), radius / 4 / step)
+    envelope, radius = _object_region(shot.displacement, shot.prepared.mask, step)
     rows, columns = (
         np.clip(np.rint(line / step).astype(np.int64), 0, side - 1)
         for line, side in zip(sites.T, envelope.shape, strict=True)
@@ -181,11 +299,178 @@ def _absorption(shot: SolvedShot, rms: float) -> FloatArray:
     return np.asarray(rms * mass * fields)
 
 
+def _object_region(
+    displacement: FloatArray, mask: BoolArray, step: int
+) -> tuple[FloatArray, float]:
+    """Return a smooth mask of the object on every `step`th pixel, and its radius, px."""
+    length = np.hypot(*displacement[:, ::step, ::step])
+    inside = (length > _OBJECT * length.max()) & mask[::step, ::step]
+    radius = max(step * float(np.sqrt(inside.sum() / np.pi)), 1.0)
+    return gaussian_filter(inside.astype(np.float64), radius / 4 / step), radius
+
+
+def _add_background(shot: RecordedShot, share: float, numbers: FloatArray) -> RecordedShot:
+    image, source = (
+        values + share * numbers[0] * shot.mean(values) for values in (shot.image, shot.source)
+    )
+    return replace(shot, image=image, source=source)
+
+
+def _raise_to_power(shot: RecordedShot, gamma: float, numbers: FloatArray) -> RecordedShot:
+    exponent = max(1 + gamma * numbers[0], _LEAST_EXPONENT)
+
+    def respond(values: FloatArray) -> FloatArray:
+        # In the units of before, so that noise can be added.
+        power = np.maximum(values, 0) ** exponent
+        return np.asarray(power * (shot.mean(values) / shot.mean(power)))
+
+    return replace(shot, image=respond(shot.image), source=respond(shot.source))
+
+
+def _spread(shot: RecordedShot, width: float, numbers: FloatArray) -> RecordedShot:
+    mask = shot.scene.mask
+    image, used = (
+        gaussian_filter(np.where(mask, values, 0.0), width * abs(numbers[0]), mode="nearest")
+        for values in (shot.image, np.ones(mask.shape))
+    )
+    return replace(shot, image=image / np.maximum(used, _LEAST_BRIGHTNESS))
+
+
+def _absorb(shot: RecordedShot, rms: float, numbers: FloatArray) -> RecordedShot:
+    envelope, _ = shot.scene.object_region
+    return _brighten(shot, rms * envelope * shot.scene.transmission.of(numbers))
+
+
+def _brighten(shot: RecordedShot, excess: FloatArray) -> RecordedShot:
+    """Give the image a relative excess of light that its source does not have."""
+    # The map is that of the same image with less of a source, which need not be moved to it.
+    return replace(shot, source=shot.source / np.maximum(1 + excess, _LEAST_TRANSMISSION))
+
+
+def _move(shot: RecordedShot, shift: float, numbers: FloatArray) -> RecordedShot:
+    source = np.where(shot.scene.mask, shot.source, shot.mean(shot.source))
+    if np.ptp(source) == 0:
+        return shot
+    indices = np.indices(source.shape, dtype=np.float64)
+    y, x = (
+        (along - (side - 1) / 2) / (np.hypot(*source.shape) / 2)
+        for along, side in zip(indices, source.shape, strict=True)
+    )
+    down, right, turn, scale = shift * numbers
+    indices[0] += down + turn * x + scale * y
+    indices[1] += right - turn * y + scale * x
+    moved = map_coordinates(source, indices, order=3, mode="nearest")
+    return replace(shot, source=np.maximum(moved, 0))
+
+
 IMPERFECTIONS: tuple[Imperfection, ...] = (
-    Imperfection("background", "background", "{:.2g} %", 0.05, _background),
-    Imperfection("gamma", "gamma", "{:.2g}", 0.05, _response),
-    Imperfection("blur", "blur", "{:.2g} px", 1.0, _blur),
-    Imperfection("absorption", "absorption", "{:.2g} %", 0.01, _absorption),
-    Imperfection("registration", "registration", "{:.2g} px", 0.0, _registration),
+    Imperfection(
+        "background", "background", "{:.2g} %", 0.05, pattern=_background, change=_add_background
+    ),
+    Imperfection("gamma", "gamma", "{:.2g}", 0.05, pattern=_response, change=_raise_to_power),
+    Imperfection("blur", "blur", "{:.2g} px", 1.0, pattern=_blur, change=_spread, is_even=True),
+    Imperfection(
+        "absorption",
+        "absorption",
+        "{:.2g} %",
+        0.01,
+        pattern=_absorption,
+        change=_absorb,
+        count=lambda scene: scene.transmission.count,
+    ),
+    Imperfection(
+        "registration",
+        "registration",
+        "{:.2g} px",
+        0.0,
+        pattern=_registration,
+        change=_move,
+        count=lambda scene: 4,
+    ),
 )
 """Quantities of the instrument with their effects on an image, in the order of the budget."""
+
+
+class _BeamExcess:
+    """Relative differences of beams from their source: shapes of a prior, and smooth fields."""
+
+    def __init__(self, beam: BeamPrior, source: FloatArray) -> None:
+        self._rest = SmoothField(beam.length * min(source.shape), source)
+        self._rest_share, self._shapes = 1.0, np.empty((0, *source.shape))
+        if beam.components is not None:
+            block = beam.components.block
+            places = (np.indices(source.shape) + 0.5) / block - 0.5
+            self._shapes = np.array(
+                [
+                    map_coordinates(pattern / beam.rms, places, order=1, mode="nearest")
+                    for pattern in beam.components.patterns
+                ]
+            ).reshape(-1, *source.shape)
+            self._rest_share = beam.components.rest / beam.rms
+        self.count = len(self._shapes) + self._rest.count
+
+    def change(self, shot: RecordedShot, rms: float, numbers: FloatArray) -> RecordedShot:
+        """Return the shot with a beam of an r.m.s. difference."""
+        of_shapes, of_rest = np.split(numbers, [len(self._shapes)])
+        excess = self._rest_share * self._rest.of(of_rest)
+        return _brighten(shot, rms * (excess + np.tensordot(of_shapes, self._shapes, 1)))
+
+
+class InstrumentDraws:
+    """Random imperfections of a recorded shot, by independent normal numbers.
+
+    Attributes
+    ----------
+    recorded : RecordedShot
+        The shot without them.
+    names : tuple of str
+        Imperfections with their sizes.
+    count : int
+        Number of normal numbers.
+    is_even : ndarray of bool, shape (count,)
+        Numbers whose square acts.
+    """
+
+    def __init__(self, shot: RecordedShot, instrument: Instrument, beam: BeamPrior) -> None:
+        self.recorded, self._other_field = shot, instrument.other_field
+        names, even = [], [False]  # the first number is that of the other field
+        if self._other_field:
+            names.append(f"other field, {100 * self._other_field:.2g} %")
+        self._parts: list[tuple[Change, float, slice]] = []
+
+        def add(change: Change, size: float, count: int, name: str, is_even: bool) -> None:
+            self._parts.append((change, size, slice(len(even), len(even) + count)))
+            even.extend([is_even] * count)
+            names.append(name)
+
+        if beam.rms:
+            excess = _BeamExcess(beam, shot.scene.source)
+            add(excess.change, beam.rms, excess.count, f"beam, {100 * beam.rms:.2g} %", False)
+        # From the light to the detector, which adds its background last.
+        for each in reversed(IMPERFECTIONS):
+            if size := each.stated(instrument):
+                count = each.count(shot.scene)
+                add(each.change, size, count, each.name(size), each.is_even)
+        self.names, self.count, self.is_even = tuple(names), len(even), np.array(even)
+
+    def shot(self, numbers: FloatArray) -> RecordedShot:
+        """Return the shot with the imperfections of `count` numbers."""
+        shot = self.recorded
+        for change, size, places in self._parts:
+            shot = change(shot, size, numbers[places])
+        return shot
+
+    def scale(self, numbers: FloatArray) -> FloatArray:
+        """Return the field's relative change by the other field, for numbers (..., count)."""
+        return np.asarray(self._other_field * numbers[..., 0])
+
+    def steps(self) -> Iterator[tuple[int, float, RecordedShot]]:
+        """Yield place and size of a step for each number, with the shot that it changes.
+
+        Numbers whose square acts make a step of 1, others a small one.
+        """
+        for place in range(1, self.count):
+            step = 1.0 if self.is_even[place] else _STEP
+            numbers = np.zeros(self.count)
+            numbers[place] = step
+            yield place, step, self.shot(numbers)

@@ -1,0 +1,383 @@
+"""Random samples of an inversion: images with noise, by an instrument that is not exact.
+
+- random images with noise: `noise_of`
+- inversion of each sample, by a new solution of its transport: `FullResampling`; by the linear
+  response of the image's own transport: `LinearResampling`
+- sums over samples: `Scatter`
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import ndimage
+
+from napari_shadowinv._system.arrays import plain_array, unpack_array
+from napari_shadowinv._system.progress import Reporter
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.interpolation import WIDTH
+from napari_shadowinv.geometry.power_diagram import PowerDiagram, pixel_shares
+from napari_shadowinv.inversion.imperfections import InstrumentDraws
+from napari_shadowinv.inversion.normalise import flooring_for, masked_source, power_of_two
+from napari_shadowinv.inversion.readout import LinearReadout, read_out
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.poisson import border_mean
+from napari_shadowinv.transport.linear import FactorisedLaplacian, LaplacianSolver
+from napari_shadowinv.transport.sites import Level, Levels, Margin, SitePlan
+from napari_shadowinv.transport.solvers import LevelSolution, Target, solve
+
+__all__ = [
+    "Draw",
+    "FullResampling",
+    "LinearResampling",
+    "Measure",
+    "Sample",
+    "Scatter",
+    "Seed",
+    "noise_of",
+]
+
+
+Draw = Callable[[np.random.Generator, float], FloatArray]
+"""Returns a noisy image, with noise that a Gaussian of some standard deviation (px) correlates."""
+
+_BLUR_REACH = 4.0  # standard deviations
+_MOST_QUANTA = 1e18  # numpy draws no larger Poisson numbers
+
+
+def noise_of(
+    image: ArrayLike, noise: object, units_per_quantum: float | None, mask: ArrayLike | None
+) -> tuple[Draw, str]:
+    """Return a function that draws a noisy image, and a text that describes the noise."""
+    values = np.asarray(unpack_array(image, "image")[0])
+    if values.dtype.kind not in "buif":
+        raise InputError(f"image has values of type {values.dtype}, expected real numbers")
+    usable = np.isfinite(values)
+    if mask is not None and np.shape(mask) == values.shape:
+        usable &= np.asarray(mask, dtype=bool)
+    values = np.where(usable, values, 0.0)
+    if isinstance(noise, str):
+        if noise != "poisson":
+            raise InputError(
+                f"noise is {noise!r}, expected 'poisson', a standard deviation or an array of them"
+            )
+        return _poisson(values, units_per_quantum)
+    if units_per_quantum is not None:
+        raise InputError(
+            f"units per quantum are {units_per_quantum!r} and noise a standard deviation: "
+            "they belong to Poisson noise"
+        )
+    return _gaussian(values, np.asarray(plain_array(noise, "noise")), usable)
+
+
+def _poisson(values: FloatArray, units_per_quantum: float | None) -> tuple[Draw, str]:
+    if units_per_quantum is None:
+        if np.any(values != np.rint(values)):
+            raise InputError(
+                "image has values that are not whole numbers, so they are not counts: give the "
+                "image units per detected quantum, or the noise as a standard deviation"
+            )
+        units_per_quantum = 1.0
+    if not (np.isreal(units_per_quantum) and 0 < units_per_quantum < np.inf):
+        raise InputError(
+            f"units per quantum are {units_per_quantum!r}, expected a positive number: image units"
+        )
+    quanta = np.maximum(values, 0) / units_per_quantum
+    if quanta.max(initial=0) > _MOST_QUANTA:
+        raise InputError(
+            f"units per quantum are {units_per_quantum:g} and the brightest pixel is "
+            f"{values.max():g}: that is more than {_MOST_QUANTA:g} quanta in a pixel, expected "
+            "fewer: check the unit"
+        )
+    # A blur leaves the counting noise of many pixels as it was.
+    text = f"Poisson, {units_per_quantum:g} per quantum"
+    return lambda rng, blur: units_per_quantum * rng.poisson(quanta), text
+
+
+def _gaussian(values: FloatArray, sigma: AnyArray, usable: BoolArray) -> tuple[Draw, str]:
+    if sigma.dtype.kind not in "uif":
+        raise InputError(
+            f"noise has values of type {sigma.dtype}, expected 'poisson', a standard deviation "
+            "or an array of them"
+        )
+    if sigma.ndim > 0 and sigma.shape != values.shape:
+        raise InputError(
+            f"noise has shape {sigma.shape}, image {values.shape}: they must match, or give one "
+            "number for all pixels"
+        )
+    deviation = np.where(usable, sigma, 0.0)
+    if not (np.isfinite(deviation).all() and (deviation >= 0).all() and deviation.any()):
+        raise InputError(
+            "noise is zero everywhere, or somewhere negative or not finite: expected standard "
+            "deviations in the image's units"
+        )
+    described = f"Gaussian, {sigma:g}" if sigma.ndim == 0 else "Gaussian, pixel by pixel"
+    return lambda rng, blur: values + deviation * _normal(rng, values.shape, blur), described
+
+
+def _normal(rng: np.random.Generator, shape: tuple[int, ...], blur: float) -> FloatArray:
+    """Normal noise of deviation 1, correlated as by a Gaussian blur (px)."""
+    if not blur > 0:
+        return rng.normal(size=shape)
+    reach = math.ceil(_BLUR_REACH * blur)
+    kernel = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * blur**2))
+    kernel /= np.sqrt((kernel**2).sum())
+    noise: FloatArray = rng.normal(size=[side + 2 * reach for side in shape])
+    for axis in (0, 1):
+        noise = ndimage.correlate1d(noise, kernel, axis)
+    return noise[reach:-reach, reach:-reach]
+
+
+Seed = np.random.SeedSequence
+
+_SAMPLE_SHARE = 0.2  # of the noise's flux errors that a sample may leave unsolved
+_LOOSEST_TOLERANCE = 0.1
+_MOST_FACTORISED = 300_000  # sites; their factors take 0.2 GB and two seconds
+_LINEAR_TOLERANCE = 0.02
+_ROWS = 64  # read out between two calls of `should_stop`
+
+
+Measure = Callable[[FloatArray], dict[str, FloatArray]]
+"""Returns quantities of a change of potential and displacement, (3, H, W)."""
+
+
+class Sample(NamedTuple):
+    """One noisy image, inverted."""
+
+    field: FloatArray  # potential and displacement, (3, H, W)
+    solution: LevelSolution
+
+
+@dataclass(frozen=True)
+class FullResampling:
+    """Solution of the transport of each sample on a plan's finest level, from start weights."""
+
+    plan: SitePlan
+    start: FloatArray
+    draw: Callable[[np.random.Generator], FloatArray]
+    options: InversionOptions
+    instrument: InstrumentDraws | None = None
+
+    def sample(self, seeds: list[Seed], report: Reporter) -> Sample:
+        """Invert the noisy image of one seed, without caustics and other results."""
+        (seed,) = seeds
+        plan, image, scale = self._changed(seed)
+        solution = solve(
+            plan.levels, image, self.options, report, start=self.start, margin=plan.margin
+        )[-1]
+        potential, displacement = (
+            plan.within(values) for values in read_out(solution, self.options)
+        )
+        field = np.stack([potential - border_mean(potential), *displacement])
+        return Sample(scale * field, solution)
+
+    def _changed(self, seed: Seed) -> tuple[SitePlan, FloatArray, float]:
+        """Return plan and image of a sample, and the scale of its field."""
+        if self.instrument is None:
+            return self.plan, self.image(seed), 1.0
+        noisy, numbers = self.random(seed)
+        shot = self.instrument.shot(numbers)
+        plan = _with_source(self.plan, shot.source, self.options)
+        # Light is counted after it is changed, so the noise stays as it is.
+        image = shot.image + (noisy - self.instrument.recorded.image)
+        image = flooring_for(plan.source, self.options, plan.mask)(image)
+        return plan, image, 1 + float(self.instrument.scale(numbers))
+
+    def to_tolerance_of_noise(self, seed: Seed) -> FullResampling:
+        """Loosen the tolerance to a share of the flux errors by noise."""
+        # The remaining error is white, and moves the field far less than the flux that the solver
+        # has moved: where a fifth remains in the worst cell, a sample's field is within 3 % of
+        # its change, and the deviation of many within 0.2 %.
+        level = self.plan.levels[-1]
+        target = Target.of(self.image(seed), self.plan.margin, self.options)
+        objective = target.objective(level)
+        by_noise = objective.residual(objective.diagram(self.start))
+        loosest = min(_SAMPLE_SHARE * by_noise, _LOOSEST_TOLERANCE)
+        tolerance = max(loosest, self.options.tolerance)
+        return replace(self, options=self.options.model_copy(update={"tolerance": tolerance}))
+
+    def image(self, seed: Seed) -> FloatArray:
+        """Draw a noisy image, as the transport sees it."""
+        noisy, _ = self.random(seed)
+        return self.apply_floor(noisy)
+
+    def random(self, seed: Seed) -> tuple[FloatArray, FloatArray]:
+        """Draw a noisy image, as recorded, and the numbers of the instrument."""
+        rng = np.random.default_rng(seed)
+        noisy = self.draw(rng)
+        return noisy, rng.normal(size=0 if self.instrument is None else self.instrument.count)
+
+    @cached_property
+    def apply_floor(self) -> Callable[[FloatArray], FloatArray]:
+        """Function from a recorded image to what the transport sees of it."""
+        return flooring_for(self.plan.source, self.options, self.plan.mask)
+
+
+def _with_source(plan: SitePlan, source: FloatArray, options: InversionOptions) -> SitePlan:
+    """Return the finest sites of a plan for another source."""
+    beam, unit, margin = _spread_beam(plan, source, options)
+    level = plan.levels[-1]
+    density = Density.from_image(beam, threads=options.threads)
+    diagram = PowerDiagram(level.triangulation, density, with_moments=True, threads=options.threads)
+    changed = replace(level, mass=diagram.masses, centroids=diagram.centroids)
+
+    def make(count: int, report: Reporter) -> Level:
+        return changed
+
+    levels = Levels((len(level.sites),), make)
+    return replace(plan, source=source, levels=levels, margin=margin, unit=unit)
+
+
+def _spread_beam(
+    plan: SitePlan, source: FloatArray, options: InversionOptions
+) -> tuple[FloatArray, float, Margin | None]:
+    """Return a source as sites are spread over it, in its power of two, and its margin."""
+    beam = source if plan.mask is None else masked_source(source, plan.mask, options)
+    unit = power_of_two(beam)
+    beam = beam / unit
+    if plan.margin is None:
+        return beam, unit, None
+    margin = Margin.around(beam, plan.margin_width, plan.mask)
+    return margin.beam, unit, margin
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Sums over samples of changes of (potential, displacement), (3, H, W)."""
+
+    # Changes are relative to the image's field, so sums of squares lose no digits.
+    count: int
+    sums: FloatArray
+    squares: FloatArray
+    quantities: tuple[dict[str, FloatArray], ...] = ()  # of each sample
+
+    @classmethod
+    def of(cls, change: FloatArray, measure: Measure | None = None) -> Scatter:
+        quantities = () if measure is None else (measure(change),)
+        return cls(1, change, change**2, quantities)
+
+    def __add__(self, other: Scatter) -> Scatter:
+        return Scatter(
+            self.count + other.count,
+            self.sums + other.sums,
+            self.squares + other.squares,
+            self.quantities + other.quantities,
+        )
+
+    @property
+    def mean(self) -> FloatArray:
+        return self.sums / self.count
+
+    @property
+    def std(self) -> FloatArray:
+        variance = (self.squares - self.sums * self.mean) / (self.count - 1)
+        return np.sqrt(np.maximum(variance, 0))
+
+
+class LinearResampling:
+    """Linear response of an inversion to the changes of the image in its samples."""
+
+    def __init__(
+        self,
+        samples: FullResampling,
+        image: FloatArray,
+        threads: int | None,
+        measure: Measure | None = None,
+    ) -> None:
+        self._samples, self._image, self._measure = samples, image, measure
+        plan, level = samples.plan, samples.plan.levels[-1]
+        objective = Target.of(image, plan.margin, samples.options).objective(level)
+        diagram = objective.diagram(samples.start)
+        self._shares = pixel_shares(diagram, level.shape, threads=threads)
+        self._network = diagram.laplacian(), objective.ground(samples.start)
+        self._factors = None
+        if len(level.sites) <= _MOST_FACTORISED:
+            with suppress(RuntimeError):  # the multigrid reports it if it fails as well
+                self._factors = FactorisedLaplacian(*self._network)
+        self._readout = LinearReadout(plan, level, threads)
+        self._solvers = threading.local()  # each has vectors of its own
+        self._gains = None if samples.instrument is None else self._flux_gains(threads)
+
+    def scatter(self, seeds: list[Seed], report: Reporter) -> Scatter:
+        """Sum the changes by up to `WIDTH` noisy images, in order."""
+        values = self._at_sites(seeds, report)
+        sums, squares = np.zeros((2, 3, *self._image.shape))
+        for start in range(0, len(self._image), _ROWS):
+            report("samples", 0)
+            self._readout.add(values, sums, squares, start, _ROWS)
+        quantities: tuple[dict[str, FloatArray], ...] = ()
+        if self._measure is not None:
+            quantities = tuple(map(self._measure, self._fields(values, len(seeds))))
+        return Scatter(len(seeds), sums, squares, quantities)
+
+    def changes(self, seeds: list[Seed]) -> FloatArray:
+        """Return changes of potential and displacement by up to `WIDTH` images, (k, 3, H, W)."""
+        return np.array(list(self._fields(self._at_sites(seeds, Reporter()), len(seeds))))
+
+    def _fields(self, values: FloatArray, count: int) -> Iterator[FloatArray]:
+        return (self._readout.field(values[..., k]) for k in range(count))
+
+    def _at_sites(self, seeds: list[Seed], report: Reporter) -> FloatArray:
+        plan, instrument = self._samples.plan, self._samples.instrument
+        change = np.zeros(plan.levels[-1].shape)
+        lacking = np.zeros((self._shares.shape[0], WIDTH))
+        numbers = np.zeros((WIDTH, 0 if instrument is None else instrument.count))
+        for sample, seed in enumerate(seeds):
+            report("samples", 0)
+            noisy, numbers[sample] = self._samples.random(seed)
+            plan.within(change)[:] = self._image - self._samples.apply_floor(noisy)
+            lacking[:, sample] = self._shares @ change.ravel()
+        if instrument is None or self._gains is None:
+            return self._readout.at_sites(self._solve(lacking, report))
+        strengths = np.where(instrument.is_even, numbers**2, numbers)
+        weights = self._solve(lacking - self._gains @ strengths.T, report)
+        weights += self._samples.start[:, None] * instrument.scale(numbers)
+        return self._readout.at_sites(weights)
+
+    def _flux_gains(self, threads: int | None) -> FloatArray:
+        """Return the flux that cells gain by each number of the instrument, (n, count)."""
+        # What the source gains, cells lack.
+        samples, plan, level = self._samples, self._samples.plan, self._samples.plan.levels[-1]
+        assert samples.instrument is not None
+        options, recorded = samples.options, samples.instrument.recorded
+        beam, _, _ = _spread_beam(plan, plan.source, options)
+        density = Density.from_image(beam, threads=threads)
+        diagram = PowerDiagram(level.triangulation, density, threads=threads)
+        shares_of_source = pixel_shares(diagram, level.shape, threads=threads)
+        gains = np.zeros((len(level.sites), samples.instrument.count))
+        for place, step, shot in samples.instrument.steps():
+            source = shot.source * (plan.source.sum() / shot.source.sum())
+            changed_beam, unit, _ = _spread_beam(plan, source, options)
+            of_source = changed_beam * (unit / plan.unit) - beam
+            of_image = of_source.copy()  # in a margin
+            inner = plan.within(of_image)
+            inner[:] = 0.0
+            if shot.image is not recorded.image:
+                floored = flooring_for(source, options, plan.mask)(shot.image)
+                inner[:] = floored * (unit / plan.unit) - self._image
+            gain = self._shares @ of_image.ravel() - shares_of_source @ of_source.ravel()
+            gains[:, place] = gain / step
+        return gains
+
+    def _solve(self, right: FloatArray, report: Reporter) -> FloatArray:
+        if self._factors is not None:
+            return self._factors.solve(right)
+        if not hasattr(self._solvers, "multigrid"):
+            self._solvers.multigrid = LaplacianSolver(*self._network)
+        weights = np.zeros_like(right)
+        for sample in np.flatnonzero(right.any(axis=0)):
+            report("samples", 0)
+            weights[:, sample], _, _ = self._solvers.multigrid.solve(
+                right[:, sample].copy(), _LINEAR_TOLERANCE
+            )
+        return weights

@@ -1,0 +1,292 @@
+"""Samples by an instrument that is not exact, against formulas and images changed here."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from napari_shadowinv import (
+    BeamPrior,
+    InputError,
+    Instrument,
+    InversionOptions,
+    invert,
+    plan_sites,
+    synthetic_image,
+    uncertainty,
+)
+from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.inversion.imperfections import (
+    IMPERFECTIONS,
+    InstrumentDraws,
+    RecordedShot,
+    Scene,
+    SmoothField,
+)
+from napari_shadowinv.physics.phantoms import gaussian_blob
+
+SHAPE = (48, 56)
+OPTIONS = InversionOptions(n_sites=1000, negative="clip")
+EVERYTHING = Instrument(
+    beam_rms=0.02,
+    background=0.05,
+    gamma=0.05,
+    blur=1.0,
+    absorption=0.02,
+    registration=0.5,
+    other_field=0.05,
+)
+NOISE = 0.002
+
+
+@pytest.fixture(scope="module")
+def blob():
+    return gaussian_blob(SHAPE, 14.0, 6.0)
+
+
+@pytest.fixture(scope="module")
+def source():
+    white = np.random.default_rng(5).normal(size=SHAPE)
+    smooth = ndimage.gaussian_filter(white, 5, mode="wrap")
+    return 1 + 0.1 * smooth / smooth.std()
+
+
+@pytest.fixture(scope="module")
+def image(blob, source):
+    return synthetic_image(blob.displacement, source)
+
+
+def rms(field):
+    return float(np.sqrt((field**2).mean()))
+
+
+def sample(image, source, instrument, n=60, **choices):
+    return uncertainty(
+        image,
+        n,
+        **{"source": source, "noise": NOISE, "options": OPTIONS, **choices},
+        instrument=instrument,
+    )
+
+
+def test_a_smooth_field_has_the_correlation_of_its_length():
+    """A Gaussian of the distance, less the mean over the image, which is removed."""
+    length, weights = 5.0, np.ones((40, 30))
+    field = SmoothField(length, weights)
+    modes = np.array([field.of(unit) for unit in np.eye(field.count)]).reshape(field.count, -1)
+    covariance = modes.T @ modes
+    places = np.indices(weights.shape).reshape(2, -1).T
+    squares = ((places[:, None] - places) ** 2).sum(axis=2)
+    kernel = np.exp(-squares / (2 * length**2))
+    centred = kernel - kernel.mean(axis=0) - kernel.mean(axis=1)[:, None] + kernel.mean()
+    centred /= np.diag(centred).mean()
+    assert np.diag(covariance).mean() == pytest.approx(1)
+    assert np.abs(covariance - centred).max() < 0.03
+    np.testing.assert_allclose(modes.mean(axis=1), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("exact", [Instrument(), Instrument(beam_rms=0), None])
+def test_an_exact_instrument_leaves_the_samples_of_noise_bit_for_bit(image, source, exact):
+    plain = sample(image, source, None, n=5)
+    stated = sample(image, source, exact, n=5)
+    for name in ("potential_mean", "potential_std", "displacement_mean", "displacement_std"):
+        np.testing.assert_array_equal(getattr(plain, name), getattr(stated, name))
+    assert plain.residuals == stated.residuals
+    assert stated.imperfections == ()
+
+
+@pytest.mark.parametrize("method", ["linear", "resolve"])
+def test_samples_depend_on_the_seed_alone(image, source, method):
+    def draw(threads, seed=0, n=11):
+        options = OPTIONS.model_copy(update={"threads": threads, "seed": seed})
+        peak = {"peak": lambda potential, displacement: np.hypot(*displacement).max()}
+        return sample(
+            image, source, EVERYTHING, n=n, method=method, options=options, quantities=peak
+        )
+
+    serial, parallel = draw(1), draw(3)
+    for name in ("potential_mean", "potential_std", "displacement_mean", "displacement_std"):
+        np.testing.assert_array_equal(getattr(serial, name), getattr(parallel, name))
+    samples = serial.quantities["peak"].samples
+    np.testing.assert_array_equal(samples, parallel.quantities["peak"].samples)
+    np.testing.assert_array_equal(draw(1, n=3).quantities["peak"].samples, samples[:3])
+    assert not np.allclose(draw(1, seed=1).quantities["peak"].samples, samples, rtol=1e-4)
+
+
+def changed(key, size, image, source):
+    if key == "background":
+        return image + size * image.mean(), source + size * source.mean()
+    if key == "gamma":
+        return image ** (1 + size), source ** (1 + size)
+    return ndimage.gaussian_filter(image, size, mode="nearest"), source
+
+
+@pytest.mark.parametrize(("key", "size"), [("background", 0.02), ("gamma", 0.02), ("blur", 1.0)])
+def test_the_effect_of_a_single_number_is_the_change_of_the_field(image, source, key, size):
+    """Its standard deviation is the change by one of it; a blur's √2 times, by its square."""
+    result = sample(image, source, Instrument(**{key: size}), n=400)
+    moved, beam = changed(key, size, image, source)
+    other = invert(moved, source=beam, options=OPTIONS)
+    change = other.displacement - result.inversion.displacement
+    width = np.sqrt(2) if key == "blur" else 1.0
+    assert rms(result.displacement_std) == pytest.approx(width * rms(change), rel=0.1)
+    mean = result.displacement_mean - result.inversion.displacement
+    expected = change if key == "blur" else 0 * change
+    assert rms(mean - expected) < 0.15 * rms(change)
+
+
+def test_another_field_scales_every_sample(image, source):
+    result = sample(image, source, Instrument(other_field=0.1), n=400)
+    length = rms(result.inversion.displacement)
+    assert rms(result.displacement_std) == pytest.approx(0.1 * length, rel=0.1)
+
+
+def test_a_beams_error_is_that_of_inversions_with_other_beams(image, source):
+    """Beams of random waves, drawn here."""
+    result = sample(image, source, Instrument(beam_rms=0.01), n=200)
+    plan = plan_sites(source, OPTIONS)
+    here = invert(image, plan=plan, options=OPTIONS)
+    rng, indices, fields = np.random.default_rng(1), np.indices(SHAPE), []
+    for _ in range(40):
+        waves = rng.normal(size=(40, 2)) / (0.25 * min(SHAPE))
+        phases = rng.uniform(0, 2 * np.pi, 40)[:, None, None]
+        wave = np.cos(np.tensordot(waves, indices, 1) + phases).sum(axis=0)
+        wave = (wave - wave.mean()) / np.sqrt(20)
+        beam = source * (1 + 0.01 * wave / np.sqrt(_share_within()))
+        fields.append(invert(image, source=beam, options=OPTIONS).displacement)
+    scatter = np.sqrt(((np.array(fields) - here.displacement) ** 2).mean(axis=0))
+    assert rms(result.displacement_std) == pytest.approx(rms(scatter), rel=0.2)
+
+
+def _share_within():
+    """Variance of random waves that their mean over the image leaves."""
+    places = [np.arange(side) for side in SHAPE]
+    along = [np.exp(-((p[:, None] - p) ** 2) / 2 / (0.25 * min(SHAPE)) ** 2).mean() for p in places]
+    return 1 - along[0] * along[1]
+
+
+def test_linear_samples_are_near_the_solved_ones(image, source):
+    linear = sample(image, source, EVERYTHING, n=24)
+    solved = sample(image, source, EVERYTHING, n=24, method="resolve")
+    assert linear.imperfections == solved.imperfections
+    assert len(linear.imperfections) == 7
+    ratio = rms(linear.displacement_std) / rms(solved.displacement_std)
+    assert ratio == pytest.approx(1, abs=0.1)
+    assert linear.spread_ratio == pytest.approx(1, abs=0.1)
+    assert linear.mean_shift < 0.2
+    assert not any(caution.code == "samples" for caution in linear.warnings)
+
+
+def test_an_instrument_too_uncertain_for_a_linear_answer_is_reported(image, source):
+    result = sample(image, source, Instrument(background=0.4), n=8)
+    (caution,) = (c for c in result.warnings if c.code == "samples")
+    assert "use the method 'resolve'" in caution.text
+    assert result.spread_ratio > 1.15 or result.mean_shift > 0.3
+
+
+@pytest.mark.parametrize("kind", ["masked", "free"])
+def test_linear_samples_follow_a_mask_and_a_margin(image, source, kind):
+    mask, options = None, OPTIONS
+    if kind == "masked":
+        mask = np.ones(SHAPE, bool)
+        mask[:6, :20] = mask[20:24, 4:9] = False
+    else:
+        options = OPTIONS.model_copy(update={"boundary": "free"})
+    stated = Instrument(beam_rms=0.01, background=0.02, gamma=0.02, blur=0.5, registration=0.2)
+    result = sample(image, source, stated, n=8, mask=mask, options=options)
+    assert result.spread_ratio == pytest.approx(1, abs=0.1)
+    assert result.nonlinearity < 0.3
+    assert all(result.converged)
+
+
+def test_the_order_of_the_imperfections_is_that_of_light_and_detector(image, source, blob):
+    """A dark level is added after the response; a blur spreads what the object absorbs."""
+    mask = np.ones(SHAPE, bool)
+    shot = RecordedShot(image, source, Scene(blob.displacement, source, mask))
+    draws = InstrumentDraws(shot, EVERYTHING, BeamPrior(rms=0.02))
+    assert [name.split(",")[0] for name in draws.names] == [
+        "other field",
+        "beam",
+        *reversed([each.title for each in IMPERFECTIONS]),
+    ]
+    both = InstrumentDraws(shot, Instrument(background=0.1, gamma=0.1), BeamPrior(rms=0.0))
+    power = image**1.1
+    power *= image.mean() / power.mean()
+    expected = power + 0.1 * image.mean()
+    np.testing.assert_allclose(both.shot(np.ones(3)).image, expected)
+
+
+def test_beams_vary_in_the_shapes_of_their_references(image, source, blob):
+    rng = np.random.default_rng(0)
+    tilt = np.linspace(-1, 1, SHAPE[1]) * np.ones(SHAPE)
+    references = [source * (1 + 0.02 * z * tilt) for z in rng.normal(size=8)]
+    beam = BeamPrior.from_references(references)
+    shot = RecordedShot(image, source, Scene(blob.displacement, source, np.ones(SHAPE, bool)))
+    draws = InstrumentDraws(shot, Instrument(), beam)
+    ratios = np.array(
+        [source / draws.shot(rng.normal(size=draws.count)).source - 1 for _ in range(200)]
+    )
+    of_tilt = (ratios * tilt).mean(axis=(1, 2)) / (tilt**2).mean()
+    # A new shot differs by (n + 1) / n of the references' variance.
+    scatter = np.std([(r / source - 1)[0, -1] for r in references], ddof=1) * np.sqrt(9 / 8)
+    assert of_tilt.std() == pytest.approx(scatter, rel=0.15)
+    assert np.std(ratios - of_tilt[:, None, None] * tilt) < 0.2 * scatter
+
+
+def test_a_source_that_nobody_measured_is_off_as_in_the_budget(blob):
+    image = synthetic_image(blob.displacement)
+    noise_alone = uncertainty(image, 20, noise=NOISE, options=OPTIONS)
+    result = uncertainty(image, 60, noise=NOISE, options=OPTIONS, instrument=Instrument())
+    assert noise_alone.imperfections == ()
+    assert result.imperfections == ("beam, 5 %",)
+    assert rms(result.displacement_std) > 10 * rms(noise_alone.displacement_std)
+
+
+def test_the_band_of_a_quantity_mirrors_its_samples():
+    """Where samples are 2 higher than the value on average, the value is 2 too high."""
+    samples = 7.0 + np.random.default_rng(0).normal(size=100_000)
+    quantity = Quantity(np.asarray(5.0), samples)
+    low, high = quantity.band(0.95)
+    assert (low, high) == (pytest.approx(3 - 1.96, abs=0.03), pytest.approx(3 + 1.96, abs=0.03))
+    assert quantity.bias == pytest.approx(2, abs=0.02)
+    assert quantity.std == pytest.approx(1, abs=0.01)
+
+
+def test_quantities_are_numbers_and_lines_of_each_sample(image, source):
+    result = sample(
+        image,
+        source,
+        EVERYTHING,
+        n=20,
+        quantities={
+            "line": lambda potential, displacement: displacement[:, 20],
+            "potential": lambda potential, displacement: potential,
+        },
+    )
+    line, potential = (result.quantities[name] for name in ("line", "potential"))
+    np.testing.assert_array_equal(line.value, result.inversion.displacement[:, 20])
+    np.testing.assert_allclose(line.std, result.displacement_std[:, 20], rtol=1e-6)
+    np.testing.assert_allclose(potential.std, result.potential_std, rtol=1e-6)
+    low, high = result.band(0.95)
+    middle = 2 * result.inversion.displacement - result.displacement_mean
+    np.testing.assert_allclose((low + high) / 2, middle)
+    np.testing.assert_allclose((high - low) / 2, 1.96 * result.displacement_std, rtol=1e-3)
+    narrow, wide = (np.ptp(result.potential_band(share), axis=0) for share in (0.68, 0.95))
+    assert (narrow < wide).all()
+
+
+@pytest.mark.parametrize(
+    ("choices", "text"),
+    [
+        ({"instrument": {"blur": -1}}, "blur"),
+        ({"quantities": {"peak": 3}}, "expected a dictionary of functions"),
+    ],
+)
+def test_bad_choices_are_refused_in_a_sentence(image, choices, text):
+    with pytest.raises(InputError, match=text) as error:
+        uncertainty(image, 2, noise=0.1, **choices)
+    assert "\n" not in str(error.value)
+
+
+def test_a_band_needs_a_share():
+    with pytest.raises(InputError, match="share is 95, expected a number between 0 and 1"):
+        Quantity(np.asarray(0.0), np.zeros(3)).band(95)
