@@ -11,11 +11,19 @@ from __future__ import annotations
 __all__ = ["FileFormatError", "InputError", "InversionCancelled"]
 
 
-class InputError(ValueError):
+class _UserError(Exception):
+    """Base of a user's mistakes; `option` is the switch that would allow it, such as overwrite."""
+
+    def __init__(self, *message: object, option: str = "") -> None:
+        super().__init__(*message)
+        self.option = option
+
+
+class InputError(_UserError, ValueError):
     """An argument, image or option that cannot be used."""
 
 
-class FileFormatError(OSError):
+class FileFormatError(_UserError, OSError):
     """A file that is missing, damaged, or of another kind than its name says."""
 
 

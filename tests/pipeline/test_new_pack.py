@@ -63,7 +63,7 @@ def test_one_distance_alone_is_refused(scans: Path) -> None:
 def test_film_command_writes_a_new_pack(scans: Path) -> None:
     ended = shadowinv("film", "--new", scans)
     assert ended.exit_code == 0, ended.output
-    for words in ("calibration of EBT3", "filters: those in front", "seen_from", "pack.toml"):
+    for words in ("calibration of EBT3", "filters: those in front", "seen from", "pack.toml"):
         assert words in flat(ended.output)
     assert len(read_pack(scans / "pack.toml").layers) == 3
     again = shadowinv("film", "--new", scans)

@@ -187,5 +187,5 @@ def test_fit_warns_of_broken_pixels_in_an_image(images: list[FloatArray], tmp_pa
 
 def test_a_fit_refuses_a_recipe_with_an_instrument() -> None:
     recipe = Recipe(instrument=Instrument(gamma=0.1), fit=FitChoices())
-    with pytest.raises(InputError, match=r"instrument.*not those of fits.*beam_variation"):
+    with pytest.raises(InputError, match=r"instrument.*not those of fits.*variation of the beam"):
         run_fit(recipe, [np.ones((32, 32))])

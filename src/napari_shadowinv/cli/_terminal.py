@@ -172,6 +172,8 @@ def notify_errors(command: Callable[P, None]) -> Callable[P, None]:
                 code, text = cancel_exit_code(), "Cancelled"
             elif isinstance(error, OSError | MemoryError | InputError | ValidationError):
                 code, text = EXIT_MISTAKE, str(error) or "There is not enough memory for this"
+                if option := getattr(error, "option", ""):
+                    text = f"{text} (--{option.replace('_', '-')})"
             else:
                 raise  # a bug deserves its traceback
             with suppress(OSError):  # the terminal was closed

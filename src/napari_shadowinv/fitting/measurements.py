@@ -353,7 +353,8 @@ def _refuse_what_one_image_cannot_tell(
         raise InputError(
             "received one image and an unknown source: one image cannot tell the beam from the "
             "object; give the source or an image of another energy, or allow an ambiguous fit, "
-            "one of many"
+            "one of many",
+            option="ambiguous",
         )
 
 

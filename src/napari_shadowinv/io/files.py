@@ -95,7 +95,9 @@ def check_output(
     if path.is_dir():
         raise FileFormatError(f"{path} is a folder: give a file name")
     if path.exists() and not overwrite:
-        raise FileFormatError(f"{path} exists: choose another name, or allow to overwrite it")
+        raise FileFormatError(
+            f"{path} exists: choose another name, or allow to overwrite it", option="overwrite"
+        )
     return path
 
 

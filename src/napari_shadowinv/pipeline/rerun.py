@@ -343,7 +343,8 @@ class _Reader:
         if not (self.other_folders or is_inside):
             raise InputError(
                 f"{self.result} names {name} {file}, which is in another folder: name the file to "
-                "use, or allow other folders if you trust the result"
+                "use, or allow other folders if you trust the result",
+                option="other_folders",
             )
 
     def inputs(self, dataset: xarray.Dataset, provenance: Provenance) -> RerunInputs:
