@@ -24,6 +24,7 @@ from napari_shadowinv._system.arrays import plain_array, unpack_array
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.geometry.compiler import njit
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.geometry.power_diagram import PowerDiagram, pixel_shares
@@ -284,6 +285,22 @@ class Scatter:
         return np.sqrt(np.maximum(variance, 0))
 
 
+@njit(nogil=True, cache=True)
+def _subtract_product(factors: FloatArray, strengths: FloatArray, values: FloatArray) -> None:
+    """Subtract the product of (n, k) and (`WIDTH`, k) from values (n, `WIDTH`) in this thread."""
+    by_number = np.ascontiguousarray(strengths.T)
+    row = np.empty(WIDTH)
+    for i in range(factors.shape[0]):
+        for s in range(WIDTH):
+            row[s] = values[i, s]
+        for k in range(factors.shape[1]):
+            factor = factors[i, k]
+            for s in range(WIDTH):
+                row[s] -= factor * by_number[k, s]
+        for s in range(WIDTH):
+            values[i, s] = row[s]
+
+
 class LinearResampling:
     """Linear response of an inversion to the changes of the image in its samples."""
 
@@ -340,7 +357,8 @@ class LinearResampling:
         if instrument is None or self._gains is None:
             return self._readout.at_sites(self._solve(lacking, report))
         strengths = np.where(instrument.is_even, numbers**2, numbers)
-        weights = self._solve(lacking - self._gains @ strengths.T, report)
+        _subtract_product(self._gains, strengths, lacking)
+        weights = self._solve(lacking, report)
         weights += self._samples.start[:, None] * instrument.scale(numbers)
         return self._readout.at_sites(weights)
 
