@@ -1,30 +1,52 @@
-"""Inversions with an instrument that is not exact: the table of docs/uncertainty.md.
+"""Inversions with an instrument that is not exact: the tables of docs/uncertainty.md.
 
-    python benchmarks/instrument.py [--inversions 200] [--side 128] [--first-seed 0]
+    python benchmarks/instrument.py [totals bands ranks cost] [--shots 210] [--side 128]
 
 Each image is counted rays (`counted` of `fit.py`; the package's forward model is not used) of one
 of six objects, with an imperfection drawn from its stated prior: a beam of random waves, a
 background, a gamma, a blur, a transmission of smooth noise, a reference out of register. The noise
-is that of 1,000 counts a pixel. The columns are the number of inversions, the r.m.s. ratio of the
-error to the total of the budget, the share of errors within one and two totals, and the median
-error. A total is right if the ratio is about 1; of a single unknown number 68 and 95 % are within.
+is that of 1,000 counts a pixel.
+
+Totals: the r.m.s. ratio of the error to the total of the budget, the share of errors within one
+and two totals, and the median error. A total is right if the ratio is about 1; of a single unknown
+number 68 and 95 % are within.
+Bands: the share of pixels whose true displacement lies within the bands of `uncertainty`, for
+imperfections as large as stated, half and twice as large.
+Ranks: for random objects, the rank of the truth among the samples of quantities, mirrored at the
+inversion's, and TARP, the rank of its distance from random points. The columns are the share of
+truths within 68 and 95 %, and the probability of ranks as uneven if all were equally likely
+(Kolmogorov and Smirnov).
+Cost: samples a minute, and time and memory of the budget.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
+import time
 from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, shift
+from scipy.ndimage import gaussian_filter
+from scipy.stats import kstest
 
 from fit import Beam, Field, blobs, counted
-from napari_shadowinv import Instrument, invert
+from napari_shadowinv import (
+    Instrument,
+    InversionOptions,
+    invert,
+    plan_sites,
+    synthetic_image,
+    uncertainty,
+)
+from napari_shadowinv._system.machine import available_threads
+from reference import toroid_case
 
 FloatArray = NDArray[np.float64]
-COUNTS, RAYS, WAVES = 1000.0, 20, 12
+COUNTS, RAYS, WAVES = 1000.0, 12, 12
+BANDS, RANKS = 100, 199  # samples
 
 
 def objects(side: int) -> dict[str, Field]:
@@ -59,8 +81,8 @@ def objects(side: int) -> dict[str, Field]:
 class Shot:
     """An image of an object while it is simulated, its source, and what is stated of both."""
 
-    def __init__(self, side: int, displaced: Field, seed: int) -> None:
-        self.side, self.displaced = side, displaced
+    def __init__(self, side: int, displaced: Field, seed: int, times: float = 1.0) -> None:
+        self.side, self.displaced, self.times = side, displaced, times
         self.rng = np.random.default_rng([seed, 28])
         self.source = np.ones((side, side))
         self.beam: Beam | None = None
@@ -91,24 +113,24 @@ class Shot:
 
 def beam_off(shot: Shot) -> None:
     wave = shot.waves(0.25)
-    shot.beam = lambda y, x: 1 + 0.02 * wave(y, x)
+    shot.beam = lambda y, x: 1 + 0.02 * shot.times * wave(y, x)
     shot.instrument = Instrument(beam_rms=0.02)
 
 
 def background(shot: Shot) -> None:
-    share = 0.1 * shot.rng.normal()
+    share = 0.1 * shot.times * shot.rng.normal()
     shot.after = lambda image: image + share * image.mean()
     shot.instrument = Instrument(background=0.1)
 
 
 def gamma(shot: Shot) -> None:
-    exponent = 1 + 0.1 * shot.rng.normal()
+    exponent = 1 + 0.1 * shot.times * shot.rng.normal()
     shot.after = lambda image: np.maximum(image, 0) ** exponent
     shot.instrument = Instrument(gamma=0.1)
 
 
 def blur(shot: Shot) -> None:
-    width = abs(2 * shot.rng.normal())
+    width = abs(2 * shot.times * shot.rng.normal())
     shot.after = lambda image: gaussian_filter(image, width, mode="nearest")
     shot.instrument = Instrument(blur=2.0)
 
@@ -125,25 +147,28 @@ def absorption(shot: Shot) -> None:
     def beam(y: FloatArray, x: FloatArray) -> FloatArray:
         depth = np.hypot(*shot.displaced(y, x)) / peak
         within = 1 / (1 + np.exp(-2 * (np.log(np.maximum(depth, 1e-9)) + edge)))
-        return np.asarray(1 + 0.02 * within * wave(y, x))
+        return np.asarray(1 + 0.02 * shot.times * within * wave(y, x))
 
     shot.beam, shot.instrument = beam, Instrument(absorption=0.02)
 
 
 def registration(shot: Shot) -> None:
-    """A beam with structure of a tenth of the image, whose reference lies elsewhere."""
+    """A beam with structure of a tenth of the image, whose reference is shifted and turned."""
     wave = shot.waves(0.1)
     shot.beam = lambda y, x: 1 + 0.1 * wave(y, x)
+    middle = (shot.side - 1) / 2
     y, x = np.indices((shot.side, shot.side), dtype=np.float64)
-    shot.source = shift(shot.beam(y, x), shot.rng.normal(size=2), order=3, mode="nearest")
+    down, right, turn, scale = shot.times * shot.rng.normal(size=4)
+    v, u = ((place - middle) / (np.sqrt(0.5) * shot.side) for place in (y, x))
+    shot.source = shot.beam(y + down + turn * u + scale * v, x + right - turn * v + scale * u)
     shot.instrument = Instrument(registration=1.0)
 
 
 def everything(shot: Shot) -> None:
     """Beam, background, gamma and blur together."""
     wave = shot.waves(0.25)
-    shot.beam = lambda y, x: 1 + 0.01 * wave(y, x)
-    share, exponent, width = shot.rng.normal(size=3) * [0.1, 0.1, 1.0]
+    shot.beam = lambda y, x: 1 + 0.01 * shot.times * wave(y, x)
+    share, exponent, width = shot.times * shot.rng.normal(size=3) * [0.1, 0.1, 1.0]
 
     def after(image: FloatArray) -> FloatArray:
         image = gaussian_filter(image, abs(width), mode="nearest")
@@ -175,15 +200,10 @@ def length(displacement: FloatArray) -> float:
     return float(np.sqrt((displacement**2).sum(axis=0).mean()))
 
 
-def main() -> None:
+def table_of_totals(side: int, shots: int, first_seed: int) -> None:
     """Print a row for each imperfection, then how often an error is far above its total."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--inversions", type=int, default=210)
-    parser.add_argument("--side", type=int, default=128)
-    parser.add_argument("--first-seed", type=int, default=0)
-    arguments = parser.parse_args()
-    names = list(objects(arguments.side))
-    count = -(-arguments.inversions // len(IMPERFECTIONS))
+    names = list(objects(side))
+    count = -(-shots // len(IMPERFECTIONS))
     print("| imperfection | inversions | error over total | within 1, 2 totals | error |")
     print("|---|---|---|---|---|")
     ratios_of_all = []
@@ -191,13 +211,12 @@ def main() -> None:
         ratios, shares = [], []
         for number in range(count):
             name = names[number % len(names)]
-            field = objects(arguments.side)[name]
-            shot = Shot(arguments.side, field, arguments.first_seed + number)
+            shot = Shot(side, objects(side)[name], first_seed + number)
             change(shot)
             inversion = invert(
                 shot.image(), source=COUNTS * shot.source, instrument=shot.instrument
             )
-            exact = truth(arguments.side, name)
+            exact = truth(side, name)
             error = length(inversion.displacement - exact)
             assert inversion.errors is not None
             ratios.append(error / inversion.errors.total.rms)
@@ -212,8 +231,184 @@ def main() -> None:
     total = np.array(ratios_of_all)
     print(
         f"\n{len(total)} inversions: within 2 totals {(total < 2).mean():.1%}, within 3 "
-        f"{(total < 3).mean():.1%}, largest {total.max():.1f}"
+        f"{(total < 3).mean():.1%}, largest {total.max():.1f}\n",
+        flush=True,
     )
+
+
+def table_of_bands(side: int, shots: int, first_seed: int) -> None:
+    """Print the share of pixels within their bands, for imperfections as stated and not."""
+    names = list(objects(side))
+    count = -(-shots // len(IMPERFECTIONS))
+    sizes = 1.0, 0.5, 2.0
+    heads = ["as stated", "half as large", "twice as large"]
+    print(f"| imperfection, {count} shots each | " + " | ".join(f"{h}, 68, 95 %" for h in heads))
+    print("|---|---|---|---|")
+    for title, change in IMPERFECTIONS.items():
+        row = []
+        for times in sizes:
+            within = []
+            for number in range(count):
+                name = names[number % len(names)]
+                shot = Shot(side, objects(side)[name], first_seed + number, times)
+                change(shot)
+                result = uncertainty(
+                    shot.image(), BANDS, source=COUNTS * shot.source, instrument=shot.instrument
+                )
+                exact = truth(side, name)
+                ends = [result.band(share) for share in (0.68, 0.95)]
+                within.append([((low < exact) & (exact < high)).mean() for low, high in ends])
+            narrow, wide = np.mean(within, axis=0)
+            row.append(f"{narrow:.0%}, {wide:.0%}")
+        print(f"| {title} | " + " | ".join(row) + " |", flush=True)
+    print()
+
+
+def quantities(side: int) -> dict[str, Callable[[FloatArray, FloatArray], FloatArray]]:
+    """Return a peak, an r.m.s., the flux through a line, and a sum of charges by its field."""
+    start, stop = side // 4, side - side // 4
+
+    def enclosed(potential: FloatArray, displacement: FloatArray) -> FloatArray:
+        """Flux of the displacement out of a square, by Gauss the sum of its sources."""
+        along_y, along_x = displacement[:, start:stop, start:stop]
+        ends = along_y[-1] - along_y[0] + along_x[:, -1] - along_x[:, 0]
+        return np.asarray(ends.sum())
+
+    return {
+        "peak": lambda potential, displacement: np.hypot(*displacement).max(),
+        "r.m.s.": lambda potential, displacement: np.asarray(length(displacement)),
+        "flux through a line": lambda potential, displacement: displacement[
+            1, start:stop, side // 3
+        ].sum(),
+        "enclosed integral": enclosed,
+    }
+
+
+def table_of_ranks(side: int, shots: int, first_seed: int, method: str) -> None:
+    """Print how even the ranks of the truth are among the samples."""
+    measures = quantities(side)
+    names = list(objects(side))
+    samples, truths = [], []
+    for number in range(shots):
+        rng = np.random.default_rng([first_seed + number, 29])
+        strength = rng.uniform(0.5, 1.0)
+        shape = objects(side)[names[number % len(names)]]
+        scaled = scale_field(shape, strength)
+        shot = Shot(side, scaled, first_seed + number)
+        everything(shot)
+        result = uncertainty(
+            shot.image(),
+            RANKS,
+            source=COUNTS * shot.source,
+            instrument=shot.instrument,
+            quantities=measures,
+            method=method,
+            options=InversionOptions(seed=number),
+        )
+        mirrored = [2 * q.value - q.samples for q in result.quantities.values()]
+        samples.append(np.array(mirrored).T)
+        exact = strength * truth(side, names[number % len(names)])
+        truths.append([float(measure(exact[0], exact)) for measure in measures.values()])
+    drawn, exact = np.array(samples), np.array(truths)
+    print(f"| quantity, {shots} objects, {method} | within 68, 95 % | probability |")
+    print("|---|---|---|")
+    rng = np.random.default_rng(first_seed)
+    ranks = dict(zip(measures, ((drawn < exact[:, None]).mean(axis=1)).T, strict=True))
+    scale = drawn.std(axis=1, keepdims=True)
+    # Random points near each truth's inversion, not at it.
+    points = drawn.mean(axis=1, keepdims=True) + 2 * scale * rng.normal(size=scale.shape)
+    of_samples = np.linalg.norm((drawn - points) / scale, axis=2)
+    of_truth = np.linalg.norm((exact[:, None] - points) / scale, axis=2)
+    for title, rank in ranks.items():
+        within = [(abs(rank - 0.5) < share / 2).mean() for share in (0.68, 0.95)]
+        print(f"| {title} | {within[0]:.0%}, {within[1]:.0%} | {evenness(rank):.2g} |")
+    rank = (of_samples < of_truth).mean(axis=1)
+    within = [(rank < share).mean() for share in (0.68, 0.95)]
+    print(f"| TARP | {within[0]:.0%}, {within[1]:.0%} | {evenness(rank):.2g} |\n", flush=True)
+
+
+def scale_field(shape: Field, strength: float) -> Field:
+    """Return a field times a number."""
+
+    def scaled(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        along_y, along_x = shape(y, x)
+        return strength * along_y, strength * along_x
+
+    return scaled
+
+
+def evenness(ranks: FloatArray) -> float:
+    return float(kstest(ranks, "uniform").pvalue)
+
+
+INSTRUMENT = Instrument(
+    beam_rms=0.02,
+    background=0.05,
+    gamma=0.05,
+    blur=1.0,
+    absorption=0.02,
+    registration=1.0,
+    other_field=0.05,
+)
+
+
+def table_of_cost() -> None:
+    """Print samples a minute, by wall and by processor time, and what a budget costs."""
+    options = InversionOptions(n_sites=10_000)
+    image = np.random.default_rng(0).poisson(COUNTS * toroid_case(97).image).astype(float)
+    plan = plan_sites(COUNTS * np.ones(image.shape), options)
+    print("| samples, 200², 10,000 sites | a minute | a minute by processor time |")
+    print("|---|---|---|")
+    for method, (few, many) in {"linear": (8, 1608), "resolve": (8, 108)}.items():
+
+        def seconds(n: int, method: str = method) -> FloatArray:
+            start = np.array([time.perf_counter(), time.process_time()])
+            uncertainty(image, n, plan=plan, options=options, instrument=INSTRUMENT, method=method)
+            return np.array([time.perf_counter(), time.process_time()]) - start
+
+        seconds(few)
+        wall, processor = np.median([seconds(many) - seconds(few) for _ in range(3)], axis=0)
+        count, threads = many - few, available_threads(None)
+        print(f"| {method} | {60 * count / wall:,.0f} | {60 * threads * count / processor:,.0f} |")
+    print("\n| budget | all imperfections, s | exact, s | memory of the process, GB |")
+    print("|---|---|---|---|")
+    for side in (200, 1000):
+        rng = np.random.default_rng(0)
+        displaced = objects(side)["ring"]
+        moves = np.stack(displaced(*np.indices((side, side), dtype=np.float64)))
+        image = rng.poisson(COUNTS * synthetic_image(moves)).astype(float)
+        source = COUNTS * np.ones((side, side))
+        # The last ones are timed: the first compiles.
+        stated, exact = (
+            [
+                invert(image, source=source, instrument=instrument).report.seconds["errors"]
+                for _ in range(3)
+            ][-1]
+            for instrument in (INSTRUMENT, Instrument())
+        )
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+        print(f"| {side}² | {stated:.2f} | {exact:.2f} | {memory:.1f} |", flush=True)
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    tables = ["totals", "bands", "ranks", "cost"]
+    parser.add_argument("tables", nargs="*", choices=[*tables, []], default=tables)
+    parser.add_argument("--shots", type=int, default=210)
+    parser.add_argument("--side", type=int, default=128)
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--method", choices=["linear", "resolve"], default="linear")
+    arguments = parser.parse_args()
+    size = arguments.side, arguments.shots, arguments.first_seed
+    if "totals" in arguments.tables:
+        table_of_totals(*size)
+    if "bands" in arguments.tables:
+        table_of_bands(*size)
+    if "ranks" in arguments.tables:
+        table_of_ranks(*size, arguments.method)
+    if "cost" in arguments.tables:
+        table_of_cost()
 
 
 if __name__ == "__main__":
