@@ -545,3 +545,30 @@ def test_threads_change_neither_the_answer_nor_its_errors(image):
     np.testing.assert_array_equal(serial.displacement, parallel.displacement)
     assert serial.errors == parallel.errors
     assert serial.report.sites_reason == parallel.report.sites_reason
+
+
+@pytest.mark.parametrize("width", [0.8, 2.0, 4.0])
+def test_the_error_by_noise_follows_a_stated_correlation(width):
+    """The scatter of repeats; over 4 px the correlation is too long to be measured."""
+    blob = phantoms.gaussian_blob((128, 128), 60.0, 14.0)
+    clean, source = synthetic_image(blob.displacement), np.ones((128, 128))
+    options = InversionOptions(n_sites=4000, negative="clip")
+    plan = plan_sites(source, options)
+    rng = np.random.default_rng(8)
+
+    def shot():
+        noise = gaussian_filter(rng.normal(size=clean.shape), width, mode="wrap")
+        return clean + 0.02 * noise / noise.std()
+
+    results = [
+        invert(shot(), plan=plan, options=options, instrument={"noise_correlation": width})
+        for _ in range(16)
+    ]
+    moves = np.array([result.displacement for result in results])
+    scatter = np.sqrt((moves.var(axis=0, ddof=1)).sum(axis=0).mean())
+    errors = [result.errors for result in results]
+    assert np.median([e.noise.rms for e in errors]) == pytest.approx(scatter, rel=0.35)
+    assert errors[0].noise_correlation == pytest.approx(width)
+    assert not any(c.code == "correlated-noise" for c in results[0].report.warnings)
+    white = invert(shot(), plan=plan, options=options, instrument={"noise_correlation": 0})
+    assert white.errors.noise_correlation == 0

@@ -261,7 +261,7 @@ def invert(
             )
             scale = prepared.flux_scale / image_flux
             prepared = prepare(image, source, options, mask, flux_scale=scale)
-        noise = ImageNoise(prepared.in_units(), options)
+        noise = ImageNoise(prepared.in_units(), options, instrument.noise_correlation)
         budget = Budget(plan, prepared, noise, options, instrument)
         if not options.is_adaptive and not levels.is_complete:
             levels = levels.up_to(_site_domain(plan.source, options, plan.mask).n_sites)

@@ -167,6 +167,8 @@ _GRAIN_PER_BLUR = 3.51 / math.exp(-0.5772 / 2)
 class ImageNoise:
     """Noise of an image, and of its source, as shares of the source's mean.
 
+    Its correlation is that of a Gaussian blur of a stated width, px, or measured.
+
     Attributes
     ----------
     largest, typical : float
@@ -181,15 +183,24 @@ class ImageNoise:
         above is then too small.
     """
 
-    def __init__(self, prepared: Prepared, options: InversionOptions | None = None) -> None:
+    def __init__(
+        self,
+        prepared: Prepared,
+        options: InversionOptions | None = None,
+        correlation: float | None = None,
+    ) -> None:
         image, mask = prepared.image, prepared.mask  # in units of `prepared.unit`
         self.shape = mask.shape[0], mask.shape[1]
         mean = prepared.source[mask].mean()
         excess = (image - prepared.source) / mean
         used = mask[1:, 1:] & mask[1:, :-1] & mask[:-1, 1:] & mask[:-1, :-1]
         differences = _finest(excess, used)
-        inflation, self.clumping = _correlation(excess, mask)
-        self.is_correlated_far = self.clumping == 1 and _is_correlated_far(excess, mask)
+        if correlation is None:
+            inflation, self.clumping = _correlation(excess, mask)
+            self.is_correlated_far = self.clumping == 1 and _is_correlated_far(excess, mask)
+        else:
+            inflation, self.clumping = _stated_correlation(excess, mask, correlation)
+            self.is_correlated_far = False
         self.largest = _rms(differences) * math.sqrt(inflation)
         self.typical = _clipped_rms(differences) * math.sqrt(inflation)
         # The source's mean, in units of the recorded image.
@@ -283,6 +294,24 @@ def _correlation(excess: FloatArray, mask: BoolArray) -> tuple[float, float]:
     steps = np.arange(lags[-1] + 1)
     along_axis = np.interp(steps, [0, *lags], [1.0, *correlation])
     return inflation, float((2 * along_axis.sum() - 1) ** 2)
+
+
+def _stated_correlation(excess: FloatArray, mask: BoolArray, width: float) -> tuple[float, float]:
+    """Return the same where the noise is correlated as by a Gaussian blur of a width, px."""
+    clumping = 4 * math.pi * width**2
+    if clumping <= 1:
+        return 1.0, 1.0
+    # The nearest pixels hardly differ: the noise is measured where they are nearly independent.
+    lag = min(math.ceil(2 * width), _LAGS_PX[-1])
+    near, far = ((1 - math.exp(-((d / width) ** 2) / 4)) ** 2 for d in (1, lag))
+    side = _TILE_PX if min(excess.shape) >= _MIN_SIDE_PX else _SMALL_TILE_PX
+    if _MIN_TILES * side + lag > min(excess.shape):
+        return 1 / near, clumping
+    tiles = _quiet_tiles(*_tiles(excess, mask, side, lag), side, lag)
+    if len(tiles) < _MIN_TILES:
+        return 1 / near, clumping
+    ratio = _difference_variance(tiles, side, lag) / _difference_variance(tiles, side, 1)
+    return float(np.median(ratio)) / far, clumping
 
 
 def _is_correlated_far(excess: FloatArray, mask: BoolArray) -> bool:

@@ -179,6 +179,16 @@ class Instrument(CheckedModel):
             "displacement by the retrieved one."
         ),
     )
+    noise_correlation: float | None = Field(
+        default=None,
+        ge=0,
+        le=20,
+        title="Noise correlation (px)",
+        description=(
+            "Standard deviation of the Gaussian blur that correlates the noise of neighbouring "
+            "pixels, in px; 0 for white noise. Default: measured in the image."
+        ),
+    )
 
     @classmethod
     def of(cls, detector: str | None = None, source: str | None = None, **numbers: Any) -> Self:
