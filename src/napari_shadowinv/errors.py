@@ -12,7 +12,7 @@ __all__ = ["FileFormatError", "InputError", "InversionCancelled"]
 
 
 class _UserError(Exception):
-    """Base of a user's mistakes; `option` is the switch that would allow it, such as overwrite."""
+    """Base of a user's mistakes; `option` is the one that resolves it, such as overwrite."""
 
     def __init__(self, *message: object, option: str = "") -> None:
         super().__init__(*message)

@@ -98,7 +98,8 @@ def invert_shot(
                 recipe, shot, source=source, **masks, on_progress=show, should_stop=is_interrupted
             )
         except InputError as error:
-            raise InputError(f"{shot.path}: {error}" if shot.path else str(error)) from error
+            text = f"{shot.path}: {error}" if shot.path else str(error)
+            raise InputError(text, option=error.option) from error
 
 
 def warn_of_setups(experiments: Iterable[tuple[Setup | None, tuple[int, int] | None]]) -> None:

@@ -70,7 +70,8 @@ def prepare(
     if negative and options.negative == "refuse":
         raise InputError(
             f"image has {negative} negative pixels (lowest {values.min():.4g}), expected none: "
-            "if they result from background subtraction, clip them"
+            "if they result from background subtraction, clip them",
+            option="clip_negative",
         )
     values = _clip_negative(values)
     _check_range(values, "image")

@@ -242,7 +242,8 @@ class FitInputs:
         if setup is None:
             raise InputError(
                 f"{self.names[k]} has no setup, and source size and resolution are in m: give the "
-                "setup, or the point spread in px"
+                "setup, or the point spread in px",
+                option="psf",
             )
         return point_spread(setup, choices.source_size or 0.0, choices.resolution or 0.0)
 
@@ -541,5 +542,6 @@ def row_setup(row: ShotRow, shot: Radiograph, recipe: Recipe) -> Setup | None:
     article = "an" if nouns[0] in "aeiou" else "a"
     raise InputError(
         f"{row.file} has {article} {nouns} of {row.beam_text} and no setup: give the rest of the "
-        "geometry as a setup"
+        "geometry as a setup",
+        option="setup",
     )
