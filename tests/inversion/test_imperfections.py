@@ -11,6 +11,7 @@ from napari_shadowinv import (
     InversionOptions,
     OpticalSetup,
     invert,
+    plan_sites,
 )
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.physics import phantoms
@@ -106,6 +107,13 @@ def test_the_effect_of_a_reference_out_of_register_is_that_of_shifts_and_turns()
     ]
     effect = exact.errors.effects["registration, 0.4 px"]
     assert effect.rms == pytest.approx(np.sqrt(np.sum(np.square(changes))), rel=0.15)
+
+
+def test_an_estimated_source_is_in_register():
+    image = lens(0.006)
+    plan = plan_sites(uneven_source(), OPTIONS, measured=False)
+    estimated = invert(image, plan=plan, options=OPTIONS, instrument={"registration": 1})
+    assert not any("registration" in name for name in estimated.errors.parts)
 
 
 def test_the_effect_of_an_absorbing_object_is_that_of_smooth_transmissions():

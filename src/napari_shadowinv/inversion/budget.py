@@ -263,7 +263,8 @@ class Budget:
         instrument: Instrument,
     ) -> None:
         self._plan, self._prepared = plan, prepared
-        self._noise, self.options, self.instrument = noise, options, instrument
+        self._noise, self.options = noise, options
+        self.instrument = instrument if plan.measured else instrument.without_reference()
         if self._beam.components is not None:
             self._beam.components.check_shape(prepared.mask.shape)
         self._places = _places(prepared)

@@ -485,6 +485,8 @@ def _draws(
 ) -> InstrumentDraws | None:
     """Return the imperfections to be drawn; None if the instrument is exact."""
     mask = inversion.mask
+    if not plan.measured:
+        instrument = instrument.without_reference()
     beam, errors = instrument.beam_of(measured=plan.measured), inversion.errors
     if errors is not None and errors.beam_variation != beam.rms:  # more was seen
         beam = BeamPrior(rms=min(errors.beam_variation, _MAX_BEAM_RMS), length=beam.length)

@@ -266,6 +266,20 @@ class Instrument(CheckedModel):
         stated = beam.model_dump(exclude_unset=True)
         return numbers | {f"beam_{name}": value for name, value in stated.items()}
 
+    def without_reference(self) -> Self:
+        """Return the instrument for an estimated source, which is in register with its image."""
+        return self.model_copy(update={"registration": 0.0})
+
+    def with_beam(self, beam: BeamPrior) -> Instrument:
+        """Return the instrument with another beam, of the same difference between energies."""
+        numbers = {
+            name: value
+            for name, value in self.stated.items()
+            if not name.startswith("beam_") or name == "beam_source"
+        }
+        beam = beam.model_copy(update={"between": self.beam_between})
+        return Instrument(**{**numbers, "beam": beam})
+
     def beam_of(self, *, measured: bool) -> BeamPrior:
         """Return the prior of the beam, assumed unless stated.
 

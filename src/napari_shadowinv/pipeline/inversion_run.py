@@ -45,6 +45,7 @@ from napari_shadowinv.preprocessing import (
     UniformEstimate,
     estimate_source,
     uniform_warnings,
+    with_prior_of,
 )
 from napari_shadowinv.preprocessing.estimates import centre_within
 from napari_shadowinv.provenance import ImageOrigin, MaskOrigin, Origin, Provenance, index_masks
@@ -331,19 +332,22 @@ def run_prepared(
     if shot.source is None:
         prepare(shot.image, None, options, shot.mask)
     source = _source(inputs, shot, report, should_stop, cache, doubts, preview=preview)
+    instrument, estimate = inputs.recipe.instrument, inputs.recipe.estimate
+    if estimate is not None:
+        instrument = with_prior_of(estimate, shot, instrument, should_stop)
     report("prepare", 0, None)
     prepare(shot.image, source, options, shot.mask)
     seconds["source"] = time.perf_counter() - clock
     ensure_compiled(on_progress, should_stop)
     clock = time.perf_counter()
-    measured = inputs.recipe.estimate is None
+    measured = estimate is None
     plan = cache.plan(source, shot.mask, options, on_progress, should_stop, measured=measured)
     seconds["sites"] = time.perf_counter() - clock
     inversion = invert(
         shot.image,
         plan=plan,
         options=options,
-        instrument=inputs.recipe.instrument,
+        instrument=instrument,
         # The final result must not depend on earlier previews.
         start=cache.last_inversion(plan) if preview else start,
         on_progress=on_progress,

@@ -6,7 +6,7 @@
   `high_pass`, `butterworth`, `remove_background`, `remove_hot_pixels`
 - estimates of the source by name in `ESTIMATES`; as functions `uniform_source`,
   `isotropic_source`, `gaussian_source`, `polynomial_source`, `low_pass_source`,
-  `total_variation_source`, `interpolated_source`
+  `total_variation_source`, `interpolated_source`, `kriged_source`
 """
 
 import lazy_loader

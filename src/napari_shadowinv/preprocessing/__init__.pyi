@@ -3,6 +3,7 @@ from .estimates import (
     GaussianEstimate,
     InterpolatedEstimate,
     IsotropicEstimate,
+    KrigedEstimate,
     LowPassEstimate,
     PolynomialEstimate,
     TotalVariationEstimate,
@@ -29,6 +30,7 @@ from .filters import (
     remove_hot_pixels,
 )
 from .image_checks import ReferencePair, image_warnings
+from .kriging import kriged_source
 from .pixels import fit_polynomial, interpolated_source
 from .recipe import (
     ESTIMATES,
@@ -39,6 +41,7 @@ from .recipe import (
     Recipe,
     check_masks,
     estimate_source,
+    with_prior_of,
 )
 from .steps import Bin, Choice, Crop, Dark, Radiograph, Rotate, Step
 
@@ -60,6 +63,7 @@ __all__ = [
     "HotPixelFilter",
     "InterpolatedEstimate",
     "IsotropicEstimate",
+    "KrigedEstimate",
     "LowPassEstimate",
     "LowPassFilter",
     "MeasuredSource",
@@ -80,6 +84,7 @@ __all__ = [
     "image_warnings",
     "interpolated_source",
     "isotropic_source",
+    "kriged_source",
     "low_pass",
     "low_pass_source",
     "polynomial_source",
@@ -88,4 +93,5 @@ __all__ = [
     "total_variation_source",
     "uniform_source",
     "uniform_warnings",
+    "with_prior_of",
 ]

@@ -9,6 +9,7 @@ none was recorded, or the beam changes from shot to shot, it must be estimated f
 - the beam varies slowly, in no known way: `polynomial_source`, `low_pass_source`
 - the beam has edges that matter: `total_variation_source`
 - the object covers a known part of the image: `interpolated_source`
+- the beam is smooth and random, and visible around the object: `kriged_source`
 - in a recipe: `Estimate` and the classes derived from it
 
 Each takes an image ``[y, x]``, counts or any linear measure of fluence, and returns float64
@@ -41,9 +42,11 @@ from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution, OnCaution, warn_of
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics.setup import Setup, bin_setup
 from napari_shadowinv.preprocessing import pixels
 from napari_shadowinv.preprocessing.filters import low_pass
+from napari_shadowinv.preprocessing.kriging import kriged_beam, kriged_source
 from napari_shadowinv.preprocessing.pixels import (
     FILL_WIDTH,
     beam_pixels,
@@ -102,6 +105,12 @@ class Estimate(Choice):
         on_caution: OnCaution | None,
     ) -> FloatArray:
         return self.function(image, mask=mask, should_stop=should_stop, **self.values())
+
+    def beam_prior(
+        self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
+    ) -> BeamPrior | None:
+        """Return the prior of the beam's difference from `source`, if the image determines it."""
+        return None
 
     def coarsen(self, factor: int) -> Estimate:
         """Return the estimate for an image with pixels `factor` times as large."""
@@ -337,6 +346,22 @@ class InterpolatedEstimate(Estimate):
             "gaps at the edge."
         ),
     )
+
+
+class KrigedEstimate(Estimate):
+    """A smooth random beam, predicted from around the object with its error."""
+
+    needs_mask = True
+    title = "predicted from around the object"
+    function = staticmethod(kriged_source)
+    place = 80
+    method: Literal["kriged"] = "kriged"
+
+    def beam_prior(
+        self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
+    ) -> BeamPrior:
+        assert mask is not None
+        return kriged_beam(image, mask, should_stop=should_stop)[1]
 
 
 _MAX_FITTED_PIXELS = 2**16

@@ -250,14 +250,32 @@ def estimate_source(
     by : callable, optional
         Called instead of `Estimate.source`, such as a cached one.
     """
-    masks = [mask for mask in (shot.mask, shot.source_mask) if mask is not None]
-    usable = np.logical_and.reduce(masks) if masks else None
-    # An estimate shall see no negative pixels, and 0 where they are masked.
-    beam = np.maximum(shot.image if shot.mask is None else np.where(shot.mask, shot.image, 0), 0)
+    beam, usable = _for_estimate(shot)
     estimated = estimate.source if by is None else by
     source = estimated(beam, usable, should_stop=should_stop, on_caution=on_caution)
     _check_fall(source, beam, shot.mask, shot.source_mask, on_caution)
     return source
+
+
+def with_prior_of(
+    estimate: Estimate,
+    shot: Radiograph,
+    instrument: Instrument,
+    should_stop: ShouldStop | None = None,
+) -> Instrument:
+    """Return an instrument with the error of an estimated source, unless another is stated."""
+    if "beam_rms" in instrument.stated:
+        return instrument
+    prior = estimate.beam_prior(*_for_estimate(shot), should_stop)
+    return instrument if prior is None else instrument.with_beam(prior)
+
+
+def _for_estimate(shot: Radiograph) -> tuple[FloatArray, BoolArray | None]:
+    """Return the image without negative pixels, 0 where it is masked, and the usable pixels."""
+    masks = [mask for mask in (shot.mask, shot.source_mask) if mask is not None]
+    usable = np.logical_and.reduce(masks) if masks else None
+    image = shot.image if shot.mask is None else np.where(shot.mask, shot.image, 0)
+    return np.maximum(image, 0), usable
 
 
 def _check_fall(

@@ -1,0 +1,264 @@
+"""The beam behind an object, predicted from the image around it: `kriged_source`, `kriged_beam`.
+
+The logarithm of the beam is a Gaussian process: smooth, random, correlated by exp(-r²/2L²). Blocks
+of pixels without the object give its r.m.s., its length L and the noise by their marginal
+likelihood; lengths count in proportion to it. The conditional mean is the source, the conditional
+variance the prior of the error that remains. The process is a sum of cosines over a domain half as
+large again as the image, so that the border needs no slope of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike
+from threadpoolctl import threadpool_limits
+
+from napari_shadowinv._system.arrays import block_means
+from napari_shadowinv._system.progress import Reporter, ShouldStop
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.options import BeamComponents, BeamPrior
+from napari_shadowinv.preprocessing.pixels import beam_pixels, with_flux_of
+
+__all__ = ["kriged_beam", "kriged_source"]
+
+_GRID = 48  # blocks along the longer side
+_DOMAIN = 1.5  # sides of the image
+_LENGTHS = np.geomspace(0.1, 1.2, 6)  # shorter sides
+_SHORTEST_WAVE = 3.6  # in units of 1/L: the spectrum has fallen to 1/650
+_RATIOS = np.geomspace(1e-4, 1e8, 97)  # variance of the beam over the noise of a block
+_MIN_WEIGHT = 0.02  # of a length, to count
+_MAX_COMPONENTS, _LEFT_OUT = 32, 1e-3  # share of the variance
+_MIN_USED_SHARE = 0.5  # of a block's pixels
+_DIMMEST = 1e-2  # of the mean
+_MIN_BARE_SHARE = 0.1  # of the blocks
+_MIN_BLOCKS = 20
+
+
+def kriged_source(
+    image: ArrayLike,
+    mask: ArrayLike,
+    *,
+    should_stop: ShouldStop | None = None,
+) -> FloatArray:
+    """Beam predicted from the pixels without the object, as a Gaussian process.
+
+    It is an estimate as in `napari_shadowinv.preprocessing.estimates`; an `InputError` also refuses
+    an image in which hardly a pixel is free of the object.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W)
+    mask : array_like of bool, shape (H, W)
+        True where the image shows the bare beam, False where the object or its halo is.
+    should_stop : callable, optional
+    """
+    return kriged_beam(image, mask, should_stop=should_stop)[0]
+
+
+def kriged_beam(
+    image: ArrayLike,
+    mask: ArrayLike,
+    *,
+    should_stop: ShouldStop | None = None,
+) -> tuple[FloatArray, BeamPrior]:
+    """Return the beam of `kriged_source`, and the prior of its error."""
+    report = Reporter(None, should_stop)
+    values, usable = beam_pixels(image, mask)
+    block = -(-max(values.shape) // _GRID)
+    share = block_means(usable.astype(np.float64), block)
+    means = block_means(np.where(usable, values, 0.0), block) / np.maximum(share, 1e-300)
+    bare = share > _MIN_USED_SHARE
+    if bare.any():
+        bare &= means > _DIMMEST * means[bare].mean()
+    if bare.sum() < max(_MIN_BARE_SHARE * bare.size, _MIN_BLOCKS):
+        raise InputError(
+            f"{bare.mean():.0%} of the image is free of the object, too little to predict the "
+            "beam behind it: mask less, or choose another estimate"
+        )
+    level = float(means[bare].mean())
+    logs = np.log(means[bare] / level)
+    counts = share[bare] * means[bare] / level
+    fits = []
+    with _one_thread():
+        for length in _LENGTHS:
+            report("source", 0)
+            waves = _Waves(values.shape, block, length * min(values.shape))
+            fits.append(_Fit.to(waves, bare, logs, counts))
+        beam, light, patterns, weights = _joint(fits)
+    source = with_flux_of(level * np.exp(beam), values, usable)
+    variance = (patterns**2).sum(axis=0)
+    rms = math.sqrt(float((light * variance).sum() / light.sum()))
+    size = (values.shape[0], values.shape[1])
+    components = BeamComponents(patterns, block, size, 0.0, "outside")
+    length = float(np.exp(weights @ np.log(_LENGTHS)))
+    prior = BeamPrior(rms=min(rms, 0.99), length=min(length, 1.0)).with_components(components)
+    return source, prior
+
+
+@dataclass(frozen=True, eq=False)
+class _Waves:
+    """Cosines over the domain with the spectrum of a length, px, whose variances sum to 1."""
+
+    shape: tuple[int, ...]
+    block: int
+    length: float
+
+    @cached_property
+    def _numbers(self) -> list[FloatArray]:
+        """Wave numbers along y and x, rad/px."""
+        steps = [np.pi / (_DOMAIN * side) for side in self.shape]
+        counts = [max(2, int(_SHORTEST_WAVE / (self.length * step)) + 1) for step in steps]
+        return [
+            step * np.arange(count, dtype=np.float64)
+            for step, count in zip(steps, counts, strict=True)
+        ]
+
+    @cached_property
+    def _spectrum(self) -> FloatArray:
+        """Variance of each product of cosines, 0 for those that are not used."""
+        along_y, along_x = self._numbers
+        squares = self.length**2 * (along_y[:, None] ** 2 + along_x**2)
+        variances = np.where(squares <= _SHORTEST_WAVE**2, np.exp(-0.5 * squares), 0.0)
+        return np.asarray(variances / variances.sum())
+
+    def _cosines(self, axis: int, places: FloatArray) -> FloatArray:
+        """Return cosines along an axis with a mean square of 1, shape (places, waves)."""
+        numbers = self._numbers[axis]
+        beyond = (_DOMAIN - 1) / 2 * self.shape[axis]
+        cosines = np.cos(np.outer(places + 0.5 + beyond, numbers))
+        return np.asarray(np.where(numbers > 0, math.sqrt(2), 1.0) * cosines)
+
+    @cached_property
+    def at_blocks(self) -> FloatArray:
+        """Waves of one standard deviation at the middles of blocks, shape (h, w, waves)."""
+        along_y, along_x = (
+            self._cosines(
+                axis, self.block * (np.arange(-(-side // self.block), dtype=np.float64) + 0.5) - 0.5
+            )
+            for axis, side in enumerate(self.shape)
+        )
+        rows, columns = np.nonzero(self._spectrum)
+        waves = along_y[:, None, rows] * along_x[None, :, columns]
+        return np.asarray(waves * np.sqrt(self._spectrum[rows, columns]))
+
+    def at_pixels(self, coefficients: FloatArray) -> FloatArray:
+        """Return the sum of the waves at all pixels."""
+        table = np.sqrt(self._spectrum)
+        table[table > 0] *= coefficients
+        along_y, along_x = (
+            self._cosines(axis, np.arange(side, dtype=np.float64))
+            for axis, side in enumerate(self.shape)
+        )
+        return np.asarray(along_y @ table @ along_x.T)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Process of one length, conditioned on the blocks without the object.
+
+    Attributes
+    ----------
+    waves : _Waves
+    level : float
+        Mean of the logarithms.
+    middle : ndarray, shape (waves,)
+        Mean of the waves, in which the level replaces them.
+    coefficients : ndarray, shape (waves,)
+        Mean amplitudes, in standard deviations of the waves.
+    spread : ndarray, shape (waves, waves)
+        Columns whose squares sum to the covariance of the amplitudes.
+    evidence : float
+        Logarithm of the marginal likelihood, up to a constant.
+    """
+
+    waves: _Waves
+    level: float
+    middle: FloatArray
+    coefficients: FloatArray
+    spread: FloatArray
+    evidence: float
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean of the logarithm of the beam in each block."""
+        return np.asarray(self.rows @ self.coefficients + self.level)
+
+    @property
+    def rows(self) -> FloatArray:
+        """Waves in each block, less their mean."""
+        return np.asarray(self.waves.at_blocks - self.middle)
+
+    @classmethod
+    def to(cls, waves: _Waves, bare: BoolArray, logs: FloatArray, counts: FloatArray) -> _Fit:
+        """Fit the logarithms of bare blocks, whose noise has a variance of σ² / counts."""
+        rows = waves.at_blocks[bare]
+        counts = counts / counts.mean()
+        middle, level = (counts @ rows) / counts.sum(), float(counts @ logs / counts.sum())
+        roots = np.sqrt(counts)
+        data = roots * (logs - level)
+        centred = roots[:, None] * (rows - middle)
+        powers, turned = scipy.linalg.eigh(centred.T @ centred)
+        powers = np.maximum(powers, 0.0)
+        pull = turned.T @ (centred.T @ data)
+        gain = _RATIOS[:, None] / (1 + _RATIOS[:, None] * powers)
+        noise = (data @ data - gain @ pull**2) / (len(data) - 1)
+        noise = np.maximum(noise, 1e-12)
+        evidences = -0.5 * (
+            np.log1p(_RATIOS[:, None] * powers).sum(axis=1) + (len(data) - 1) * np.log(noise)
+        )
+        best = int(evidences.argmax())
+        coefficients = turned @ (gain[best] * pull)
+        return cls(
+            waves,
+            level,
+            middle,
+            coefficients,
+            turned * np.sqrt(noise[best] * gain[best]),
+            float(evidences[best]),
+        )
+
+
+def _joint(fits: list[_Fit]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the logarithm of the beam, the beam in blocks, its components, and the weights."""
+    evidence = np.array([fit.evidence for fit in fits])
+    weights = np.exp(evidence - evidence.max())
+    weights[weights < _MIN_WEIGHT * weights.sum()] = 0.0
+    weights /= weights.sum()
+    likely = [(weight, fit) for weight, fit in zip(weights, fits, strict=True) if weight]
+    beam = sum(
+        weight * (fit.waves.at_pixels(fit.coefficients) - fit.middle @ fit.coefficients)
+        for weight, fit in likely
+    )
+    light = np.exp(sum(weight * fit.mean for weight, fit in likely))
+    return np.asarray(beam), np.asarray(light), _components(likely), weights
+
+
+def _one_thread() -> threadpool_limits:
+    """Keep BLAS from threads, which on a busy machine wait for each other far longer than work."""
+    import scipy.linalg  # noqa: F401  only libraries that are loaded are limited
+
+    return threadpool_limits(limits=1, user_api="blas")
+
+
+def _components(fits: list[tuple[float, _Fit]]) -> FloatArray:
+    """Return shapes whose squares sum to the variance of the beam in each block, (k, h, w)."""
+    mean = sum(weight * fit.mean for weight, fit in fits)
+    columns = [
+        math.sqrt(weight) * np.concatenate([fit.rows @ fit.spread, shift], axis=2)
+        for weight, fit in fits
+        for shift in [(fit.mean - mean)[..., None]]
+    ]
+    joint = np.concatenate(columns, axis=2)
+    height, width, count = joint.shape
+    flat = joint.reshape(-1, count)
+    # Few of the many columns matter.
+    powers, turned = scipy.linalg.eigh(flat.T @ flat)
+    beyond = np.cumsum(powers) < _LEFT_OUT * powers.sum()
+    chosen = turned[:, ~beyond][:, -_MAX_COMPONENTS:]
+    return np.ascontiguousarray((flat @ chosen).T.reshape(-1, height, width))
