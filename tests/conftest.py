@@ -112,6 +112,7 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
             noise=ErrorEstimate(0.1, 0.05),
             effects={"solver": ErrorEstimate(1e-5, 2e-5)},
             beam=ErrorEstimate(2.0, 1.0),
+            beam_variation=0.05,
         ),
         "image_residual": image_residual(image, reprojection, np.ones(shape, dtype=bool)),
     }

@@ -29,7 +29,7 @@ __all__ = [
     "in_headline",
     "masked_fact",
     "time_fact",
-    "verdict_facts",
+    "verdict_fact",
 ]
 
 
@@ -133,14 +133,10 @@ def in_headline(cautions: Iterable[Caution]) -> list[str]:
     return list(dict.fromkeys(caution.short for caution in cautions))
 
 
-def verdict_facts(verdict: Verdict, reason: str) -> list[Fact]:
-    """Return a verdict, and its reason unless it is empty."""
-    is_determined = verdict is Verdict.DETERMINED
-    level = Level.SOUND if is_determined else Level.DOUBTFUL
-    facts = [Fact("verdict", "Verdict", str(verdict), level, short=str(verdict))]
-    if reason:
-        facts.append(Fact("verdict", "Reason" if is_determined else "Warning", reason, level))
-    return facts
+def verdict_fact(verdict: Verdict) -> Fact:
+    """Return a verdict, whose reason is in the headline."""
+    level = Level.SOUND if verdict is Verdict.DETERMINED else Level.DOUBTFUL
+    return Fact("verdict", "Verdict", str(verdict), level, short=str(verdict))
 
 
 def caution_facts(cautions: Iterable[Caution]) -> list[Fact]:

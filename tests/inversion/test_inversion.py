@@ -535,12 +535,14 @@ def test_a_margin_wider_than_the_image_is_refused_before_it_is_made():
         invert(_lens(), options=options)
 
 
-def test_the_headline_puts_warnings_before_the_peak(image):
-    inversion = invert(image)
+def test_the_headline_puts_verdict_and_warnings_before_the_peak(image):
+    inversion = invert(image, source=np.ones(image.shape))
     assert inversion.headline.level == "sound"
-    assert f"{peak(inversion.displacement):.2f}" in inversion.headline.text
+    verdict, peak_text = inversion.headline.text.split("; ")
+    assert verdict.startswith("DETERMINED: errors of ")
+    assert f"{peak(inversion.displacement):.4f}" in peak_text
     doubtful = inversion.with_warnings([Caution("beam", "the beam is wrong")]).headline
     assert doubtful.level == "doubtful"
-    assert doubtful.text == f"{CAUTION_CODES['beam']}; {inversion.headline.text}"
+    assert doubtful.text == f"{verdict}; {CAUTION_CODES['beam']}; {peak_text}"
     unconverged = dataclasses.replace(inversion.report, converged=False)
     assert dataclasses.replace(inversion, report=unconverged).headline.level == "failed"

@@ -32,9 +32,10 @@ def viewer() -> ViewerModel:
 
 @pytest.fixture(scope="session")
 def solved() -> Inversion:
-    """A small inversion that was really solved, of an object without symmetry."""
+    """A small inversion that was really solved, of an object without symmetry, and determined."""
     image = synthetic_image(ellipse_pair((40, 52)).displacement)
-    return invert(image, options=InversionOptions(n_sites=500))
+    options = InversionOptions(n_sites=500, max_error=0.2)
+    return invert(image, options=options, instrument={"beam_rms": 0.0})
 
 
 @pytest.fixture(scope="session")

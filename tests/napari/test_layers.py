@@ -349,7 +349,7 @@ EDGE = (Caution("closed-edge", "the field reaches the edge"),)
 
 
 def test_doubtful_result_has_the_doubt_in_its_names(solved: Inversion) -> None:
-    marks = {((), True): "", (EDGE, True): " (doubtful)", (EDGE, False): " (failed)"}
+    marks = {((), True): "", (EDGE, True): " (reaches the edge)", (EDGE, False): " (failed)"}
     for (warnings, converged), mark in marks.items():
         report = replace(solved.report, warnings=warnings, converged=converged)
         for _, keywords, _ in inversion_layers(replace(solved, report=report), name="a"):

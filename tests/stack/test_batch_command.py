@@ -571,13 +571,15 @@ def test_ctrl_c_while_the_store_is_made_leaves_nothing(night, folder):
     assert sorted(folder.rglob("*")) == before
 
 
-def test_status_counts_levels_and_lists_warnings_once(store):
+def test_status_counts_verdicts_and_lists_warnings_once(store):
     reports = StackStore(store).reports()
     assert {report["level"] for report in reports} <= {"sound", "doubtful", "failed"}
     assert all("peak" in report["headline"] for report in reports)
     doubtful = [report for report in reports if report["level"] == "doubtful"]
     assert all(report["warnings"] for report in doubtful)
     text = flat(shadowinv("status", store).output)
-    assert f"{len(doubtful)} doubtful" in text
+    determined = sum(report["verdict"] == "determined" for report in reports)
+    assert f"{determined} determined" in text
     codes = {caution["code"] for report in doubtful for caution in report["warnings"]}
-    assert text.count("warning ") == len(codes)
+    verdicts = {report["verdict"] for report in reports} - {"determined"}
+    assert text.count("warning ") == len(codes) + len(verdicts)

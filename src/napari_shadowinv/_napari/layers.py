@@ -191,11 +191,13 @@ def result_layers(
 
 
 def trust_label(inversion: Inversion) -> str:
-    """Return the level of trust as a suffix of layers' names; empty for a sound result."""
-    from napari_shadowinv.facts import Level
+    """Return the verdict, or the doubt, as a suffix of layers' names; empty for a sound result."""
+    from napari_shadowinv.facts import Level, Verdict
 
-    level = inversion.headline.level
-    return "" if level is Level.SOUND else f"({level.value})"
+    level, verdict = inversion.headline.level, inversion.verdict
+    if level is Level.SOUND:
+        return ""
+    return f"({level if verdict is Verdict.DETERMINED or level is Level.FAILED else verdict})"
 
 
 def dataset_layers(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import json
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -131,9 +130,9 @@ def shot_reader(channel: str | None, variable: str | None) -> Callable[..., Arra
 
 def _is_reliable(report: Mapping[str, Any]) -> bool:
     """Whether the report of a finished shot casts no doubt on its result."""
-    if "verdict" in report:
-        return bool(report["verdict"] == _DETERMINED)
-    return bool(report.get("converged"))
+    if "level" in report:  # an inversion
+        return bool(report.get("converged"))
+    return bool(report.get("verdict") == _DETERMINED)
 
 
 def _check_store(out: Path, resume: bool, overwrite: bool) -> None:
@@ -306,27 +305,19 @@ def _trouble_rows(store: StackStore) -> Rows:
     if unconverged:
         text = f"{len(unconverged)} shots did not converge: {_list_text(unconverged)}"
         rows.append(("warning", text))
-    return [*rows, *_verdict_rows(store), *_level_rows(store)]
+    return [*rows, *_verdict_rows(store), *_warning_rows(store)]
 
 
-def _level_rows(store: StackStore) -> Rows:
-    """Count the shots of each level of trust, and list each kind of warning with its shots."""
-    levels: Counter[str] = Counter()
+def _warning_rows(store: StackStore) -> Rows:
+    """List each kind of warning about inversions with its shots."""
     warned: dict[str, tuple[str, list[str]]] = {}
     for name, report in zip(store.names, store.reports(), strict=True):
         if "level" not in report:
             continue
-        levels[report["level"]] += 1
         for caution in map(Caution.from_json, report.get("warnings", ())):
             key = caution.text if caution.code == "other" else caution.code
             warned.setdefault(key, (caution.text, []))[1].append(name)
-    if not levels:
-        return []
-    counts = ", ".join(f"{count} {level}" for level, count in levels.most_common())
-    return [
-        ("levels", counts),
-        *[("warning", f"{_list_text(names)}: {warning}") for warning, names in warned.values()],
-    ]
+    return [("warning", f"{_list_text(names)}: {warning}") for warning, names in warned.values()]
 
 
 def _list_text(names: Sequence[str]) -> str:
@@ -334,7 +325,7 @@ def _list_text(names: Sequence[str]) -> str:
 
 
 def _verdict_rows(store: StackStore) -> Rows:
-    """Count the fits that are determined, and list the others by their verdict."""
+    """Count the shots that are determined, and list the others by their verdict."""
     shots: dict[str, list[str]] = {}
     for name, report in zip(store.names, store.reports(), strict=True):
         if "verdict" in report:
@@ -459,11 +450,14 @@ class _WatchPrinter:
         if outcome.reason:
             self._print(self.err, f"failed: {name}: {outcome.reason}", "red")
             return
+        from napari_shadowinv.facts import Level
+
         assert status.result is not None
         summary, doubts = _shot_summary(status.result)
         summary = f"  {summary}  {outcome.seconds:.2f} s{waiting}{doubts}"
         name = _shorten_name(name, _LINE_COLUMNS - len(summary))
-        self._print(self.out, f"{name}{summary}", "yellow" if doubts else "")
+        is_sound = status.result.headline.level is Level.SOUND
+        self._print(self.out, f"{name}{summary}", "" if is_sound else "yellow")
         for warning in status.result.cautions:
             if warning.code not in self.warned:
                 self.warned.add(warning.code)
@@ -480,13 +474,9 @@ def _shorten_name(name: str, columns: int) -> str:
 
 
 def _shot_summary(result: Inversion | Fit) -> tuple[str, str]:
-    """Return the facts of a shot in a few words, and the doubts about them."""
-    from napari_shadowinv.facts import Level
-
-    level, count = result.headline.level, len(result.cautions)
-    doubts = "" if level is Level.SOUND else f"  {level}"
-    if count:
-        doubts += f", {count} warning{'s' if count > 1 else ''}"
+    """Return the facts of a shot in a few words, and warnings that its verdict does not imply."""
+    count = len(result.cautions) if result.verdict == _DETERMINED else 0
+    doubts = f", {count} warning{'s' if count > 1 else ''}" if count else ""
     return "  ".join(fact.short for fact in result.facts if fact.short), doubts
 
 

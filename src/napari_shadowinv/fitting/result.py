@@ -25,7 +25,7 @@ from napari_shadowinv.facts import (
     in_headline,
     masked_fact,
     time_fact,
-    verdict_facts,
+    verdict_fact,
 )
 from napari_shadowinv.fitting.posterior import BeamError
 from napari_shadowinv.inversion.variables import (
@@ -337,8 +337,11 @@ class Fit:
         names : sequence of str
             A name for each image, or none.
         """
+        is_determined = self.verdict is Verdict.DETERMINED
+        level = Level.SOUND if is_determined else Level.DOUBTFUL
         return (
-            *verdict_facts(self.verdict, self.explanation),
+            verdict_fact(self.verdict),
+            Fact("verdict", "Reason" if is_determined else "Warning", self.explanation, level),
             *caution_facts(self.warnings),
             *self._image_facts(names),
             *(self._field_fact(field) for field in self.fields),

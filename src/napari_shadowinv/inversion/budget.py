@@ -67,6 +67,16 @@ _BEAM_TEXTS = {
     "references": "beam by its references, {:.2g} %",
     "outside": "beam measured outside the object, {:.2g} %",
 }
+_BASES = {
+    "assumed": "assumed",
+    "stated": "stated",
+    "seen": "seen outside the object",
+    "references": "by its references",
+    "outside": "measured outside the object",
+}
+
+_REDUCED_SHARE = 0.25  # of the wanted mean square, at least for parts that are to be reduced
+_REMEDIES = {"discretisation": "more sites", "solver": "a smaller tolerance"}
 
 
 class ErrorEstimate(NamedTuple):
@@ -102,6 +112,8 @@ class Errors:
     sensitivities : dict of str to ErrorEstimate
         Effects of imperfections of the instrument, by their names with a size, such as
         "background, 5 %".
+    sizes : dict of str to float
+        Standard deviations of the instrument that `effects` stand for, by their names.
     beam_variation : float
         Relative r.m.s. difference of beam and source that `beam` stands for.
     beam_scale : float
@@ -123,6 +135,7 @@ class Errors:
     beam: ErrorEstimate | None = None
     beam_sensitivity: ErrorEstimate | None = None
     sensitivities: dict[str, ErrorEstimate] = dataclasses.field(default_factory=dict)
+    sizes: dict[str, float] = dataclasses.field(default_factory=dict)
     beam_variation: float = 0.0
     beam_scale: float = ASSUMED_BEAM.length
     beam_basis: str = "assumed"
@@ -154,9 +167,117 @@ class Errors:
             noise = f"noise, correlated over {self.noise_correlation:.2g} px"
         parts = {noise: self.noise, "discretisation": self.discretisation, **self.effects}
         if self.beam is not None:
-            parts[_BEAM_TEXTS[self.beam_basis].format(100 * self.beam_variation)] = self.beam
+            parts[self._beam_name] = self.beam
         known = {name: error for name, error in parts.items() if not math.isnan(error.rms)}
         return dict(sorted(known.items(), key=lambda part: -part[1].rms))
+
+    @property
+    def _beam_name(self) -> str:
+        return _BEAM_TEXTS[self.beam_basis].format(100 * self.beam_variation)
+
+    @property
+    def limited_by(self) -> str:
+        """Largest part with its share of the displacement (r.m.s.), such as "beam 23 %"."""
+        name, error = next(iter(self.parts.items()))
+        return f"{self._title(name)} {_percent(error.rms, self.rms)}"
+
+    def _title(self, name: str) -> str:
+        return "beam" if name == self._beam_name else name.partition(",")[0]
+
+    @property
+    def share(self) -> float:
+        """Total as a share of the displacement (r.m.s.); infinite without a displacement."""
+        return self.total.rms / self.rms if self.rms > 0 else math.inf
+
+    @property
+    def share_text(self) -> str:
+        """Total as a share of the displacement (r.m.s.), such as "23 %"."""
+        return _percent(self.total.rms, self.rms)
+
+    @property
+    def largest_part(self) -> str:
+        """Largest part with its share, such as "beam 23 % (5 % rms over a quarter, assumed)"."""
+        name, error = next(iter(self.parts.items()))
+        return self._part_text(name, _percent(error.rms, self.rms))
+
+    @property
+    def ranking(self) -> str:
+        """The parts as shares of the displacement (r.m.s.), the largest first."""
+        return ", ".join(
+            self._part_text(name, _percent(error.rms, self.rms))
+            for name, error in self.parts.items()
+        )
+
+    def _part_text(self, name: str, share: str) -> str:
+        """Describe a part by its title, its share, and the deviation that it stands for."""
+        if name == self._beam_name:
+            size = f"{100 * self.beam_variation:.2g} % rms over {self._beam_length}"
+            return f"beam {share} ({size}, {_BASES[self.beam_basis]})"
+        title, _, size = name.partition(", ")
+        return f"{title} {share} ({size})" if size else f"{title} {share}"
+
+    @property
+    def _beam_length(self) -> str:
+        lengths = {0.25: "a quarter", 0.5: "half"}
+        return lengths.get(self.beam_scale, f"{self.beam_scale:.2g}")
+
+    def measure_next(self, share: float) -> str:
+        """Return what has to be known better for a total of at most `share`, and that total.
+
+        Parameters
+        ----------
+        share : float
+            Of the displacement (r.m.s.).
+
+        Returns
+        -------
+        str
+            Such as "with the beam known to 0.5 %: 12 %"; empty if the total is no larger.
+        """
+        if not self.rms > 0:
+            return ""
+        squares = {name: error.rms**2 for name, error in self.parts.items()}
+        wanted, rest = (share * self.rms) ** 2, self.total.rms**2
+        large: list[str] = []
+        for name, square in squares.items():
+            if rest <= wanted * (1 - _REDUCED_SHARE if large else 1):
+                break
+            large.append(name)
+            rest -= square
+        if not large:
+            return ""
+        statements = []
+        for name in large:
+            allowed = math.sqrt(max(wanted - rest, 0) / len(large) / squares[name])
+            statement, reached = self._statement(name, min(allowed, 1.0))
+            statements.append(statement)
+            squares[name] *= reached**2
+        total = math.sqrt(sum(squares.values()))
+        *others, last = statements
+        listed = f"{', '.join(others)} and {last}" if others else last
+        return f"with {listed}: {_percent(total, self.rms)}"
+
+    def _statement(self, name: str, factor: float) -> tuple[str, float]:
+        """Return what reduces a part by a factor, in round numbers, and their factor."""
+        title = self._title(name)
+        if title == "noise":
+            shots = math.ceil(factor**-2)
+            return f"{shots:,} shots averaged", shots**-0.5
+        if title in _REMEDIES:
+            return _REMEDIES[title], factor
+        if name == self._beam_name and self.beam_variation:
+            size, text, power, unit = self.beam_variation, "{:.1g} %", 1.0, 100.0
+        elif name in self.sizes:
+            size = self.sizes[name]
+            known = {each.title: each for each in IMPERFECTIONS}.get(title)
+            text, power, unit = "{:.1g} %", 1.0, 100.0
+            if known is not None:
+                text, unit = known.size_text, known.factor
+                power = 2.0 if known.is_even else 1.0
+        else:
+            return f"{factor:.1g} times the {title} error", factor
+        rounded = _round_down(unit * size * factor ** (1 / power))
+        return f"the {title} known to {text.format(rounded)}", (rounded / unit / size) ** power
 
     def accuracy_caution(self, accuracy: float, why: str) -> Caution | None:
         """Warn if the discretisation error exceeds the accuracy and is not hidden by noise."""
@@ -182,34 +303,33 @@ class Errors:
             lengths[name] = {cause: _scale_error(error, factor) for cause, error in table.items()}
         return dataclasses.replace(self, **lengths)
 
-    def with_scale(self, cause: str, share: float) -> Errors:
-        """Return the budget of a quantity whose scale has a relative error."""
-        size = ErrorEstimate(self.rms, self.peak)
-        return dataclasses.replace(self, effects={**self.effects, cause: _scale_error(size, share)})
+    def with_scale(self, cause: str, size: float, share: float) -> Errors:
+        """Return the budget of a quantity whose scale has a relative error `share` by a cause.
+
+        The cause, such as "energy, 5 %", is known to `size`.
+        """
+        lengths = ErrorEstimate(self.rms, self.peak)
+        effects = {**self.effects, cause: _scale_error(lengths, share)}
+        return dataclasses.replace(self, effects=effects, sizes={**self.sizes, cause: size})
 
     def rows(self, subject: str = "displacement") -> list[tuple[str, str]]:
         """Describe the budget of a subject in words: names and texts."""
-        parts = ", ".join(
-            f"{_percent(error.rms, self.rms)} ({cause})" for cause, error in self.parts.items()
-        )
         text = (
-            f"{_percent(self.total.rms, self.rms)} of the {subject} (r.m.s.): {parts}; crossing "
-            "rays are not in it"
+            f"{self.share_text} of the {subject} (r.m.s.): {self.ranking}; "
+            "crossing rays are not in it"
         )
         if math.isnan(self.discretisation.rms):
             text += "; discretisation was not estimated, as only one level was solved"
         rows = [("errors", text)]
+        if next_step := self.measure_next(self.share / 2):
+            rows.append(("measure next", next_step))
         if self.beam_sensitivity is not None:
-            length = {0.25: "a quarter"}.get(self.beam_scale, f"{self.beam_scale:.2g}")
-            basis = "recorded"
-            if self.beam is not None:
-                basis = _BEAM_TEXTS[self.beam_basis].format(100 * self.beam_variation)
-                basis = basis.removeprefix("beam ")
+            basis = "recorded" if self.beam is None else self._beam_name.removeprefix("beam ")
             rows.append(
                 (
                     "beam",
-                    f"{basis}; a source that differs from it by 1 % (r.m.s.) over {length} of the "
-                    "image's shorter side moves the displacement by "
+                    f"{basis}; a source that differs from it by 1 % (r.m.s.) over "
+                    f"{self._beam_length} of the image's shorter side moves the displacement by "
                     f"{_percent(self.beam_sensitivity.rms, self.rms)} (r.m.s.), its peak by "
                     f"{_percent(self.beam_sensitivity.at_peak, self.peak)}",
                 )
@@ -337,14 +457,18 @@ class Budget:
         shot = SolvedShot(self._prepared.in_units(), displacement, response, self.options.seed)
         effects: dict[str, ErrorEstimate] = {}
         sensitivities: dict[str, ErrorEstimate] = {}
+        sizes: dict[str, float] = {}
         for imperfection in IMPERFECTIONS:
-            sizes = imperfection.tested, imperfection.stated(self.instrument)
-            for size, errors in zip(sizes, (sensitivities, effects), strict=True):
+            stated = imperfection.stated(self.instrument)
+            for size, errors in ((imperfection.tested, sensitivities), (stated, effects)):
                 if size:
                     pattern = imperfection.pattern(shot, size)
                     errors[imperfection.name(size)] = estimate(response.to(pattern))
+            if stated:
+                sizes[imperfection.name(stated)] = stated
         if share := self.instrument.other_field:
-            effects[f"other field, {100 * share:.2g} %"] = _scale_error(lengths, share)
+            name = f"other field, {100 * share:.2g} %"
+            effects[name], sizes[name] = _scale_error(lengths, share), share
         by_percent = estimate(_TESTED_VARIATION * response.to(self._beams(response)))
         beam = _scale_error(by_percent, variation / _TESTED_VARIATION) if variation else None
         components = self._beam.components
@@ -363,6 +487,7 @@ class Budget:
             beam=beam,
             beam_sensitivity=by_percent,
             sensitivities=sensitivities,
+            sizes=sizes,
             beam_variation=variation,
             beam_scale=self._beam.length,
             beam_basis=basis,
@@ -554,6 +679,12 @@ def _near(peak: FloatArray, places: FloatArray, spacing: float) -> FloatArray:
 
 def _roots(square: float, square_at_peak: float) -> ErrorEstimate:
     return ErrorEstimate(math.sqrt(square), math.sqrt(square_at_peak))
+
+
+def _round_down(number: float) -> float:
+    """Return a positive number with one digit."""
+    step = 10.0 ** math.floor(math.log10(number))
+    return float(f"{math.floor(number / step + 1e-9) * step:.1g}")
 
 
 def _percent(error: float, total: float) -> str:

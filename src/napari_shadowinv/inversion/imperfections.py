@@ -228,8 +228,12 @@ class Imperfection:
 
     def name(self, size: float) -> str:
         """Return the title with the size, such as "background, 5 %"."""
-        factor = 100 if "%" in self.size_text else 1
-        return f"{self.title}, {self.size_text.format(factor * size)}"
+        return f"{self.title}, {self.size_text.format(self.factor * size)}"
+
+    @property
+    def factor(self) -> float:
+        """Factor from the standard deviation to the number in its text."""
+        return 100 if "%" in self.size_text else 1
 
     def stated(self, instrument: Instrument) -> float:
         """Return the standard deviation in an instrument."""

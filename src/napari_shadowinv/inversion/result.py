@@ -20,14 +20,16 @@ from napari_shadowinv.facts import (
     Headline,
     Level,
     ResultKind,
+    Verdict,
     caution_facts,
     error_fact,
     in_headline,
     masked_fact,
     time_fact,
+    verdict_fact,
 )
 from napari_shadowinv.inversion.budget import Errors
-from napari_shadowinv.inversion.solution_checks import image_residual
+from napari_shadowinv.inversion.solution_checks import Assessment, assess_verdict, image_residual
 from napari_shadowinv.inversion.variables import VARIABLES, dataset_from_field, setup_from_dataset
 from napari_shadowinv.options import Instrument, InversionOptions
 from napari_shadowinv.physics.units import label, numbers_of, peak_facts, shown_fields
@@ -191,7 +193,7 @@ class Inversion:
         if not share:
             return self.errors
         noun = setup.beam_quantity().noun
-        return self.errors.with_scale(f"{noun}, {100 * error:.2g} %", share)
+        return self.errors.with_scale(f"{noun}, {100 * error:.2g} %", error, share)
 
     @property
     def cautions(self) -> tuple[Caution, ...]:
@@ -226,8 +228,31 @@ class Inversion:
         return None if self.provenance is None else self.provenance.setup
 
     @property
+    def verdict(self) -> Verdict:
+        """Whether the field is known within the largest error of the options."""
+        return self.assess_in(self.setup).verdict
+
+    def assess_in(self, setup: Setup | None) -> Assessment:
+        """Return the verdict on the main field of a setup, with its reason.
+
+        Parameters
+        ----------
+        setup : Setup or None
+            None: the verdict on the displacement.
+        """
+        errors = self.errors_in(setup)
+        subject = "displacement" if errors is self.errors else "field"
+        return assess_verdict(
+            self.report.warnings,
+            errors,
+            self.options.max_error,
+            subject,
+            converged=self.report.converged,
+        )
+
+    @property
     def headline(self) -> Headline:
-        """Warnings and the peak of the main field in one line."""
+        """Verdict, warnings and the peak of the main field in one line."""
         return self.headline_in(self.setup)
 
     def headline_in(self, setup: Setup | None) -> Headline:
@@ -241,12 +266,13 @@ class Inversion:
         errors = self.errors_in(setup)
         error = None if errors is None else errors.of_peak
         (field,) = shown_fields([self.displacement], setup, mask=self.mask)
-        cautions = self.report.warnings
-        texts = in_headline(each for each in cautions if each.code != "not-converged")
-        level = Level.DOUBTFUL if texts else Level.SOUND
+        assessment, cautions = self.assess_in(setup), self.report.warnings
+        texts = [f"{assessment.verdict.upper()}: {assessment.reason}"]
+        texts += in_headline(each for each in cautions if each is not assessment.caution)
+        is_sound = assessment.verdict is Verdict.DETERMINED and not cautions
+        level = Level.SOUND if is_sound else Level.DOUBTFUL
         if not self.report.converged:
             level = Level.FAILED
-            texts.insert(0, "not converged: do not trust the field")
         return Headline(level, "; ".join([*texts, field.peak_text(error)]))
 
     @property
@@ -269,6 +295,7 @@ class Inversion:
         }
         convergence = Level.SOUND if report.converged else Level.FAILED
         return (
+            verdict_fact(self.assess_in(setup).verdict),
             *caution_facts(report.warnings),
             *peak_facts(
                 self.displacement,
@@ -348,8 +375,9 @@ class Inversion:
         -------
         xarray.Dataset
             Dimensions y, x, component ("y", "x") and site. Each variable has ``units`` and
-            ``long_name``; options, report (with the errors in px), setup and ``errors_si`` (the
-            errors of the setup's main field) are JSON texts in the attributes.
+            ``long_name``; verdict and explanation are attributes; options, report (with the errors
+            in px), setup and ``errors_si`` (the errors of the setup's main field) are JSON texts
+            in the attributes.
         """
         history = {
             "format": self.kind.value,
@@ -361,7 +389,8 @@ class Inversion:
         if self.provenance is not None:
             history["provenance"] = self.provenance.to_json()
             setup = self.setup if setup is None else setup
-        errors = self.errors_in(setup)
+        errors, assessment = self.errors_in(setup), self.assess_in(setup)
+        history |= {"verdict": assessment.verdict.value, "explanation": assessment.reason}
         if errors is not None and setup is not None:
             field = setup.main_field
             (unit,) = (si_field.unit for si_field in setup.si_fields if si_field.name == field.name)

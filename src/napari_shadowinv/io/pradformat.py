@@ -202,11 +202,12 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
         "inversion_type": "simple",
         "dr": setup.object_pixel_size,
         **_beam_attributes(setup),
-        "description": "Power-diagram inversion by napari-shadowinv",
     }
+    method = ResultKind.of(dataset.attrs).noun.capitalize()
     verdict = dataset.attrs.get("verdict")
-    if verdict:
-        attributes["description"] = f"Fit of the forward model by napari-shadowinv: {verdict}"
+    attributes["description"] = ": ".join(
+        filter(None, [f"{method} by napari-shadowinv", verdict and str(verdict)])
+    )
     provenance = Provenance.of(dataset.attrs)
     if provenance is not None:
         attributes["provenance"] = provenance.to_json()

@@ -116,8 +116,8 @@ COLUMNS: tuple[Column, ...] = (
         "verdict",
         "Whether the field may be believed",
         kind=str,
-        stores=(FITS,),
-        value=lambda fit: str(fit.verdict),
+        stores=(INVERSIONS, ROWS, FITS),
+        value=lambda result: str(result.verdict),
         format="s",
         width=len("determined"),  # not broken into letters
     ),
@@ -146,6 +146,23 @@ COLUMNS: tuple[Column, ...] = (
         format=".2%",
     ),
     Column(
+        "total_error",
+        "errors",
+        "Error of the displacement, r.m.s., as a share of it",
+        stores=(INVERSIONS, ROWS),
+        value=lambda result: result.errors and result.errors.share,
+    ),
+    Column(
+        "limited_by",
+        "limited by",
+        "Largest part of the error, as a share of the displacement",
+        kind=str,
+        stores=(INVERSIONS, ROWS),
+        value=lambda result: result.errors and result.errors.limited_by,
+        format="s",
+        width=len("beam 12 %"),
+    ),
+    Column(
         "converged",
         "converged",
         "Whether the solver converged",
@@ -167,7 +184,6 @@ COLUMNS: tuple[Column, ...] = (
         kind=int,
         stores=(INVERSIONS, ROWS),
         value=attrgetter("report.iterations"),
-        format="d",
     ),
     Column(
         "iterations",

@@ -55,6 +55,17 @@ class InversionOptions(CheckedModel):
             "other than 'newton'."
         ),
     )
+    max_error: float = Field(
+        default=0.05,
+        gt=0,
+        le=1,
+        title="Largest error",
+        description=(
+            "Largest error of a determined field (relative r.m.s., sum of the error budget). With "
+            "a larger one the verdict is 'too uncertain'."
+        ),
+        json_schema_extra=_BUDGET,
+    )
     floor: float = Field(
         default=1e-3,
         gt=0,

@@ -281,7 +281,7 @@ def test_proton_radiograph_is_clicked_to_its_end(
     wrong = layer_of(window, "field")
     assert wrong is not field
     assert field in window.layers
-    assert wrong.name.endswith("(doubtful)")
+    assert wrong.name.endswith("(reaches the edge)")
     peak, error = (float(number) for number in re.findall(r"now ([\d.]+) ± ([\d.]+) mT", text)[0])
     assert float(wrong.data.max()) == pytest.approx(peak, abs=0.06)
     assert f"{peak} ± {error} mT" in report_of(tool)

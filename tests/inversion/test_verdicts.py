@@ -1,0 +1,102 @@
+"""The verdict on an inversion, and what has to be measured for a better one."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from napari_shadowinv import InversionOptions, invert, synthetic_image
+from napari_shadowinv.cautions import CAUTION_CODES, Caution
+from napari_shadowinv.facts import Level, Verdict
+from napari_shadowinv.inversion.budget import ErrorEstimate
+from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+
+FEW = InversionOptions(n_sites=900)
+
+
+@pytest.fixture(scope="module")
+def image():
+    return synthetic_image(gaussian_blob((60, 72), 30.0, 8.0).displacement)
+
+
+def stated_deviations(text):
+    """Read "the beam known to 0.5 %" of a text as numbers of an `Instrument`."""
+    found = re.findall(r"the ([a-z ]+) known to ([\d.e-]+) ?(%?)", text)
+    return {name: float(number) / (100 if percent else 1) for name, number, percent in found}
+
+
+@pytest.mark.parametrize("instrument", [{"beam_rms": 0.03}, {"beam_rms": 0.0, "blur": 3.0}])
+def test_measure_next_is_the_total_with_that_instrument(image, instrument):
+    first = invert(image, options=FEW, instrument=instrument).errors
+    text = first.measure_next(first.share / 2)
+    better = stated_deviations(text)
+    assert set(better) == {"beam" if instrument["beam_rms"] else "blur"}
+    changes = {"beam_rms" if name == "beam" else name: size for name, size in better.items()}
+    second = invert(image, options=FEW, instrument=instrument | changes).errors
+    assert text.endswith(f": {second.share_text}")
+    assert second.share <= first.share / 2
+
+
+def test_measure_next_of_noise_is_an_average(image):
+    noisy = image + np.random.default_rng(1).normal(0, 0.2, image.shape)
+    errors = invert(noisy, source=np.ones(image.shape), options=FEW).errors
+    assert errors.limited_by.startswith("noise ")
+    shots = int(re.search(r"with (\d+) shots averaged", errors.measure_next(errors.share / 2))[1])
+    averaged = dataclasses.replace(
+        errors, noise=ErrorEstimate(*np.divide(errors.noise, shots**0.5))
+    )
+    assert averaged.share <= errors.share / 2
+    assert errors.measure_next(1.1 * errors.share) == ""
+
+
+def test_the_total_against_the_largest_error_decides_the_verdict(image):
+    inversion = invert(image, options=FEW, instrument={"beam_rms": 0.001})
+    share = inversion.errors.share
+    for factor, verdict in ((1.01, Verdict.DETERMINED), (0.99, Verdict.UNCERTAIN)):
+        options = FEW.model_copy(update={"max_error": factor * share})
+        again = dataclasses.replace(inversion, options=options)
+        assert again.verdict is verdict
+        assert again.headline.text.startswith(f"{verdict.upper()}: errors of ")
+        assert (again.headline.level is Level.SOUND) == (verdict is Verdict.DETERMINED)
+
+
+def test_the_error_of_the_energy_counts_for_the_field_alone(image):
+    instrument = {"beam_rms": 0.0, "energy": 0.4}
+    inversion = invert(image, options=FEW, instrument=instrument)
+    assert inversion.assess_in(None).verdict is Verdict.DETERMINED
+    verdict, reason, _ = inversion.assess_in(paper_setup())
+    assert verdict is Verdict.UNCERTAIN
+    assert "energy" in reason
+    assert "the energy known to" in reason
+
+
+def test_an_error_beyond_proportion_is_said_to_be_rough(image):
+    errors = [invert(image, options=FEW, instrument={"beam_rms": rms}) for rms in (0.002, 0.3)]
+    assert errors[0].errors.share < 0.5 < errors[1].errors.share
+    assert ["not proportional" in each.headline.text for each in errors] == [False, True]
+
+
+def test_errors_of_zero_displacement_are_not_determined():
+    inversion = invert(np.ones((32, 32)), options=FEW)
+    assert inversion.verdict is Verdict.UNCERTAIN
+    assert inversion.errors.measure_next(0.05) == ""
+
+
+@pytest.mark.parametrize(
+    ("code", "verdict"),
+    [
+        ("misfit", Verdict.MISFIT),
+        ("folds", Verdict.AMBIGUOUS),
+        ("closed-edge", Verdict.EDGE),
+        ("cut-object", Verdict.EDGE),
+        ("masked-peak", Verdict.UNCERTAIN),
+    ],
+)
+def test_a_caution_about_the_solution_decides_the_verdict(image, code, verdict):
+    inversion = invert(image, source=np.ones(image.shape), options=FEW)
+    assert inversion.verdict is Verdict.DETERMINED
+    doubtful = inversion.with_warnings([Caution(code, "a sentence")])
+    assert doubtful.verdict is verdict
+    assert doubtful.to_dataset().attrs["verdict"] == verdict
+    assert doubtful.headline.text.startswith(f"{verdict.upper()}: {CAUTION_CODES[code]}; peak ")
