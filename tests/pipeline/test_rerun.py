@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import chdir
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -146,14 +147,34 @@ def shot_of_stack(folder: Path) -> Example:
 KINDS = (inversion, fit, refinement, leave_one_out, film_pack, energy_windows, shot_of_stack)
 
 
-@pytest.fixture
-def example(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: Any) -> Example:
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def example(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Example]:
+    """A result in its folder, which is the current one; a test that changes its files is last."""
     make: Callable[[Path], Example] = request.param
-    return make(tmp_path)
+    with chdir(tmp_path_factory.mktemp(make.__name__)):
+        yield make(Path.cwd())
 
 
 every_kind = pytest.mark.parametrize("example", KINDS, indirect=True, ids=lambda f: f.__name__)
+
+
+@every_kind
+def test_a_file_elsewhere_is_asked_for(example: Example) -> None:
+    dataset, foreign = example.dataset, "../private/shot.npy"
+    provenance = json.loads(provenance_of(dataset).to_json())
+    for part in (provenance, provenance.get("start", {})):
+        for image in part.get("images", []):
+            image["file"] = foreign
+    if "pack" in provenance:
+        provenance["pack"]["layers"][0]["file"] = foreign
+    dataset = dataset.drop_vars("report", errors="ignore")
+    harmful = dataset.assign_attrs(provenance=json.dumps(provenance))
+    with pytest.raises(InputError, match=f"names .* {foreign}, which is in another folder"):
+        rerun(harmful)
+    with pytest.raises(FileFormatError, match=r"shot.npy"):
+        rerun(harmful, other_folders=True)
 
 
 @every_kind
@@ -196,20 +217,3 @@ def test_a_result_is_repeated_bit_for_bit(example: Example, tmp_path: Path) -> N
     example.image.unlink()
     with pytest.raises(FileFormatError, match=f"{name} does not exist"):
         rerun(example.result)
-
-
-@every_kind
-def test_a_file_elsewhere_is_asked_for(example: Example, tmp_path: Path) -> None:
-    dataset, foreign = example.dataset, "../private/shot.npy"
-    provenance = json.loads(provenance_of(dataset).to_json())
-    for part in (provenance, provenance.get("start", {})):
-        for image in part.get("images", []):
-            image["file"] = foreign
-    if "pack" in provenance:
-        provenance["pack"]["layers"][0]["file"] = foreign
-    dataset = dataset.drop_vars("report", errors="ignore")
-    harmful = dataset.assign_attrs(provenance=json.dumps(provenance))
-    with pytest.raises(InputError, match=f"names .* {foreign}, which is in another folder"):
-        rerun(harmful)
-    with pytest.raises(FileFormatError, match=r"shot.npy"):
-        rerun(harmful, other_folders=True)

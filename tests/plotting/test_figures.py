@@ -42,7 +42,7 @@ def panels(figure: Figure) -> list[Any]:
 
 
 def assert_nothing_overlaps(figure: Figure) -> None:
-    figure.canvas.draw()
+    figure.draw_without_rendering()
     boxes = [axes.get_tightbbox() for axes in panels(figure)]
     texts = [text.get_window_extent() for text in figure.texts]
     page = figure.bbox
@@ -71,7 +71,7 @@ def test_no_panel_touches_another_or_leaves_the_page(
 @pytest.mark.parametrize("shape", SHAPES)
 def test_pixels_are_square(make_inversion: Make, shape: tuple[int, int]) -> None:
     figure = report_figure(make_inversion(shape))
-    figure.canvas.draw()
+    figure.draw_without_rendering()
     for axes in panels(figure)[:5]:
         box = axes.get_window_extent()
         assert box.height / box.width == pytest.approx(shape[0] / shape[1], rel=0.01)
