@@ -3,7 +3,7 @@
 import pytest
 
 from napari_shadowinv import BeamPrior, InputError, Instrument, Recipe
-from napari_shadowinv.cli._flags import recipe_of
+from napari_shadowinv.cli._flags import _option_flags, recipe_of
 from napari_shadowinv.options import BEAM_SOURCES, DETECTORS
 from napari_shadowinv.pipeline import read_recipe, write_recipe
 
@@ -48,3 +48,11 @@ def test_flags_replace_the_detector_of_a_recipe():
     base = Recipe(instrument=Instrument.of("film", blur=2))
     flagged = recipe_of({"detector": "CR-39", "gamma": 0.2}, base, {})
     assert flagged.instrument == Instrument.of("CR-39", blur=2, gamma=0.2)
+
+
+def test_flags_list_the_detectors_and_the_sources_of_beams():
+    kinds = dict(_option_flags(Instrument, None))
+    (flag,) = kinds["detector"].annotation.__metadata__
+    assert flag.metavar == "film|image plate|CR-39|scintillator|camera"
+    (flag,) = kinds["beam_source"].annotation.__metadata__
+    assert flag.metavar == "TNSA|implosion|X-ray tube|laser"

@@ -314,8 +314,9 @@ def _type_of(field: FieldInfo) -> tuple[Any, str | None]:
     """Return the type of a flag, and the placeholder for its value in the help."""
     annotation: Any = field.annotation
     kinds = [kind for kind in get_args(annotation) or (annotation,) if kind is not type(None)]
-    if get_origin(annotation) is Literal:
-        return str, "|".join(get_args(annotation))
+    choices = next((kind for kind in (annotation, *kinds) if get_origin(kind) is Literal), None)
+    if choices is not None:
+        return str, "|".join(get_args(choices))
     if kinds == [bool]:
         return bool, None
     if len(kinds) == 1 and kinds[0] in (int, float):

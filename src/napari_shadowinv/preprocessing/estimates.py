@@ -352,7 +352,7 @@ class KrigedEstimate(Estimate):
     """A smooth random beam, predicted from around the object with its error."""
 
     needs_mask = True
-    title = "predicted from around the object"
+    title = "predicted under the mask"
     function = staticmethod(kriged_source)
     place = 80
     method: Literal["kriged"] = "kriged"
