@@ -94,6 +94,20 @@ def test_dark_level_of_image_and_source_needs_no_deep_shadows():
     assert np.count_nonzero(alone) < 4
 
 
+def test_most_dark_levels_of_a_tenth_show_in_shallow_shadows():
+    truth = toroid(SHAPE, paper_setup(), 97.0, 30e-6).displacement
+    clean = synthetic_image(truth, beam())
+    levels = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        image, source = (rng.poisson(COUNTS * plane).astype(float) for plane in (clean, beam()))
+        offset = 0.1 * image.mean()
+        levels.append(dark_level(image + offset, None, source + offset))
+        assert dark_level(image, None, source) == 0
+    assert np.count_nonzero(levels) >= 8
+    assert np.median(levels) == pytest.approx(0.1 / 1.1, rel=0.15)
+
+
 @pytest.mark.parametrize(("uneven", "speckle"), [(0.03, 0.0), (0.0, 0.1), (0.01, 0.03)])
 def test_noise_in_proportion_to_the_signal_is_no_dark_level(uneven, speckle):
     truth = toroid(SHAPE, paper_setup(), 97.0, 30e-6).displacement

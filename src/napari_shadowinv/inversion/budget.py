@@ -43,6 +43,7 @@ from napari_shadowinv.transport.solvers import LevelSolution, Target
 
 __all__ = ["FLUX_ERRORS", "Budget", "ErrorEstimate", "Errors"]
 
+_AROUND = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])  # px
 _PLACES = 48  # along the longer side, where levels are compared
 _USUAL_RATE, _RATES = 0.35, (0.25, 0.7)  # of the change between levels to the one before
 _MIN_STEP = 3.0  # times the sites of the level before, for a full step
@@ -519,8 +520,8 @@ class Budget:
         """Return the displacement at the places, shape (2, n), as in the read-out."""
         if solution not in self._moves:
             places = self._places.T + self._plan.margin_width
-            steps = np.concatenate([places + step for step in ((1, 0), (-1, 0), (0, 1), (0, -1))])
-            y_high, y_low, x_high, x_low = np.split(solution.surface(steps), 4)
+            around = (places[:, None] + _AROUND).reshape(-1, 2)
+            y_high, y_low, x_high, x_low = solution.surface(around).reshape(-1, len(_AROUND)).T
             self._moves[solution] = np.stack([y_low - y_high, x_low - x_high]) / 2
         return self._moves[solution]
 

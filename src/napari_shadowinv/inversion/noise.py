@@ -19,7 +19,8 @@ source is a plane plus noise, and its differences between such tiles are differe
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -195,12 +196,14 @@ class ImageNoise:
         excess = (image - prepared.source) / mean
         used = mask[1:, 1:] & mask[1:, :-1] & mask[:-1, 1:] & mask[:-1, :-1]
         differences = _finest(excess, used)
-        if correlation is None:
-            inflation, self.clumping = _correlation(excess, mask)
-            self.is_correlated_far = self.clumping == 1 and _is_correlated_far(excess, mask)
-        else:
+        self.is_correlated_far = False
+        if correlation is not None:
             inflation, self.clumping = _stated_correlation(excess, mask, correlation)
-            self.is_correlated_far = False
+        elif (tiles := _Tiles.of(excess, mask)) is None:
+            inflation = self.clumping = 1.0
+        else:
+            inflation, self.clumping = _correlation(tiles)
+            self.is_correlated_far = self.clumping == 1 and _is_correlated_far(tiles)
         self.largest = _rms(differences) * math.sqrt(inflation)
         self.typical = _clipped_rms(differences) * math.sqrt(inflation)
         # The source's mean, in units of the recorded image.
@@ -260,28 +263,58 @@ def _clipped_rms(differences: FloatArray) -> float:
     return _rms(np.minimum(differences, limit)) if limit > 0 else _rms(differences)
 
 
-def _correlation(excess: FloatArray, mask: BoolArray) -> tuple[float, float]:
+@dataclass(frozen=True, eq=False)
+class _Tiles:
+    """Tiles of an image on a grid, each with the pixels at a lag; not all are used."""
+
+    values: FloatArray
+    used: BoolArray
+    side: int
+    lag: int
+
+    @classmethod
+    def of(cls, excess: FloatArray, mask: BoolArray, lag: int | None = None) -> _Tiles | None:
+        """Cut an image into tiles; None if it has too few."""
+        side = _TILE_PX if min(excess.shape) >= _MIN_SIDE_PX else _SMALL_TILE_PX
+        if lag is None:
+            lag = max(known for known in _LAGS_PX if known < side)
+        size = side + lag
+        if _MIN_TILES * side + lag > min(excess.shape):
+            return None
+        steps = [max(side, -(-(n - size) // _MAX_TILES)) for n in excess.shape]
+        places = np.s_[:: steps[0], :: steps[1]]
+        values = sliding_window_view(excess, (size, size))[places]
+        used = sliding_window_view(mask, (size, size))[places].all(axis=(2, 3))
+        return cls(values, np.asarray(used), side, lag)
+
+    @cached_property
+    def quiet(self) -> FloatArray:
+        """Tiles with the least structure around them, without hot pixels."""
+        tiles = _without_hot_pixels(self.values)
+        finest = _difference_variance(tiles, self.side, 1)
+        used = self.used & (finest > 0)
+        far = _difference_variance(tiles, self.side, self.lag)
+        around = _average_neighbours(np.where(used, far / np.where(used, finest, 1.0), 1.0))
+        return tiles[used & (around <= np.quantile(around, _QUIET_SHARE))]
+
+
+def _correlation(tiles: _Tiles) -> tuple[float, float]:
     """Return the variance of a pixel relative to the finest differences, and the clumping."""
-    side = _TILE_PX if min(excess.shape) >= _MIN_SIDE_PX else _SMALL_TILE_PX
-    lags = [lag for lag in _LAGS_PX if lag < side]
-    if _MIN_TILES * side + lags[-1] > min(excess.shape):
+    side, lags = tiles.side, [lag for lag in _LAGS_PX if lag <= tiles.lag]
+    finest = _difference_variance(tiles.values, side, 1)
+    rising = _difference_variance(tiles.values, side, _RISE_LAG_PX) > _MIN_RISE * finest
+    if (tiles.used & (finest > 0) & rising).mean() < _QUIET_SHARE * (1 - _LOW_QUANTILE):
         return 1.0, 1.0
-    tiles, used = _tiles(excess, mask, side, lags[-1])
-    finest = _difference_variance(tiles, side, 1)
-    used &= finest > 0
-    is_rising = used & (_difference_variance(tiles, side, _RISE_LAG_PX) > _MIN_RISE * finest)
-    if is_rising.mean() < _QUIET_SHARE * (1 - _LOW_QUANTILE):
-        return 1.0, 1.0
-    tiles = _quiet_tiles(tiles, used, side, lags[-1])
-    count = len(tiles)
+    quiet = tiles.quiet
+    count = len(quiet)
     if count < _MIN_TILES:
         return 1.0, 1.0
-    finest = _difference_variance(tiles, side, 1)
-    rise = _difference_variance(tiles, side, _RISE_LAG_PX) / np.maximum(finest, 1e-300)
+    finest = _difference_variance(quiet, side, 1)
+    rise = _difference_variance(quiet, side, _RISE_LAG_PX) / np.maximum(finest, 1e-300)
     least = max(_MIN_RISE, 1 + _RISE_DEVIATIONS / math.sqrt(count))
     if np.quantile(rise, _LOW_QUANTILE) < least or np.log(rise).std() > _MAX_UNEVENNESS:
         return 1.0, 1.0
-    variances = [_difference_variance(tiles, side, lag) for lag in lags]
+    variances = [_difference_variance(quiet, side, lag) for lag in lags]
     ratios = np.array([np.median(variance / finest) for variance in variances])
     if ratios[-1] > _MAX_PLATEAU_RISE * ratios[-2]:
         return 1.0, 1.0  # structure, which grows with the distance
@@ -304,54 +337,26 @@ def _stated_correlation(excess: FloatArray, mask: BoolArray, width: float) -> tu
     # The nearest pixels hardly differ: the noise is measured where they are nearly independent.
     lag = min(math.ceil(2 * width), _LAGS_PX[-1])
     near, far = ((1 - math.exp(-((d / width) ** 2) / 4)) ** 2 for d in (1, lag))
-    side = _TILE_PX if min(excess.shape) >= _MIN_SIDE_PX else _SMALL_TILE_PX
-    if _MIN_TILES * side + lag > min(excess.shape):
+    tiles = _Tiles.of(excess, mask, lag)
+    if tiles is None or len(tiles.quiet) < _MIN_TILES:
         return 1 / near, clumping
-    tiles = _quiet_tiles(*_tiles(excess, mask, side, lag), side, lag)
-    if len(tiles) < _MIN_TILES:
-        return 1 / near, clumping
-    ratio = _difference_variance(tiles, side, lag) / _difference_variance(tiles, side, 1)
+    far_variance, finest = (_difference_variance(tiles.quiet, tiles.side, d) for d in (lag, 1))
+    ratio = far_variance / finest
     return float(np.median(ratio)) / far, clumping
 
 
-def _is_correlated_far(excess: FloatArray, mask: BoolArray) -> bool:
+def _is_correlated_far(tiles: _Tiles) -> bool:
     """Whether tiles vary over many pixels, all of them alike, as noise does and structure not."""
-    lag = _LAGS_PX[-1]
-    if min(excess.shape) < _MIN_SIDE_PX:
+    if tiles.side < _TILE_PX or len(tiles.quiet) < _MIN_FAR_TILES:
         return False
-    tiles = _quiet_tiles(*_tiles(excess, mask, _TILE_PX, lag), _TILE_PX, lag)
-    if len(tiles) < _MIN_FAR_TILES:
-        return False
-    far = _difference_variance(tiles, _TILE_PX, lag)
-    rise = far / _difference_variance(tiles, _TILE_PX, 1)
+    far = _difference_variance(tiles.quiet, tiles.side, tiles.lag)
+    rise = far / _difference_variance(tiles.quiet, tiles.side, 1)
     return bool(
         np.quantile(rise, _LOW_QUANTILE) > _MIN_FAR_RISE
         and np.log(rise).std() < _MAX_FAR_UNEVENNESS
         and np.log(far).std() < _MAX_FAR_SPREAD
         and np.median(far) > _MIN_DEVIATION**2
     )
-
-
-def _quiet_tiles(tiles: FloatArray, used: BoolArray, side: int, lag: int) -> FloatArray:
-    """Choose the tiles with the least structure around them, without hot pixels."""
-    tiles = _without_hot_pixels(tiles)
-    finest = _difference_variance(tiles, side, 1)
-    used = used & (finest > 0)
-    rise = np.where(used, _difference_variance(tiles, side, lag) / np.where(used, finest, 1.0), 1.0)
-    around = _average_neighbours(rise)
-    return tiles[used & (around <= np.quantile(around, _QUIET_SHARE))]
-
-
-def _tiles(
-    excess: FloatArray, mask: BoolArray, side: int, lag: int
-) -> tuple[FloatArray, BoolArray]:
-    """Return tiles on a grid, each with the pixels at a lag, and which are usable."""
-    size = side + lag
-    steps = [max(side, -(-(n - size) // _MAX_TILES)) for n in excess.shape]
-    places = np.s_[:: steps[0], :: steps[1]]
-    tiles = sliding_window_view(excess, (size, size))[places]
-    used = sliding_window_view(mask, (size, size))[places].all(axis=(2, 3))
-    return tiles, np.asarray(used)
 
 
 def _without_hot_pixels(tiles: FloatArray) -> FloatArray:

@@ -60,6 +60,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy import ndimage
 
+from napari_shadowinv._system.arrays import complete_block_means
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Verdict
@@ -156,6 +157,7 @@ _AT_EDGE = 0.8  # of the peak
 _CROSSING = 0.1  # of the displacement along the edge
 
 _CONTRAST_BLUR = 0.025  # of the shorter side
+_BIN_SHARE = 0.3  # of the blur's width: side of the pixels' bins
 _MIN_EDGE_CONTRAST = 0.4  # of the strongest contrast of the same sign
 _MAX_OPPOSITE_CONTRAST = 0.35  # of the contrast at an edge, at the opposite edge
 _MIN_SIGN_CONTRAST = 0.03  # of the strongest contrast
@@ -490,7 +492,9 @@ def _cut_by_edge(prepared: Prepared, noise: ImageNoise, beam_difference: float) 
     is_lit = mask & (prepared.source > 0)
     ratio = prepared.image / np.where(is_lit, prepared.source, 1.0)
     contrast = np.where(is_lit, ratio / (prepared.image[mask].mean() / mean) - 1, 0.0)
-    contrast = ndimage.gaussian_filter(contrast, width, truncate=3.0)
+    step = max(1, int(_BIN_SHARE * width))
+    contrast = complete_block_means(contrast, step)
+    contrast = ndimage.gaussian_filter(contrast, width / step, truncate=3.0)
     # Along an edge the noise is √2 times as large, in a corner twice.
     by_noise = noise.typical * np.sqrt(noise.clumping / (2 * np.pi)) / width
     strongest = float(np.abs(contrast).max())

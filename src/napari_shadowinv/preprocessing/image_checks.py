@@ -31,7 +31,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import fft, ndimage
 from scipy.optimize import nnls
 
-from napari_shadowinv._system.arrays import NORMAL_MAD, blocks_of, order_by_value
+from napari_shadowinv._system.arrays import NORMAL_MAD, complete_block_means, order_by_value
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 
@@ -53,7 +53,7 @@ _PLATEAU_EXCESS = 4.0  # pixels at the maximum over those just below
 _STRAY_RATIO, _STRAY_DEVIATIONS = 1.5, 10.0
 _MAX_NEIGHBOUR_DIFFERENCE = 0.3  # of the surroundings' brightness, by which a neighbour may differ
 _STRAY_STEP = 0.05  # of the mean, from the pixel on the left
-_NOISE_SAMPLES = 100_000
+_NOISE_SAMPLES = 50_000
 
 # Reference
 _COARSE_SIDE_PX = 128
@@ -189,7 +189,7 @@ def stray_pixels(image: FloatArray, mask: BoolArray | None = None) -> BoolArray:
     """
     stray = np.zeros(image.shape, bool)
     part = image[:: max(1, image.size // _NOISE_SAMPLES)]
-    mean = float(part.mean() if mask is None else image[mask].mean())
+    mean = float(image.mean() if mask is None or mask.all() else image[mask].mean())
     if not mean > 0:
         return stray
     bends = part[:, 3:] - 3 * part[:, 2:-1] + 3 * part[:, 1:-2] - part[:, :-3]
@@ -300,12 +300,10 @@ class ReferencePair:
     def _blocks(self) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Image and source in blocks of pixels, of mean 1, and the blocks that are usable."""
         step = _coarse_step(self.image.shape)
-        usable = blocks_of(self.mask, step).mean(axis=(1, 3)) > _MIN_USABLE_SHARE
-        planes = []
-        for plane in (self.image, self.source):
-            blocks = blocks_of(plane, step).mean(axis=(1, 3))
-            planes.append(blocks / max(float(blocks[usable].mean()), 1e-300))
-        return planes[0], planes[1], usable
+        usable = complete_block_means(self.mask, step) > _MIN_USABLE_SHARE
+        planes = [complete_block_means(plane, step) for plane in (self.image, self.source)]
+        shot, beam = (plane / max(float(plane[usable].mean()), 1e-300) for plane in planes)
+        return shot, beam, usable
 
     @cached_property
     def _ring(self) -> BoolArray:
@@ -413,7 +411,8 @@ def _fits_after(
     return len(better) >= _MIN_SIDES and sum(better) >= len(better) - 1
 
 
-_MAX_NOISE_SAMPLES = 120_000
+_WINDOW_PX = 4  # side of the squares in which noise is measured
+_MAX_NOISE_SAMPLES = 80_000
 _N_BRIGHTNESS_BINS = 20
 _BRIGHTEST_LEFT_OUT = 0.05  # share of the pixels: bright lines are not smooth
 _CLIP_DEVIATIONS, _CLIPPED_VARIANCE = (
@@ -421,14 +420,14 @@ _CLIP_DEVIATIONS, _CLIPPED_VARIANCE = (
     0.9733,
 )  # standard deviations; variance of a clipped normal
 _MIN_PIXELS = 4000
-_INDEPENDENT_SHARE = 1 / 3  # of the differences, which share pixels
+_INDEPENDENT_SHARE = 4 / 9  # of the differences, which share pixels
 _WIDE_RANGE, _MIN_RANGE = 2.0, 1.3  # brightest over dimmest bin
 _MIN_DARK = 0.05  # of the mean
 # Difference of χ² without and with an offset, over χ² per degree of freedom: of one image, of
 # image and source, of either if the range is narrow, and if any noise in proportion to the signal
 # is allowed.
-_MIN_GAIN, _MIN_SHARED_GAIN, _MIN_GAIN_NARROW, _MIN_GAIN_FREE = 8.0, 11.0, 40.0, 3.0
-_MAX_CHI2 = 3.0  # per degree of freedom
+_MIN_GAIN, _MIN_SHARED_GAIN, _MIN_GAIN_NARROW, _MIN_GAIN_FREE = 8.0, 11.0, 40.0, 1.0
+_MAX_CHI2 = 5.0  # per degree of freedom
 _PATTERN_DEVIATIONS = 2.0
 
 
@@ -452,6 +451,8 @@ def dark_level(
         0 unless the noise cannot be explained without an offset, by any sum of a constant
         variance, one in proportion to the signal, and one to its square.
     """
+    if min(image.shape) < _WINDOW_PX:
+        return 0.0
     planes = [_NoisyPlane(plane, mask) for plane in (image, source) if plane is not None]
     if any(plane.brightness.size < _MIN_PIXELS for plane in planes):
         return 0.0
@@ -474,17 +475,19 @@ class _NoisyPlane:
 
     @cached_property
     def _local(self) -> tuple[FloatArray, FloatArray]:
-        """Means of 3 × 3 usable pixels, and differences in which all but noise cancels."""
+        """Means of 4 × 4 usable pixels, and differences in which smooth structure cancels."""
         image, mask = self.image, self.mask
-        rows = max(1, image.size // _MAX_NOISE_SAMPLES)  # of long images, lines far apart
-        starts = np.arange(0, image.shape[0] - 2, rows)
-        above, middle, below = (image[starts + shift] for shift in range(3))
-        column_sums, bends = above + middle + below, above - 2 * middle + below
-        means = (column_sums[:, 2:] + column_sums[:, 1:-1] + column_sums[:, :-2]) / 9
-        differences = (bends[:, 2:] - 2 * bends[:, 1:-1] + bends[:, :-2]) / 6
+        lines = max(1, image.size // _MAX_NOISE_SAMPLES)  # of long images, lines far apart
+        last = len(image) - _WINDOW_PX + 1
+        first, second, third, fourth = (image[k : last + k : lines] for k in range(_WINDOW_PX))
+        steps = second - third
+        columns = first + second + third + fourth
+        pairs = columns[:, 1:] + columns[:, :-1]
+        means = (pairs[:, 2:] + pairs[:, :-2]) / 16
+        differences = (steps[:, 1:-2] - steps[:, 2:-1]) / 2
         if mask is None or mask.all():
             return means.ravel(), differences.ravel()
-        inside = np.asarray(sliding_window_view(mask, (3, 3)).all(axis=(2, 3)))[starts]
+        inside = sliding_window_view(mask, (_WINDOW_PX, _WINDOW_PX))[::lines].all(axis=(2, 3))
         return means[inside], differences[inside]
 
     @property
@@ -512,13 +515,18 @@ class _NoisyPlane:
         """Differences over the brightness, clipped."""
         brightness, differences = self._local
         values = differences / np.maximum(brightness, _MIN_DARK * abs(float(brightness.mean())))
-        limit = _CLIP_DEVIATIONS * NORMAL_MAD * float(np.median(np.abs(values)))
+        limit = _clip_limit(np.abs(values))
         return np.clip(values, -limit, limit)
+
+
+def _clip_limit(sizes: FloatArray) -> float:
+    """Return the largest absolute difference that counts."""
+    return _CLIP_DEVIATIONS * NORMAL_MAD * float(np.median(sizes))
 
 
 def _clipped_variance(differences: FloatArray) -> float:
     sizes = np.abs(differences)
-    limit = _CLIP_DEVIATIONS * NORMAL_MAD * float(np.median(sizes))
+    limit = _clip_limit(sizes)
     return float((sizes[sizes <= limit] ** 2).mean()) / _CLIPPED_VARIANCE
 
 
