@@ -1,6 +1,6 @@
 """Give the package input that is wrong on purpose, and see that it answers in one sentence.
 
-    python benchmarks/hostile.py [--only tables packs recipes setups options arrays files]
+    python benchmarks/hostile.py [--only tables packs recipes instruments setups …]
 
 Prints a Markdown table: of each kind of input how many cases there are, how many were refused in
 one sentence, how many were accepted, and what failed: any other error, several lines, more than
@@ -143,6 +143,30 @@ def recipes() -> Iterator[Case]:
         yield _with_text("r.toml", text, "invert", "shot.npy", flag, "r.toml")
 
 
+def instruments() -> Iterator[Case]:
+    """Instruments with hostile numbers: in Python, in recipes and as flags."""
+    from napari_shadowinv import Instrument, invert
+
+    junk = ("x", -1, 1e300, 1e-300, float("nan"), float("inf"), 2**70, None, [], {}, object())
+    image, names = _shot(), (*Instrument.model_fields, "beam", "bakground")
+    for name, value in itertools.product(names, junk):
+        yield lambda name=name, value=value: invert(
+            image, options={"n_sites": 60}, instrument={name: value}
+        )
+    for value in ("x", -1, [], {1: 2}, object(), Instrument):
+        yield lambda value=value: invert(image, options={"n_sites": 60}, instrument=value)
+    invert_shot = ["invert", "shot.npy", "--n-sites", 60]
+    for name, number in itertools.product(names, NUMBERS):
+        text = f"[instrument]\n{name} = {number}\n"
+        yield _with_text("r.toml", text, *invert_shot, "--recipe", "r.toml")
+    for number in NUMBERS:
+        text = f"instrument = {number}\n"
+        yield _with_text("r.toml", text, *invert_shot, "--recipe", "r.toml")
+    flags = [name.replace("_", "-") for name in Instrument.model_fields]
+    for flag, number in itertools.product(flags, ("nan", "inf", "-1", "1e308", "1e-308", "x", "")):
+        yield lambda flag=flag, number=number: _command(*invert_shot, f"--{flag}={number}")
+
+
 def packs() -> Iterator[Case]:
     """Descriptions of film packs."""
     layer = '[[layers]]\nfilm = "HDV2"\nfile = "shot.npy"\n'
@@ -242,7 +266,10 @@ def _with_places(arguments: list[str]) -> Case:
     return run
 
 
-KINDS = {kind.__name__: kind for kind in (tables, packs, recipes, setups, options, arrays, files)}
+KINDS = {
+    kind.__name__: kind
+    for kind in (tables, packs, recipes, instruments, setups, options, arrays, files)
+}
 
 
 def outcome(case: Case) -> str:
