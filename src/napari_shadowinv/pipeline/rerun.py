@@ -544,6 +544,5 @@ def _describe_pairs(pairs: Mapping[str, tuple[Any, Any]]) -> str:
 
 
 def _verdict_change(before: Mapping[Any, Any], after: Mapping[Any, Any]) -> str:
-    if before.get("verdict") == after.get("verdict"):
-        return ""
-    return f"; the verdict was '{before['verdict']}'"
+    verdict = before.get("verdict")  # a shot of a stack has none in its attributes
+    return f"; the verdict was '{verdict}'" if verdict not in (None, after.get("verdict")) else ""
