@@ -134,6 +134,22 @@ def test_the_effect_of_a_single_number_is_the_change_of_the_field(image, source,
     assert rms(mean - expected) < 0.15 * rms(change)
 
 
+def test_linear_samples_add_a_pattern_times_its_number_to_those_of_noise(image, source):
+    """The same noise with and without: the difference has one pattern, and normal factors."""
+    move = {"move": lambda potential, displacement: displacement}
+    with_noise, with_both = (
+        sample(image, source, stated, n=200, quantities=move).quantities["move"].samples
+        for stated in (None, Instrument(background=0.02))
+    )
+    added = (with_both - with_noise).reshape(200, -1)
+    strengths, sizes, _ = np.linalg.svd(added, full_matrices=False)
+    assert sizes[1] < 1e-9 * sizes[0]
+    numbers = strengths[:, 0] * np.sqrt(200)
+    assert abs(numbers.mean()) < 3 / np.sqrt(200)
+    below = (np.abs(numbers) < numbers.std()).mean()
+    assert below == pytest.approx(0.683, abs=0.1)
+
+
 def test_another_field_scales_every_sample(image, source):
     result = sample(image, source, Instrument(other_field=0.1), n=400)
     length = rms(result.inversion.displacement)
