@@ -149,7 +149,7 @@ def test_subtracting_serves_a_potential_that_changes_sign():
     tilt = np.linspace(-3, 3, SHAPE[1])
     flat = remove_background(potential + tilt, 1, kind="subtract")
     np.testing.assert_allclose(flat, potential, atol=0.02)
-    with pytest.raises(InputError, match="kind='subtract'"):
+    with pytest.raises(InputError, match="the kind 'subtract'"):
         remove_background(potential + tilt, 1)
 
 
