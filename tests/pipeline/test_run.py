@@ -244,7 +244,7 @@ OTHER = {
     "readout": "centroid", "integration": "y", "solver": "lbfgs", "stages": "single",
     "max_iterations": 9, "negative": "clip", "boundary": "free", "margin": 9, "decay_length": 3.0,
     "flux": "known", "caustic_jacobian": 0.5, "seed": 4, "threads": 1, "accuracy": 0.3,
-    "noise_level": 0.1, "units_per_quantum": 2.0,
+    "noise_level": 0.1, "units_per_quantum": 2.0, "max_error": 0.2,
 }  # fmt: skip
 
 
