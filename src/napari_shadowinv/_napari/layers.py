@@ -124,7 +124,7 @@ def add_inversion(
     >>> viewer = ViewerModel()
     >>> layers = add_inversion(viewer, invert(np.ones((20, 20))), name="blank")
     >>> [layer.name for layer in layers if layer.visible]
-    ['|d| (px) – blank (doubtful)', 'displacement arrows – blank (doubtful)']
+    ['|d| (px) – blank (too uncertain)', 'displacement arrows – blank (too uncertain)']
     """
     layer_data = inversion_layers(inversion, setup, name=name, **keywords)
     return add_layers(viewer, layer_data if all_layers else main_layers(layer_data))

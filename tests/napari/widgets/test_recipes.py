@@ -326,7 +326,7 @@ def test_the_selected_result_is_repeated_from_its_files(
     qtbot.waitUntil(lambda: bool(said), timeout=60_000)
     assert said == ["Difference: none: the same result, bit for bit. Changed: nothing"]
     first, second = [layer for layer in viewer.layers if role_of(layer) == "field"]
-    assert second.name.endswith("repeated")
+    assert second.name == first.name.replace("shot", "shot repeated")
     np.testing.assert_array_equal(first.data, second.data)
     np.testing.assert_array_equal(first.affine.affine_matrix, second.affine.affine_matrix)
 
