@@ -39,6 +39,16 @@ def start(body: str, *arguments: object) -> subprocess.Popen[str]:
     return process
 
 
+# A process started by nohup ignores SIGHUP, as do the ones it starts.
+DEFAULT_SIGNALS = """
+    import signal
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+"""
+IGNORED_HANGUP = """
+    import signal
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+"""
 WRITE = """
     import sys, time
     from napari_shadowinv.io.files import replacing
@@ -60,10 +70,17 @@ KEEP = """
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_signal_while_writing_leaves_nothing(tmp_path: Path, number: int) -> None:
-    process = start(WRITE, tmp_path / "a.tif")
+    process = start(DEFAULT_SIGNALS + WRITE, tmp_path / "a.tif")
     process.send_signal(number)
     assert process.wait(60) == 128 + number
     assert list(tmp_path.iterdir()) == []
+
+
+def test_ignored_signal_does_not_stop_writing(tmp_path: Path) -> None:
+    process = start(IGNORED_HANGUP + WRITE.replace("600", "1"), tmp_path / "a.tif")
+    process.send_signal(signal.SIGHUP)
+    assert process.wait(60) == 0
+    assert (tmp_path / "a.tif").read_text() == "half"
 
 
 @pytest.mark.parametrize("body", [WRITE, KEEP])
