@@ -144,7 +144,7 @@ class BeamPrior(CheckedModel):
         >>> y = np.linspace(-1, 1, 64)[:, None] * np.ones(64)
         >>> prior = BeamPrior.from_references([1 + a * y for a in (-0.1, 0.0, 0.1)])
         >>> round(prior.rms, 3), len(prior.components.patterns)
-        (0.067, 1)
+        (0.068, 1)
         """
         beams = _normalise(images)
         mean = np.mean(beams, axis=0)
