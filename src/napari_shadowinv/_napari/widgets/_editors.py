@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import re
 import types
+from contextlib import suppress
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -23,34 +25,35 @@ from superqt import QLabeledDoubleSlider, QLabeledSlider, QLargeIntSpinBox
 
 from napari_shadowinv._napari.widgets._qt import side_by_side
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.beam import unit_in_title
 
 _MAX_INTEGER = 2**63 - 1
 _UNSET = "not set"
-_TITLE = re.compile(r"^(?P<name>.*\S)\s*\((?P<unit>[^()]+)\)$")
-_NUMBER = re.compile(
-    r"^\s*(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?P<unit>\S*)\s*$"
-)
+_NUMBER = re.compile(r"(?P<number>[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?)\s*(?P<unit>\S*)")
 # Units with prefixes; kilopixels are not in use.
 _UNITS_WITH_PREFIX = ("m", "eV", "MeV")
-
-
-def unit_of_title(title: str) -> tuple[str, str]:
-    """Split a title such as ``"Wavelength (m)"`` into its name and its unit."""
-    match = _TITLE.match(title)
-    return (match["name"], match["unit"]) if match else (title, "")
+_EXAMPLES = {"m": ", such as 1.3 mm", "MeV": ", such as 14.7 MeV"}
 
 
 def parse_number(text: str, unit: str) -> float:
     """Parse a number such as ``1.3 mm`` or ``inf``; without a unit it is in `unit`."""
     if text.strip().lower() in ("inf", "infinite", "∞"):
         return math.inf
-    match = _NUMBER.match(text)
-    if match is None:
-        raise InputError(f"{text!r} is not a number, expected {_example(unit)}")
-    number = float(match["number"])
-    if match["unit"] in ("", unit):
-        return number
-    return _convert(match["number"], match["unit"], unit)
+    match = _NUMBER.fullmatch(text.strip())
+    if match is not None and match["unit"] in ("", unit):
+        return float(match["number"])
+    with suppress(Exception):  # whatever pint raises for what is no unit, or another kind of it
+        if match is not None and unit:
+            import pint
+
+            factor = pint.application_registry.Quantity(1.0, match["unit"]).to(unit).magnitude
+            power = round(math.log10(factor)) if factor > 0 else 0
+            if math.isclose(factor, 10.0**power, rel_tol=1e-9):
+                # In decimals, so that 1.3 mm is exactly 0.0013 m.
+                return float(Decimal(match["number"]).scaleb(power))
+            return float(match["number"]) * float(factor)
+    example = _EXAMPLES.get(unit, "")
+    raise InputError(f"{text!r} is not a number{f' in {unit}' if unit else ''}{example}")
 
 
 def format_number(value: float, unit: str) -> str:
@@ -63,31 +66,6 @@ def format_number(value: float, unit: str) -> str:
 
     compact = pint.application_registry.Quantity(value, unit).to_compact()
     return f"{compact.magnitude:.12g} {compact.units:~P}"
-
-
-def _convert(number: str, from_unit: str, to_unit: str) -> float:
-    import pint
-
-    # Convert the decimal text, so that 1.3 mm is exactly 0.0013 m.
-    if not to_unit:
-        raise InputError(f"{number} {from_unit} has a unit, expected a plain number")
-    registry = pint.application_registry
-    try:
-        factor = registry.Quantity(1.0, from_unit).to(to_unit).magnitude
-    except (pint.errors.PintError, AttributeError, ValueError):
-        raise InputError(
-            f"{number} {from_unit} cannot be converted to {to_unit}, expected {_example(to_unit)}"
-        ) from None
-    power = round(math.log10(factor)) if factor > 0 else 0
-    if math.isclose(factor, 10.0**power, rel_tol=1e-9):
-        mantissa, _, exponent = number.lower().partition("e")
-        return float(f"{mantissa}e{int(exponent or 0) + power}")
-    return float(number) * float(factor)
-
-
-def _example(unit: str) -> str:
-    examples = {"m": "something like 1.3 mm", "MeV": "something like 14.7 MeV"}
-    return examples.get(unit, f"a number in {unit}" if unit else "a number")
 
 
 class _WheelGuard(QObject):
@@ -357,7 +335,7 @@ def _plain_editor(kind: Any, field: FieldInfo) -> Editor:
     if kind is int:
         return _Integer(*_integer_bounds(field))
     if kind is float:
-        return _Quantity(unit_of_title(field.title or "")[1])
+        return _Quantity(unit_in_title(field.title))
     if get_origin(kind) is tuple:
         return _Range()
     if Path in get_args(kind):

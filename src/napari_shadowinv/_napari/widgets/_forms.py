@@ -13,15 +13,11 @@ from qtpy.QtGui import QColor
 from qtpy.QtWidgets import QSizePolicy, QWidget
 from superqt import QCollapsible
 
-from napari_shadowinv._napari.widgets._editors import (
-    Editor,
-    SteadyComboBox,
-    editor_for,
-    unit_of_title,
-)
+from napari_shadowinv._napari.widgets._editors import Editor, SteadyComboBox, editor_for
 from napari_shadowinv._napari.widgets._qt import column, notify_errors, side_by_side
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.beam import unit_in_title
 from napari_shadowinv.preprocessing import STEPS, Step
 
 # For each key a title, and the model's class, if any.
@@ -143,7 +139,8 @@ class ModelForm(QtWidgets.QWidget):
                 continue
             editor = editor_for(field, (initial or {}).get(name))
             title = field.title or name
-            label = QtWidgets.QLabel(unit_of_title(title)[0] if editor.shows_unit else title)
+            unit = unit_in_title(title) if editor.shows_unit else ""
+            label = QtWidgets.QLabel(title.removesuffix(f" ({unit})"))
             for widget in (label, editor):
                 # Qt wraps rich text only.
                 widget.setToolTip(f"<qt>{field.description}</qt>" if field.description else "")
