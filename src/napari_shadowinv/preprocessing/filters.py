@@ -56,12 +56,9 @@ __all__ = [
 class Filter(Step):
     """A step that changes the values of the image, and of a measured source alike."""
 
+    moves_pixels = False
     function: ClassVar[Callable[..., FloatArray]]
     """Filters an image by the parameters."""
-
-    @property
-    def moves_pixels(self) -> bool:
-        return False
 
     def filter_image(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None

@@ -211,16 +211,13 @@ class Step(Choice):
     """A step applied to a shot before its inversion."""
 
     key = "step"
+    # Does it change where pixels are, and leave their values.
+    moves_pixels: ClassVar[bool] = True
 
     @property
     def flattens(self) -> bool:
         """Whether it removes the beam from the image, so that a measured source no longer fits."""
         return False
-
-    @property
-    def moves_pixels(self) -> bool:
-        """Whether it changes where pixels are, and leaves their values."""
-        return True
 
     @property
     def smooths(self) -> bool:
@@ -276,6 +273,7 @@ class Dark(Step):
     title = "subtract dark level"
     primary = "level"
     place = 5
+    moves_pixels = False
     step: Literal["dark"] = "dark"
     level: Level = Field(
         default=0.0,
@@ -286,10 +284,6 @@ class Dark(Step):
         ),
         json_schema_extra={"metavar": "COUNTS|FILE"},
     )
-
-    @property
-    def moves_pixels(self) -> bool:
-        return False
 
     @property
     def frame_file(self) -> Path | None:
