@@ -397,13 +397,17 @@ def _where(condition: Any, value: float, data: Any) -> Any:
 
 
 def _caustics(view: _View, kind: Kind) -> Content:
+    look = {"colormap": label_colours(_CAUSTIC_COLOUR), "opacity": 0.5}
+    return view.dataset["caustic"].data.astype(np.uint8), {}, look
+
+
+def label_colours(*colours: str) -> Any:
+    """Return the colour map of labels from 1 on; 0 is transparent."""
     from napari.utils.colormaps import CyclicLabelColormap
     from napari.utils.colormaps.standardize_color import transform_color
 
     # For a dictionary of colours, napari would compile code for two seconds.
-    colours = transform_color(["transparent", _CAUSTIC_COLOUR])
-    look = {"colormap": CyclicLabelColormap(colours), "opacity": 0.5}
-    return view.dataset["caustic"].data.astype(np.uint8), {}, look
+    return CyclicLabelColormap(transform_color(["transparent", *colours]))
 
 
 def _arrows(view: _View, kind: Kind) -> Content:

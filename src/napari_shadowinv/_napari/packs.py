@@ -26,7 +26,7 @@ from napari_shadowinv._napari.layer_metadata import (
     frame_for,
     metadata_for,
 )
-from napari_shadowinv._napari.layers import FullLayerData, Limits
+from napari_shadowinv._napari.layers import FullLayerData, Limits, label_colours
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
@@ -49,7 +49,6 @@ KINDS = (
 EXCLUDED, BY_HAND = 1, 2
 """Labels of unusable pixels: excluded by `run_film`, and painted by the user."""
 
-_LABEL_COLOURS = ["transparent", "#5dff5d", "#00c8ff"]
 _MIN_SIGNIFICANCE = 2.0  # fluence over its error, dose over that of a flat background
 _MAX_BACKGROUND_SHARE = 0.05  # of the largest dose; above, the last film sees the beam
 _LIMITS_PERCENTILES = (0.1, 99.7)
@@ -186,14 +185,10 @@ def painted_by_hand(labels: AnyArray, doses: FilmDoses) -> BoolArray:
 
 
 def _labels(usable: BoolArray, by_hand: BoolArray | None) -> tuple[AnyArray, dict[str, Any]]:
-    from napari.utils.colormaps import CyclicLabelColormap
-    from napari.utils.colormaps.standardize_color import transform_color
-
     labels = np.where(usable, 0, EXCLUDED).astype(np.uint8)
     if by_hand is not None:
         labels[by_hand] = BY_HAND
-    colours = CyclicLabelColormap(transform_color(_LABEL_COLOURS))
-    return labels, {"colormap": colours, "opacity": 0.5}
+    return labels, {"colormap": label_colours("#5dff5d", "#00c8ff"), "opacity": 0.5}
 
 
 def _limits(plane: AnyArray, used: BoolArray) -> Limits:
