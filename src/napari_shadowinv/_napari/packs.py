@@ -78,21 +78,10 @@ def pack_layers(
     plane: int = 0,
     **facts: Any,
 ) -> list[FullLayerData]:
-    """Describe the layers of a pack, the lowest first.
+    """Describe the layers of a pack, the lowest first; their names start with the pack's.
 
-    Parameters
-    ----------
-    result : Result
-        With the doses of `run_film` as its content.
-    frame : Frame
-    name : str
-        Name of the pack, with which the layers' names start.
-    by_hand : ndarray of bool, shape (n, H, W), optional
-        Painted pixels, which are not usable.
-    plane : int
-        The displayed film, which sets the contrast.
-    **facts
-        Metadata of each layer.
+    Painted pixels, `by_hand`, shape (n, H, W), are not usable. The displayed film, `plane`, sets
+    the contrast. `facts` are metadata of each layer.
     """
     doses = result.content
     times = doses.times_of_flight
@@ -209,35 +198,17 @@ class EvaluatedPack(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PackJob(Job):
-    """Arguments of `run_film`; corrections are written to a folder, which a failed run removes.
+    """Arguments of `run_film`; corrections are written to a folder, which a failed run removes."""
 
-    Attributes
-    ----------
-    pack : Pack
-        The pack before any correction.
-    path : str
-        Path of the pack file.
-    name : str
-    folder : Path
-        Folder to create.
-    corners : mapping of str to ndarray, optional
-        Corners of all films by number.
-    by_hand : ndarray of bool, shape (n, H, W), optional
-        Painted pixels, which are not used.
-    scales : ndarray, shape (n,), optional
-        Pixel side of the upright films in pixels of each film's scan; required with corners.
-    plane : int
-        The film in view.
-    """
-
-    pack: Pack
-    path: str
+    pack: Pack  # before any correction
+    path: str  # of the pack file
     name: str
-    folder: Path
-    corners: Mapping[str, FloatArray] | None = None
-    by_hand: BoolArray | None = None
+    folder: Path  # to create
+    corners: Mapping[str, FloatArray] | None = None  # of all films by number
+    by_hand: BoolArray | None = None  # painted pixels, which are not used, (n, H, W)
+    # Pixel side of the upright films in pixels of each film's scan, (n,); needed with corners.
     scales: FloatArray | None = None
-    plane: int = 0
+    plane: int = 0  # the film in view
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> EvaluatedPack:
         """Write the corrections and evaluate the pack."""

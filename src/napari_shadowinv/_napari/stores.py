@@ -65,13 +65,7 @@ def _open(path: Path) -> xarray.Dataset:
 
 @as_file_errors
 def shot_of_store(path: Path, index: int) -> xarray.Dataset:
-    """Read a shot of a store as the dataset of a single result.
-
-    Raises
-    ------
-    InputError
-        If the shot is not finished.
-    """
+    """Read a shot of a store as the dataset of a single result; an `InputError` if not done."""
     from napari_shadowinv.io.store import DONE, STATUS_NAMES, StackStore, read_stack
 
     store = StackStore(path)

@@ -83,27 +83,15 @@ class Stopping:
 
     @classmethod
     def from_srim(cls, path: str | Path) -> Stopping:
-        """Read a table of stopping and ranges as SRIM writes it, in its default units.
-
-        Raises
-        ------
-        FileFormatError
-            If the file is no such table, or has other units.
-        """
+        """Read a table as SRIM writes it in its default units; else a `FileFormatError`."""
         return _from_srim(path)
 
     @classmethod
     def by_bethe(cls, density: float, charge_per_mass: float, excitation: float) -> Stopping:
         """Compute losses by Bethe's formula, to about 5 % from 1 MeV and 2 % from 10 MeV on.
 
-        Parameters
-        ----------
-        density : float
-            In kg/m³.
-        charge_per_mass : float
-            Mean Z/A, in mol/g.
-        excitation : float
-            Mean excitation energy in eV.
+        The density is in kg/m³, the charge per mass, mean Z/A, in mol/g, and the mean excitation
+        energy in eV.
 
         Examples
         --------

@@ -373,21 +373,9 @@ def _read_report(root: Path, index: int) -> dict[str, Any]:
 
 
 def check_chunk(layout: Layout, key: str, name: str, index: int) -> None:
-    """Refuse a chunk that is lost or was exchanged.
+    """Refuse a chunk of the array `name` that is lost or was exchanged.
 
-    Parameters
-    ----------
-    layout : Layout
-        Of the store.
-    key, name : str
-        The chunk and its array.
-    index : int
-        The first of the chunk's numbers.
-
-    Raises
-    ------
-    FileFormatError
-        With the shot that is damaged.
+    `index` is the first of the chunk's numbers. The `FileFormatError` names the damaged shot.
     """
     problem = ""
     if name in layout.of_each_shot:
@@ -399,18 +387,7 @@ def check_chunk(layout: Layout, key: str, name: str, index: int) -> None:
 
 
 def check_content(layout: Layout, key: str, name: str, index: int, raw: bytes) -> None:
-    """Refuse a chunk that has changed since it was written; other arguments as in `check_chunk`.
-
-    Parameters
-    ----------
-    raw : bytes
-        All of the chunk.
-
-    Raises
-    ------
-    FileFormatError
-        With the shot that is damaged.
-    """
+    """Refuse a chunk, `raw`, that has changed since it was written; otherwise as `check_chunk`."""
     if not _is_intact(raw):
         damaged = f"its {name}" if name in layout.of_each_shot else key
         problem = f"{damaged} is damaged (its content does not match its checksum)"
@@ -500,35 +477,18 @@ def _chunk_problem(layout: Layout, key: str, every_byte: bool) -> str:
 
 @dataclass(frozen=True)
 class Damage:
-    """Damage to a store.
-
-    Attributes
-    ----------
-    shots : dict of int to str
-        Shots that have ended and cannot be trusted, with the reason.
-    files : tuple of str
-        Descriptions of damage to files that belong to no single shot.
-    noted : dict of int to dict
-        The report's values of each sound shot that has ended, by the arrays that repeat them.
-    """
+    """Damage to a store."""
 
     shots: dict[int, str] = field(default_factory=dict)
-    files: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()  # damage to files that belong to no single shot, in words
+    # Values in the report of each sound shot that has ended, by the arrays that repeat them.
     noted: dict[int, dict[str, Any]] = field(default_factory=dict)
 
 
 def find_damage(layout: Layout, *, every_byte: bool = False) -> Damage:
     """Look for files of a store that are lost, exchanged or damaged.
 
-    Parameters
-    ----------
-    layout : Layout
-    every_byte : bool, optional
-        Read all files. Otherwise only reports and the checksums of chunks are read.
-
-    Returns
-    -------
-    Damage
+    With `every_byte` all files are read, otherwise only reports and the checksums of chunks.
     """
     names = layout.of_each_shot
     shots: dict[int, str] = {}

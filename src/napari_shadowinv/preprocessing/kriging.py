@@ -160,29 +160,14 @@ class _Waves:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Process of one length, conditioned on the blocks without the object.
-
-    Attributes
-    ----------
-    waves : _Waves
-    level : float
-        Mean of the logarithms.
-    middle : ndarray, shape (waves,)
-        Mean of the waves, in which the level replaces them.
-    coefficients : ndarray, shape (waves,)
-        Mean amplitudes, in standard deviations of the waves.
-    spread : ndarray, shape (waves, waves)
-        Columns whose squares sum to the covariance of the amplitudes.
-    evidence : float
-        Logarithm of the marginal likelihood, up to a constant.
-    """
+    """Process of one length, conditioned on the blocks without the object."""
 
     waves: _Waves
-    level: float
-    middle: FloatArray
-    coefficients: FloatArray
-    spread: FloatArray
-    evidence: float
+    level: float  # mean of the logarithms
+    middle: FloatArray  # (waves,), their mean, in which the level replaces them
+    coefficients: FloatArray  # (waves,), mean amplitudes, in standard deviations of the waves
+    spread: FloatArray  # (waves, waves), columns whose squares sum to the amplitudes' covariance
+    evidence: float  # logarithm of the marginal likelihood, up to a constant
 
     @property
     def mean(self) -> FloatArray:

@@ -507,10 +507,7 @@ def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
 def reopen_damaged(store: StackStore) -> StackStore:
     """Read all of a store, mark its damaged shots as pending, and return it as it is now.
 
-    Raises
-    ------
-    FileFormatError
-        If there is damage that cannot be repaired from the shots.
+    A `FileFormatError` if there is damage that cannot be repaired from the shots.
     """
     damage = StackStore(store.path, every_byte=True).damage
     for index in damage.shots:

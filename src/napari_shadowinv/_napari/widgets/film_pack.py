@@ -65,20 +65,14 @@ _MIN_SIZE_PX = (620, 560)
 
 
 class NewPackDialog(QtWidgets.QDialog):
-    """The scans of a folder in pack order, and entries that the scans do not contain.
-
-    Attributes
-    ----------
-    written : Path or None
-        Path of the pack file after saving.
-    """
+    """The scans of a folder in pack order, and entries that the scans do not contain."""
 
     def __init__(self, folder: Path, parent: QtWidgets.QWidget | None = None) -> None:
         super().__init__(parent)
         self.setWindowTitle("New film pack")
         self.setMinimumSize(*_MIN_SIZE_PX)
         self._folder = folder
-        self.written: Path | None = None
+        self.written: Path | None = None  # the pack file after saving
         self.form = ModelForm(NewPack)
         self.table = QtWidgets.QTableWidget(0, len(_COLUMNS))
         self.table.setHorizontalHeaderLabels(_COLUMNS)
