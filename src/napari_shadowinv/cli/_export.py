@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv.cli._inputs import make_folder, protect_store
+from napari_shadowinv.cli._inputs import protect_store
 from napari_shadowinv.cli._terminal import escape_invisible
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import check_output, replacing, write
+from napari_shadowinv.io.files import make_folder
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
 from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.io.store import DAMAGED, DONE, STATUS_NAMES, StackStore, read_stack

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._system.safety import resolved_path
-from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import PNG, PRADFORMAT, RESULT
 
 if TYPE_CHECKING:
@@ -85,16 +85,6 @@ def check_setup(result: Path, setup: Setup | None, fields: Sequence[str] | None 
     if result.suffix.lower() in PRADFORMAT.suffixes:
         check_pradformat_setup(setup)
         check_pradformat_fields(fields or ())
-
-
-def make_folder(path: Path) -> None:
-    """Make a folder and its parents, unless they exist."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileFormatError(
-            f"{path} cannot be created as a folder ({error.strerror}): choose another name"
-        ) from None
 
 
 def write_result(

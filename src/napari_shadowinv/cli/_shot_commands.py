@@ -324,10 +324,11 @@ def demo(
         raise InputError(f"noise is {noise:g}: it must be 0 or more, as a fraction of the mean")
     if not math.isfinite(dm):
         raise InputError(f"dm is {dm:g}: it must be a finite number, in MG·µm")
-    chosen = _inputs.options_from(
-        {} if n_sites is None else {"n_sites": n_sites}, clip_negative=True
-    )
-    _inputs.make_folder(out)
+    from napari_shadowinv.io.files import make_folder
+
+    flags = {} if n_sites is None else {"n_sites": n_sites}
+    chosen = _inputs.recipe_from(flags, None, None, clip_negative=True)
+    make_folder(out)
     from napari_shadowinv.physics.phantoms import paper_setup
     from napari_shadowinv.preprocessing import Radiograph, Recipe
 

@@ -3,7 +3,7 @@
 - its fingerprint: `sha256`; its name as text: `text_of`; many in order: `in_counting_order`
 - refuse a header that promises more than there is: `check_promise`
 - refuse an output before hours of work: `check_output`, `check_folder_of`
-- write all of a file or nothing: `replacing`, `write_toml`
+- write all of a file or nothing: `replacing`, `write_toml`; make a folder: `make_folder`
 """
 
 from __future__ import annotations
@@ -117,6 +117,16 @@ def check_folder_of(path: Path) -> None:
         raise FileFormatError(
             f"{path} cannot be written: the folder {path.parent} is read-only; choose another"
         )
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and its parents, unless they exist."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileFormatError(
+            f"{path} cannot be created as a folder ({error.strerror}): choose another name"
+        ) from None
 
 
 def write_toml(path: str | Path, content: Mapping[str, Any], overwrite: bool = False) -> None:

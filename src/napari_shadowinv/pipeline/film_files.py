@@ -23,7 +23,7 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.film import Calibration, Pack, PackLayer
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read_toml, replacing, write
-from napari_shadowinv.io.files import in_counting_order, write_toml
+from napari_shadowinv.io.files import in_counting_order, make_folder, write_toml
 from napari_shadowinv.io.formats import PRADFORMAT, SCAN_SUFFIXES, SITES, TIFF
 from napari_shadowinv.io.pradformat import write_radiograph
 
@@ -103,12 +103,7 @@ def write_layers(
     InputError
         If the doses have no setup, which pradformat needs.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileFormatError(
-            f"{folder} cannot be created as a folder ({error.strerror}): choose another name"
-        ) from None
+    make_folder(folder)
     setups = doses.setups
     if form == "pradformat" and not setups:
         raise InputError("pradformat needs a setup: give the pack's distances, or write TIFF")
