@@ -17,7 +17,6 @@ from napari_shadowinv.io.formats import PNG, PRADFORMAT, RESULT
 
 if TYPE_CHECKING:
     from napari_shadowinv.io.read_write import AnyResult
-    from napari_shadowinv.options import InversionOptions
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.pipeline.static_checks import StaticChecks
     from napari_shadowinv.preprocessing import Radiograph, Recipe
@@ -127,12 +126,9 @@ def recipe_from(
 ) -> Recipe:
     """Read a recipe, and override it with an options file and flags."""
     from napari_shadowinv.cli._flags import recipe_of
-    from napari_shadowinv.io import read_toml
-    from napari_shadowinv.pipeline import read_recipe
-    from napari_shadowinv.preprocessing import MeasuredSource, Recipe
+    from napari_shadowinv.preprocessing import MeasuredSource
 
-    base = Recipe() if recipe is None else read_recipe(recipe)
-    content = {} if options is None else read_toml(options)
+    base, content, where = _recipe_and_options(recipe, options)
     if "prepare" in content:
         raise InputError(
             f"{options} has a table [prepare], which recipes replace: write steps and source "
@@ -141,7 +137,7 @@ def recipe_from(
     if clip_negative:
         flags = {"negative": "clip", **flags}
     files = {"mask": mask, "source_mask": source_mask}
-    chosen = recipe_of(flags, base, content, "options" if options is None else str(options))
+    chosen = recipe_of(flags, base, content, where)
     chosen = chosen.model_copy(update={name: file for name, file in files.items() if file})
     if source is None and source_variable is None:
         return chosen
@@ -153,9 +149,16 @@ def recipe_from(
     return chosen.model_copy(update={"source": measured})
 
 
-def options_from(flags: Mapping[str, Any], clip_negative: bool) -> InversionOptions:
-    """Return the options that flags set."""
-    return recipe_from(flags, None, None, clip_negative=clip_negative).options
+def _recipe_and_options(
+    recipe: Path | None, options: Path | None
+) -> tuple[Recipe, dict[str, Any], str]:
+    """Read the files of a recipe and of options, and name the latter."""
+    from napari_shadowinv.io import read_toml
+    from napari_shadowinv.pipeline import read_recipe
+    from napari_shadowinv.preprocessing import Recipe
+
+    base = Recipe() if recipe is None else read_recipe(recipe)
+    return (base, {}, "options") if options is None else (base, read_toml(options), str(options))
 
 
 def fit_recipe_from(
@@ -169,19 +172,15 @@ def fit_recipe_from(
 ) -> Recipe:
     """Read the recipe of a fit, and override it with an options file and flags."""
     from napari_shadowinv.cli._flags import fit_recipe_of
-    from napari_shadowinv.io import read_toml
-    from napari_shadowinv.pipeline import read_recipe
-    from napari_shadowinv.preprocessing import MeasuredSource, Recipe
+    from napari_shadowinv.preprocessing import MeasuredSource
 
-    base = Recipe() if recipe is None else read_recipe(recipe)
-    content = {} if options is None else read_toml(options)
+    base, content, where = _recipe_and_options(recipe, options)
     choices = {} if brightness is None else {"brightness": brightness}
     changes: dict[str, Any] = {} if mask is None else {"mask": mask}
     if source is not None:
         is_unknown = source == "unknown"
         choices["beam"] = "unknown" if is_unknown else "known"
         changes["source"] = None if is_unknown else MeasuredSource(file=Path(source))
-    where = "options" if options is None else str(options)
     return fit_recipe_of({**flags, **choices}, base, content, where).model_copy(update=changes)
 
 

@@ -330,11 +330,11 @@ def demo(
     chosen = _inputs.recipe_from(flags, None, None, clip_negative=True)
     make_folder(out)
     from napari_shadowinv.physics.phantoms import paper_setup
-    from napari_shadowinv.preprocessing import Radiograph, Recipe
+    from napari_shadowinv.preprocessing import Radiograph
 
     setup = paper_setup()
     image, truth = simulate_shot(setup, dm, noise)
-    inversion = invert_shot(Recipe(setup=setup, options=chosen), Radiograph(image))
+    inversion = invert_shot(chosen.model_copy(update={"setup": setup}), Radiograph(image))
     fields = fields_to_compare(image, truth, inversion)
     written = write_demo(out, f"toroid_{dm:g}", inversion, setup, fields)
     say(demo_table(inversion, setup, fields, written))
