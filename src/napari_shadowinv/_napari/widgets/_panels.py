@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from napari.utils import progress as activity
 from qtpy import QtWidgets
-from qtpy.QtCore import QObject, QSize, Qt, Signal
+from qtpy.QtCore import QObject, Qt, Signal
 
 from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import main_layers
@@ -187,8 +187,6 @@ def _run(work: Work, box: _Mailbox) -> None:
         outcome = Outcome(error=error, tag=box.tag)
     box.outcome = outcome
 
-
-WIDTH = 330
 
 _STAGES = {
     "compile": "Compiling",
@@ -481,10 +479,6 @@ class ToolPanel(qt.Docked):
         self.area.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.area.setWidget(content)
         qt.column(self, self.area)
-        self.setMinimumWidth(WIDTH)
-        self.setSizePolicy(
-            QtWidgets.QSizePolicy.Policy.Preferred, QtWidgets.QSizePolicy.Policy.Expanding
-        )
         self._keeper = qt.StateKeeper(self, name, self.state)
         self._revealed: QtWidgets.QWidget | None = None
         self._revealing = qt.timer(self, _SETTLE_MS, self._reveal, once=True)
@@ -499,9 +493,6 @@ class ToolPanel(qt.Docked):
     def _reveal(self) -> None:
         if self._revealed is not None:
             self.area.ensureWidgetVisible(self._revealed)
-
-    def sizeHint(self) -> QSize:
-        return QSize(WIDTH + 30, 600)
 
     def show_problem(self, text: str) -> None:
         """Show a problem until the next run."""

@@ -10,7 +10,7 @@ from itertools import groupby
 from typing import Any, TypeVar
 
 import numpy as np
-from qtpy.QtCore import QObject, QSettings, Qt, QTimer
+from qtpy.QtCore import QObject, QSettings, QSize, Qt, QTimer
 from qtpy.QtWidgets import QDockWidget, QHBoxLayout, QMainWindow, QSizePolicy, QVBoxLayout, QWidget
 
 from napari_shadowinv._napari.viewer_sync import USER_ERRORS, error_text, show_user_error
@@ -18,6 +18,7 @@ from napari_shadowinv._napari.viewer_sync import USER_ERRORS, error_text, show_u
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
+_WIDTH_PX = 330  # of a panel
 _CURVE_HEIGHT_PX = 210
 _CONSTANT_STAGES = ("samples",)  # do not change the objective
 _WRITE_DELAY_MS = 300  # a moving slider is written once
@@ -108,6 +109,15 @@ class Docked(QWidget):
 
     _dock: QDockWidget | None = None
     _in_front = True
+    spare_width = 30  # px, in which a new dock is wider than needed
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setMinimumWidth(_WIDTH_PX)
+        self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Expanding)
+
+    def sizeHint(self) -> QSize:
+        return QSize(_WIDTH_PX + self.spare_width, 600)
 
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)

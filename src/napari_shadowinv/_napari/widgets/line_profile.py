@@ -12,14 +12,13 @@ import numpy as np
 from napari.utils.notifications import show_info
 from numpy.typing import ArrayLike
 from qtpy import QtWidgets
-from qtpy.QtCore import QSignalBlocker, QSize, Qt
+from qtpy.QtCore import QSignalBlocker, Qt
 
 from napari_shadowinv._napari.layer_metadata import role_of, unit_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._layers import LayerPicker, kind_of, new_shapes, shown_plane
-from napari_shadowinv._napari.widgets._panels import WIDTH
 from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
@@ -201,6 +200,8 @@ class ProfilePlot(Plot):
 class LineProfile(qt.Docked):
     """Draw a line to plot the values of the checked layers along it, in their units."""
 
+    spare_width = 50
+
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         super().__init__()
         self.viewer = viewer
@@ -246,15 +247,8 @@ class LineProfile(qt.Docked):
         layout.addWidget(self.plot, 1)
         for widget in (self.measures, self.export, self.problem):
             layout.addWidget(widget)
-        self.setMinimumWidth(WIDTH)
-        self.setSizePolicy(
-            QtWidgets.QSizePolicy.Policy.Preferred, QtWidgets.QSizePolicy.Policy.Expanding
-        )
         self._connect()
         self._fill()
-
-    def sizeHint(self) -> QSize:
-        return QSize(WIDTH + 50, 600)
 
     def _connect(self) -> None:
         self._timer = qt.timer(self, _REDRAW_MS, self.update_plot, once=True)
