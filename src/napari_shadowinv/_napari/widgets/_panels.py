@@ -349,13 +349,18 @@ class RunPanel(QtWidgets.QWidget):
 def fact_rows(facts: Iterable[Fact], *, details: bool | None = False) -> list[tuple[str, str]]:
     """Return facts as rows: of the result, of the solver (`details`) or, with None, of both.
 
-    Warnings have rows of their own.
+    Warnings have rows of their own: `warning_rows`.
     """
     return [
         (fact.title, fact.text)
         for fact in facts
         if details in (fact.is_detail, None) and fact.key not in CAUTION_CODES
     ]
+
+
+def warning_rows(facts: Iterable[Fact]) -> list[tuple[str, str]]:
+    """Return the warnings among facts as rows."""
+    return [(fact.title, fact.text) for fact in facts if fact.key in CAUTION_CODES]
 
 
 class ReportTable(QtWidgets.QTableWidget):

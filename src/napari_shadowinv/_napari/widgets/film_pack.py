@@ -36,7 +36,13 @@ from napari_shadowinv._napari.widgets._forms import (
     wrapping_label,
 )
 from napari_shadowinv._napari.widgets._layers import LayerPicker, LayerWatch, mask_of, new_shapes
-from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, ToolPanel, fact_rows
+from napari_shadowinv._napari.widgets._panels import (
+    ReportTable,
+    RunPanel,
+    ToolPanel,
+    fact_rows,
+    warning_rows,
+)
 from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.hidden_files import temporary_folder
@@ -517,7 +523,7 @@ class FilmPack(ToolPanel):
         self.actions.setVisible(has_result)
         if has_result:
             _, doses = self._selected()
-            self.report.show_rows(_rows(doses))
+            self.report.show_rows([*fact_rows(doses.facts), *warning_rows(doses.facts)])
         self.update_plot()
 
     def _schedule_plot(self) -> None:
@@ -614,12 +620,6 @@ class FilmPack(ToolPanel):
 
     def _new_folder(self) -> Path:
         return self._scratch / str(next(self._folders))
-
-
-def _rows(doses: FilmDoses) -> list[tuple[str, str]]:
-    """Return the report of a pack as rows; warnings come last."""
-    cautions = [("Warning", caution.text) for caution in doses.cautions]
-    return [*fact_rows(doses.facts), *cautions]
 
 
 def _title(role: str) -> str:

@@ -61,6 +61,7 @@ from napari_shadowinv._napari.widgets._panels import (
     RunPanel,
     VerdictLine,
     fact_rows,
+    warning_rows,
 )
 from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, while_alive
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_inputs, result_frame
@@ -310,8 +311,7 @@ class InvertShot(InversionInputs, LivePanel):
     ) -> None:
         self.verdict.show_headline(inversion.headline_in(setup))
         facts = inversion.facts_in(setup)
-        warnings = [("Warning", caution.text) for caution in inversion.cautions]
-        rows = [*warnings, *input_rows, *fact_rows(facts)]
+        rows = [*warning_rows(facts), *input_rows, *fact_rows(facts)]
         self.report.show_rows(rows, fact_rows(facts, details=True))
 
     def _show_inversion(self, finished: Finished, job: InversionJob) -> None:
