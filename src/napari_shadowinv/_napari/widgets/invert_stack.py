@@ -48,8 +48,6 @@ from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 
 if TYPE_CHECKING:
     import napari
-    from napari_shadowinv._typing import BoolArray
-    from napari_shadowinv.preprocessing import Recipe
 
 _REFRESH_INTERVAL_MS = 200  # many small shots may finish within a second
 _MAX_FAILURES = 100
@@ -304,50 +302,32 @@ class InvertStack(InversionInputs, ToolPanel):
         recipe = self.recipe()
         mask = self.masks.usable(layer)
         self.source.check(mask)
-        if self.shots.is_watched:
-            return self._watch(recipe, mask)
-        scheduler, workers = self.engine.engine()
-        job = StackJob(
-            shots=self.shots.shots(),
-            out=self.store.store,
-            recipe=recipe,
-            source=self._source(layer),
-            mask=mask,
-            source_mask=self.hidden_from_source(layer),
-            run_options=RunOptions(workers=workers, **self._store_choices()),
-            scheduler=scheduler,
-        )
-        return StackRequest(
-            job,
-            layer,
-            self.companions(layer),
-            {} if layer is None else placement_on(layer, recipe),
-            self.origins(layer, self.shots.name),
-        )
-
-    def _fields_shown(self) -> list[Any]:
-        return field_of(self.results.layers)
-
-    def _watch(self, recipe: Recipe, mask: BoolArray | None) -> WatchRequest:
-        job = WatchJob(
-            shots=self.shots.folder.path,
-            out=self.store.store,
-            recipe=recipe,
-            source=self._source(None),
-            mask=mask,
-            source_mask=self.hidden_from_source(None),
-            watch_options=WatchOptions(
-                pattern=self.shots.folder.pattern.text().strip(), **self._store_choices()
-            ),
-        )
-        origins = self.origins(None, self.shots.name)
-        return WatchRequest(job, None, self.companions(None), {}, origins)
-
-    def _store_choices(self) -> dict[str, bool]:
-        return {
+        inputs: dict[str, Any] = {
+            "out": self.store.store,
+            "recipe": recipe,
+            "source": self._source(layer),
+            "mask": mask,
+            "source_mask": self.hidden_from_source(layer),
+        }
+        choices: dict[str, Any] = {
             "overwrite": self.overwrite.isChecked(),
             "redo_failed": self.redo_failed.isChecked(),
         }
+        placement = {} if layer is None else placement_on(layer, recipe)
+        origins = self.origins(layer, self.shots.name)
+        if self.shots.is_watched:
+            folder = self.shots.folder
+            watch = WatchOptions(pattern=folder.pattern.text().strip(), **choices)
+            job: StackJob = WatchJob(shots=folder.path, watch_options=watch, **inputs)
+            return WatchRequest(job, layer, self.companions(layer), placement, origins)
+        scheduler, workers = self.engine.engine()
+        options = RunOptions(workers=workers, **choices)
+        shots = self.shots.shots()
+        job = StackJob(shots=shots, run_options=options, scheduler=scheduler, **inputs)
+        return StackRequest(job, layer, self.companions(layer), placement, origins)
+
+    def _fields_shown(self) -> list[Any]:
+        return field_of(self.results.layers)
 
     def _source(self, layer: Any) -> ArrayLike | None:
         # A stack of sources has one for each shot.
