@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.io.read_write import AnyResult
 
 _LOOKS, _NAME = "napari_layers", "napari_name"
+_MAX_NAMES = 3  # in a message
 
 # Attributes that are recomputed when a result is saved.
 _COMPUTED_ATTRIBUTES = {_LOOKS, _NAME, "format", "options", "report", "image_residual", "errors_si"}
@@ -297,6 +298,6 @@ def _name(layer: FullLayerData) -> str:
     return str(layer[1].get("name", "?"))
 
 
-def _quote_names(names: Sequence[str], max_count: int = 3) -> str:
-    text = ", ".join(f"'{name}'" for name in names[:max_count])
-    return text + (f" and {len(names) - max_count} more" if len(names) > max_count else "")
+def _quote_names(names: Sequence[str]) -> str:
+    text = ", ".join(f"'{name}'" for name in names[:_MAX_NAMES])
+    return text + (f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else "")

@@ -80,9 +80,9 @@ def refuse_masked(values: Any, name: str) -> Any:
     return values
 
 
-def unpack_mask(mask: Any, name: str = "mask", dims: Sequence[str] = PLANE) -> Any:
-    """Return a mask in the order of `dims`, false where it is masked itself; None for None."""
-    array, usable = unpack_array(mask, name, dims)
+def unpack_mask(mask: Any, name: str = "mask") -> Any:
+    """Return a mask as a plain plane, false where it is masked itself; None for None."""
+    array, usable = unpack_array(mask, name)
     return array if usable is None else np.where(usable, array, False)
 
 

@@ -161,20 +161,18 @@ _MIN_BEAM_SHARE = 1e-3
 MAX_EXTRAPOLATION = 10.0  # times the brightest pixel seen
 
 
-def checked_pixels(
-    image: ArrayLike, mask: ArrayLike | None = None, *, name: str = "image"
-) -> tuple[FloatArray, BoolArray]:
+def checked_pixels(image: ArrayLike, mask: ArrayLike | None = None) -> tuple[FloatArray, BoolArray]:
     """Return a copy of an image as floats and its usable pixels, or raise an `InputError`.
 
     Masked pixels, which may be NaN, are set to the mean of the usable ones.
     """
     image, _, mask = unpack_shot(image, None, mask)
-    values = np.array(check_plane(image, name, 1), dtype=np.float64)
-    usable = check_mask(mask, values.shape, name)
+    values = np.array(check_plane(image, "image"), dtype=np.float64)
+    usable = check_mask(mask, values.shape)
     bad = int((~np.isfinite(values[usable])).sum())
     if bad:
         raise InputError(
-            f"{name} has {bad} usable pixels that are NaN or infinite, expected none: replace or "
+            f"image has {bad} usable pixels that are NaN or infinite, expected none: replace or "
             "mask them"
         )
     values[~usable] = values[usable].mean()

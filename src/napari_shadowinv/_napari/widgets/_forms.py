@@ -213,9 +213,9 @@ class ModelForm(QtWidgets.QWidget):
                 unchecked.set_value(None)
 
 
-def kinds_of(models: Mapping[str, Any], prefix: str = "") -> Kinds:
+def kinds_of(models: Mapping[str, Any]) -> Kinds:
     """Return the kinds of a `ModelPicker` from model classes with titles."""
-    return {name: (f"{prefix}{model.title}", model) for name, model in models.items()}
+    return {name: (model.title, model) for name, model in models.items()}
 
 
 class ModelPicker(QtWidgets.QWidget):
