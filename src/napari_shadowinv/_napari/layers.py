@@ -378,13 +378,9 @@ def _field(view: _View, role: str) -> tuple[Any, Limits, dict[str, str]]:
         return data, (0.0, peak), {"unit": field.unit, "symbol": field.symbol}
     axis = "yx".index(role[-1])
     # In another shot of a stack the field may lie along the other axis.
-    limit = peak if view.shot is not None else _largest(field.vectors, view.used)
+    limit = peak if view.shot is not None else float(np.abs(field.vectors[:, view.used]).max())
     words = {"unit": field.unit, "symbol": field.components[axis]}
     return view.vectors[axis], (-limit, limit), words
-
-
-def _largest(vectors: FloatArray, used: BoolArray) -> float:
-    return float(np.abs(vectors[:, used]).max())
 
 
 def _where(condition: Any, value: float, data: Any) -> Any:

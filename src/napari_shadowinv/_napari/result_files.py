@@ -99,16 +99,9 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]
             affine=matrix_of(np.array(placement["affine"])[-3:, -3:]),
         )
     layers = layers_of_result(result, frame, name, cells="cells" in looks)
-    return _with_looks(main_layers(layers, also={*looks, "image"}), looks)
-
-
-def _with_looks(
-    layers: list[FullLayerData], looks: dict[str, dict[str, Any]]
-) -> list[FullLayerData]:
-    """Return layers with their saved looks."""
     return [
         (data, keywords | looks.get(layer_key(keywords), {}), kind)
-        for data, keywords, kind in layers
+        for data, keywords, kind in main_layers(layers, also={*looks, "image"})
     ]
 
 

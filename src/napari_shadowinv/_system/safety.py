@@ -158,14 +158,9 @@ def check_size(path: str | Path, promised: int) -> None:
         )
 
 
-def memory_limit() -> int | None:
-    """Return the memory for work (bytes), by `LIMIT_VARIABLE` or the memory; None if unknown."""
-    return physical_memory() if os.environ.get(LIMIT_VARIABLE) is None else size_limit()
-
-
 def check_memory(shape: Sequence[int], bytes_per_pixel: float, work: str) -> None:
     """Refuse an image of `shape` for which `work` needs more memory than there is."""
-    limit = memory_limit()
+    limit = physical_memory() if os.environ.get(LIMIT_VARIABLE) is None else size_limit()
     needed = bytes_per_pixel * math.prod(shape)
     if limit is not None and needed > limit:
         raise InputError(

@@ -177,7 +177,8 @@ def register(
     report = report or Reporter(None, None)
     edges = np.broadcast_to(np.asarray(spread, np.float64), len(values))
     alike: list[Hashable] = [None] * len(values) if kinds is None else list(kinds)
-    films = [_film(*film) for film in zip(values, is_usable, strict=True)]
+    planes = zip(values, is_usable, strict=True)
+    films = [_Film(image, mask, *_texture(image, mask)) for image, mask in planes]
     compared = []
     for first in range(len(films)):
         report("register", first, len(films))
@@ -297,11 +298,6 @@ def _is_confirmed(pair: _Pair, pairs: list[_Pair], kinds: list[Hashable]) -> boo
         if gap < max(_MIN_GAP_PX, _MAX_GAP_ERRORS * error):
             return True
     return False
-
-
-def _film(image: FloatArray, usable: BoolArray) -> _Film:
-    """Film with its texture."""
-    return _Film(image, usable, *_texture(image, usable))
 
 
 def _with_dose_of(film: _Film, onto: _Film) -> tuple[FloatArray, BoolArray]:

@@ -267,11 +267,11 @@ class Layout:
         """Return the key of a chunk by its first number; along other axes there is one."""
         return "/".join([name, "c", str(index), *["0"] * (len(self.arrays[name]["shape"]) - 1)])
 
-    def keys_of_many(self) -> Iterator[str]:
-        """Yield the keys of chunks with the values of many shots."""
-        for name in self.of_many_shots:
-            for index in range(-(-self.shots // self._together(name))):
-                yield self.key(name, index)
+    @property
+    def keys_of_many(self) -> list[str]:
+        """Keys of chunks with the values of many shots."""
+        counts = {name: -(-self.shots // self._together(name)) for name in self.of_many_shots}
+        return [self.key(name, index) for name in counts for index in range(counts[name])]
 
 
 def _has_shots(description: Mapping[str, Any]) -> bool:
@@ -479,6 +479,7 @@ def _chunk_problem(layout: Layout, key: str, every_byte: bool) -> str:
 class Damage:
     """Damage to a store."""
 
+    # Shots that have ended and cannot be trusted, with the reason.
     shots: dict[int, str] = field(default_factory=dict)
     files: tuple[str, ...] = ()  # damage to files that belong to no single shot, in words
     # Values in the report of each sound shot that has ended, by the arrays that repeat them.
@@ -500,7 +501,7 @@ def find_damage(layout: Layout, *, every_byte: bool = False) -> Damage:
         elif report:
             values = {**report, **report.get(LABELS, {})}
             noted[index] = {k: values[k] for k in layout.of_many_shots if k in values}
-    keys = [*layout.keys_of_many(), *layout.fixed]
+    keys = [*layout.keys_of_many, *layout.fixed]
     problems = [_chunk_problem(layout, key, every_byte) for key in keys]
     if every_byte:
         problems += [_description_problem(layout, name) for name in layout.arrays]

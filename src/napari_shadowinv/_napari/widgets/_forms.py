@@ -89,9 +89,9 @@ def wrapping_label(text: str = "", style: str = "") -> QtWidgets.QLabel:
 class PathEdit(QtWidgets.QWidget):
     changed = Signal()
 
-    def __init__(self, title: str, example: str = "path of a file") -> None:
+    def __init__(self, title: str, example: str = "path of a file", files: str = "") -> None:
         super().__init__()
-        self._title = title
+        self._title, self._files = title, files
         self.edit = QtWidgets.QLineEdit()
         self.edit.setPlaceholderText(example)
         self.edit.setMinimumWidth(60)
@@ -104,7 +104,7 @@ class PathEdit(QtWidgets.QWidget):
 
     def ask(self) -> str:
         """Open a dialog and return the chosen path, or an empty string."""
-        path, _ = QtWidgets.QFileDialog.getOpenFileName(self, self._title)
+        path, _ = QtWidgets.QFileDialog.getOpenFileName(self, self._title, "", self._files)
         return str(path)
 
     def _choose(self) -> None:

@@ -394,12 +394,6 @@ _MASK = 1 + len(_SHOT_COLUMNS)
 _FILE_FILTER = "tables (*.csv)"
 
 
-class _TableEdit(PathEdit):
-    def ask(self) -> str:
-        path, _ = QFileDialog.getOpenFileName(self, self._title, "", _FILE_FILTER)
-        return str(path)
-
-
 class ShotTable(QWidget):
     """The rows of a table of shots; changes are written to the file only by Save."""
 
@@ -409,7 +403,7 @@ class ShotTable(QWidget):
         super().__init__()
         self._rows: list[ShotRow] = []
         self._loaded = ""
-        self.file = _TableEdit("Table of the shots", "shots.csv")
+        self.file = PathEdit("Table of the shots", "shots.csv", _FILE_FILTER)
         self.file.edit.setToolTip(
             "<qt>A table (.csv) with a row for each shot and the columns file, setup, energy "
             "or wavelength, brightness, mask, source, exclude.</qt>"

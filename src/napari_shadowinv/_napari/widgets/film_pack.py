@@ -434,7 +434,7 @@ class FilmPack(ToolPanel):
             (self.write, self._write_layers),
             (self.save, self._save),
         ):
-            button.clicked.connect(partial(_call, action))
+            button.clicked.connect(lambda _, action=action: action())
 
     # A run
 
@@ -604,14 +604,10 @@ class FilmPack(ToolPanel):
             return
         has_suffix = name.lower().endswith(RESULT.suffix)
         path = Path(name if has_suffix else name + RESULT.suffix)
-        scratch = self._scratch
         result = result_of(layer)
         assert result is not None
-        saved = Result(
-            packs.copy_edits(doses, scratch, path),
-            result.setup,
-            result.attributes,
-        )
+        doses = packs.copy_edits(doses, self._scratch, path)
+        saved = Result(doses, result.setup, result.attributes)
         layers = [each for each in self.viewer.layers if result_of(each) is result]
         layer_data = [each.as_layer_data_tuple() for each in layers]
         show_info(
@@ -630,7 +626,3 @@ def _button(text: str, tip: str) -> QtWidgets.QPushButton:
     button = QtWidgets.QPushButton(text)
     button.setToolTip(f"<qt>{tip}</qt>")
     return button
-
-
-def _call(action: Any, _: bool = False) -> None:
-    action()
