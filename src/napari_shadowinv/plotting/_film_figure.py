@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import textwrap
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -53,7 +53,7 @@ def pack_figure(doses: FilmDoses, *, title: str | None = None) -> Figure:
     width, height = (_PANEL_SHARE * side for side in _panels.panel_size(shape))
     grid = Grid(-(-panels_shown // columns), columns, width, height, foot=0.1, head=0.0)
     header = _header(doses, int(grid.figure_size[0] * _LETTERS_PER_INCH))
-    grid = Grid(grid.rows, columns, width, height, foot=0.1, head=0.52 + 0.18 * len(header))
+    grid = replace(grid, head=0.52 + 0.18 * len(header))
     with mpl.rc_context(_panels.STYLE):
         figure, panels = _panels.new_page(grid, Scale(1.0, "px"), title)
         for k in range(count):
@@ -70,10 +70,8 @@ def _header(doses: FilmDoses, letters: int) -> list[tuple[str, str]]:
     facts = [fact for fact in doses.facts if not fact.is_detail]
     cautions = [fact.text for fact in facts if fact.level is not Level.SOUND]
     line = _panels.fact_line(fact for fact in facts if fact.level is Level.SOUND)
-    lines = [(part, QUIET_COLOUR) for part in textwrap.wrap(line, letters)]
-    for text in cautions:
-        lines += [(part, ALARM_COLOUR) for part in textwrap.wrap(text, letters)]
-    return lines
+    sentences = [(line, QUIET_COLOUR), *((text, ALARM_COLOUR) for text in cautions)]
+    return _panels.wrapped(sentences, letters)
 
 
 def _film_title(doses: FilmDoses, k: int) -> str:

@@ -78,15 +78,13 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
     columns = count if upright else len(kinds)
     rows = len(kinds) if upright else count
     fields = [_field_in_units(fit, field) for field in fit.fields]
-    width, height = _panels.panel_size(shape)
-    grid = Grid(rows + len(fields), columns, width, height, foot=0.0, head=0.0)
-    letters = int(grid.figure_size[0] * _LETTERS_PER_INCH)
-    heading = title and textwrap.shorten(title, int(letters * 0.7), placeholder=" …")
-    header = _header(fit, letters)
+    sentences = [_panels.headline_sentence(fit.headline)]
+    grid, header, heading = _page(shape, rows + len(fields), columns, sentences, title)
     facts = fit.facts_with_names(())
     of_images = [fact for fact in facts if fact.key.startswith("image_")]
+    letters = int(grid.figure_size[0] * _LETTERS_PER_INCH)
     footer = _panels.footer_lines(facts, fit.headline.text, letters)
-    grid = replace(grid, foot=0.12 + 0.18 * len(footer), head=0.52 + 0.18 * len(header))
+    grid = replace(grid, foot=0.12 + 0.18 * len(footer))
     with mpl.rc_context(_panels.STYLE):
         figure, panels = _panels.new_page(grid, _panels.image_scale(shape, setup), heading)
         for k in range(count):
@@ -184,12 +182,6 @@ def _magnitude_error(fit: Fit, field: FittedField) -> FloatArray | None:
     strongest = in_units.peak
     # Displacements become fields by a factor.
     return np.asarray(pixels * in_units.magnitude[strongest] / max(length[strongest], 1e-12))
-
-
-def _header(fit: Fit, letters: int) -> list[tuple[str, str]]:
-    """Return the lines of the headline, each with its colour."""
-    colour = level_colour(fit.headline.level)
-    return [(line, colour) for line in textwrap.wrap(fit.headline.text, letters)]
 
 
 _PANELS_PER_IMAGE = 3  # image, prediction, residual
@@ -307,7 +299,7 @@ def _page(
     width, height = _panels.panel_size(shape)
     grid = Grid(rows, columns, width, height, foot=0.3, head=0.0)
     letters = int(grid.figure_size[0] * _LETTERS_PER_INCH)
-    header = [(line, colour) for text, colour in sentences for line in textwrap.wrap(text, letters)]
+    header = _panels.wrapped(sentences, letters)
     heading = title and textwrap.shorten(title, int(letters * 0.7), placeholder=" …")
     return replace(grid, head=0.52 + 0.18 * len(header)), header, heading
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from napari_shadowinv.facts import Fact
+    from napari_shadowinv.facts import Fact, Headline
     from napari_shadowinv.physics.setup import Setup
 
 
@@ -298,6 +298,16 @@ def level_colour(level: Level) -> str:
     return GOOD_COLOUR if level is Level.SOUND else ALARM_COLOUR
 
 
+def wrapped(sentences: Iterable[tuple[str, str]], letters: int) -> list[tuple[str, str]]:
+    """Wrap sentences, each with its colour, to lines of a number of letters."""
+    return [(line, colour) for text, colour in sentences for line in textwrap.wrap(text, letters)]
+
+
+def headline_sentence(headline: Headline) -> tuple[str, str]:
+    """Return a headline with the colour of its level."""
+    return headline.text, level_colour(headline.level)
+
+
 def write_header(
     figure: Figure, lines: list[tuple[str, str]], grid: Grid, *, has_title: bool = True
 ) -> None:
@@ -327,7 +337,7 @@ def footer_lines(facts: Iterable[Fact], headline: str, letters: int) -> list[tup
     paragraphs = [(fact_line([fact]), ALARM_COLOUR) for fact in warnings]
     paragraphs.append((fact_line(fact for fact in quiet if not is_long[fact]), QUIET_COLOUR))
     paragraphs += [(fact_line([fact]), QUIET_COLOUR) for fact in quiet if is_long[fact]]
-    return [(line, colour) for text, colour in paragraphs for line in textwrap.wrap(text, letters)]
+    return wrapped(paragraphs, letters)
 
 
 def write_footer(figure: Figure, lines: list[tuple[str, str]], grid: Grid) -> None:

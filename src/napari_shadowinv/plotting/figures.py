@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +27,6 @@ from napari_shadowinv.plotting._panels import (
     draw_intensity,
     draw_potential,
     draw_side_by_side,
-    level_colour,
     outline_caustics,
 )
 
@@ -71,9 +69,10 @@ def report_figure(
     shape = inversion.potential.shape
     (field,) = shown_fields([inversion.displacement], setup, mask=inversion.mask)
     width = _panels.choose_grid(shape, panels=6).figure_size[0]
-    header = _header(inversion, setup, columns=int(width * 12))
+    headline = inversion.headline_in(setup)
+    header = _panels.wrapped([_panels.headline_sentence(headline)], int(width * 12))
     facts = inversion.facts_in(setup)
-    footer = _panels.footer_lines(facts, inversion.headline_in(setup).text, int(width * 14))
+    footer = _panels.footer_lines(facts, headline.text, int(width * 14))
     grid = _panels.choose_grid(shape, panels=6, foot=0.12 + 0.18 * len(footer), title=bool(title))
     grid = replace(grid, head=(0.52 if title else 0.22) + 0.18 * len(header))
     with mpl.rc_context(_panels.STYLE):
@@ -183,13 +182,6 @@ def save_figure(path: str | Path, figure: Figure, overwrite: bool = False) -> Pa
     with replacing(path, overwrite) as temporary:
         figure.savefig(temporary, dpi=DOTS_PER_INCH)
     return Path(path)
-
-
-def _header(inversion: Inversion, setup: Setup | None, columns: int) -> list[tuple[str, str]]:
-    """Lines of the headline, each with its colour, wrapped to a number of letters."""
-    headline = inversion.headline_in(setup)
-    colour = level_colour(headline.level)
-    return [(line, colour) for line in textwrap.wrap(headline.text, columns)]
 
 
 def _draw_residual(panel: Panel, inversion: Inversion, title: str) -> None:
