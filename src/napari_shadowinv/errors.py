@@ -8,6 +8,8 @@ value and the remedy. Everything the package raises for a user's mistake is an
 
 from __future__ import annotations
 
+from typing import Self
+
 __all__ = ["FileFormatError", "InputError", "InversionCancelled"]
 
 
@@ -17,6 +19,10 @@ class _UserError(Exception):
     def __init__(self, *message: object, option: str = "") -> None:
         super().__init__(*message)
         self.option = option
+
+    def about(self, name: object) -> Self:
+        """Return the same error with the name of its file or shot in front."""
+        return type(self)(f"{name}: {self}", option=self.option)
 
 
 class InputError(_UserError, ValueError):

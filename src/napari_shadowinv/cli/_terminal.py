@@ -98,8 +98,9 @@ def invert_shot(
                 recipe, shot, source=source, **masks, on_progress=show, should_stop=is_interrupted
             )
         except InputError as error:
-            text = f"{shot.path}: {error}" if shot.path else str(error)
-            raise InputError(text, option=error.option) from error
+            if shot.path is None:
+                raise
+            raise error.about(shot.path) from error
 
 
 def warn_of_setups(experiments: Iterable[tuple[Setup | None, tuple[int, int] | None]]) -> None:

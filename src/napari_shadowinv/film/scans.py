@@ -340,7 +340,7 @@ def read_corners(path: str | Path) -> dict[str, FloatArray]:
         try:
             corners[row.film] = checked_corners(row.places)
         except InputError as error:
-            raise InputError(f"{path}, line {line}: {error}") from None
+            raise error.about(f"{path}, line {line}") from None
     return corners
 
 

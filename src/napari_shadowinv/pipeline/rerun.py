@@ -153,7 +153,9 @@ class RerunInputs:
         try:
             inversion = run(recipe, image, source=source, **masks, **callbacks)
         except InputError as error:
-            raise InputError(f"{image.path}: {error}" if image.path else str(error)) from error
+            if image.path is None:
+                raise
+            raise error.about(image.path) from error
         assert inversion.provenance is not None
         provenance = inversion.provenance.with_image(brightness=brightness)
         return replace(inversion, provenance=self._with_masks(provenance))

@@ -220,7 +220,7 @@ def _invert(
         start = None if previous is None else previous["inversion"]
         inversion = task.run(images, beam, source, start=start)
     except InputError as error:
-        raise InputError(f"{label}: {error}") from error
+        raise error.about(label) from error
     return {
         **task.arrays(inversion),
         **column_values(INVERSIONS, inversion),

@@ -102,7 +102,7 @@ class NumberTable(QTableWidget):
         try:
             return parse_number(text, self._columns[column - 1].unit or "")
         except InputError as error:
-            raise InputError(f"'{self.item(row, 0).text()}': {error}") from error
+            raise error.about(f"'{self.item(row, 0).text()}'") from error
 
     def write(self, row: int, column: int, value: Any) -> None:
         """Show a number, a file's name, or text that the user has to correct."""
