@@ -74,9 +74,8 @@ WATCHING = "watching"  # name of the engine of a watched folder
 _POLL_S = 0.25  # between two looks at the engine and at `should_stop`
 _CHOSEN_SITES = "chosen_sites"  # attribute: number of sites from the accuracy and the first shots
 _APPENDED = "appended_at"  # attribute: numbers of the first shots appended by later runs
-NUMBERED_AS_ARRIVED = {
-    "order": "as they arrived"
-}  # attribute: the order does not follow from the names
+# Attribute: the order does not follow from the names.
+NUMBERED_AS_ARRIVED = {"order": "as they arrived"}
 _ALTERNATIVES = "use the same, overwrite the store, or choose another name"
 
 
@@ -553,11 +552,10 @@ def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:
             f"{store.path} was started with different shots ({missing}): {_ALTERNATIVES}"
         )
     known_places = [places[name] for name in store.names]
-    if NUMBERED_AS_ARRIVED.items() <= store.attributes.items():
-        return [*known_places, *sorted(set(range(len(names))) - set(known_places))]
     # Shots of a run keep their order; names of later runs may sort before them.
     ends = [0, *store.attributes.get(_APPENDED, []), count]
-    for first, last in pairwise(ends):
+    as_arrived = NUMBERED_AS_ARRIVED.items() <= store.attributes.items()
+    for first, last in () if as_arrived else pairwise(ends):
         for index in range(first + 1, last):
             if known_places[index] < known_places[index - 1]:
                 raise InputError(
