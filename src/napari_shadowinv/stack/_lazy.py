@@ -31,7 +31,7 @@ from napari_shadowinv.stack._plan import (
     values_of_beam,
 )
 from napari_shadowinv.stack._shots import ArrayReference, ImageReference, Reader, Shot, read_shot
-from napari_shadowinv.stack._worker import Beam, Task
+from napari_shadowinv.stack._worker import AnyTask, Beam
 
 if TYPE_CHECKING:
     import xarray
@@ -209,7 +209,7 @@ def _invert(
     shot: Shot,
     block: AnyArray | None,
     beam: Beam | None,
-    task: Task,
+    task: AnyTask,
     previous: dict[str, Any] | None = None,
     keep: bool = False,
 ) -> dict[str, Any]:

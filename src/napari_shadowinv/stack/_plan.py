@@ -61,6 +61,7 @@ from napari_shadowinv.stack._shots import (
     usual_shape,
 )
 from napari_shadowinv.stack._worker import (
+    AnyTask,
     Beam,
     FitTask,
     InvertTask,
@@ -87,7 +88,7 @@ class Stack:
     """
 
     shots: Shots
-    task: InvertTask | FitTask
+    task: AnyTask
     beam: Beam | None  # to invert, after all steps; None if shots have their own
     common: AnyArray | None = None  # measured source of rows to invert without one, as recorded
     reader: str = ""  # name of the reader of the files
@@ -162,7 +163,7 @@ class Stack:
         )
 
     @property
-    def shot_task(self) -> InvertTask | FitTask:
+    def shot_task(self) -> AnyTask:
         """The task without the variables that are stored once."""
         names = tuple(name for name in self.task.variables if not self.is_shared(name))
         return replace(self.task, variables=names)
@@ -259,7 +260,7 @@ def describe_stack(
             "for each shot"
         )
     image = None if sources is None or shot_sources is not None else np.asarray(sources, np.float64)
-    task: InvertTask | FitTask
+    task: AnyTask
     common = None
     if resolved.fit is not None:
         task, beam = _plan_fit(inputs, shot_sources, image, resolved, variables, warm_start)

@@ -153,35 +153,12 @@ class Task:
         return self.moved.setup
 
     @property
-    def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
-        """Dimensions and labels of all variables that the results can have."""
-        raise NotImplementedError
-
-    @property
-    def identity(self) -> dict[str, str]:
-        """The choices that affect the results, as JSON."""
-        raise NotImplementedError
-
-    @property
     def attributes(self) -> dict[str, str]:
         """Attributes of a dataset of the results."""
         provenance = self.inputs.provenance
         provenance = provenance.model_copy(update={"setup": self.setup, "kind": self.kind})
         options = self.recipe.options.model_dump_json()
         return {"options": options, "provenance": provenance.to_json()}
-
-    def run(
-        self,
-        images: Sequence[FitShot],
-        beam: Beam | None,
-        source: AnyArray | None = None,
-        *,
-        start: Any = None,
-        workers: int | None = None,
-        should_stop: ShouldStop | None = None,
-    ) -> Inversion | Fit:
-        """Invert or fit a shot, whose source is `source`, or else that of the beam."""
-        raise NotImplementedError
 
     def arrays(self, result: Any) -> dict[str, AnyArray]:
         """Return the variables by name, fields in SI units among them."""
@@ -193,10 +170,6 @@ class Task:
 
     def _planes(self, result: Any) -> tuple[dict[str, AnyArray], Any]:
         """Return variables in pixels by name, and the field that others follow from."""
-        raise NotImplementedError
-
-    def report(self, result: Any) -> dict[str, Any]:
-        """Return the report of a shot."""
         raise NotImplementedError
 
 
@@ -211,10 +184,12 @@ class InvertTask(Task):
 
     @property
     def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
+        """Dimensions and labels of all variables that the results can have."""
         return variable_labels(self.setup)
 
     @property
     def identity(self) -> dict[str, str]:
+        """The choices that affect the results, as JSON."""
         options = self.recipe.options
         if self.sites_chosen:
             options = options.model_copy(update={"n_sites": None})
@@ -247,7 +222,7 @@ class InvertTask(Task):
         workers: int | None = None,
         should_stop: ShouldStop | None = None,
     ) -> Inversion:
-        """Apply the recipe to a shot as recorded, and to its source if it has its own."""
+        """Apply the recipe to a shot as recorded, with `source`, or else that of the beam."""
         (image,) = images
         assert isinstance(image.image, Radiograph)
         shape, expected = np.shape(image.image.image), self.inputs.shot.shape
@@ -453,6 +428,9 @@ class FitTask(Task):
         return entries
 
 
+AnyTask = InvertTask | FitTask
+
+
 def _with_sites_reason(inversion: Inversion) -> Inversion:
     """Add the reason for the number of sites, and a warning if it does not suffice."""
     caution, errors = None, inversion.errors
@@ -550,7 +528,7 @@ class TaskContext:
     """Context that the tasks of all shots share."""
 
     writer: ShotWriter
-    task: Task
+    task: AnyTask
     workers: int | None
 
 
@@ -591,7 +569,7 @@ class Attempt:
 
 
 def try_shot(
-    task: Task,
+    task: AnyTask,
     shot: Shot,
     beam: Beam | None,
     start: Any = None,
@@ -619,10 +597,10 @@ def try_shot(
 
 
 def write_shot(
-    writer: ShotWriter | GrowingStore, task: Task, index: int, attempt: Attempt
+    writer: ShotWriter | GrowingStore, task: AnyTask, index: int, attempt: Attempt
 ) -> ShotOutcome:
     """Write the result or the failure of a shot."""
-    result = attempt.result
+    result: Any = attempt.result
     cautions = [dataclasses.asdict(caution) for caution in attempt.origin.get("warnings", ())]
     if result is None:
         failed = {"reason": attempt.failure, "seconds": attempt.seconds}

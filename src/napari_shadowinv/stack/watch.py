@@ -59,8 +59,8 @@ from napari_shadowinv.stack._shots import (
     stamp,
 )
 from napari_shadowinv.stack._worker import (
+    AnyTask,
     Attempt,
-    FitTask,
     InvertTask,
     ShotOutcome,
     failure_text,
@@ -170,7 +170,7 @@ class Watch:
         self._failures: dict[str, str] = {}
         self._overwrite = False
         self._stack: Stack | None = None
-        self._task: InvertTask | FitTask | None = None  # once the number of sites is known
+        self._task: AnyTask | None = None  # once the number of sites is known
         self._pool = ThreadPoolExecutor(_LANES)
         self._abandoned = Event()
         self._running: deque[_RunningShot] = deque()
