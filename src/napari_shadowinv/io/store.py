@@ -189,7 +189,7 @@ class StackStore:
                 end = min(first + length, len(self.names))
                 sound = [index for index in range(first, end) if index in damage.noted]
                 key = f"{name}/c/{first // length}"
-                if not sound or any(problem.startswith(f"{key} ") for problem in damage.files):
+                if not sound or key in damage.keys:
                     continue
                 values = self._values(name, slice(first, end)).tolist()
                 column = columns.get(name)

@@ -482,6 +482,7 @@ class Damage:
     # Shots that have ended and cannot be trusted, with the reason.
     shots: dict[int, str] = field(default_factory=dict)
     files: tuple[str, ...] = ()  # damage to files that belong to no single shot, in words
+    keys: frozenset[str] = frozenset()  # of damaged chunks among them
     # Values in the report of each sound shot that has ended, by the arrays that repeat them.
     noted: dict[int, dict[str, Any]] = field(default_factory=dict)
 
@@ -502,10 +503,11 @@ def find_damage(layout: Layout, *, every_byte: bool = False) -> Damage:
             values = {**report, **report.get(LABELS, {})}
             noted[index] = {k: values[k] for k in layout.of_many_shots if k in values}
     keys = [*layout.keys_of_many, *layout.fixed]
-    problems = [_chunk_problem(layout, key, every_byte) for key in keys]
+    damaged = {key: text for key in keys if (text := _chunk_problem(layout, key, every_byte))}
+    problems = [*damaged.values()]
     if every_byte:
-        problems += [_description_problem(layout, name) for name in layout.arrays]
-    return Damage(shots, tuple(filter(None, problems)), noted)
+        problems += filter(None, (_description_problem(layout, name) for name in layout.arrays))
+    return Damage(shots, tuple(problems), frozenset(damaged), noted)
 
 
 def _description_problem(layout: Layout, name: str) -> str:
