@@ -230,14 +230,14 @@ class CornerEditor(QObject):
 
     def _show(self, plane: int) -> None:
         corners = self._moved.get(plane, self._doses.corners[plane])
-        text = self._doses.film_label(plane)
         if not np.isfinite(corners).all():
             raise InputError(
-                f"{text}: the layer is excluded and shows no film; choose another film"
+                f"{self._doses.film_label(plane)}: the layer is excluded and shows no film; choose "
+                "another film"
             )
         pixels = self._scan_of(plane)
         self._plane = plane
-        title = text.partition(":")[0]
+        title = f"film {plane + 1}"
         # The scan has the pixel size of the films, and its film lies over them.
         frame = frame_of(self._films)
         size = np.array(self._films.data.shape[-2:])
