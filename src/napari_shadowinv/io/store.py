@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -338,16 +339,12 @@ def with_own_setups(dataset: xarray.Dataset) -> xarray.Dataset:
 
 def with_places(dataset: xarray.Dataset) -> xarray.Dataset:
     """Add the coordinates of each shot's pixels in metres, by the shot's own setup."""
-    sizes = of_each_setup(dataset, _pixel_size)[:, np.newaxis]
+    sizes = of_each_setup(dataset, attrgetter("object_pixel_size"))[:, np.newaxis]
     places = {
         f"{name}_si": (("shot", name), sizes * dataset[name].values, place_label(name))
         for name in ("y", "x")
     }
     return dataset.assign_coords(places)
-
-
-def _pixel_size(setup: Any) -> float:
-    return float(setup.object_pixel_size)
 
 
 def _setups_of_block(reports: AnyArray) -> AnyArray:
@@ -372,10 +369,9 @@ def _measure_setups(texts: AnyArray, measure: Callable[[Any], float]) -> FloatAr
 
 def field_in_si(dataset: xarray.Dataset, origin: str, name: str, setup: Any) -> Any:
     """Return a field of all shots in SI units, lazily, by one setup for each or for all."""
-    data = dataset[origin].data
-    if "setup" not in dataset:
-        return data.map_blocks(_field_of_block, None, name, setup, dtype=np.float64)
-    texts = dataset["setup"].data[(..., *[np.newaxis] * (data.ndim - 1))]
+    data, texts = dataset[origin].data, None
+    if "setup" in dataset:
+        texts = dataset["setup"].data[(..., *[np.newaxis] * (data.ndim - 1))]
     return data.map_blocks(
         _field_of_block, texts, name, setup, dtype=np.float64, chunks=data.chunks
     )
