@@ -16,6 +16,7 @@ from napari_shadowinv.cli._summary import (
     setup_text,
     size_text,
     two_columns,
+    written_rows,
 )
 from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
@@ -95,8 +96,7 @@ def comparison_table(fits: Sequence[Fit]) -> Table:
 
 def fit_table(fit: Fit, names: Sequence[str], written: Sequence[Path]) -> Table:
     """Build the table of a fit: its verdict, images, fields and files."""
-    rows = [*fit_rows(fit, names), *[("written", str(path)) for path in written]]
-    return two_columns("Fit", rows)
+    return two_columns("Fit", [*fit_rows(fit, names), *written_rows(written)])
 
 
 def exit_unless_determined(fit: Fit, out: Path) -> None:

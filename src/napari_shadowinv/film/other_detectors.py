@@ -35,7 +35,7 @@ Scientific Instruments 86, 113304 (2015).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -135,13 +135,8 @@ class Tracks:
         for name, limits in ranges.items():
             if limits is not None:
                 is_inside &= _within(getattr(self, name), name, limits)
-        return Tracks(
-            self.y[is_inside],
-            self.x[is_inside],
-            self.diameter[is_inside],
-            self.contrast[is_inside],
-            self.eccentricity[is_inside],
-            self.size,
+        return replace(
+            self, **{name: getattr(self, name)[is_inside] for name in ("y", "x", *ranges)}
         )
 
     def image(self, bin: float | None = None) -> TrackImage:

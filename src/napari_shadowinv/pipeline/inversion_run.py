@@ -520,14 +520,13 @@ def _mask(values: ArrayLike | None, file: Path | None, name: str, shot: Radiogra
 
 def _without_masked(mask: _Mask, *images: Any) -> _Mask:
     """Remove the masked pixels of arrays from a mask."""
-    masks = [unpack_array(image, "image")[1] for image in images if not _is_file(image)]
+    arrays = [
+        image for image in images if not isinstance(image, (Radiograph, str, Path, type(None)))
+    ]
+    masks = [unpack_array(image, "image")[1] for image in arrays]
     if all(usable is None for usable in masks):
         return mask
     return _Mask(join_masks(mask.pixels, *masks), None)
-
-
-def _is_file(image: Any) -> bool:
-    return image is None or isinstance(image, (Radiograph, str, Path))
 
 
 def picture_mask(path: Path) -> BoolArray:
