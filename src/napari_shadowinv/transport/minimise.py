@@ -112,21 +112,6 @@ class TransportObjective:
         """Return the image that the cells divide among themselves."""
         return self.image
 
-    def newton_step(
-        self,
-        systems: SimilarSystems,
-        laplacian: csr_array,
-        weights: FloatArray,
-        gap: FloatArray,
-        tolerance: float,
-    ) -> FloatArray:
-        """Return the change of the weights that fills each cell's gap to first order.
-
-        The Laplacian belongs to the diagram of these weights. A RuntimeError is raised if the
-        cells fall into groups with no flux between them.
-        """
-        return systems.solve(laplacian, gap, tolerance, ground=self.ground(weights))
-
     def ground(self, weights: FloatArray) -> FloatArray | None:
         """Return the derivative of each site's image flux by its weight, if it is not zero."""
         return None
@@ -245,8 +230,9 @@ def newton(
         gap = mass - diagram.masses
         laplacian = diagram.laplacian()
         del diagram  # the trial steps need its memory
+        ground = objective.ground(weights)
         try:
-            step = objective.newton_step(systems, laplacian, weights, gap, _LINEAR_TOLERANCE)
+            step = systems.solve(laplacian, gap, _LINEAR_TOLERANCE, ground=ground)
         except RuntimeError as error:
             reason = f"Newton's system cannot be solved: {error}"
             break
