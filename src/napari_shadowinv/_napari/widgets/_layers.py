@@ -14,6 +14,7 @@ from napari_shadowinv._napari.layer_metadata import frame_of
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import labelled, with_button
 from napari_shadowinv._napari.widgets._qt import column, notify_errors, while_alive
+from napari_shadowinv._system.arrays import blocks_of
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
@@ -296,9 +297,7 @@ def _structure(layer: Any) -> float:
     data = layer.data
     if not isinstance(data, np.ndarray) or data.ndim != 2 or min(data.shape) < 4 * _BLOCK_PX:
         return 0.0
-    height, width = (side // _BLOCK_PX * _BLOCK_PX for side in data.shape)
-    blocks = data[:height, :width].reshape(height // _BLOCK_PX, _BLOCK_PX, -1, _BLOCK_PX)
-    means = blocks.mean(axis=(1, 3), dtype=np.float64)
+    means = blocks_of(data, _BLOCK_PX).mean(axis=(1, 3), dtype=np.float64)
     mean = means.mean()
     if not np.isfinite(mean) or mean <= 0:
         return 0.0
