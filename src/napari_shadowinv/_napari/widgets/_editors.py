@@ -18,12 +18,11 @@ from qtpy.QtWidgets import (
     QFileDialog,
     QLineEdit,
     QSizePolicy,
-    QToolButton,
     QWidget,
 )
 from superqt import QLabeledDoubleSlider, QLabeledSlider, QLargeIntSpinBox
 
-from napari_shadowinv._napari.widgets._qt import side_by_side
+from napari_shadowinv._napari.widgets._qt import side_by_side, small_button
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.beam import unit_in_title
 
@@ -227,50 +226,35 @@ class _Quantity(Editor):
         self.inner.setCursorPosition(0)
 
 
-class _Range(Editor):
-    """A pixel range ``first:end`` as text; empty for all pixels."""
+class _Text(Editor):
+    """Text that the model validates; empty if the field is unset."""
 
-    def __init__(self) -> None:
+    def __init__(self, hint: str) -> None:
         super().__init__(QLineEdit())
-        self.inner.setPlaceholderText("all, or a range such as 10:200")
+        self.inner.setPlaceholderText(hint)
         self.inner.setMinimumWidth(80)
         self.inner.editingFinished.connect(self.changed)
 
     def value(self) -> str | None:
-        """Return the text, which the model validates."""
         return self.inner.text().strip() or None
 
     def set_value(self, value: Any) -> None:
-        if not isinstance(value, str):
-            start, stop = (0, None) if value is None else value
-            value = f"{start}:{'' if stop is None else stop}" if start or stop else ""
-        self.inner.setText(value)
-        self.changed.emit()
-
-
-class _NumberOrFile(Editor):
-    """A number or a file name, as text, with a button to choose the file."""
-
-    def __init__(self, title: str) -> None:
-        text, button = QLineEdit(), QToolButton()
-        text.setPlaceholderText("a number, or a file")
-        text.setMinimumWidth(80)
-        button.setText("…")
-        button.setToolTip("Choose a file.")
-        super().__init__(side_by_side((text, 1), (button, 0)))
-        self._text, self._title = text, title
-        self._text.editingFinished.connect(self.changed)
-        button.clicked.connect(lambda: self._choose())
-
-    def value(self) -> str | None:
-        """Return the text, which the model validates."""
-        return self._text.text().strip() or None
-
-    def set_value(self, value: Any) -> None:
+        if isinstance(value, tuple):  # of pixels, first and end
+            start, stop = value
+            value = f"{start}:{'' if stop is None else stop}" if start or stop else None
         if isinstance(value, float):
             value = f"{value:.10g}"
-        self._text.setText("" if value is None else str(value))
+        self.inner.setText("" if value is None else str(value))
         self.changed.emit()
+
+
+class _NumberOrFile(_Text):
+    """A number or a file name, with a button to choose the file."""
+
+    def __init__(self, title: str) -> None:
+        super().__init__("a number, or a file")
+        self._title = title
+        self.layout().addWidget(small_button("…", "Choose a file.", self._choose))
 
     def _choose(self) -> None:
         path, _ = QFileDialog.getOpenFileName(self, self._title)
@@ -337,7 +321,7 @@ def _plain_editor(kind: Any, field: FieldInfo) -> Editor:
     if kind is float:
         return _Quantity(unit_in_title(field.title))
     if get_origin(kind) is tuple:
-        return _Range()
+        return _Text("all, or a range such as 10:200")
     if Path in get_args(kind):
         return _NumberOrFile(field.title or "")
     raise TypeError(f"no editor for a field of type {kind}")

@@ -14,7 +14,14 @@ from qtpy.QtWidgets import QSizePolicy, QWidget
 from superqt import QCollapsible
 
 from napari_shadowinv._napari.widgets._editors import Editor, SteadyComboBox, editor_for
-from napari_shadowinv._napari.widgets._qt import column, notify_errors, side_by_side
+from napari_shadowinv._napari.widgets._qt import (
+    column,
+    notify_errors,
+    push_button,
+    side_by_side,
+    small_button,
+    with_button,
+)
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.beam import unit_in_title
@@ -37,21 +44,6 @@ def labelled(text: str, widget: QtWidgets.QWidget) -> QtWidgets.QWidget:
     label = QtWidgets.QLabel(text)
     label.setMinimumWidth(_LABEL_WIDTH_PX)
     return side_by_side((label, 0), (widget, 1))
-
-
-def with_button(
-    widget: QtWidgets.QWidget, text: str, tip: str, action: Callable[[], Any]
-) -> QtWidgets.QWidget:
-    """Put a small button on the right of a widget."""
-    return side_by_side((widget, 1), (small_button(text, tip, action), 0))
-
-
-def small_button(text: str, tip: str, action: Callable[[], Any]) -> QtWidgets.QToolButton:
-    button = QtWidgets.QToolButton()
-    button.setText(text)
-    button.setToolTip(tip)
-    button.clicked.connect(lambda: action())
-    return button
 
 
 def section(title: str, *widgets: QtWidgets.QWidget) -> QCollapsible:
@@ -333,17 +325,12 @@ class TomlButtons(QtWidgets.QWidget):
     ) -> None:
         super().__init__()
         self._subject, self._values, self._load_values = subject, values, load
-        self.load_button = QtWidgets.QPushButton(f"Load {subject}…")
-        self.save_button = QtWidgets.QPushButton("Save…")
-        self.load_button.setToolTip(f"Read {subject} from a TOML file.")
-        self.save_button.setToolTip(
-            f"Write {subject} to a TOML file, for use here or on the command line."
+        tip = f"Write {subject} to a TOML file, for use here or on the command line."
+        self.load_button = push_button(
+            f"Load {subject}…", f"Read {subject} from a TOML file.", self._load
         )
-        side_by_side((self.load_button, 0), (self.save_button, 0), holder=self).layout().addStretch(
-            1
-        )
-        self.load_button.clicked.connect(lambda: self._load())
-        self.save_button.clicked.connect(lambda: self._save())
+        self.save_button = push_button("Save…", tip, self._save)
+        side_by_side((self.load_button, 0), (self.save_button, 0), (QWidget(), 1), holder=self)
 
     @notify_errors
     def _load(self) -> None:
@@ -375,7 +362,9 @@ class StepForm(QWidget):
         self.kind = kind
         self.form = ModelForm(kind)
         self.form.layout().setContentsMargins(INDENT, 0, 0, 0)
-        self.title = small_button("", "Show or hide the parameters.", self._unfold_or_fold)
+        self.title = small_button(
+            "", "Show or hide the parameters.", lambda: self.fold(not self.form.isHidden())
+        )
         self.title.setToolButtonStyle(Qt.ToolButtonStyle.ToolButtonTextBesideIcon)
         self.title.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
         self.up = small_button("↑", "Move this step up.", lambda: move(self, -1))
@@ -393,9 +382,6 @@ class StepForm(QWidget):
         self.form.setVisible(not folded)
         self.title.setArrowType(Qt.ArrowType.RightArrow if folded else Qt.ArrowType.DownArrow)
         self._show_title()
-
-    def _unfold_or_fold(self) -> None:
-        self.fold(not self.form.isHidden())
 
     def _on_change(self) -> None:
         self._show_title()

@@ -12,8 +12,8 @@ from qtpy.QtWidgets import QCheckBox, QWidget
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import frame_of
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
-from napari_shadowinv._napari.widgets._forms import labelled, with_button
-from napari_shadowinv._napari.widgets._qt import column, notify_errors, while_alive
+from napari_shadowinv._napari.widgets._forms import labelled
+from napari_shadowinv._napari.widgets._qt import column, notify_errors, while_alive, with_button
 from napari_shadowinv._system.arrays import blocks_of
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution

@@ -11,7 +11,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 from qtpy.QtCore import QObject, QSettings, QSize, Qt, QTimer
-from qtpy.QtWidgets import QDockWidget, QHBoxLayout, QMainWindow, QSizePolicy, QVBoxLayout, QWidget
+from qtpy.QtWidgets import (
+    QDockWidget,
+    QHBoxLayout,
+    QMainWindow,
+    QPushButton,
+    QSizePolicy,
+    QToolButton,
+    QVBoxLayout,
+    QWidget,
+)
 
 from napari_shadowinv._napari.viewer_sync import USER_ERRORS, error_text, show_user_error
 
@@ -46,6 +55,27 @@ def side_by_side(*widgets: tuple[QWidget, int], holder: QWidget | None = None) -
     for widget, share in widgets:
         layout.addWidget(widget, share)
     return holder
+
+
+def with_button(widget: QWidget, text: str, tip: str, action: Callable[[], Any]) -> QWidget:
+    """Put a small button on the right of a widget."""
+    return side_by_side((widget, 1), (small_button(text, tip, action), 0))
+
+
+def small_button(text: str, tip: str, action: Callable[[], Any]) -> QToolButton:
+    button = QToolButton()
+    button.setText(text)
+    return _with_action(button, tip, action)
+
+
+def push_button(text: str, tip: str, action: Callable[[], Any]) -> QPushButton:
+    return _with_action(QPushButton(text), tip, action)
+
+
+def _with_action(button: Any, tip: str, action: Callable[[], Any]) -> Any:
+    button.setToolTip(f"<qt>{tip}</qt>")
+    button.clicked.connect(lambda: action())
+    return button
 
 
 def timer(parent: QObject, interval: int, action: Callable[[], Any], once: bool = False) -> QTimer:

@@ -21,9 +21,15 @@ from qtpy.QtWidgets import (
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.widgets._editors import format_number, parse_number
-from napari_shadowinv._napari.widgets._forms import PROBLEM_COLOUR, PathEdit, labelled, small_button
+from napari_shadowinv._napari.widgets._forms import PROBLEM_COLOUR, PathEdit, labelled
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, kind_of, stack_of
-from napari_shadowinv._napari.widgets._qt import column, notify_errors, side_by_side, while_alive
+from napari_shadowinv._napari.widgets._qt import (
+    column,
+    notify_errors,
+    side_by_side,
+    small_button,
+    while_alive,
+)
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import SITES

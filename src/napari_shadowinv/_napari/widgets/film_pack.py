@@ -28,13 +28,7 @@ from napari_shadowinv._napari.packs import PackJob
 from napari_shadowinv._napari.result_files import dataset_of_layers
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._forms import (
-    ModelForm,
-    PathEdit,
-    labelled,
-    with_button,
-    wrapping_label,
-)
+from napari_shadowinv._napari.widgets._forms import ModelForm, PathEdit, labelled, wrapping_label
 from napari_shadowinv._napari.widgets._layers import LayerPicker, LayerWatch, mask_of, new_shapes
 from napari_shadowinv._napari.widgets._panels import (
     ReportTable,
@@ -43,7 +37,7 @@ from napari_shadowinv._napari.widgets._panels import (
     fact_rows,
     warning_rows,
 )
-from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
+from napari_shadowinv._napari.widgets._qt import COLOURS, Plot, push_button
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.hidden_files import temporary_folder
 from napari_shadowinv._typing import AnyArray, FloatArray
@@ -385,25 +379,33 @@ class FilmPack(ToolPanel):
             "Hatched layers are not a measurement: they have no usable pixels or a fluence below "
             "twice its error, or are the last layer, which also records all protons beyond it.</qt>"
         )
-        self.show_corners = _button(
-            "Show corners", "Show the scan of the displayed film, with corners to drag."
+        self.show_corners = push_button(
+            "Show corners",
+            "Show the scan of the displayed film, with corners to drag.",
+            self._show_corners,
         )
-        self.paint = _button("Paint mask", "Paint pixels of the displayed film to exclude them.")
-        self.run_again = _button(
+        self.paint = push_button(
+            "Paint mask", "Paint pixels of the displayed film to exclude them.", self._paint
+        )
+        self.run_again = push_button(
             "Run again",
             "Evaluate the pack again with the dragged corners and without the painted pixels.",
+            self._run_again,
         )
-        self.to_fit = _button(
+        self.to_fit = push_button(
             "Layers for a fit",
             "Add each film as an image with energy, setup and mask, for Invert shot and Fit "
             "several images.",
+            self._add_fit_images,
         )
-        self.write = _button(
-            "Write layers…", "Save each film as an image, with a table of all films."
+        self.write = push_button(
+            "Write layers…",
+            "Save each film as an image, with a table of all films.",
+            self._write_layers,
         )
-        self.save = _button("Save…", "Save the result as a .shadowinv file.")
+        self.save = push_button("Save…", "Save the result as a .shadowinv file.", self._save)
         self.actions = QtWidgets.QWidget()
-        region = with_button(self.regions, "✎", "Draw a region.", self._draw_region)
+        region = qt.with_button(self.regions, "✎", "Draw a region.", self._draw_region)
         column = qt.column(
             self.actions,
             labelled("Result", self.packs),
@@ -414,7 +416,8 @@ class FilmPack(ToolPanel):
             qt.side_by_side((self.to_fit, 1), (self.write, 1), (self.save, 1)),
         )
         column.setAlignment(Qt.AlignmentFlag.AlignTop)
-        self.new = _button("New pack…", "Create a pack file from a folder of scans.")
+        tip = "Create a pack file from a folder of scans."
+        self.new = push_button("New pack…", tip, self._new_pack)
         pack_row = qt.side_by_side((self.path, 1), (self.new, 0))
         self.add(labelled("Pack", pack_row), self._last.keep_earlier, self.panel, self.actions)
         self.corners = CornerEditor(self.viewer, self)
@@ -425,16 +428,6 @@ class FilmPack(ToolPanel):
         for signal in (self.regions.picked, edits.edited):
             signal.connect(self._schedule_plot)
         self.packs.picked.connect(self._on_pack)
-        for button, action in (
-            (self.new, self._new_pack),
-            (self.show_corners, self._show_corners),
-            (self.paint, self._paint),
-            (self.run_again, self._run_again),
-            (self.to_fit, self._add_fit_images),
-            (self.write, self._write_layers),
-            (self.save, self._save),
-        ):
-            button.clicked.connect(lambda _, action=action: action())
 
     # A run
 
@@ -620,9 +613,3 @@ class FilmPack(ToolPanel):
 
 def _title(role: str) -> str:
     return next(kind.title for kind in packs.KINDS if kind.role == role)
-
-
-def _button(text: str, tip: str) -> QtWidgets.QPushButton:
-    button = QtWidgets.QPushButton(text)
-    button.setToolTip(f"<qt>{tip}</qt>")
-    return button

@@ -42,7 +42,6 @@ from napari_shadowinv._napari.widgets._forms import (
     ModelPicker,
     kinds_of,
     labelled,
-    with_button,
     wrapping_label,
 )
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
@@ -63,7 +62,12 @@ from napari_shadowinv._napari.widgets._panels import (
     fact_rows,
     warning_rows,
 )
-from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, while_alive
+from napari_shadowinv._napari.widgets._qt import (
+    notify_errors,
+    side_by_side,
+    while_alive,
+    with_button,
+)
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_inputs, result_frame
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop

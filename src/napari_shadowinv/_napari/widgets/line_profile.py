@@ -184,11 +184,8 @@ class ProfilePlot(Plot):
             for number, profile in enumerate(profiles):
                 if profile.unit == of_unit:
                     colour, name = COLOURS[number % len(COLOURS)], profile.name
-                    name = (
-                        name
-                        if len(name) <= _MAX_NAME_LENGTH
-                        else f"…{name[1 - _MAX_NAME_LENGTH :]}"
-                    )
+                    if len(name) > _MAX_NAME_LENGTH:
+                        name = f"…{name[1 - _MAX_NAME_LENGTH :]}"
                     axis.plot(distance, profile.values, color=colour, label=name)
             if profiles:
                 self.add_legend(axis)
@@ -233,9 +230,8 @@ class LineProfile(qt.Docked):
         )
         self.hint = forms.wrapping_label("Press ✎ and draw a line on the image.")
         self.problem = forms.wrapping_label(style=forms.PROBLEM_STYLE)
-        self.export = QtWidgets.QPushButton("Export CSV…")
-        self.export.setToolTip("Save the profile as a table.")
-        lines = forms.with_button(self.lines, "✎", "Draw a new line.", self._draw)
+        self.export = qt.push_button("Export CSV…", "Save the profile as a table.", self._export)
+        lines = qt.with_button(self.lines, "✎", "Draw a new line.", self._draw)
         width = qt.side_by_side((self.width_edit, 2), (self.width_unit, 1))
         rows = (
             forms.labelled("Line", lines),
@@ -264,7 +260,6 @@ class LineProfile(qt.Docked):
             self.width_unit.currentIndexChanged,
         ):
             signal.connect(lambda _: self._schedule_plot())
-        self.export.clicked.connect(lambda: self._export())
 
     def _items(self) -> list[tuple[Any, Any]]:
         """Return the items of the list with their layers."""
@@ -376,21 +371,20 @@ class LineProfile(qt.Docked):
     def _fill(self, event: Any = None) -> None:
         """List all grey images; new visible ones are checked."""
         listed, checked = [layer for _, layer in self._items()], self.checked()
-        self.layers.blockSignals(True)
-        self.layers.clear()
-        for layer in reversed(self.viewer.layers):
-            if kind_of(layer) != "image" or layer.rgb or layer.ndim < 2:
-                continue
-            is_new = not any(layer is old for old in listed)
-            on = any(layer is old for old in checked) or (
-                is_new and layer.visible and (role_of(layer) is not None or not listed)
-            )
-            item = QtWidgets.QListWidgetItem(layer.name)
-            item.setData(_LAYER_ROLE, layer)
-            item.setToolTip(layer.name)
-            item.setCheckState(Qt.CheckState.Checked if on else Qt.CheckState.Unchecked)
-            self.layers.addItem(item)
-        self.layers.blockSignals(False)
+        with QSignalBlocker(self.layers):
+            self.layers.clear()
+            for layer in reversed(self.viewer.layers):
+                if kind_of(layer) != "image" or layer.rgb or layer.ndim < 2:
+                    continue
+                is_new = not any(layer is old for old in listed)
+                on = any(layer is old for old in checked) or (
+                    is_new and layer.visible and (role_of(layer) is not None or not listed)
+                )
+                item = QtWidgets.QListWidgetItem(layer.name)
+                item.setData(_LAYER_ROLE, layer)
+                item.setToolTip(layer.name)
+                item.setCheckState(Qt.CheckState.Checked if on else Qt.CheckState.Unchecked)
+                self.layers.addItem(item)
         self._schedule_plot()
 
     @qt.notify_errors
