@@ -378,7 +378,8 @@ class InvertStack(InversionInputs, ToolPanel):
             self.viewer.reset_view()
             if isinstance(self._shown, WatchRequest):
                 show_shot(self.viewer, newest_shot(self.results.layers))
-        arrows = next(filter(_is_arrows, self.results.layers), None)
+        layers = self.results.layers
+        arrows = next((layer for layer in layers if role_of(layer) == "arrows"), None)
         if arrows is not self._arrows:
             self._arrows = arrows
             self._read_arrows = None if arrows is None else follow_shots(self.viewer, arrows)
@@ -460,7 +461,3 @@ class InvertStack(InversionInputs, ToolPanel):
         if not self.panel.runner.running:
             self.forget()
         self.keep()
-
-
-def _is_arrows(layer: Any) -> bool:
-    return role_of(layer) == "arrows"
