@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-__all__ = ["CAUTION_CODES", "Caution", "OnCaution", "warn_of"]
-
 CAUTION_CODES: Mapping[str, str] = MappingProxyType(
     {
         # the solution

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from typing import Self
 
-__all__ = ["FileFormatError", "InputError", "InversionCancelled"]
-
 
 class _UserError(Exception):
     """Base of a user's mistakes; `option` is the one that resolves it, such as overwrite."""

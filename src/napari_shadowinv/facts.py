@@ -18,20 +18,6 @@ from typing import Any
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.cautions import Caution
 
-__all__ = [
-    "Fact",
-    "Headline",
-    "Level",
-    "ResultKind",
-    "Verdict",
-    "caution_facts",
-    "error_fact",
-    "in_headline",
-    "masked_fact",
-    "time_fact",
-    "verdict_fact",
-]
-
 
 class ResultKind(StrEnum):
     """Kind of a result; its value is the attribute ``format`` of the result's file."""

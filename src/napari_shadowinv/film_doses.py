@@ -25,8 +25,6 @@ from napari_shadowinv.provenance import Provenance
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["FilmDoses"]
-
 _PLANES = ("layer", "y", "x")
 _PER_AREA = "1/(m² MeV)"
 # Variable: attribute of `FilmDoses`, dimensions, units, long name.

@@ -24,8 +24,6 @@ from napari_shadowinv.options import Noise
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing.recipe import Recipe
 
-__all__ = ["ImageOrigin", "MaskOrigin", "Origin", "Provenance", "index_masks"]
-
 # Characters of a mask, of a table and of the whole: HDF5 keeps no attribute longer than 64,000.
 _MAX_MASK, _MAX_FIDUCIALS, _MAX_TEXT = 48_000, 9_000, 54_000
 _MASKS = ("mask", "source_mask")

@@ -158,7 +158,8 @@ def check_requests(
     count: int, *, left_out: bool, window: int | None, fiducials: Path | None, result: Path
 ) -> None:
     """Refuse, before any work, checks that the images or the result file do not allow."""
-    from napari_shadowinv.pipeline.static_checks import check_count, check_window
+    from napari_shadowinv.fitting.windows import check_count
+    from napari_shadowinv.pipeline.static_checks import check_window
 
     if left_out:
         check_count(count)

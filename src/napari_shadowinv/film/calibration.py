@@ -31,16 +31,6 @@ from napari_shadowinv._system.tables import Table, read_table
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
-__all__ = [
-    "Calibration",
-    "CombinedDose",
-    "DoseMap",
-    "combined_dose",
-    "dose",
-    "net_optical_density",
-    "unexposed_pixel",
-]
-
 _CHANNELS = ("red", "green", "blue")
 _TYPICAL_SPREAD = 0.02  # of a pixel, where the table has none
 _LEAST_SPREAD = 1e-4  # of the optical density

@@ -44,15 +44,6 @@ from numpy.typing import ArrayLike, NDArray
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
-__all__ = [
-    "Luminescence",
-    "TrackImage",
-    "Tracks",
-    "fading",
-    "fuji_luminescence",
-    "ge_luminescence",
-]
-
 _TRACKS_PER_BIN = 50
 _BINS_PER_SIDE = 300
 _MAX_BINS = 100_000_000

@@ -33,18 +33,6 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.physics.setup import ProtonSetup, setup_from_dict
 
-__all__ = [
-    "FILM_TYPES",
-    "MATERIALS",
-    "PROTON_MASS",
-    "FilmType",
-    "Material",
-    "Pack",
-    "PackLayer",
-    "Slab",
-    "Stopping",
-]
-
 PROTON_MASS = 938.27209  # MeV
 _ELECTRON_MASS = 0.51099895  # MeV
 _BETHE_FACTOR = 0.307075  # MeV cm²/mol

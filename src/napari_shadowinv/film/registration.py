@@ -28,15 +28,6 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.scans import upright
 
-__all__ = [
-    "EDGE_ERROR_PX",
-    "Poses",
-    "check_orientation",
-    "move_corners",
-    "poses_by_fiducials",
-    "register",
-]
-
 EDGE_ERROR_PX = 3.0  # standard deviation of a film's place by its edges
 # Structure between these sizes is compared.
 _FINE_BLUR_PX = 2.0

@@ -26,15 +26,6 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.calibration import Calibration, checked_scan, net_optical_density
 
-__all__ = [
-    "burnt_edges",
-    "find_films",
-    "read_corners",
-    "straighten_film",
-    "usable_pixels",
-    "write_corners",
-]
-
 _MAX_FILM_BRIGHTNESS = 0.75  # of the bed's brightness, in the film's darkest colour
 _BED_PERCENTILE = 99.0  # percentile of the brightness
 _MIN_FILM_SHARE = 0.02  # of the scan's area, or `least_side` squared

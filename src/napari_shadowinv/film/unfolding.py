@@ -23,14 +23,6 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.pack import PROTON_MASS, Pack, Slab, Stopping
 
-__all__ = [
-    "Band",
-    "Response",
-    "Spectra",
-    "relative_strengths",
-    "unfold",
-]
-
 _JOULES_PER_MEV = 1.602176634e-13  # J
 _MIN_ENERGY_MEV = 0.5
 _MAX_ENERGY_MEV = 200.0

@@ -27,8 +27,6 @@ from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.compiler import njit
 
-__all__ = ["Density", "split_pixels", "walk_edge"]
-
 Triple = tuple[float, float, float]
 
 _MIN_PIXELS_PER_THREAD = 100_000  # pixels

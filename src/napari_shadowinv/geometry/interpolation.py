@@ -37,17 +37,6 @@ from napari_shadowinv.geometry.compiler import njit
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
-__all__ = [
-    "BLOCK",
-    "WIDTH",
-    "CloughTocher",
-    "corner_weights",
-    "fit_gradients",
-    "natural_neighbor",
-    "with_gradients",
-    "with_mirror_images",
-]
-
 BLOCK = 2048  # queries that share one walk; fixed, so that threads change nothing
 WIDTH = 8  # numbers in a cache line
 _LARGEST_CAVITY = 256

@@ -30,11 +30,6 @@ from napari_shadowinv.geometry.density import Density, walk_edge
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
-__all__ = [
-    "PowerDiagram",
-    "pixel_shares",
-]
-
 
 @njit(nogil=True, cache=True)
 def _power_centres(

@@ -41,8 +41,6 @@ from napari_shadowinv.geometry.triangle_mesh import (
     insertion_order,
 )
 
-__all__ = ["RegularTriangulation", "hilbert_order"]
-
 # Distance of the ghosts from the centre of the sites, in extents of the sites. From 3.5 on a ghost
 # that weighs no more than any site has its cell outside three times the bounding box.
 GHOST_DISTANCE = 10.0

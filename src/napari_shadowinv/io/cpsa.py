@@ -40,8 +40,6 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.film.other_detectors import Tracks
 from napari_shadowinv.io.files import check_promise
 
-__all__ = ["as_text", "read_image", "read_tracks"]
-
 _HEADER, _FRAME, _TRACK = struct.Struct("<4i2f6i"), struct.Struct("<10i"), 9
 _IN_MEMORY = 10  # times the size of a file: its bytes and the arrays of its tracks
 _MOST_FRAMES = 500_000  # scans have some ten thousand

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["BURNER_FILES", "BURNER_URL", "fetch_burner"]
-
 # Data of doi:10.1016/j.expthermflusci.2025.111562, MIT licence.
 BURNER_URL = (
     "https://raw.githubusercontent.com/pyrimidine/"

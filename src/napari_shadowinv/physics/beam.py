@@ -35,20 +35,6 @@ from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 
-__all__ = [
-    "BeamQuantity",
-    "BeamSetup",
-    "Deflector",
-    "MainField",
-    "SIField",
-    "deflection_warnings",
-    "displacement_from_potential",
-    "field_of_view_text",
-    "geometry_text",
-    "number_in_unit",
-    "setup_warnings",
-]
-
 _QUANTITY = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+))(?:[eE]([+-]?\d+))?\s*([^\W\d_]+)")
 _UNIT_IN_TITLE = re.compile(r"\(([^()]+)\)$")
 _POWERS = {"f": -15, "p": -12, "n": -9, "µ": -6, "μ": -6, "u": -6, "m": -3, "c": -2, "": 0}

@@ -33,13 +33,6 @@ from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry.compiler import njit
 
-__all__ = [
-    "deposit_band",
-    "jacobian_determinant",
-    "synthetic_image",
-]
-
-
 # Of a tile: y0, x0, y1, x1, y2, x2, y3, x3.
 Corners = tuple[float, float, float, float, float, float, float, float]
 

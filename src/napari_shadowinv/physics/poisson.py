@@ -15,8 +15,6 @@ from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 
-__all__ = ["border_mean", "poisson_invert"]
-
 _BYTES_PER_PIXEL = 64  # image, source, ratio, transform and copies of them
 
 

@@ -36,13 +36,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import MIN_SIDE_PX, checked_displacement, synthetic_image
 from napari_shadowinv.physics.setup import Setup, deflector_titles
 
-__all__ = [
-    "default_deflector",
-    "project",
-    "project_potential",
-    "transferred_displacement",
-]
-
 # Share of a pixel by which rounding may put an image's edge beyond the other's.
 _EDGE_TOLERANCE_PX = 1e-6
 # Pixels that differ by less are the same ones, divided and multiplied by a magnification.

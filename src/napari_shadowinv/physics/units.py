@@ -31,23 +31,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = [
-    "PeakError",
-    "ShownField",
-    "display_unit",
-    "intensity_limits",
-    "label",
-    "numbers_of",
-    "peak_facts",
-    "place_coordinates",
-    "place_label",
-    "prefix_for",
-    "shown_fields",
-    "shown_potential",
-    "takes_prefix",
-    "with_error",
-]
-
 _SHOWN_PERCENTILES = 0.1, 99.7
 _MAX_SHOWN_PER_MEAN = 3.5
 _MIN_SHADE = 0.3  # of the brightest intensity; the limits of darker images begin at 0

@@ -48,15 +48,6 @@ from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.images import Scan, read_scan
 from napari_shadowinv.provenance import ImageOrigin, Provenance
 
-__all__ = [
-    "Film",
-    "in_parallel",
-    "read_films",
-    "run_film",
-    "to_scan_frame",
-]
-
-
 _UNEXPOSED_RANGE = (0.98, 1.2)  # unexposed film over the lightest film of the table
 # Films are cut at right angles, but by hand: by share of the diagonal, and in metres.
 _MAX_ASKEW_SHARE, _MAX_ASKEW_M = 0.015, 2e-3

@@ -20,8 +20,6 @@ from napari_shadowinv.io.files import write_toml
 from napari_shadowinv.physics.setup import SETUPS, Setup, setup_from_dict
 from napari_shadowinv.preprocessing import Radiograph, Recipe
 
-__all__ = ["read_part", "read_recipe", "setup_from", "write_recipe"]
-
 
 def read_recipe(path: Path) -> Recipe:
     """Read a recipe; file names in it are relative to its folder.

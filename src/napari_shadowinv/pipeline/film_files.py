@@ -27,18 +27,6 @@ from napari_shadowinv.io.files import in_counting_order, make_folder, write_toml
 from napari_shadowinv.io.formats import PRADFORMAT, SCAN_SUFFIXES, SITES, TIFF
 from napari_shadowinv.io.pradformat import write_radiograph
 
-__all__ = [
-    "LAYERS_TABLE",
-    "PACK_FILE",
-    "NewPack",
-    "draft_pack",
-    "missing_entries",
-    "read_pack",
-    "write_layers",
-    "write_new_pack",
-]
-
-
 LAYERS_TABLE = f"layers{SITES.suffix}"
 _COLUMNS = ("file", "mask", "setup", "energy", "strength", "exclude")
 

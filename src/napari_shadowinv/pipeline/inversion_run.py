@@ -51,18 +51,6 @@ from napari_shadowinv.preprocessing.estimates import centre_within
 from napari_shadowinv.provenance import ImageOrigin, MaskOrigin, Origin, Provenance, index_masks
 from napari_shadowinv.transport.sites import SitePlan
 
-__all__ = [
-    "PREVIEW_PIXELS",
-    "PREVIEW_SITES",
-    "Cache",
-    "Inputs",
-    "collect_inputs",
-    "quick_source",
-    "run",
-    "run_prepared",
-    "same_array",
-]
-
 
 @dataclass
 class Cache:

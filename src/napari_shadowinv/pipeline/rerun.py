@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.io.read_write import AnyResult
 
-__all__ = ["IDENTICAL", "Rerun", "RerunInputs", "collect_rerun", "provenance_of", "rerun"]
-
 IDENTICAL = "none: the same result, bit for bit"
 _PAINTED = {"caustic"}  # may have been corrected by hand
 

@@ -9,8 +9,6 @@ from pydantic import ConfigDict, Field, field_validator
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv.io.formats import TIFF
 
-__all__ = ["RunOptions", "WatchOptions"]
-
 _RARE: Any = {"panel": "Rarely used options of a run"}
 
 

@@ -23,17 +23,6 @@ from napari_shadowinv.io.formats import SITES
 from napari_shadowinv.options import MAX_STRENGTH, Noise
 from napari_shadowinv.physics.setup import beam_quantities
 
-__all__ = [
-    "ShotRow",
-    "fiducials_from",
-    "is_table",
-    "rows_by_shot",
-    "rows_to_invert",
-    "shot_rows",
-    "table_rows",
-    "write_table",
-]
-
 _BeamValue = Annotated[float, Field(gt=0, le=1e5)] | None
 
 

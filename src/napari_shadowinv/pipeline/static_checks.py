@@ -27,15 +27,6 @@ from napari_shadowinv.preprocessing import Recipe
 if TYPE_CHECKING:
     import xarray
 
-__all__ = [
-    "StaticChecks",
-    "check_count",
-    "check_window",
-    "run_checks",
-    "run_leave_one_out",
-    "run_windows",
-]
-
 
 @dataclass(frozen=True)
 class StaticChecks:

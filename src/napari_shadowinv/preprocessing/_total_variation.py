@@ -10,8 +10,6 @@ from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.compiler import njit
 
-__all__ = ["least_variation"]
-
 _STEP = 0.25  # the largest for which the iteration is known to converge in two dimensions
 _TOLERANCE = 1e-7  # change of the energy in one step, as a share of the energy at the start
 

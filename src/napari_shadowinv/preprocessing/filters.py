@@ -38,20 +38,6 @@ from napari_shadowinv.preprocessing import pixels
 from napari_shadowinv.preprocessing.pixels import fill_masked_pixels
 from napari_shadowinv.preprocessing.steps import Radiograph, Step, degree_field, width_field
 
-__all__ = [
-    "BackgroundFilter",
-    "ButterworthFilter",
-    "Filter",
-    "HighPassFilter",
-    "HotPixelFilter",
-    "LowPassFilter",
-    "butterworth",
-    "high_pass",
-    "low_pass",
-    "remove_background",
-    "remove_hot_pixels",
-]
-
 
 class Filter(Step):
     """A step that changes the values of the image, and of a measured source alike."""

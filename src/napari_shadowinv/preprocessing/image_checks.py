@@ -35,14 +35,6 @@ from napari_shadowinv._system.arrays import NORMAL_MAD, complete_block_means, or
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 
-__all__ = [
-    "ReferencePair",
-    "dark_level",
-    "image_warnings",
-    "saturated_share",
-    "stray_pixels",
-]
-
 # Saturation
 _MIN_PLATEAU_PIXELS, _MIN_PLATEAU_SHARE = 10, 5e-4
 _PLATEAU_RISE = 1.15  # of the maximum over the median

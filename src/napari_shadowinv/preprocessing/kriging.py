@@ -25,8 +25,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import BeamComponents, BeamPrior
 from napari_shadowinv.preprocessing.pixels import beam_pixels, with_flux_of
 
-__all__ = ["kriged_beam", "kriged_source"]
-
 _GRID = 48  # blocks along the longer side
 _DOMAIN = 1.5  # sides of the image
 _LENGTHS = np.geomspace(0.1, 1.2, 6)  # shorter sides

@@ -37,14 +37,6 @@ from napari_shadowinv.geometry.compiler import njit
 from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.geometry.triangle_mesh import Indices
 
-__all__ = [
-    "FactorisedLaplacian",
-    "LaplacianSolver",
-    "SimilarSystems",
-    "factorise",
-]
-
-
 _MAX_COARSEST_NODES = 60
 _MIN_TIE = 0.2
 _MAX_PAIRED_SHARE = 0.75

@@ -50,18 +50,6 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.transport.linear import SimilarSystems
 from napari_shadowinv.transport.sites import Level, Margin
 
-__all__ = [
-    "SHORTEST_STEP",
-    "OpenObjective",
-    "Solution",
-    "TransportObjective",
-    "blur_image",
-    "descend",
-    "newton",
-    "sharpen",
-    "with_full_cells",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Solution:

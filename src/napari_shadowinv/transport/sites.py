@@ -46,17 +46,6 @@ from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
 
-__all__ = [
-    "Level",
-    "Levels",
-    "Margin",
-    "SitePlan",
-    "edge_flux",
-    "lloyd",
-    "plan_levels",
-    "sample_sites",
-]
-
 
 @dataclass(frozen=True)
 class Margin:

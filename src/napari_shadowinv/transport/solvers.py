@@ -36,9 +36,6 @@ from napari_shadowinv.transport.minimise import (
 )
 from napari_shadowinv.transport.sites import RATIO, Level, Levels, Margin
 
-__all__ = ["LevelSolution", "Target", "fit_flux_factor", "solve"]
-
-
 _COARSE_TOLERANCE = 3e-2
 _PREPARED_SITES = 20_000  # levels up to this size are needed for almost any accuracy
 _MAX_KEPT_SURFACE_SITES = 50_000  # larger surfaces are computed again rather than kept
