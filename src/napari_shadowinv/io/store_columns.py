@@ -246,6 +246,5 @@ def column_values(store: str, result: Any) -> dict[str, Any]:
     """Return the values of a result by the columns' keys, for the shot's report."""
     setup = getattr(result, "setup", None)
     available = columns_of(store) if setup is None else columns_of(store, setup.kind)
-    columns = (column for column in available if column.value is not None)
-    values = {column.key: column.value(result) for column in columns if column.value}
+    values = {column.key: column.value(result) for column in available if column.value}
     return {key: value for key, value in values.items() if value is not None}
