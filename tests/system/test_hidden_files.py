@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from napari_shadowinv._system import hidden_files
-from napari_shadowinv._system.hidden_files import hidden_name, sweep, temporary_folder
+from napari_shadowinv._system.hidden_files import hidden_name, locked, sweep, temporary_folder
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import check_output, replacing
 
@@ -95,6 +95,34 @@ def test_litter_of_a_killed_process_is_swept(tmp_path: Path, body: str) -> None:
     with replacing(tmp_path / "b.tif") as draft:
         draft.write_text("all")
     assert [path.name for path in tmp_path.iterdir()] == ["b.tif"]
+
+
+@pytest.mark.parametrize(
+    ("holder", "step"),
+    [
+        (hidden_files, "_open_lock"),
+        (hidden_files, "_try_lock"),
+        (hidden_files, "_write_owner"),
+        (Path, "unlink"),
+    ],
+)
+def test_lock_is_removed_whenever_a_signal_comes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, holder: object, step: str
+) -> None:
+    work = getattr(holder, step)
+
+    def interrupted(*arguments: object) -> object:
+        if step == "unlink":
+            signal.raise_signal(signal.SIGINT)
+            return work(*arguments)
+        result = work(*arguments)
+        signal.raise_signal(signal.SIGINT)
+        return result
+
+    monkeypatch.setattr(holder, step, interrupted)
+    with pytest.raises(KeyboardInterrupt), locked(tmp_path / "a.shadowinv.zarr"):
+        pass
+    assert list(tmp_path.iterdir()) == []
 
 
 def dead_process() -> int:

@@ -24,11 +24,12 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import BinaryIO, cast
 
+from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv.errors import FileFormatError
 
 MAX_NAME_BYTES = 255  # of almost all file systems
@@ -147,22 +148,29 @@ def locked(path: Path) -> Iterator[None]:
     # locks, or is shared and they do not reach other hosts, signs of life stand in for them: a
     # lock whose file does not change while one watches is stale, whatever the clocks say.
     lock = path.with_name(f".{_shorten_name(path.name)}.lock")
-    file, is_new = _open_lock(path, lock)
-    with file:
-        _take_lock(path, lock, file, is_new)
-        ended = threading.Event()
+    ended = threading.Event()
 
-        def beat() -> None:
-            while not ended.wait(_BEAT_S):
-                with suppress(OSError):
-                    os.utime(lock)
+    def beat() -> None:
+        while not ended.wait(_BEAT_S):
+            with suppress(OSError):
+                os.utime(lock)
 
+    with ExitStack() as stack:
+        with defer_interrupts():  # a signal leaves no lock without its release
+            file, is_new = _open_lock(path, lock)
+            stack.enter_context(file)
+            taken = _try_lock(file)
+            is_certain = _is_certain(file, is_new, taken)
+            if is_certain:
+                stack.callback(_release, file, lock)
+        if taken is False or not (is_certain or _is_silent(lock)):
+            raise _lock_error(path, file)
+        _sign(path, lock, file, settle=not is_certain)
+        if not is_certain:
+            stack.callback(_release, file, lock)
+        stack.callback(ended.set)
         threading.Thread(target=beat, daemon=True, name="lock").start()
-        try:
-            yield
-        finally:
-            ended.set()
-            _release(file, lock)
+        yield
 
 
 def _shorten_name(name: str) -> str:
@@ -208,18 +216,21 @@ def _not_a_file_error(path: Path, lock: Path) -> FileFormatError:
     )
 
 
-def _take_lock(path: Path, lock: Path, file: BinaryIO, is_new: bool) -> None:
-    """Make the lock this process's own."""
-    taken = _try_lock(file)
-    is_certain = is_new or (taken and _read_owner(file).get("host") in (None, socket.gethostname()))
-    if taken is False or not (is_certain or _is_silent(lock)):
-        raise _lock_error(path, file)
+def _is_certain(file: BinaryIO, is_new: bool, taken: bool | None) -> bool:
+    """Return whether no other process can hold the lock."""
+    if taken is False:
+        return False
+    return is_new or bool(taken and _read_owner(file).get("host") in (None, socket.gethostname()))
+
+
+def _sign(path: Path, lock: Path, file: BinaryIO, *, settle: bool) -> None:
+    """Write this process into the lock, and see whether another one does so meanwhile."""
     try:
         signature = _write_owner(file)
     except OSError as error:
         _release(file, lock)
         raise _not_writable_error(path, error) from None
-    if not is_certain:
+    if settle:
         time.sleep(_SETTLE_S)
         if _read_owner(file) != signature:
             raise _lock_error(path, file)
@@ -253,6 +264,7 @@ def _read_lock(lock: Path) -> tuple[int, bytes] | None:
         return None
 
 
+@defer_interrupts()
 def _release(file: BinaryIO, lock: Path) -> None:
     with suppress(OSError):
         if os.path.samestat(os.fstat(file.fileno()), os.stat(lock)):
