@@ -536,7 +536,7 @@ def test_the_compiler_is_told_and_does_not_hold_up_cancelling(
 
 
 def test_a_window_is_closed_during_a_fit(
-    make_napari_viewer: Any, qtbot: Any, messages: list[str]
+    make_napari_viewer: Any, qtbot: Any, messages: list[str], traced_images: list[int]
 ) -> None:
     viewer = make_napari_viewer(show=True)
     for energy, setup, image in zip(ENERGIES, SETUPS, images(), strict=True):
@@ -546,8 +546,12 @@ def test_a_window_is_closed_during_a_fit(
     tool.options.set_values({"samples": 1000})
     tool.panel.button.click()
     qtbot.waitUntil(lambda: len(tool.panel.runner.tag.progress.history) > 100, timeout=PATIENCE)
+    stop = tool.panel.runner._box.stop
     viewer.close()
-    qtbot.waitUntil(lambda: not threads(), timeout=1000)
+    qtbot.waitUntil(stop.is_set, timeout=PATIENCE)
+    traced_images.clear()
+    qtbot.waitUntil(lambda: not threads(), timeout=PATIENCE)
+    assert len(traced_images) <= 8 * len(ENERGIES)  # a line search of the step under way
     assert messages == []
 
 
@@ -566,18 +570,19 @@ def test_a_result_whose_first_image_is_gone_is_shown_and_placed(
 
 
 def test_closing_the_dock_ends_the_fit(
-    window: Any, tool: Any, qtbot: Any, messages: list[str]
+    window: Any, tool: Any, qtbot: Any, messages: list[str], traced_images: list[int]
 ) -> None:
     tool.view._redraw_timer.setInterval(REDRAW_MS)
     tool.options.set_values({"samples": 1000})
     tool.panel.button.click()
     qtbot.waitUntil(lambda: bool(tool.panel.runner.tag.progress.history), timeout=PATIENCE)
+    stop = tool.panel.runner._box.stop
     window.window.remove_dock_widget(tool)
     tool.deleteLater()
-    qtbot.waitUntil(
-        lambda: not any(thread.name == "shadowinv" for thread in threading.enumerate()),
-        timeout=5000,
-    )
+    qtbot.waitUntil(stop.is_set, timeout=PATIENCE)
+    traced_images.clear()
+    qtbot.waitUntil(lambda: not threads(), timeout=PATIENCE)
+    assert len(traced_images) <= 8 * len(ENERGIES)
     qtbot.wait(100)
     window.add_image(np.ones((8, 8)))
     assert messages == []
