@@ -143,6 +143,14 @@ def test_saturation_leaves_uniform_images_alone():
     assert saturated_share(np.ones(SHAPE)) == 0
 
 
+def test_saturation_leaves_a_beam_with_a_flat_top_alone():
+    y, x = np.mgrid[-1:1:200j, -1:1:200j]
+    beam = np.round(100 + 1000 * np.exp(-((x**2 + y**2) ** 2) / 0.03))
+    assert (beam == beam.max()).mean() > 2e-3  # whole numbers repeat the maximum
+    assert saturated_share(beam) == 0
+    assert saturated_share(np.minimum(beam, 1000.0)) == pytest.approx((beam >= 1000).mean())
+
+
 def test_saturated_pixels_under_a_mask_do_not_count(shot):
     image = shot[0].copy()
     image[:20] = 10 * image.max()
