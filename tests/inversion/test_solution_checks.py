@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from napari_shadowinv.inversion import Inversion, Report, invert
+from napari_shadowinv.inversion import Inversion, Report, invert, solution_checks
 from napari_shadowinv.inversion.solution_checks import (
     image_residual,
     inner_sides,
@@ -440,6 +440,18 @@ def test_a_mask_beside_the_peak_is_reported():
     length = np.hypot(*inversion.displacement)
     assert length[~mask].max() < length[mask].max()
     assert "masked-peak" in codes_of(inversion)
+
+
+@pytest.mark.parametrize(("under", "is_reported"), [(0.9, False), (1.1, True)])
+def test_a_field_stronger_under_a_mask_than_outside_is_reported(under, is_reported):
+    mask = np.ones((60, 60), bool)
+    mask[10:20, 10:20] = False
+    displacement = np.zeros((2, 60, 60))
+    displacement[0, 15, 15] = under
+    displacement[1, 40, 45] = 1.0
+    text = solution_checks._peak_at_mask(displacement, mask)
+    assert ("up to 1.1 px under the mask, 1 px outside" in text) == is_reported
+    assert bool(text) == is_reported
 
 
 def test_the_headline_and_errors_leave_masked_pixels_out():
