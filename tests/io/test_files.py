@@ -101,6 +101,7 @@ def test_temporary_file_lies_beside_with_the_same_ending(tmp_path: Path) -> None
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals to oneself")
+@pytest.mark.usefixtures("usual_ctrl_c")
 def test_ctrl_c_during_the_clean_up_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

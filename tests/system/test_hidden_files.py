@@ -106,6 +106,7 @@ def test_litter_of_a_killed_process_is_swept(tmp_path: Path, body: str) -> None:
         (Path, "unlink"),
     ],
 )
+@pytest.mark.usefixtures("usual_ctrl_c")
 def test_lock_is_removed_whenever_a_signal_comes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, holder: object, step: str
 ) -> None:
