@@ -144,6 +144,18 @@ def test_given_noise_is_used_and_scales(image):
     assert noise_errors["counts"] == pytest.approx(noise_errors["weak"] * 0.2646 / 0.07, rel=0.25)
 
 
+@pytest.mark.parametrize(
+    ("choices", "variance"), [({"noise_level": 0.03}, 9e-4), ({"units_per_quantum": 4e-4}, 4e-4)]
+)
+def test_stated_noise_of_an_image_adds_to_that_of_its_source(choices, variance):
+    smooth = np.ones((120, 120))
+    recorded = smooth + 0.04 * np.random.default_rng(8).normal(size=smooth.shape)
+    options = InversionOptions(**choices)
+    for source, by_source in ((smooth, 0.0), (recorded, 16e-4)):
+        noise = ImageNoise(prepare(smooth, source, options).in_units(), options)
+        assert noise.variance(np.ones(1))[0] == pytest.approx(variance + by_source, rel=0.05)
+
+
 def test_discretisation_is_the_change_by_many_more_sites(every_image):
     size = every_image.size
     many, *coarse = (
