@@ -9,6 +9,7 @@ import pytest
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.forward import Scene, blurred
+from napari_shadowinv.fitting.instrument import EXACT, Imperfect, Shapes
 from napari_shadowinv.fitting.rays import KNOT, at_rest
 from napari_shadowinv.fitting.unknowns import AdditiveBlock, Fiducials, Unknowns
 from napari_shadowinv.options import FitOptions
@@ -68,6 +69,16 @@ def scene() -> Scene:
         spacing=1 / 3,
         threads=1,
         added=(Stripes(),),
+        imperfect=Imperfect(
+            gamma=0.1,
+            blur=0.5,
+            background=0.05,
+            other_strengths=0.2 * np.array([[1.0, 1.0], [0.8, 0.5]]),
+            shapes=(
+                Shapes("beam", 0.1 * beams),
+                Shapes("between", 0.05 * beams[::-1], is_common=False),
+            ),
+        ),
     )
 
 
@@ -79,6 +90,8 @@ def some(scene: Scene) -> Unknowns:
     unknowns.potentials[0] = -18 * bump
     unknowns.potentials[1] = 9 * bump * np.cos(x / 3)
     unknowns.beam[0, 1], unknowns.beam[2, 1] = 0.1, -0.05
+    unknowns.common[:] = 0.5, 0.6, -0.4, 0.7, 0.3
+    unknowns.separate[:] = [[0.5, -0.6, 0.4], [-0.3, 0.7, 0.2]]
     unknowns.brightness[:] = 0.1, -0.2
     unknowns.frames[1] = [0.4, 1.01, -0.01, -0.3, 0.02, 0.98]
     unknowns.added[0][:] = [[0.1, 0.05], [-0.05, 0.02]]
@@ -100,7 +113,9 @@ def only(part: str, change: Unknowns) -> Unknowns:
     return change if part == "all" else change.zeros()._replace(**{part: getattr(change, part)})
 
 
-@pytest.mark.parametrize("part", ["potentials", "beam", "brightness", "frames", "added", "all"])
+@pytest.mark.parametrize(
+    "part", ["potentials", "beam", "brightness", "frames", "common", "separate", "added", "all"]
+)
 def test_the_gradient_is_that_of_the_value(scene: Scene, part: str) -> None:
     unknowns = some(scene)
     counts = scene.ray_counts(unknowns)
@@ -216,8 +231,14 @@ def test_the_hessian_is_the_change_of_the_gradient_where_images_are_explained(
 def test_an_image_is_made_by_the_sum_of_the_fields_at_its_strengths(scene: Scene) -> None:
     unknowns = some(scene)
     first, second = unknowns.potentials
+    exact = replace(scene, imperfect=EXACT)
     np.testing.assert_allclose(
-        scene.potentials(unknowns), [first + second, 0.6 * first + 0.35 * second]
+        exact.potentials(unknowns), [first + second, 0.6 * first + 0.35 * second]
+    )
+    # Another field adds 0.4 standard deviations of 20 % and of its shares of them, reversed.
+    np.testing.assert_allclose(
+        scene.potentials(unknowns),
+        [0.92 * (first + second), 0.536 * first + 0.31 * second],
     )
 
 

@@ -37,7 +37,14 @@ def prior() -> Prior:
 def nothing(prior: Prior) -> Unknowns:
     shape = len(prior.smoothness), *prior.rays.shape
     modes = prior.beam_modes, prior.beam_modes
-    return Unknowns(np.zeros(shape), np.zeros(modes), np.zeros(3), np.tile(at_rest(), (3, 1)))
+    return Unknowns(
+        potentials=np.zeros(shape),
+        beam=np.zeros(modes),
+        common=np.zeros(2),
+        brightness=np.zeros(3),
+        frames=np.tile(at_rest(), (3, 1)),
+        separate=np.zeros((3, 1)),
+    )
 
 
 def random(prior: Prior, seed: int) -> Unknowns:

@@ -19,6 +19,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer
 from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.instrument import absorption_shapes
 from napari_shadowinv.fitting.measurements import FitData, collect_data
 from napari_shadowinv.fitting.pattern import (
     Pattern,
@@ -52,7 +53,7 @@ from napari_shadowinv.fitting.shots import Images, list_shots
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.fitting.verdict import assess_verdict, hidden_contrast
 from napari_shadowinv.inversion import invert
-from napari_shadowinv.options import FitOptions, InversionOptions, KindOfNoise
+from napari_shadowinv.options import FitOptions, Instrument, InversionOptions, KindOfNoise
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.physics.setup import Setup
@@ -70,6 +71,8 @@ _MIN_BLUR_SCORE = 4.0  # standard deviations
 _DARKEST = 1e-3  # of a beam's mean
 _MAX_RIVAL_CHI2 = 3.0  # a fit that ended further away is no start for a rival
 _SPACING_OF_SAMPLES = 1 / 3  # px
+# Before a field has been found, they would take its place.
+_HELD_IN_SEARCH = frozenset({"gamma", "blur", "other_field"})
 
 
 def fit(
@@ -83,6 +86,7 @@ def fit(
     psf: Any = 0.0,
     mask: ArrayLike | None = None,
     brightness: ArrayLike | Literal["known", "free"] = "known",
+    instrument: Instrument | None = None,
     options: FitOptions | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
@@ -164,6 +168,7 @@ def fit(
         psf=psf,
         mask=mask,
         brightness=brightness,
+        instrument=instrument,
         options=options,
     )
     ensure_compiled(on_progress, should_stop)
@@ -176,7 +181,10 @@ def fit(
         report("fit", steps, None, stage, objective)
 
     with _timed("starts", seconds):
-        minima = search(scene, collect_starts(data, on_step, should_stop), on_step)
+        held = replace(scene, imperfect=scene.imperfect.held(_HELD_IN_SEARCH))
+        minima = search(held, collect_starts(data, on_step, should_stop), on_step)
+        if data.instrument.absorption:
+            scene, minima = _with_absorption(data, scene, minima)
     with _timed("smoothness", seconds):
         scene, best = estimate_smoothness(scene, minima[0], rng, on_step)
         if data.counted:
@@ -341,6 +349,26 @@ def _transport_potential(
         ).potential
     except InputError:
         return None
+
+
+def _with_absorption(
+    data: FitData, scene: Scene, minima: Sequence[Minimum]
+) -> tuple[Scene, list[Minimum]]:
+    """Return the scene and minima with an unknown transmission of the object that was found."""
+    height, width = data.size
+    coarse = minima[0].displacement.sum(axis=0)
+    displacement = coarse.repeat(MIDDLE, axis=1).repeat(MIDDLE, axis=2)[:, :height, :width]
+    used = (scene.weights[:, :height, :width] > 0).any(axis=0)
+    shapes = absorption_shapes(data.instrument.absorption, displacement, used, data.around)
+    imperfect = replace(scene.imperfect, shapes=(*scene.imperfect.shapes, shapes))
+    zeros = np.zeros(len(shapes.values))
+    return replace(scene, imperfect=imperfect), [
+        replace(
+            each,
+            unknowns=each.unknowns._replace(common=np.append(each.unknowns.common, zeros)),
+        )
+        for each in minima
+    ]
 
 
 def reweight_counts(data: FitData, scene: Scene, minimum: Minimum) -> Scene:

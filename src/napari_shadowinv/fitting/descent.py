@@ -229,7 +229,8 @@ class Preconditioner:
         frames = np.where(scene.free_frames, 1 / np.sqrt(moved + prior.frame_weights), 0.0)
         frames[0] = 0
         added = [block.scales(scene.weights) for block in scene.added]
-        self._diagonals = [beam, brightness, frames, *added]
+        common, separate = scene.number_scales()
+        self._diagonals = [beam, common, brightness, frames, separate, *added]
 
     def damp(self, unknowns: Unknowns) -> Unknowns:
         """Return unknowns without the finest waves, which knots further apart leave behind."""
@@ -412,6 +413,7 @@ def coarser(scene: Scene, factor: int) -> Scene:
         decay=scene.decay / factor,
         pad=scene.pad // factor,
         fiducials=None if fiducials is None else Fiducials(*(part / factor for part in fiducials)),
+        imperfect=scene.imperfect.coarsen(factor),
         bin=scene.bin * factor,
     )
 

@@ -11,13 +11,15 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, laplace
 from scipy.signal import oaconvolve
 from scipy.sparse import csc_array, csr_array
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
+from napari_shadowinv.fitting.instrument import DARKEST, EXACT, Imperfect, widen, widening
 from napari_shadowinv.fitting.rays import RayModel, at_rest
 from napari_shadowinv.fitting.unknowns import AdditiveBlock, Fiducials, Prior, Unknowns
 
@@ -60,6 +62,8 @@ class Scene:
         Number of threads. Default: all cores. It does not affect the result.
     added : tuple of AdditiveBlock
         Unknown light that adds to each image.
+    imperfect : Imperfect
+        Standard deviations of an instrument that is not exact.
     """
 
     images: FloatArray
@@ -82,6 +86,7 @@ class Scene:
     bin: int = 1
     threads: int | None = None
     added: tuple[AdditiveBlock, ...] = ()
+    imperfect: Imperfect = EXACT
 
     def only(self, numbers: Sequence[int]) -> Scene:
         """Return some of the images, in this order; fields stay in the same unit."""
@@ -93,12 +98,13 @@ class Scene:
             strengths=self.strengths[chosen],
             beams=self.beams[chosen],
             psf=[self.psf[k] for k in chosen],
+            imperfect=self.imperfect.only(chosen),
         )
 
     @cached_property
     def rays(self) -> RayModel:
         """The rays of all images."""
-        beyond = max(_reach(width) for width in self.psf)
+        beyond = max(_reach(width, self.imperfect.blur) for width in self.psf)
         size = self.images.shape[1], self.images.shape[2]
         return RayModel(size, self.pad, beyond, self.spacing, self.threads)
 
@@ -122,17 +128,28 @@ class Scene:
     def nothing(self) -> Unknowns:
         """Return the unknowns of no object in a beam as known."""
         count, fields = self.strengths.shape
+        common, separate = self.imperfect.counts
         return Unknowns(
-            np.zeros((fields, *self.rays.shape)),
-            np.zeros((self.beam_modes, self.beam_modes)),
-            np.zeros(count),
-            np.tile(at_rest(), (count, 1)),
-            tuple(np.zeros((count, len(block.spreads()))) for block in self.added),
+            potentials=np.zeros((fields, *self.rays.shape)),
+            beam=np.zeros((self.beam_modes, self.beam_modes)),
+            common=np.zeros(common),
+            brightness=np.zeros(count),
+            frames=np.tile(at_rest(), (count, 1)),
+            separate=np.zeros((count, separate)),
+            added=tuple(np.zeros((count, len(block.spreads()))) for block in self.added),
         )
+
+    def strengths_with(self, unknowns: Unknowns) -> FloatArray:
+        """Return the displacement in image l by each field's, with that by another field."""
+        other = self.imperfect.other_strengths
+        if other is None:
+            return self.strengths
+        return self.strengths + unknowns.common[self.imperfect.place("other_field")] * other
 
     def potentials(self, unknowns: Unknowns) -> FloatArray:
         """Return the coefficients of each image's own potential, shape (L, …)."""
-        return np.asarray(np.einsum("lm,myx->lyx", self.strengths, unknowns.potentials))
+        strengths = self.strengths_with(unknowns)
+        return np.asarray(np.einsum("lm,myx->lyx", strengths, unknowns.potentials))
 
     def ray_counts(self, unknowns: Unknowns) -> list[IntArray]:
         """Return how many rays each cell of each image needs; see `RayModel.ray_counts`."""
@@ -146,7 +163,8 @@ class Scene:
     def beam(self, unknowns: Unknowns) -> FloatArray:
         """Return the beam of each image within it, without brightness, shape (L, H, W)."""
         height, width = self.rays.size
-        beams = self.beams * self._beam_shape(unknowns)
+        shape = self._beam_shape(unknowns)
+        beams = np.stack([shape * self._light(unknowns, k) for k in range(len(self.beams))])
         return np.asarray(beams[:, self.pad : self.pad + height, self.pad : self.pad + width])
 
     def chi2(self, unknowns: Unknowns, counts: list[IntArray]) -> FloatArray:
@@ -161,13 +179,28 @@ class Scene:
         value, slope = self.prior.value_and_slope(unknowns)
         of_shape = np.zeros(self.beams.shape[1:])
         for shot in self._shots(unknowns, counts):
-            k, root = shot[0], np.sqrt(self.weights[shot[0]])
-            model = np.exp(unknowns.brightness[k]) * self._lit(unknowns, shot)
+            k, root = shot.number, np.sqrt(self.weights[shot.number])
+            seen = self._seen(unknowns, shot)
+            model = np.exp(unknowns.brightness[k]) * seen.image
             residual = blurred(root * (model - self.images[k]), self.blur)
             value += float(np.einsum("yx,yx", residual, residual)) / 2
             pull = root * blurred(residual, self.blur)
             slope.brightness[k] += np.einsum("yx,yx", pull, model)
-            self._add_pulls(slope, of_shape, unknowns, shot, pull)
+            scaled = np.exp(unknowns.brightness[k]) * pull
+            self._add_light_pulls(slope, k, scaled)
+            seen.add_pulls(slope, k, scaled)
+            pulls = self.rays.gradient(
+                shot.potential,
+                shot.counts,
+                shot.beam,
+                self._spread_back(k, seen.slope * scaled, unknowns),
+                shot.frame,
+                of_beam=self._has_beam,
+                of_frame=k > 0 and bool(self.free_frames.any()),
+            )
+            self._add_potential_pulls(slope, unknowns, k, pulls.potential)
+            of_shape += self._add_beam_pulls(slope, unknowns, k, pulls.beam)
+            slope.frames[k] += pulls.frame
         slope.beam[:] += self._of_modes(of_shape * self._beam_shape(unknowns))
         return value, self._only_free(slope)
 
@@ -193,39 +226,114 @@ class Scene:
         `variations` are shares of the beams; an image is linear in its beam.
         """
         changes = np.empty_like(self.images)
-        for k, psi, count, beam, frame in self._shots(unknowns, counts):
-            bare = self._bare(k, psi, count, variations[k] * beam, frame)
+        for k, shot in enumerate(self._shots(unknowns, counts)):
+            changed = self._bare(unknowns, shot._replace(beam=variations[k] * shot.beam))
+            slope = self._seen(unknowns, shot).slope if self.imperfect.gamma else 1.0
+            bare = slope * changed
             changes[k] = np.sqrt(self.weights[k]) * np.exp(unknowns.brightness[k]) * bare
         return changes
 
     def linear(self, unknowns: Unknowns, counts: list[IntArray]) -> Linear:
         """Return the scene to first order around unknowns."""
         shots = list(self._shots(unknowns, counts))
-        of_beam, of_frame = bool(self.beam_modes), bool(self.free_frames.any())
+        of_beam, of_frame = self._has_beam, bool(self.free_frames.any())
         jacobians = [
-            self.rays.jacobian(*shot[1:], of_beam=of_beam, of_frame=shot[0] > 0 and of_frame)
+            self.rays.jacobian(*shot[1:], of_beam=of_beam, of_frame=shot.number > 0 and of_frame)
             for shot in shots
         ]
         if not of_beam and not of_frame:
             columns = math.prod(self.rays.shape)
             for jacobian in jacobians:
                 jacobian.resize(jacobian.shape[0], columns)
-        return Linear(self, unknowns, jacobians, [self._lit(unknowns, shot) for shot in shots])
+        return Linear(self, unknowns, jacobians, [self._seen(unknowns, shot) for shot in shots])
+
+    def number_scales(self) -> tuple[FloatArray, FloatArray]:
+        """Return approximate standard deviations of the instrument's numbers, (n,) and (L, n)."""
+        imperfect, weights = self.imperfect, self.weights
+        common, separate = (np.ones(count) for count in imperfect.counts)
+        separate = np.tile(separate, (len(weights), 1))
+        images = np.maximum(self.images, DARKEST)
+        changes = {
+            "gamma": imperfect.gamma * images * np.log(images),
+            "blur": imperfect.blur / 2 * laplace(gaussian_filter(images, (0, 1, 1))),
+            "other_field": 0.1 * (images - 1),
+            "background": np.full(weights.shape, imperfect.background),
+        }
+        shapes = {each.key: each.values for each in imperfect.shapes}
+        for part in imperfect.parts:
+            if part.key in shapes:
+                rows, columns = weights.shape[1:]
+                inner = shapes[part.key][
+                    :, self.pad : self.pad + rows, self.pad : self.pad + columns
+                ]
+                curvature = np.einsum("lyx,kyx->lk", weights, inner**2)
+            else:
+                curvature = np.einsum("lyx,lyx->l", weights, changes[part.key] ** 2)[:, None]
+            if part.is_common:
+                common[part.places] = 1 / np.sqrt(1 + curvature.sum(axis=0))
+            else:
+                separate[:, part.places] = 1 / np.sqrt(1 + curvature)
+        return common, separate
+
+    @property
+    def _has_beam(self) -> bool:
+        """Whether light that enters is unknown."""
+        return bool(self.beam_modes) or self.imperfect.changes_beam
 
     def _shots(self, unknowns: Unknowns, counts: list[IntArray]) -> Iterator[_Shot]:
         shape = self._beam_shape(unknowns)
         for k, psi in enumerate(self.potentials(unknowns)):
-            yield k, psi, counts[k], self.beams[k] * shape, unknowns.frames[k]
+            beam = self._light(unknowns, k) * shape
+            yield _Shot(k, psi, counts[k], beam, unknowns.frames[k])
 
-    def _bare(
-        self, k: int, psi: FloatArray, counts: IntArray, beam: FloatArray, frame: FloatArray
-    ) -> FloatArray:
+    def _light(self, unknowns: Unknowns, k: int) -> FloatArray:
+        """Light of an image's beam by its source, without the modes of an unknown beam."""
+        numbers = unknowns.common, unknowns.separate[k]
+        light = self.imperfect.entering(self.beams[k], *numbers)
+        return np.asarray(light * self.imperfect.excess(*numbers))
+
+    def _bare(self, unknowns: Unknowns, shot: _Shot) -> FloatArray:
         """The light of an image's rays, without its brightness."""
-        return self._spread(k, self.rays.image(psi, counts, beam, frame))
+        rays = self.rays.image(shot.potential, shot.counts, shot.beam, shot.frame)
+        return self._inner(self._spread(shot.number, rays, unknowns))
 
     def _lit(self, unknowns: Unknowns, shot: _Shot) -> FloatArray:
         """An image without its brightness: the light of its rays, and what adds to it."""
-        return self._with_added(unknowns, shot[0], self._bare(*shot))
+        return self._seen(unknowns, shot).image
+
+    def _seen(self, unknowns: Unknowns, shot: _Shot) -> _Seen:
+        """An image without its brightness, and its derivatives."""
+        imperfect, k = self.imperfect, shot.number
+        rays = self.rays.image(shot.potential, shot.counts, shot.beam, shot.frame)
+        bare = self._inner(self._spread(k, rays, unknowns))
+        image, slope = bare, np.ones(())
+        derivatives = {}
+        if imperfect.gamma:
+            exponent = imperfect.exponent(unknowns.common)
+            light = np.maximum(bare, DARKEST)
+            power = light ** (exponent - 1)
+            image, slope = light * power, exponent * power
+            derivatives["gamma"] = imperfect.gamma * image * np.log(light)
+        if imperfect.blur:
+            variance, extra = self._variance(k), imperfect.variance(unknowns.common)
+            spread = rays if isinstance(self.psf[k], float) else _spread(rays, self.psf[k])
+            wider = self._inner(widening(spread, variance + extra))
+            derivatives["blur"] = imperfect.blur * slope * wider
+        if imperfect.background:
+            image = image + imperfect.offset(unknowns.separate[k])
+            derivatives["background"] = np.full(image.shape, imperfect.background)
+        places = {
+            part.key: (part.is_common, part.places.start)
+            for part in imperfect.parts
+            if part.key in derivatives
+        }
+        effects = [(*places[key], values) for key, values in derivatives.items()]
+        return _Seen(self._with_added(unknowns, k, image), slope, effects)
+
+    def _variance(self, k: int) -> float:
+        """Variance of a Gaussian point spread that an error of the blur adds to."""
+        width = self.psf[k]
+        return width**2 if isinstance(width, float) else 0.0
 
     def _with_added(self, unknowns: Unknowns, k: int, image: FloatArray) -> FloatArray:
         for block, coefficients in zip(self.added, unknowns.added, strict=True):
@@ -236,30 +344,30 @@ class Scene:
         for block, derivatives in zip(self.added, slope.added, strict=True):
             derivatives[k] += block.pull(pull)
 
-    def _add_pulls(
-        self,
-        slope: Unknowns,
-        of_shape: FloatArray,
-        unknowns: Unknowns,
-        shot: _Shot,
-        pull: FloatArray,
+    def _add_potential_pulls(
+        self, slope: Unknowns, unknowns: Unknowns, k: int, pull: FloatArray
     ) -> None:
-        k, psi, counts, beam, frame = shot
-        scaled = np.exp(unknowns.brightness[k]) * pull
-        self._add_light_pulls(slope, k, scaled)
-        back = self._spread_back(k, scaled)
-        pulls = self.rays.gradient(
-            psi,
-            counts,
-            beam,
-            back,
-            frame,
-            of_beam=bool(self.beam_modes),
-            of_frame=k > 0 and bool(self.free_frames.any()),
-        )
-        slope.potentials[:] += self.strengths[k][:, None, None] * pulls.potential
-        of_shape += pulls.beam * self.beams[k]
-        slope.frames[k] += pulls.frame
+        """Add derivatives by the potentials of an image's own."""
+        slope.potentials[:] += self.strengths_with(unknowns)[k][:, None, None] * pull
+        if (other := self.imperfect.other_strengths) is not None:
+            along = np.einsum("m,myx,yx->", other[k], unknowns.potentials, pull)
+            slope.common[self.imperfect.place("other_field")] += along
+
+    def _add_beam_pulls(
+        self, slope: Unknowns, unknowns: Unknowns, k: int, pull: FloatArray
+    ) -> FloatArray:
+        """Add derivatives by the light that enters; return those by the beam's modes."""
+        if not self._has_beam:
+            return pull
+        imperfect, numbers = self.imperfect, (unknowns.common, unknowns.separate[k])
+        light = self._light(unknowns, k)
+        if imperfect.changes_beam:
+            shaped = pull * light * self._beam_shape(unknowns)
+            for part, logarithm in imperfect.entering_changes(self.beams[k], *numbers):
+                derivatives = slope.common if part.is_common else slope.separate[k]
+                derivatives[part.places] += np.einsum("yx,yx", shaped, logarithm)
+            imperfect.pull_shapes(shaped, slope.common, slope.separate[k])
+        return pull * light
 
     def _only_free(self, slope: Unknowns) -> Unknowns:
         frames = np.where(self.free_frames, slope.frames, 0.0)
@@ -295,16 +403,62 @@ class Scene:
     def _beam_shape(self, unknowns: Unknowns) -> FloatArray:
         return np.exp(self._modes(unknowns.beam))
 
-    def _spread(self, k: int, image: FloatArray) -> FloatArray:
+    def _inner(self, image: FloatArray) -> FloatArray:
         inner = self.rays.beyond
-        spread = _spread(image, self.psf[k])
-        return spread[inner:-inner, inner:-inner] if inner else spread
+        return image[inner:-inner, inner:-inner] if inner else image
 
-    def _spread_back(self, k: int, pull: FloatArray) -> FloatArray:
-        width = self.psf[k]
-        turned = width if isinstance(width, float) else width[::-1, ::-1]
+    def _spread(self, k: int, image: FloatArray, unknowns: Unknowns) -> FloatArray:
+        width, imperfect = self.psf[k], self.imperfect
+        if not imperfect.blur:
+            return _spread(image, width)
+        if not isinstance(width, float):
+            image = _spread(image, width)
+        return widen(image, self._variance(k) + imperfect.variance(unknowns.common))
+
+    def _spread_back(self, k: int, pull: FloatArray, unknowns: Unknowns) -> FloatArray:
+        width, imperfect = self.psf[k], self.imperfect
         padded = np.pad(pull, self.rays.beyond) if self.rays.beyond else pull
-        return _spread(padded, turned)
+        if imperfect.blur:
+            padded = widen(padded, self._variance(k) + imperfect.variance(unknowns.common))
+        if not isinstance(width, float):
+            return _spread(padded, width[::-1, ::-1])
+        return padded if imperfect.blur else _spread(padded, width)
+
+
+class _Shot(NamedTuple):
+    """An image's rays: its number, potential, rays a cell, beam and frame."""
+
+    number: int
+    potential: FloatArray
+    counts: IntArray
+    beam: FloatArray
+    frame: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """An image without its brightness.
+
+    `slope` is the derivative of the response, `effects` are the derivatives by numbers of the
+    instrument, with their places: whether they are common, and which.
+    """
+
+    image: FloatArray
+    slope: FloatArray
+    effects: list[tuple[bool, int, FloatArray]]
+
+    def push(self, common: FloatArray, separate: FloatArray) -> FloatArray | float:
+        """Return the change of the image by changes of the instrument's numbers."""
+        return sum(
+            (common if is_common else separate)[place] * values
+            for is_common, place, values in self.effects
+        )
+
+    def add_pulls(self, slope: Unknowns, k: int, pull: FloatArray) -> None:
+        """Add the transpose of `push` times a pull."""
+        for is_common, place, values in self.effects:
+            derivatives = slope.common if is_common else slope.separate[k]
+            derivatives[place] += np.einsum("yx,yx", pull, values)
 
 
 @dataclass(frozen=True)
@@ -318,14 +472,14 @@ class Linear:
     jacobians : list of csr_array
         As `RayModel.jacobian` returns them, for each image; without the beam's and the frame's
         columns if neither is unknown.
-    bare : list of ndarray
-        The images without their brightness.
+    seen : list
+        The images without their brightness, and how they are seen.
     """
 
     scene: Scene
     unknowns: Unknowns
     jacobians: list[csr_array]
-    bare: list[FloatArray]
+    seen: list[_Seen]
 
     def hessian_times(self, change: Unknowns) -> Unknowns:
         """Return the Gauss-Newton Hessian times a change of the unknowns."""
@@ -336,19 +490,19 @@ class Linear:
     def push(self, change: Unknowns) -> FloatArray:
         """Return the change of all residuals (f - I) / σ, to first order, shape (L, H, W)."""
         scene = self.scene
-        potentials = scene.potentials(change)
-        if self._has_others:
-            of_shape = self._beam_shape * scene._modes(change.beam)
+        potentials = self._potential_changes(change)
         changes = np.empty_like(scene.images)
-        for k, jacobian in enumerate(self.jacobians):
+        for k, (jacobian, seen) in enumerate(zip(self.jacobians, self.seen, strict=True)):
             columns = potentials[k].ravel()
             if self._has_others:
-                of_beam = scene.beams[k] * of_shape
+                of_beam = self._lights[k] * (self._beam_shape * self._beam_change(change, k))
                 columns = np.concatenate([columns, of_beam.ravel(), change.frames[k]])
             landed = (jacobian @ columns).reshape(scene.rays.seen)
-            bare = scene._spread(k, landed) + change.brightness[k] * self.bare[k]
-            bare = scene._with_added(change, k, bare)
-            np.multiply(self._roots[k], bare, out=changes[k])
+            spread = scene._inner(scene._spread(k, landed, self.unknowns))
+            image = seen.slope * spread + change.brightness[k] * seen.image
+            image = image + seen.push(change.common, change.separate[k])
+            image = scene._with_added(change, k, image)
+            np.multiply(self._roots[k], image, out=changes[k])
         return changes
 
     def pull(self, residuals: FloatArray) -> Unknowns:
@@ -356,20 +510,44 @@ class Linear:
         scene = self.scene
         slope = self.unknowns.zeros()
         of_shape = np.zeros(scene.beams.shape[1:])
-        for k, transposed in enumerate(self._transposed):
+        for k, (transposed, seen) in enumerate(zip(self._transposed, self.seen, strict=True)):
             pull = self._roots[k] * residuals[k]
-            slope.brightness[k] = np.einsum("yx,yx", pull, self.bare[k])
+            slope.brightness[k] = np.einsum("yx,yx", pull, seen.image)
             scene._add_light_pulls(slope, k, pull)
-            columns = transposed @ scene._spread_back(k, pull).ravel()
+            seen.add_pulls(slope, k, pull)
+            back = scene._spread_back(k, seen.slope * pull, self.unknowns)
+            columns = transposed @ back.ravel()
             of_potential, of_instrument = np.split(columns, [math.prod(scene.rays.shape)])
             psi = of_potential.reshape(scene.rays.shape)
-            slope.potentials[:] += scene.strengths[k][:, None, None] * psi
+            scene._add_potential_pulls(slope, self.unknowns, k, psi)
             if self._has_others:
-                of_shape += of_instrument[:-6].reshape(of_shape.shape) * scene.beams[k]
+                of_beam = of_instrument[:-6].reshape(of_shape.shape)
+                of_shape += scene._add_beam_pulls(slope, self.unknowns, k, of_beam)
                 slope.frames[k] = of_instrument[-6:]
         if self._has_others:
             slope.beam[:] = scene._of_modes(of_shape * self._beam_shape)
         return scene._only_free(slope)
+
+    def _potential_changes(self, change: Unknowns) -> FloatArray:
+        scene, imperfect = self.scene, self.scene.imperfect
+        strengths = scene.strengths_with(self.unknowns)
+        changes = np.einsum("lm,myx->lyx", strengths, change.potentials)
+        if imperfect.other_strengths is not None:
+            other = change.common[imperfect.place("other_field")] * imperfect.other_strengths
+            changes += np.einsum("lm,myx->lyx", other, self.unknowns.potentials)
+        return np.asarray(changes)
+
+    def _beam_change(self, change: Unknowns, k: int) -> FloatArray:
+        """Relative change of the light that enters for an image."""
+        scene, imperfect = self.scene, self.scene.imperfect
+        total = scene._modes(change.beam)
+        numbers = self.unknowns.common, self.unknowns.separate[k]
+        for part, logarithm in imperfect.entering_changes(scene.beams[k], *numbers):
+            changes = change.common if part.is_common else change.separate[k]
+            total = total + changes[part.places] * logarithm
+        if imperfect.shapes:
+            total = total + imperfect.shape_changes(change.common, change.separate[k])
+        return np.asarray(total)
 
     @property
     def _has_others(self) -> bool:
@@ -385,12 +563,13 @@ class Linear:
         return self.scene._beam_shape(self.unknowns)
 
     @cached_property
+    def _lights(self) -> list[FloatArray]:
+        return [self.scene._light(self.unknowns, k) for k in range(len(self.jacobians))]
+
+    @cached_property
     def _roots(self) -> FloatArray:
         """The brightness over the standard deviation of the noise, shape (L, H, W)."""
         return np.sqrt(self.scene.weights) * np.exp(self.unknowns.brightness)[:, None, None]
-
-
-_Shot = tuple[int, FloatArray, IntArray, FloatArray, FloatArray]  # number, ψ, rays, beam, frame
 
 
 def blurred(image: FloatArray, width: float) -> FloatArray:
@@ -406,8 +585,8 @@ def _spread(image: FloatArray, width: float | FloatArray) -> FloatArray:
     return np.asarray(oaconvolve(image, width, mode="same"))
 
 
-def _reach(width: float | FloatArray) -> int:
-    """How far a point is spread, px."""
+def _reach(width: float | FloatArray, blur: float) -> int:
+    """How far a point is spread, px, with an error of its variance."""
     if isinstance(width, float):
-        return int(_SIGMAS * width + 0.5)
-    return int(max(width.shape)) // 2
+        return int(_SIGMAS * np.sqrt(width**2 + 2 * blur) + 0.5)
+    return int(max(width.shape)) // 2 + int(_SIGMAS * np.sqrt(2 * blur) + 0.5)

@@ -24,13 +24,21 @@ from napari_shadowinv._system.arrays import (
     unpack_planes,
 )
 from napari_shadowinv._system.safety import check_memory
-from napari_shadowinv._system.validation import check_instance
+from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.instrument import imperfect_instrument
 from napari_shadowinv.fitting.shots import Images, join_shots, list_shots, names_of, value_of_first
 from napari_shadowinv.fitting.unknowns import Fiducials, additive_blocks
-from napari_shadowinv.options import KINDS_OF_NOISE, MAX_STRENGTH, FitOptions, KindOfNoise
+from napari_shadowinv.options import (
+    KINDS_OF_NOISE,
+    MAX_STRENGTH,
+    BeamPrior,
+    FitOptions,
+    Instrument,
+    KindOfNoise,
+)
 from napari_shadowinv.physics.projection import transferred_displacement
 from napari_shadowinv.physics.setup import BeamSetup, Setup, deflector_titles
 
@@ -83,9 +91,18 @@ class FitData:
     single: bool  # one image, or several with the same information
     assumed: bool
     common: bool
+    instrument: Instrument
+    beam: BeamPrior
     setups: tuple[Setup, ...] | None
     names: tuple[str, ...] | None  # if the images have any
     start: FloatArray | None  # potential in px² of the first field
+
+    @property
+    def around(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Pixels by which beams reach beyond the images along y and x."""
+        pad, shape = self.scene.pad, self.scene.beams.shape[1:]
+        before_y, before_x = ((pad, n - pad - side) for n, side in zip(shape, self.size, strict=True))
+        return before_y, before_x
 
     def scene_with(self, smoothness: float | None) -> Scene:
         """Return the scene with λ as it was given, or none yet, for each field."""
@@ -104,9 +121,11 @@ def collect_data(
     psf: Any = 0.0,
     mask: ArrayLike | None = None,
     brightness: ArrayLike | Literal["known", "free"] = "known",
+    instrument: Instrument | None = None,
     options: FitOptions,
 ) -> FitData:
     """Check the inputs of a fit; see `fit` for their forms."""
+    instrument = as_model(Instrument, instrument, "instrument")
     shots = list_shots(images)
     planes: Any = images
     if shots:
@@ -156,24 +175,41 @@ def collect_data(
     free = options.boundary == "free"
     usual = max(16, 8 * round(_FREE_SHARE * min(height, width) / 8)) if free else 16
     pad = options.margin or usual
-    around = [(0, 0), *((pad, pad + filled) for _, filled in fill[1:])]
+    around = (pad, pad + fill[1][1]), (pad, pad + fill[2][1])
+    is_common = all(np.array_equal(beam, shapes[0]) for beam in shapes[1:])
+    is_assumed = source is None or not all(shot.measured for shot in shots)
+    prior = instrument.beam_of(measured=not is_assumed)
+    imperfect = imperfect_instrument(
+        instrument,
+        prior if bool(instrument.stated) else BeamPrior(),
+        beams / units[:, None, None],
+        used.any(axis=0),
+        around,
+        is_common=is_common,
+        is_unknown=unknown,
+        other_strengths=_other_strengths(setups, fields, matrix),
+    )
+    # Of a detector that is not linear, an assumed source does not have the image's mean.
+    is_dimmed = source is None and instrument.gamma > 0
+    align = "affine" if options.align == "none" and instrument.registration else options.align
     scene = Scene(
         images=np.pad(scaled, fill),
         weights=np.pad(weights, fill),
         strengths=matrix,
-        beams=np.pad(beams / units[:, None, None], around, mode="edge"),
+        beams=np.pad(beams / units[:, None, None], ((0, 0), *around), mode="edge"),
         psf=check_point_spread(psf, count, size),
         smoothness=np.zeros((matrix.shape[1], 2)),
         pad=pad,
         tie=_FREE_TIE if free else 30.0,
         decay=(options.decay_length or pad) if free else np.inf,
         beam_modes=options.beam_modes if unknown else 0,
-        free_brightness=free_brightness or unknown,
-        free_frames=_ALIGNED[options.align],
-        shift_spread=options.align_spread,
+        free_brightness=free_brightness or unknown or is_dimmed,
+        free_frames=_ALIGNED[align],
+        shift_spread=options.align_spread if align == options.align else instrument.registration,
         fiducials=_checked_fiducials(value_of_first(shots, "fiducials"), (height, width)),
         threads=options.threads,
         added=additive_blocks(options),
+        imperfect=imperfect,
     )
     spread = np.linalg.norm(matrix, axis=1)
     single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
@@ -184,8 +220,10 @@ def collect_data(
         brightness=factors,
         counted=_is(noise, "poisson"),
         single=single,
-        assumed=source is None,
-        common=all(np.array_equal(beam, shapes[0]) for beam in shapes[1:]),
+        assumed=is_assumed,
+        common=is_common,
+        instrument=instrument,
+        beam=prior,
         setups=None if setups is None else tuple(setups),
         names=names if any(shot.name for shot in shots) else None,
         start=_checked_start(value_of_first(shots, "start"), (height, width)),
@@ -251,6 +289,14 @@ def strengths_of(
             for setup in setups
         ]
     )
+
+
+def _other_strengths(
+    setups: Sequence[Setup] | None, fields: Sequence[str], strengths: FloatArray
+) -> FloatArray:
+    """Return the displacement by an electric field that is equal to each field's in image 1."""
+    has_other = setups is not None and tuple(fields) == ("B",)
+    return strengths_of(setups, ("E",), len(strengths)) if has_other else strengths
 
 
 def estimated_noise(image: FloatArray, used: BoolArray) -> float:

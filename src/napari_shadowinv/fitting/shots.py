@@ -63,6 +63,8 @@ class FitShot:
         A potential in px² to start from, of the first field, in the first image only.
     name : str, optional
         Its name in messages. Default: its file or its number.
+    measured : bool, default True
+        Whether the source was recorded, not estimated from the image.
 
     Examples
     --------
@@ -81,6 +83,7 @@ class FitShot:
     fiducials: ArrayLike | Path | None = None
     start: ArrayLike | None = None
     name: str | None = None
+    measured: bool = True
 
     @property
     def beam_unknown(self) -> bool:

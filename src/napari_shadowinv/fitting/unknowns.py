@@ -40,33 +40,36 @@ __all__ = [
     "additive_blocks",
 ]
 
-_COMMON = 2  # blocks that the images share; the others have a row for each image
+_COMMON = 3  # blocks that the images share; the others have a row for each image
 
 
 class Unknowns(NamedTuple):
     """The unknowns of a fit, or derivatives by them, or changes of them.
 
     `potentials` (M, …) are B-spline coefficients of the fields' potentials, `beam` (n, n) cosine
-    coefficients of the beam's logarithm, `brightness` (L,) logarithms, `frames` (L, 6) as a
-    `RayModel` takes them, `added` the coefficients (L, …) of each `AdditiveBlock`.
+    coefficients of the beam's logarithm, `common` (n,) and `separate` (L, n) the numbers of an
+    `Imperfect` instrument, `brightness` (L,) logarithms, `frames` (L, 6) as a `RayModel` takes
+    them, `added` the coefficients (L, …) of each `AdditiveBlock`.
     """
 
     potentials: FloatArray
     beam: FloatArray
+    common: FloatArray
     brightness: FloatArray
     frames: FloatArray
+    separate: FloatArray
     added: tuple[FloatArray, ...] = ()
 
     @property
     def blocks(self) -> tuple[FloatArray, ...]:
         """All arrays."""
-        return self.potentials, self.beam, self.brightness, self.frames, *self.added
+        return tuple(self[:-1]) + self.added
 
     @classmethod
     def from_blocks(cls, blocks: Iterable[FloatArray]) -> Unknowns:
         """Return unknowns with the arrays of `blocks`."""
-        potentials, beam, brightness, frames, *added = blocks
-        return cls(potentials, beam, brightness, frames, tuple(added))
+        potentials, beam, common, brightness, frames, separate, *added = blocks
+        return cls(potentials, beam, common, brightness, frames, separate, tuple(added))
 
     def flat(self) -> FloatArray:
         """Return all values as one array."""
@@ -84,16 +87,15 @@ class Unknowns(NamedTuple):
     def only(self, numbers: Sequence[int]) -> Unknowns:
         """Return the unknowns of some of the images."""
         chosen = list(numbers)
-        return self.from_blocks(
-            [self.potentials, self.beam, *(block[chosen] for block in self.blocks[_COMMON:])]
-        )
+        separate = (block[chosen] for block in self.blocks[_COMMON:])
+        return self.from_blocks([*self.blocks[:_COMMON], *separate])
 
     def with_images(self, numbers: Sequence[int], part: Unknowns) -> Unknowns:
         """Return the unknowns with those of some images replaced."""
         blocks = [block.copy() for block in self.blocks[_COMMON:]]
         for block, new in zip(blocks, part.blocks[_COMMON:], strict=True):
             block[list(numbers)] = new
-        return self.from_blocks([part.potentials, part.beam, *blocks])
+        return self.from_blocks([*part.blocks[:_COMMON], *blocks])
 
     def plus(self, other: Unknowns) -> Unknowns:
         """Return the sum of both."""
@@ -174,6 +176,7 @@ def additive_blocks(options: FitOptions) -> tuple[AdditiveBlock, ...]:
 POWERS = (4, 6)  # of the wave number squared: |∇⁴φ|² and |∇⁶φ|²
 
 _BRIGHTNESS_WEIGHT = 1.0  # 1 / s² of their logarithm
+_NORMAL = np.array(1.0)  # 1 / s² of the numbers of an instrument
 _STRETCH_SPREAD = 0.05  # of turns, magnifications and shears
 
 
@@ -300,7 +303,8 @@ class Prior:
     def _weights(self) -> list[FloatArray]:
         """1 / s² of the values of each block but the potentials."""
         added = (block.prior_weights() for block in self.added)
-        return [self.beam_weights, np.array(_BRIGHTNESS_WEIGHT), self.frame_weights, *added]
+        brightness = np.array(_BRIGHTNESS_WEIGHT)
+        return [self.beam_weights, _NORMAL, brightness, self.frame_weights, _NORMAL, *added]
 
     @cached_property
     def beam_weights(self) -> FloatArray:

@@ -22,12 +22,14 @@ from napari_shadowinv.options import BeamPrior, Instrument
 
 __all__ = [
     "IMPERFECTIONS",
+    "BeamExcess",
     "Imperfection",
     "InstrumentDraws",
     "RecordedShot",
     "Scene",
     "SmoothField",
     "SolvedShot",
+    "motions",
     "random_waves",
 ]
 
@@ -277,13 +279,18 @@ def _blur(shot: SolvedShot, width: float) -> FloatArray:
 def _registration(shot: SolvedShot, shift: float) -> FloatArray:
     """Shifts along y and x, a turn and a change of scale, as large at the corners."""
     source = np.where(shot.prepared.mask, shot.prepared.source, shot.mean)
-    along_y, along_x = np.gradient(source)
+    return shot.flux_of_source(2 * shift * motions(source))
+
+
+def motions(image: FloatArray) -> FloatArray:
+    """Return changes of an image by shifts along y and x, a turn and a scale, by 1 px each."""
+    along_y, along_x = np.gradient(image)
     y, x = (
-        (indices - (side - 1) / 2) / (np.hypot(*source.shape) / 2)
-        for indices, side in zip(np.indices(source.shape), source.shape, strict=True)
+        (indices - (side - 1) / 2) / (np.hypot(*image.shape) / 2)
+        for indices, side in zip(np.indices(image.shape), image.shape, strict=True)
     )
     patterns = [along_y, along_x, along_y * x - along_x * y, along_y * y + along_x * x]
-    return shot.flux_of_source(2 * shift * np.stack(patterns))
+    return np.stack(patterns)
 
 
 def _absorption(shot: SolvedShot, rms: float) -> FloatArray:
@@ -395,8 +402,14 @@ IMPERFECTIONS: tuple[Imperfection, ...] = (
 """Quantities of the instrument with their effects on an image, in the order of the budget."""
 
 
-class _BeamExcess:
-    """Relative differences of beams from their source: shapes of a prior, and smooth fields."""
+class BeamExcess:
+    """Relative differences of beams from their source: shapes of a prior, and smooth fields.
+
+    Attributes
+    ----------
+    count : int
+        Number of independent normal numbers.
+    """
 
     def __init__(self, beam: BeamPrior, source: FloatArray) -> None:
         self._rest = SmoothField(beam.length * min(source.shape), source)
@@ -413,11 +426,15 @@ class _BeamExcess:
             self._rest_share = beam.components.rest / beam.rms
         self.count = len(self._shapes) + self._rest.count
 
-    def change(self, shot: RecordedShot, rms: float, numbers: FloatArray) -> RecordedShot:
-        """Return the shot with a beam of an r.m.s. difference."""
+    def of(self, numbers: FloatArray) -> FloatArray:
+        """Return the difference of `count` numbers, (H, W), whose r.m.s. is about 1."""
         of_shapes, of_rest = np.split(numbers, [len(self._shapes)])
         excess = self._rest_share * self._rest.of(of_rest)
-        return _brighten(shot, rms * (excess + np.tensordot(of_shapes, self._shapes, 1)))
+        return np.asarray(excess + np.tensordot(of_shapes, self._shapes, 1))
+
+    def change(self, shot: RecordedShot, rms: float, numbers: FloatArray) -> RecordedShot:
+        """Return the shot with a beam of an r.m.s. difference."""
+        return _brighten(shot, rms * self.of(numbers))
 
 
 class InstrumentDraws:
@@ -448,7 +465,7 @@ class InstrumentDraws:
             names.append(name)
 
         if beam.rms:
-            excess = _BeamExcess(beam, shot.scene.source)
+            excess = BeamExcess(beam, shot.scene.source)
             add(excess.change, beam.rms, excess.count, f"beam, {100 * beam.rms:.2g} %", False)
         # From the light to the detector, which adds its background last.
         for each in reversed(IMPERFECTIONS):

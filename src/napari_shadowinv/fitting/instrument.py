@@ -1,0 +1,315 @@
+"""Unknown numbers of an instrument that is not exact, and their effect on images: `Imperfect`.
+
+All numbers are in standard deviations of the `Instrument`: their prior is normal, with mean 0 and
+variance 1. The detector records (f' + …)^(1 + g) + b of the light f' that is spread by the point
+spread and by its error; the source is recorded by the same detector.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.fft import dctn, idctn
+
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.inversion.imperfections import BeamExcess, Scene, SmoothField, motions
+from napari_shadowinv.options import BeamPrior, Instrument
+
+__all__ = ["DARKEST", "EXACT", "Imperfect", "Part", "Shapes", "widen", "widening"]
+
+DARKEST = 1e-4  # of a beam, for a logarithm
+_LEAST_EXPONENT = 0.2
+_HELD = 1e-3  # of the standard deviation of numbers that are not yet fitted
+_DIMMEST = 1e-2  # of a beam's mean, for a relative change
+
+
+class Part(NamedTuple):
+    """Numbers of one imperfection: their places among the common ones or those of each image."""
+
+    key: str
+    is_common: bool
+    places: slice
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """Relative changes of a beam by one standard deviation of each number, (n, …).
+
+    The change of the beams of all images is common, or each has its own.
+    """
+
+    key: str
+    values: FloatArray
+    is_common: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Imperfect:
+    """Standard deviations of what an instrument does to an image, in pixels of one size.
+
+    Attributes
+    ----------
+    gamma : float
+        Of the exponent of the response; 0 for a linear one.
+    blur : float
+        Of the variance of the point spread along each axis, px².
+    background : float
+        Of the constant that each image has, in units of its beam's mean.
+    other_strengths : ndarray, shape (L, M), or None
+        Of the displacement by another field, as shares of that by each field in the first image.
+    shapes : tuple of Shapes
+        Changes of the beams, of the shape of a scene's beams.
+    """
+
+    gamma: float = 0.0
+    blur: float = 0.0
+    background: float = 0.0
+    other_strengths: FloatArray | None = None
+    shapes: tuple[Shapes, ...] = ()
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """All imperfections, with the places of their numbers."""
+        return tuple(self._parts())
+
+    def _parts(self) -> Iterator[Part]:
+        sizes = [
+            ("gamma", True, int(self.gamma > 0)),
+            ("blur", True, int(self.blur > 0)),
+            ("other_field", True, int(self.other_strengths is not None)),
+            ("background", False, int(self.background > 0)),
+            *((each.key, each.is_common, len(each.values)) for each in self.shapes),
+        ]
+        ends = {True: 0, False: 0}
+        for key, is_common, size in sizes:
+            begin, ends[is_common] = ends[is_common], ends[is_common] + size
+            if size:
+                yield Part(key, is_common, slice(begin, ends[is_common]))
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """How many numbers are common, and how many each image has."""
+        common, separate = (
+            max((part.places.stop for part in self.parts if part.is_common is kind), default=0)
+            for kind in (True, False)
+        )
+        return common, separate
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether there are no numbers."""
+        return not self.parts
+
+    @property
+    def changes_beam(self) -> bool:
+        """Whether the light that enters depends on the numbers."""
+        return bool(self.gamma or self.background or self.shapes)
+
+    def only(self, images: list[int]) -> Imperfect:
+        """Return what concerns some of the images."""
+        if self.other_strengths is None:
+            return self
+        return replace(self, other_strengths=self.other_strengths[images])
+
+    def coarsen(self, factor: int) -> Imperfect:
+        """Return the same in larger pixels."""
+        shapes = tuple(
+            replace(each, values=_block_means(each.values, factor)) for each in self.shapes
+        )
+        return replace(self, blur=self.blur / factor**2, shapes=shapes)
+
+    def number(self, key: str, common: FloatArray, separate: FloatArray) -> float:
+        """Return the one number of an imperfection of an image; 0 if it is exact."""
+        for part in self.parts:
+            if part.key == key:
+                return float((common if part.is_common else separate)[part.places][0])
+        return 0.0
+
+    def exponent(self, common: FloatArray) -> float:
+        """Return the exponent of the response."""
+        if not self.gamma:
+            return 1.0
+        return max(1 + self.gamma * self.number("gamma", common, common), _LEAST_EXPONENT)
+
+    def variance(self, common: FloatArray) -> float:
+        """Return what adds to the variance of the point spread, px²."""
+        return self.blur * self.number("blur", common, common) if self.blur else 0.0
+
+    def offset(self, separate: FloatArray) -> float:
+        """Return the constant of an image, in units of its beam's mean."""
+        return self.background * self.number("background", separate, separate)
+
+    def entering(self, beam: FloatArray, common: FloatArray, separate: FloatArray) -> FloatArray:
+        """Return the light of a beam as recorded, without what the detector did to it."""
+        if not (self.gamma or self.background):
+            return beam
+        light = np.maximum(beam - self.offset(separate), DARKEST)
+        return np.asarray(light ** (1 / self.exponent(common)))
+
+    def entering_changes(
+        self, beam: FloatArray, common: FloatArray, separate: FloatArray
+    ) -> Iterator[tuple[Part, FloatArray]]:
+        """Yield the derivatives of the logarithm of `entering`, each by one number."""
+        if not (self.gamma or self.background):
+            return
+        light = beam - self.offset(separate)
+        exponent, is_lit = self.exponent(common), light > DARKEST
+        light = np.maximum(light, DARKEST)
+        for part in self.parts:
+            if part.key == "gamma":
+                yield part, -self.gamma / exponent**2 * np.log(light)
+            elif part.key == "background":
+                yield part, np.where(is_lit, -self.background / (exponent * light), 0.0)
+
+    def excess(self, common: FloatArray, separate: FloatArray) -> FloatArray | float:
+        """Return the factor by which a beam is brighter than its source."""
+        if not self.shapes:
+            return 1.0
+        return np.exp(self.shape_changes(common, separate))
+
+    def shape_changes(self, common: FloatArray, separate: FloatArray) -> FloatArray:
+        """Return the sum of the shapes times their numbers."""
+        total = np.zeros(self.shapes[0].values.shape[1:])
+        for part, each in self._shape_parts():
+            numbers = (common if part.is_common else separate)[part.places]
+            total += np.einsum("k,kyx->yx", numbers, each.values)
+        return total
+
+    def pull_shapes(self, pull: FloatArray, common: FloatArray, separate: FloatArray) -> None:
+        """Add the transpose of `shape_changes` times a pull to derivatives by the numbers."""
+        for part, each in self._shape_parts():
+            slope = common if part.is_common else separate
+            slope[part.places] += np.einsum("yx,kyx->k", pull, each.values)
+
+    def held(self, keys: frozenset[str]) -> Imperfect:
+        """Return the same numbers without most of the effect of some imperfections."""
+        shapes = tuple(
+            replace(each, values=_HELD * each.values) if each.key in keys else each
+            for each in self.shapes
+        )
+        held = replace(self, shapes=shapes)
+        for key in keys & {"gamma", "blur", "background"}:
+            held = replace(held, **{key: _HELD * getattr(held, key)})
+        if "other_field" in keys and held.other_strengths is not None:
+            held = replace(held, other_strengths=_HELD * held.other_strengths)
+        return held
+
+    def _shape_parts(self) -> Iterator[tuple[Part, Shapes]]:
+        places = {part.key: part for part in self.parts}
+        return ((places[each.key], each) for each in self.shapes if each.key in places)
+
+    def place(self, key: str) -> slice | None:
+        """Return the places of an imperfection's numbers; None if it is exact."""
+        return next((part.places for part in self.parts if part.key == key), None)
+
+
+EXACT = Imperfect()
+
+
+def _block_means(planes: FloatArray, factor: int) -> FloatArray:
+    count, height, width = planes.shape
+    blocks = planes.reshape(count, height // factor, factor, width // factor, factor)
+    return np.asarray(blocks.mean(axis=(2, 4)))
+
+
+def widen(image: FloatArray, variance: float) -> FloatArray:
+    """Return an image spread by a Gaussian of a variance in px², mirrored at its edges."""
+    if variance <= 0:
+        return image
+    return _filter(image, np.exp(-variance / 2 * _wave_numbers(image.shape)))
+
+
+def widening(image: FloatArray, variance: float) -> FloatArray:
+    """Return the derivative of `widen` by the variance; both are their own transposes."""
+    squares = _wave_numbers(image.shape)
+    return _filter(image, -squares / 2 * np.exp(-max(variance, 0.0) / 2 * squares))
+
+
+def _filter(image: FloatArray, transfer: FloatArray) -> FloatArray:
+    return np.asarray(idctn(dctn(image, norm="ortho") * transfer, norm="ortho"))
+
+
+def _wave_numbers(shape: tuple[int, ...]) -> FloatArray:
+    waves = [np.pi * np.arange(n) / n for n in shape]
+    return np.asarray(waves[0][:, None] ** 2 + waves[1] ** 2)
+
+
+def imperfect_instrument(
+    instrument: Instrument,
+    beam: BeamPrior,
+    sources: FloatArray,
+    used: BoolArray,
+    around: tuple[tuple[int, int], tuple[int, int]],
+    *,
+    is_common: bool,
+    is_unknown: bool,
+    other_strengths: FloatArray | None,
+) -> Imperfect:
+    """Return the standard deviations of an instrument's numbers for the images of a fit.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        As stated.
+    beam : BeamPrior
+        Of the difference of beams and sources.
+    sources : ndarray, shape (L, H, W)
+        Recorded or assumed, in units of their means.
+    used : ndarray of bool, shape (H, W)
+        Pixels in which the variation of beams has its r.m.s.
+    around : pairs of int
+        Pixels by which the scene's beams reach beyond the images.
+    is_common : bool
+        Whether all images have the same source.
+    is_unknown : bool
+        Whether the beam is fitted in any case.
+    other_strengths : ndarray, shape (L, M), or None
+        Of the displacement by another field, if one was equal to each field in the first image.
+    """
+    weights = used.astype(np.float64)
+    shapes = []
+
+    def add(key: str, patterns: FloatArray, *, common: bool) -> None:
+        if np.any(patterns):
+            beyond = np.pad(patterns, ((0, 0), *around), mode="edge")
+            shapes.append(Shapes(key, beyond, common))
+
+    if beam.rms and not is_unknown:
+        excess = BeamExcess(beam, weights)
+        patterns = beam.rms * np.stack([excess.of(unit) for unit in np.eye(excess.count)])
+        add("beam", patterns, common=is_common)
+    if beam.between and len(sources) > 1:
+        smooth = SmoothField(beam.length * min(weights.shape), weights)
+        patterns = beam.between * np.stack([smooth.of(unit) for unit in np.eye(smooth.count)])
+        add("beam_between", patterns, common=False)
+    if instrument.registration and is_common:
+        source = np.maximum(sources[0], _DIMMEST)
+        add("registration", instrument.registration * motions(source) / source, common=True)
+    return Imperfect(
+        gamma=instrument.gamma,
+        blur=instrument.blur**2,
+        background=instrument.background,
+        other_strengths=(
+            instrument.other_field * other_strengths
+            if instrument.other_field and other_strengths is not None
+            else None
+        ),
+        shapes=tuple(shapes),
+    )
+
+
+def absorption_shapes(
+    rms: float,
+    displacement: FloatArray,
+    used: BoolArray,
+    around: tuple[tuple[int, int], tuple[int, int]],
+) -> Shapes:
+    """Return the transmission of an object with a displacement in px, (2, H, W)."""
+    scene = Scene(displacement, used.astype(np.float64), used)
+    envelope, _ = scene.object_region
+    smooth = scene.transmission
+    patterns = np.stack([envelope * smooth.of(unit) for unit in np.eye(smooth.count)])
+    return Shapes("absorption", np.pad(rms * patterns, ((0, 0), *around)))
