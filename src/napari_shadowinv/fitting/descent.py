@@ -193,6 +193,8 @@ _DESCENTS = 3  # with fixed numbers of rays each
 _FEW = 10  # steps, after which the numbers of rays still fit
 _MOST_NEWTON, _MOST_SHORTENED, _SHARES_OF_STEP = 8, 2, (1.0, 0.5, 0.25)  # of Gauss and Newton
 _NEWTON, _MOST_SOLVING = 0.02, 200  # how exactly each is found, and in how many steps
+# Fields and numbers of an instrument that explain an image alike lie along a flat valley.
+_NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 1e-3, 600, 0.05
 _MOST_PIXELS = 2_000_000  # of all images
 
 
@@ -340,6 +342,10 @@ def settle(
     ended : bool
         Whether steps were left.
     """
+    tolerance, solving = _NEWTON, _MOST_SOLVING
+    if scene.imperfect.parts:
+        tolerance, solving = _NEWTON_IN_VALLEY, _MOST_IN_VALLEY
+        least_gain *= _GAIN_IN_VALLEY
     scales = Preconditioner(scene)
     now = scales.damp(start)
     counts = scene.ray_counts(now)
@@ -357,7 +363,7 @@ def settle(
             return scales.transpose_times(linear.hessian_times(change)).flat()  # noqa: B023
 
         down = -scales.transpose_times(slope).flat()
-        step = solve(times, down, tolerance=_NEWTON, iterations=_MOST_SOLVING)
+        step = solve(times, down, tolerance=tolerance, iterations=solving)
         change = scales.times(now.like(step))
         for share in _SHARES_OF_STEP:
             trial = now.plus(now.like(share * change.flat()))

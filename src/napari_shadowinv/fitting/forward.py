@@ -64,6 +64,8 @@ class Scene:
         Unknown light that adds to each image.
     imperfect : Imperfect
         Standard deviations of an instrument that is not exact.
+    tilt : tuple of ndarray or None
+        See `Prior`.
     """
 
     images: FloatArray
@@ -87,6 +89,7 @@ class Scene:
     threads: int | None = None
     added: tuple[AdditiveBlock, ...] = ()
     imperfect: Imperfect = EXACT
+    tilt: tuple[FloatArray, FloatArray] | None = None
 
     def only(self, numbers: Sequence[int]) -> Scene:
         """Return some of the images, in this order; fields stay in the same unit."""
@@ -99,6 +102,7 @@ class Scene:
             beams=self.beams[chosen],
             psf=[self.psf[k] for k in chosen],
             imperfect=self.imperfect.only(chosen),
+            tilt=None if self.tilt is None else (self.tilt[0], self.tilt[1][chosen]),
         )
 
     @cached_property
@@ -123,6 +127,7 @@ class Scene:
             bin=self.bin,
             shift_spread=self.shift_spread,
             added=self.added,
+            tilt=self.tilt,
         )
 
     def nothing(self) -> Unknowns:
@@ -328,7 +333,7 @@ class Scene:
             if part.key in derivatives
         }
         effects = [(*places[key], values) for key, values in derivatives.items()]
-        return _Seen(self._with_added(unknowns, k, image), slope, effects)
+        return _Seen(self._with_added(unknowns, k, image), bare, slope, effects)
 
     def _variance(self, k: int) -> float:
         """Variance of a Gaussian point spread that an error of the blur adds to."""
@@ -439,11 +444,12 @@ class _Shot(NamedTuple):
 class _Seen:
     """An image without its brightness.
 
-    `slope` is the derivative of the response, `effects` are the derivatives by numbers of the
+    `bare` is its light before the response, `slope` the derivative of the response, `effects` are the derivatives by numbers of the
     instrument, with their places: whether they are common, and which.
     """
 
     image: FloatArray
+    bare: FloatArray
     slope: FloatArray
     effects: list[tuple[bool, int, FloatArray]]
 
@@ -527,6 +533,30 @@ class Linear:
         if self._has_others:
             slope.beam[:] = scene._of_modes(of_shape * self._beam_shape)
         return scene._only_free(slope)
+
+    def sensitivity_slopes(self, residuals: FloatArray) -> dict[str, FloatArray]:
+        """Return how the response of residuals to fields changes with numbers of the instrument.
+
+        For numbers that change it in proportion, in each pixel: derivatives of the Jacobian's rows
+        times residuals, (L, H, W) for each imperfection.
+        """
+        scene, imperfect = self.scene, self.scene.imperfect
+        common, separate = self.unknowns.common, self.unknowns.separate
+        slopes = {}
+        if imperfect.gamma:
+            exponent = imperfect.exponent(common)
+            logs = np.stack([np.log(np.maximum(seen.bare, DARKEST)) for seen in self.seen])
+            # The light that enters is a root of the beam.
+            slopes["gamma"] = imperfect.gamma * (1 / exponent + logs) * residuals
+        if imperfect.blur:
+            slopes["blur"] = imperfect.blur / 2 * np.stack([laplace(plane) for plane in residuals])
+        if imperfect.background:
+            offsets = np.array([imperfect.offset(row) for row in separate])
+            slopes["background"] = -imperfect.background / (1 - offsets)[:, None, None] * residuals
+        if imperfect.other_strengths is not None:
+            ratio = imperfect.other_strengths[:, 0] / scene.strengths_with(self.unknowns)[:, 0]
+            slopes["other_field"] = ratio[:, None, None] * residuals
+        return slopes
 
     def _potential_changes(self, change: Unknowns) -> FloatArray:
         scene, imperfect = self.scene, self.scene.imperfect

@@ -176,7 +176,7 @@ def collect_data(
     usual = max(16, 8 * round(_FREE_SHARE * min(height, width) / 8)) if free else 16
     pad = options.margin or usual
     around = (pad, pad + fill[1][1]), (pad, pad + fill[2][1])
-    is_common = all(np.array_equal(beam, shapes[0]) for beam in shapes[1:])
+    is_common = all(np.allclose(beam, shapes[0], rtol=_SAME, atol=0) for beam in shapes[1:])
     is_assumed = source is None or not all(shot.measured for shot in shots)
     prior = instrument.beam_of(measured=not is_assumed)
     imperfect = imperfect_instrument(

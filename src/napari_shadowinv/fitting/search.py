@@ -46,6 +46,7 @@ _ROUNDS, _ROUND_STEPS, _SETTLED = 6, 40, 0.25  # of λ and κ; and by what share
 # An object's roughness is not spread evenly, as the likeliest λ and κ assume: they would round it
 # off where it is sharpest.
 SMOOTHNESS_RATIO = 0.1  # of them
+_TILTS, _VOLUME_PROBES = 2, 4
 _SAME_FIELD = 0.03  # of the displacement, r.m.s.
 
 
@@ -177,7 +178,14 @@ def estimate_smoothness(
         scene = replace(scene, smoothness=likely / smoothness_in_pixels(MIDDLE))
         end = settle_minimum(scene, end, on_step)
     scene = replace(scene, smoothness=SMOOTHNESS_RATIO * likely / smoothness_in_pixels(MIDDLE))
-    return scene, settle_minimum(scene, end, on_step, least_gain=_LAST_GAIN)
+    end = settle_minimum(scene, end, on_step, least_gain=_LAST_GAIN)
+    for _ in range(_TILTS if scene.imperfect.parts else 0):
+        middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
+        value = end.value
+        posterior = Posterior(middle, end.unknowns, rng, lambda: on_step("smoothness", value))  # noqa: B023
+        scene = replace(scene, tilt=posterior.tilt(_VOLUME_PROBES))
+        end = settle_minimum(scene, end, on_step, least_gain=_LAST_GAIN)
+    return scene, end
 
 
 def settle_minimum(
