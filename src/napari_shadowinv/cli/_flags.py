@@ -395,6 +395,7 @@ def _fit_flags() -> Flags:
         *_step_flags(FIT_STEPS.values(), _FIT_STEPS),
         # The command has its own --source and --brightness.
         *_option_flags(FitChoices, _FIT_CHOICES, without=("beam", "brightness", "options")),
+        *_option_flags(Instrument, _INSTRUMENT),
         *_option_flags(FitOptions, _FIT_OPTIONS),
     ]
 
@@ -522,7 +523,12 @@ def fit_recipe_of(
     )
     values = {name: value for name, value in values.items() if name not in replaced}
     choices = validate(FitChoices, {**values, **changes, "options": fit_options}, "fit")
-    return base.model_copy(update={"steps": _steps(flags, base.steps), "fit": choices})
+    changes = {
+        "steps": _steps(flags, base.steps),
+        "instrument": _instrument(flags, base),
+        "fit": choices,
+    }
+    return base.model_copy(update=changes)
 
 
 def _instrument(flags: Mapping[str, Any], base: Recipe) -> Instrument:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Literal
@@ -19,7 +19,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.instrument import absorption_shapes
+from napari_shadowinv.fitting.instrument import EXACT, absorption_shapes, numbers_in_units
 from napari_shadowinv.fitting.measurements import FitData, collect_data
 from napari_shadowinv.fitting.pattern import (
     Pattern,
@@ -35,6 +35,7 @@ from napari_shadowinv.fitting.posterior import (
     Posterior,
     Sample,
     errors_by_noise,
+    errors_by_part,
     largest_share,
     shifts_by_beam,
 )
@@ -126,6 +127,10 @@ def fit(
         The pixels to use. Default: all.
     brightness : "known", "free" or array_like, default "known"
         Brightness of each image relative to the source: factors, or "free" to fit them.
+    instrument : Instrument, optional
+        How well beam, detector and alignment are known. What is stated is fitted together with the
+        fields; what the images leave open of it enters the error bars. One image does not determine
+        it. Default: exact, and a source that was not recorded may differ by 5 %.
     options : FitOptions, optional
         Everything else.
     on_progress, should_stop : callable, optional
@@ -181,10 +186,16 @@ def fit(
         report("fit", steps, None, stage, objective)
 
     with _timed("starts", seconds):
-        held = replace(scene, imperfect=scene.imperfect.held(_HELD_IN_SEARCH))
-        minima = search(held, collect_starts(data, on_step, should_stop), on_step)
+        held = EXACT if data.single else scene.imperfect.held(_HELD_IN_SEARCH)
+        rough = replace(scene, imperfect=held)
+        minima = search(rough, collect_starts(data, on_step, should_stop), on_step)
         if data.instrument.absorption:
-            scene, minima = _with_absorption(data, scene, minima)
+            scene = _with_absorption(data, scene, minima[0])
+        imperfect = scene.imperfect
+        if data.single:
+            # One image cannot tell the instrument from the object: its numbers stay at 0.
+            scene = replace(scene, imperfect=EXACT)
+        minima = [_with_numbers(scene, minimum) for minimum in minima]
     with _timed("smoothness", seconds):
         scene, best = estimate_smoothness(scene, minima[0], rng, on_step)
         if data.counted:
@@ -197,8 +208,10 @@ def fit(
         # A fit of one image absorbs too much of its noise for the counts to be tested.
         is_counted = data.counted and not data.single
         pattern = find_pattern(fine, unknowns, data.size, is_counted=is_counted)
-        middle = replace(coarser(scene, MIDDLE), spacing=_SPACING_OF_SAMPLES)
-        posterior = Posterior(middle, best.unknowns, rng, lambda: on_step("samples", value))
+        unsure = replace(scene, imperfect=imperfect)
+        middle = replace(coarser(unsure, MIDDLE), spacing=_SPACING_OF_SAMPLES)
+        ends = _with_numbers(unsure, best).unknowns
+        posterior = Posterior(middle, ends, rng, lambda: on_step("samples", value))
         if pattern.lacks_counts:
             absorbed = posterior.count_determined(np.random.default_rng(options.seed))
             share = pattern.missing_counts - absorbed / np.count_nonzero(scene.weights)
@@ -213,13 +226,14 @@ def fit(
         count = options.samples if options.samples > 1 else 0
         samples = [posterior.draw_sample() for _ in range(count)]
         errors = errors_by_noise(scene, samples, data.size)
-        by_beam = shifts_by_beam(data, scene, posterior, samples, options)
+        by_part = errors_by_part(unsure, posterior, samples, data.size)
+        by_beam = shifts_by_beam(data, unsure, posterior, samples, options)
         evidence = float("nan")
         if options.evidence:
             evidence = log_evidence(scene, best, fields, options, on_step)
         amplification = noise_amplification(pattern.correlation)
         if errors is not None:
-            errors *= amplification
+            errors = _amplify_noise(errors, by_part, amplification)
     found_by = FitReport(
         objective=value,
         iterations=taken,
@@ -230,6 +244,11 @@ def fit(
         pattern=pattern.largest,
         noise_correlation=pattern.correlation,
         added=_added_light(data, fine, unknowns, samples, amplification),
+        numbers=numbers_in_units(
+            imperfect,
+            finer(ends) if data.single else unknowns,
+            [sample.change for sample in samples],
+        ),
     )
     return _result(
         data,
@@ -239,6 +258,7 @@ def fit(
         options,
         basins,
         errors,
+        by_part,
         by_beam,
         found_by,
         blur_gain,
@@ -351,24 +371,36 @@ def _transport_potential(
         return None
 
 
-def _with_absorption(
-    data: FitData, scene: Scene, minima: Sequence[Minimum]
-) -> tuple[Scene, list[Minimum]]:
-    """Return the scene and minima with an unknown transmission of the object that was found."""
+def _with_absorption(data: FitData, scene: Scene, minimum: Minimum) -> Scene:
+    """Return the scene with an unknown transmission of the object that was found."""
     height, width = data.size
-    coarse = minima[0].displacement.sum(axis=0)
+    coarse = minimum.displacement.sum(axis=0)
     displacement = coarse.repeat(MIDDLE, axis=1).repeat(MIDDLE, axis=2)[:, :height, :width]
-    used = (scene.weights[:, :height, :width] > 0).any(axis=0)
+    used = np.asarray((scene.weights[:, :height, :width] > 0).any(axis=0))
     shapes = absorption_shapes(data.instrument.absorption, displacement, used, data.around)
     imperfect = replace(scene.imperfect, shapes=(*scene.imperfect.shapes, shapes))
-    zeros = np.zeros(len(shapes.values))
-    return replace(scene, imperfect=imperfect), [
-        replace(
-            each,
-            unknowns=each.unknowns._replace(common=np.append(each.unknowns.common, zeros)),
-        )
-        for each in minima
-    ]
+    return replace(scene, imperfect=imperfect)
+
+
+def _with_numbers(scene: Scene, minimum: Minimum) -> Minimum:
+    """Return a minimum with all numbers of a scene's instrument; those it has not are 0."""
+    unknowns, (common, separate) = minimum.unknowns, scene.imperfect.counts
+    missing = common - unknowns.common.size, separate - unknowns.separate.shape[1]
+    unknowns = unknowns._replace(
+        common=np.pad(unknowns.common, (0, missing[0])),
+        separate=np.pad(unknowns.separate, ((0, 0), (0, missing[1]))),
+    )
+    return replace(minimum, unknowns=unknowns)
+
+
+def _amplify_noise(
+    errors: FloatArray, by_part: Mapping[str, FloatArray], amplification: float
+) -> FloatArray:
+    """Return errors with those by correlated noise, which alone it makes larger."""
+    if not by_part:
+        return errors * amplification
+    more = (amplification**2 - 1) * by_part["noise"] ** 2
+    return np.asarray(np.sqrt(errors**2 + more))
 
 
 def reweight_counts(data: FitData, scene: Scene, minimum: Minimum) -> Scene:
@@ -431,6 +463,7 @@ def _result(
     options: FitOptions,
     basins: tuple[Basin, ...],
     errors: FloatArray | None,
+    by_part: Mapping[str, FloatArray],
     by_beam: BeamShifts | None,
     report: FitReport,
     blur_gain: float,
@@ -465,10 +498,12 @@ def _result(
             sensitivity=largest_share(by_beam.by_percent, displacements),
             variation=by_beam.variation,
             share=largest_share(by_beam.errors, displacements),
-            scale=options.beam_scale,
+            scale=data.beam.length,
             assumed=data.assumed,
         )
-    report = replace(report, uncertainty=uncertainty, beam=beam)
+    shares = {key: largest_share(each, displacements) for key, each in by_part.items()}
+    parts = dict(sorted(shares.items(), key=lambda part: -part[1]))
+    report = replace(report, uncertainty=uncertainty, parts=parts, beam=beam)
     jacobians = [
         jacobian_determinant(moved)
         for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, displacements)
@@ -492,6 +527,8 @@ def _result(
         used=np.asarray(used.any(axis=0)),
         hidden=hidden_contrast(model / np.maximum(beams, _DARKEST * units) - 1, used),
         edge_is_free=options.boundary == "free",
+        parts=parts,
+        max_error=options.max_error,
     )
     return Fit(
         images=images,

@@ -76,6 +76,7 @@ def leave_one_out(
     ----------
     images, options, **keywords
         As for `fit`, with three images or more, and without fiducials or a field to start from.
+        The instrument counts as exact.
     on_progress, should_stop : callable, optional
         As for `fit`.
 
@@ -91,7 +92,7 @@ def leave_one_out(
         If `should_stop` returned true.
     """
     options = as_model(FitOptions, options, "options")
-    data = collect_data(images, options=options, **keywords)
+    data = collect_data(images, options=options, **{**keywords, "instrument": None})
     check_count(len(data.units))
     if data.scene.fiducials is not None or data.start is not None:
         raise InputError(

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -233,6 +234,15 @@ class Preconditioner:
         added = [block.scales(scene.weights) for block in scene.added]
         common, separate = scene.number_scales()
         self._diagonals = [beam, common, brightness, frames, separate, *added]
+
+    def held(self) -> Preconditioner:
+        """Return scales in which the numbers of an instrument do not change."""
+        held = copy(self)
+        places = {1, 4}
+        held._diagonals = [
+            0 * scale if place in places else scale for place, scale in enumerate(self._diagonals)
+        ]
+        return held
 
     def damp(self, unknowns: Unknowns) -> Unknowns:
         """Return unknowns without the finest waves, which knots further apart leave behind."""

@@ -444,8 +444,9 @@ class _Shot(NamedTuple):
 class _Seen:
     """An image without its brightness.
 
-    `bare` is its light before the response, `slope` the derivative of the response, `effects` are the derivatives by numbers of the
-    instrument, with their places: whether they are common, and which.
+    `bare` is its light before the response, `slope` the derivative of the response, `effects` are
+    the derivatives by numbers of the instrument, with their places: whether they are common, and
+    which.
     """
 
     image: FloatArray
@@ -453,12 +454,12 @@ class _Seen:
     slope: FloatArray
     effects: list[tuple[bool, int, FloatArray]]
 
-    def push(self, common: FloatArray, separate: FloatArray) -> FloatArray | float:
+    def push(self, common: FloatArray, separate: FloatArray) -> FloatArray:
         """Return the change of the image by changes of the instrument's numbers."""
-        return sum(
-            (common if is_common else separate)[place] * values
-            for is_common, place, values in self.effects
-        )
+        total = np.zeros(())
+        for is_common, place, values in self.effects:
+            total = total + (common if is_common else separate)[place] * values
+        return total
 
     def add_pulls(self, slope: Unknowns, k: int, pull: FloatArray) -> None:
         """Add the transpose of `push` times a pull."""

@@ -7,16 +7,25 @@ spread and by its error; the source is recorded by the same detector.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.fft import dctn, idctn
 
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.inversion.imperfections import BeamExcess, Scene, SmoothField, motions
+from napari_shadowinv.inversion.imperfections import (
+    IMPERFECTIONS,
+    BeamExcess,
+    Scene,
+    SmoothField,
+    motions,
+)
 from napari_shadowinv.options import BeamPrior, Instrument
+
+if TYPE_CHECKING:
+    from napari_shadowinv.fitting.unknowns import Unknowns
 
 __all__ = ["DARKEST", "EXACT", "Imperfect", "Part", "Shapes", "widen", "widening"]
 
@@ -207,6 +216,61 @@ class Imperfect:
 
 
 EXACT = Imperfect()
+
+TITLES = {each.key: each.title for each in IMPERFECTIONS} | {
+    "beam": "beam",
+    "beam_between": "beam between energies",
+    "other_field": "other field",
+    "noise": "noise",
+}
+"""Names of imperfections in texts."""
+
+
+def numbers_in_units(
+    imperfect: Imperfect, unknowns: Unknowns, changes: Sequence[Unknowns]
+) -> dict[str, list[list[float]]]:
+    """Return an instrument's numbers with their standard deviations by random changes.
+
+    In the units of the `Instrument`: errors of gamma and of the background of each image, px² of
+    variance for the blur, the r.m.s. of the numbers' shapes for beams and transmission.
+    """
+    units = {"gamma": imperfect.gamma, "blur": imperfect.blur, "background": imperfect.background}
+    shapes = {each.key: each.values for each in imperfect.shapes}
+    report = {}
+    for part in imperfect.parts:
+        values, *spread = (
+            np.atleast_2d(each.common if part.is_common else each.separate)[:, part.places]
+            for each in (unknowns, *changes)
+        )
+        deviation = np.sqrt(np.mean(np.square(spread), axis=0)) if spread else values * np.nan
+        if part.key in shapes:
+            squares = (shapes[part.key] ** 2).mean(axis=(1, 2))
+            rows = [np.sqrt(each**2 @ squares) for each in (values, deviation)]
+        else:
+            rows = [units.get(part.key, 1.0) * each[:, 0] for each in (values, deviation)]
+        report[part.key] = np.stack(rows, axis=1).tolist()
+    return report
+
+
+def number_text(key: str, rows: Sequence[Sequence[float]]) -> str:
+    """Describe the numbers of one imperfection, as `numbers_in_units` returns them."""
+    if key == "gamma":
+        return f"gamma {_with_error((1 + rows[0][0], rows[0][1]))}"
+    if key == "blur":
+        return f"variance of the point spread {_with_error(rows[0], '+')} px²"
+    if key in ("background", "other_field"):
+        listed = ", ".join(_with_error([100 * value for value in row]) for row in rows)
+        return f"{TITLES[key]} {listed} %"
+    size = np.sqrt(np.mean([row[0] ** 2 for row in rows]))
+    return f"{TITLES[key]} {100 * size:.2g} % (r.m.s.)"
+
+
+def _with_error(row: Sequence[float], sign: str = "") -> str:
+    value, error = row
+    if not error > 0:
+        return f"{value:{sign}.3g}"
+    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 6))
+    return f"{value:{sign}.{digits}f} ± {error:.{digits}f}"
 
 
 def _block_means(planes: FloatArray, factor: int) -> FloatArray:

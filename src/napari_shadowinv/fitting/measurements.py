@@ -101,7 +101,9 @@ class FitData:
     def around(self) -> tuple[tuple[int, int], tuple[int, int]]:
         """Pixels by which beams reach beyond the images along y and x."""
         pad, shape = self.scene.pad, self.scene.beams.shape[1:]
-        before_y, before_x = ((pad, n - pad - side) for n, side in zip(shape, self.size, strict=True))
+        before_y, before_x = (
+            (pad, n - pad - side) for n, side in zip(shape, self.size, strict=True)
+        )
         return before_y, before_x
 
     def scene_with(self, smoothness: float | None) -> Scene:
@@ -181,9 +183,9 @@ def collect_data(
     prior = instrument.beam_of(measured=not is_assumed)
     imperfect = imperfect_instrument(
         instrument,
-        prior if bool(instrument.stated) else BeamPrior(),
+        prior if instrument.has_numbers else BeamPrior(),
         beams / units[:, None, None],
-        used.any(axis=0),
+        np.asarray(used.any(axis=0)),
         around,
         is_common=is_common,
         is_unknown=unknown,

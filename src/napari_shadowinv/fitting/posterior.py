@@ -13,6 +13,7 @@ Appl. 38, 1075 (2017).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ from napari_shadowinv.fitting.descent import Preconditioner, finer, product, sol
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import FitData
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.options import ASSUMED_BEAM, FitOptions
+from napari_shadowinv.options import FitOptions
 
 __all__ = [
     "BeamError",
@@ -148,8 +149,9 @@ class Posterior:
         tuple of ndarray, shapes (n,) and (L, n)
             Derivatives by an instrument's numbers; 0 for beams, which hardly change the volume.
         """
-        common, separate = np.zeros_like(self._unknowns.common), np.zeros_like(
-            self._unknowns.separate
+        common, separate = (
+            np.zeros_like(self._unknowns.common),
+            np.zeros_like(self._unknowns.separate),
         )
         rng = np.random.default_rng(_VOLUME_SEED)
         for _ in range(probes):
@@ -163,6 +165,29 @@ class Posterior:
                 else:
                     common[place] += each.sum()
         return common, separate
+
+    def effects(self, sample: Sample) -> dict[str, Unknowns]:
+        """Return a sample's change by each imperfection of the instrument, and by the noise.
+
+        With J and B the derivatives of the residuals by the fields and by the numbers θ of an
+        imperfection, and H the Hessian of the fields, it causes -H⁻¹JᵀBθ; noise causes the rest.
+        """
+        held = copy(self)
+        held._scales = self._scales.held()
+        rest, effects = sample.change, {}
+        for part in self._scene.imperfect.parts:
+            moved = sample.change.zeros()
+            numbers, values = (
+                (moved.common, sample.change.common)
+                if part.is_common
+                else (moved.separate, sample.change.separate)
+            )
+            numbers[..., part.places] = values[..., part.places]
+            pull = self._linear.pull(-self._linear.push(moved))
+            effects[part.key] = held._change(pull, _PARTS)
+            minus = moved.like(-effects[part.key].flat())
+            rest = rest.plus(minus)
+        return {"noise": rest, **effects}
 
     def count_determined(self, rng: np.random.Generator) -> float:
         """Estimate how many numbers the data determine: so much of Σχ² the fit absorbs of noise."""
@@ -393,6 +418,7 @@ def draw_variations(
     return fields
 
 
+_PART_SAMPLES, _PARTS = 3, 0.02
 _BEAM_SAMPLES, _OPEN_BEAM_SAMPLES, _BEAM_SEED = 2, 3, 1
 _SMOOTHED_ERRORS = 4.0  # px
 
@@ -405,6 +431,25 @@ def errors_by_noise(
         return None
     changes = [sample.change for sample in samples]
     return _spread(scene, changes, size, _SMOOTHED_ERRORS)
+
+
+def errors_by_part(
+    scene: Scene,
+    posterior: Posterior,
+    samples: Sequence[Sample],
+    size: tuple[int, int],
+) -> dict[str, FloatArray]:
+    """Return standard deviations of each field's displacement by noise and by imperfections.
+
+    As `errors_by_noise`, from a few samples, of which each costs a solution for an imperfection.
+    """
+    if not scene.imperfect.parts:
+        return {}
+    effects = [posterior.effects(sample) for sample in samples[:_PART_SAMPLES]]
+    return {
+        key: _spread(scene, [each[key] for each in effects], size, _SMOOTHED_ERRORS)
+        for key in (effects[0] if effects else ())
+    }
 
 
 def _spread(
@@ -444,14 +489,12 @@ def shifts_by_beam(
 
     `samples` are the posterior's.
     """
-    if not samples or scene.beam_modes:
+    if not samples or scene.beam_modes or scene.imperfect.parts:
         return None
-    variation = options.beam_variation
-    if variation is None:
-        variation = ASSUMED_BEAM.rms if data.assumed else 0.0
+    variation = data.beam.rms
     middle = posterior.scene
     rng = np.random.default_rng([options.seed, _BEAM_SEED])
-    length = options.beam_scale * min(data.size)
+    length = data.beam.length * min(data.size)
     count = 1 if data.common else len(scene.images)
     variations = [
         np.broadcast_to(

@@ -27,6 +27,7 @@ from napari_shadowinv.facts import (
     time_fact,
     verdict_fact,
 )
+from napari_shadowinv.fitting.instrument import TITLES, number_text
 from napari_shadowinv.fitting.posterior import BeamError
 from napari_shadowinv.inversion.variables import (
     BEAM_UNCERTAINTY,
@@ -167,7 +168,8 @@ class FitReport:
     seconds : dict of str to float
         Time of each stage.
     uncertainty : float
-        R.m.s. standard deviation of the displacement as a share of it; NaN if not known.
+        R.m.s. standard deviation of the displacement by noise and by what is stated of the
+        instrument, as a share of the displacement; NaN if not known.
     log_evidence : float
         Logarithm of the evidence, up to a constant that is the same for all choices of fields; NaN
         if it was not requested.
@@ -182,6 +184,12 @@ class FitReport:
     added : dict of str to list
         Unknown light that adds to each image, by its title: for each image and each coefficient
         the value and its standard deviation, in the image's unit.
+    parts : dict of str to float
+        What `uncertainty` is made of if an instrument was stated, the largest first: r.m.s.
+        standard deviations by noise and by each imperfection, as shares of the displacement.
+    numbers : dict of str to list
+        Numbers of the instrument as fitted, by their names in `Instrument`, each with its standard
+        deviation, for all images or for each; see `numbers_in_units`.
     """
 
     objective: float
@@ -194,11 +202,25 @@ class FitReport:
     noise_correlation: float = 0.0
     beam: BeamError | None = None
     added: dict[str, list[list[list[float]]]] = dataclasses.field(default_factory=dict)
+    parts: dict[str, float] = dataclasses.field(default_factory=dict)
+    numbers: dict[str, list[list[float]]] = dataclasses.field(default_factory=dict)
 
     @property
     def total(self) -> float:
         """R.m.s. standard deviation by noise and beam as a share of the displacement."""
         return float(np.hypot(self.uncertainty, 0.0 if self.beam is None else self.beam.share))
+
+    @property
+    def ranking(self) -> str:
+        """The parts as shares of the displacement, the largest first; "" without an instrument."""
+        return ", ".join(f"{TITLES[key]} {share:.2%}" for key, share in self.parts.items())
+
+    @property
+    def error_name(self) -> str:
+        """Largest part of the total in a few words, such as "beam assumed, 5 %"."""
+        if self.parts:
+            return TITLES[next(iter(self.parts))]
+        return self.beam.name if self.beam else "noise"
 
 
 @dataclass(frozen=True)
@@ -276,6 +298,11 @@ class Fit:
         report = self.report
         if np.isnan(report.uncertainty):
             return []
+        if report.parts:
+            return [
+                ("errors", f"{report.total:.2%} of the displacement (r.m.s.): {report.ranking}"),
+                ("instrument", "; ".join(number_text(*each) for each in report.numbers.items())),
+            ]
         text = f"{report.uncertainty:.2%} of the displacement by noise (r.m.s.)"
         if report.noise_correlation > 0:
             text += f", which is correlated over {report.noise_correlation:.1f} px"
@@ -355,7 +382,7 @@ class Fit:
         share = field.error_at(*shown.peak)
         if np.isnan(share):
             return None
-        return PeakError(share, self.report.beam.name if self.report.beam else "noise")
+        return PeakError(share, self.report.error_name)
 
     @property
     def _origins(self) -> tuple[ImageOrigin, ...]:

@@ -7,7 +7,7 @@ as well. `hidden_contrast` finds masks that hide the structure that determines a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy import ndimage
@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Verdict
+from napari_shadowinv.fitting.instrument import TITLES
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
 from napari_shadowinv.fitting.posterior import BeamError
 from napari_shadowinv.inversion.solution_checks import (
@@ -81,6 +82,13 @@ _OPEN = 0.05  # of the displacement, r.m.s.
 _DEEP_FOLDS = 0.3  # of the object
 _BARS_DEEP_FOLDS, _BARS_DEEP_FOLDS_AND_BEAM = 1.4, 2.4
 _LOST = 0.01  # of the rays
+_MEASURE = "measure the {}, or add an image at another energy, which shows more of it"
+_ADVICE = {
+    "noise": "average shots, or take images at energies that differ more",
+    "beam_between": "record the beam at each energy",
+    "other_field": "fit both fields, with images at more energies",
+    "registration": "align the images by marks on each of them",
+}
 # Of blobs that the edge cuts, L2 error and the displacement's share there: 1.5 % at 0.30, 25 % at
 # 0.44; with a free edge 1.2 % at 0.61, 3.6 % at 0.88, 27 % at 0.97. It may come out too small, but
 # not its divergence: of toroids, ellipses, rims and turbulence its share is 0.03 and less where
@@ -108,6 +116,8 @@ def assess_verdict(
     used: BoolArray,
     hidden: float,
     edge_is_free: bool,
+    parts: Mapping[str, float],
+    max_error: float,
 ) -> tuple[Verdict, str]:
     """Return the verdict on a fit, and a sentence that says why.
 
@@ -143,6 +153,10 @@ def assess_verdict(
         Contrast around the mask's holes as a share of the strongest; see `hidden_contrast`.
     edge_is_free : bool
         Whether the field was let go on beyond the edge.
+    parts : mapping of str to float
+        What the uncertainty is made of, the largest first; empty without an instrument.
+    max_error : float
+        Largest total error of a determined fit, as a share of the displacement.
     """
     if worst := _those(names, chi2, chi2 > _MISFIT):
         causes = "noise, source (uniform, measured or unknown) or point spread may be wrong"
@@ -202,13 +216,19 @@ def assess_verdict(
             f"up to {max(rivals):.0%} (r.m.s.); take another energy, or compare them with what is "
             "known"
         )
-    if uncertainty > _OPEN:
+    if parts and uncertainty > max_error:
+        ranking = ", ".join(f"{TITLES[key]} {share:.1%}" for key, share in parts.items())
+        return Verdict.UNCERTAIN, (
+            f"errors of {uncertainty:.0%} of the displacement (r.m.s.): {ranking}; "
+            f"{_ADVICE.get(next(iter(parts)), _MEASURE).format(TITLES[next(iter(parts))])}"
+        )
+    if uncertainty > max_error:
         return Verdict.UNCERTAIN, (
             f"the noise leaves {uncertainty:.0%} of the displacement open (r.m.s.): average "
             "shots, or take images at energies that differ more"
         )
-    if beam is not None and np.hypot(uncertainty, beam.share) > _OPEN:
-        allowed = np.sqrt(_OPEN**2 - uncertainty**2) / beam.sensitivity
+    if beam is not None and np.hypot(uncertainty, beam.share) > max_error:
+        allowed = np.sqrt(max_error**2 - uncertainty**2) / beam.sensitivity
         origin = "was assumed, not measured" if beam.assumed else "is known to that only"
         return Verdict.UNCERTAIN, (
             f"the beam {origin}: if it differs by {beam.variation:.1%} (r.m.s.) over "

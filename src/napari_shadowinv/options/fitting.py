@@ -14,7 +14,6 @@ from pydantic import (
 )
 
 from napari_shadowinv._system.validation import CheckedModel
-from napari_shadowinv.options._beam import BeamScale, BeamVariation
 from napari_shadowinv.physics.setup import deflector_titles
 
 __all__ = [
@@ -112,6 +111,13 @@ class FitOptions(CheckedModel):
         title="Beam modes",
         description="Number of cosine modes per axis for the logarithm of an unknown beam.",
     )
+    max_error: float = Field(
+        default=0.05,
+        gt=0,
+        lt=1,
+        title="Largest error",
+        description="Largest total error, as a share of the field (r.m.s.), of a determined fit.",
+    )
     samples: int = Field(
         default=6,
         ge=0,
@@ -119,8 +125,6 @@ class FitOptions(CheckedModel):
         title="Samples",
         description="Number of random fields for the error bars; 0 for no error bars.",
     )
-    beam_variation: BeamVariation = None
-    beam_scale: BeamScale = 0.25
     evidence: bool = Field(
         default=False,
         title="Evidence",

@@ -266,6 +266,11 @@ class Instrument(CheckedModel):
         stated = beam.model_dump(exclude_unset=True)
         return numbers | {f"beam_{name}": value for name, value in stated.items()}
 
+    @property
+    def has_numbers(self) -> bool:
+        """Whether anything is stated that changes an image."""
+        return bool(self.stated.keys() - {"energy", "noise_correlation"})
+
     def without_reference(self) -> Self:
         """Return the instrument for an estimated source, which is in register with its image."""
         return self.model_copy(update={"registration": 0.0})

@@ -24,7 +24,7 @@ from napari_shadowinv.fitting import Fit, FitShot, compare, fit, point_spread
 from napari_shadowinv.fitting.shots import common_values, value_of_first
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.files import sha256, text_of
-from napari_shadowinv.options import ASSUMED_BEAM, FitChoices, FitOptions, Instrument
+from napari_shadowinv.options import BeamPrior, FitChoices, FitOptions, Instrument
 from napari_shadowinv.physics.projection import default_deflector
 from napari_shadowinv.physics.setup import (
     Setup,
@@ -107,7 +107,8 @@ def run_refinement(
         fields=choices.fields or usual_fields(None if setup is None else [setup]),
         noise=choices.noise,
         psf=choices.psf or 0.0,
-        options=_options(inversion, choices.options),
+        instrument=_instrument(inversion),
+        options=choices.options,
         on_progress=on_progress,
         should_stop=should_stop,
     )
@@ -116,12 +117,12 @@ def run_refinement(
     return replace(result, provenance=_provenance(inversion.provenance, setup, choices))
 
 
-def _options(inversion: Inversion, options: FitOptions) -> FitOptions:
-    """Return the options, with the beam's variation from the error budget of the inversion."""
+def _instrument(inversion: Inversion) -> Instrument:
+    """Return the instrument of an inversion, with the beam's difference in its error budget."""
     errors = inversion.errors
-    if options.beam_variation is not None or errors is None or errors.beam is None:
-        return options
-    return options.model_copy(update={"beam_variation": errors.beam_variation})
+    if errors is None or errors.beam is None:
+        return inversion.instrument
+    return inversion.instrument.with_beam(BeamPrior(rms=errors.beam_variation, length=errors.beam_scale))
 
 
 def refinement_choices(inversion: Inversion, setup: Setup | None, psf: float = 0.0) -> FitChoices:
@@ -186,18 +187,10 @@ class FitInputs:
         )
 
     @property
-    def options(self) -> FitOptions:
-        """The options; a variation is assumed for beams that are estimated from their images."""
-        options, estimate = self.choices.options, self.provenance.recipe.estimate
-        is_estimated = estimate is not None and self.choices.beam == "known"
-        if options.beam_variation is not None or not is_estimated:
-            return options
-        return options.model_copy(update={"beam_variation": ASSUMED_BEAM.rms})
-
-    @property
     def images(self) -> list[FitShot]:
         """The images after the steps, with all that is known of them."""
         is_known = self.choices.beam == "known"
+        is_measured = self.provenance.recipe.estimate is None
         images = [
             FitShot(
                 shot.image,
@@ -209,6 +202,7 @@ class FitInputs:
                 psf=self._point_spread(k),
                 noise=recorded.noise,
                 name=self.names[k],
+                measured=is_measured,
             )
             for k, (recorded, shot) in enumerate(zip(self.recorded, self.shots, strict=True))
         ]
@@ -223,7 +217,8 @@ class FitInputs:
             "source": "unknown" if self.choices.beam == "unknown" else None,
             "noise": self.choices.noise,
             "brightness": self.choices.brightness,
-            "options": self.options,
+            "instrument": self.provenance.recipe.instrument,
+            "options": self.choices.options,
         }
 
     def with_provenance(self, result: Fit) -> Fit:
@@ -360,12 +355,6 @@ def check_fit(recipe: Recipe) -> None:
                 f"the recipe has the step {step.summary}, which changes what the forward model "
                 f"is fitted to: leave it out; expected some of {', '.join(FIT_STEPS)}"
             )
-    if recipe.instrument != Instrument():
-        raise InputError(
-            "the recipe states how well the instrument is known, which the errors of inversions "
-            "take into account, but not those of fits: leave it out, and state the variation of "
-            "the beam in the options of the fit"
-        )
     if recipe.fit is not None and recipe.fit.beam == "unknown" and recipe.source is not None:
         raise InputError(
             "the recipe has a source and a fit with an unknown beam: expected one of them"

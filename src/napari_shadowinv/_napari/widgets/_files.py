@@ -256,6 +256,7 @@ class FitRecipeButton(RecipeButton):
         tool.steps.show_steps(recipe.steps)
         if recipe.setup is not None:
             tool.setup.load(recipe.setup.model_dump(exclude_none=True), str(path))
+        tool.instrument.set_values(recipe.instrument.model_dump())
         tool.show_choices(choices)
         if beam is not None:
             (tool.source.layers.layer,) = add_layers(tool.viewer, radiograph_layers(beam)[-1:])

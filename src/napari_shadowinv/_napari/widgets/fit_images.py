@@ -28,6 +28,7 @@ from napari_shadowinv._napari.widgets._inputs import (
     NOISES,
     UNKNOWN,
     ChoiceBox,
+    InstrumentForm,
     OptionsForm,
     SetupPicker,
     SourcePicker,
@@ -113,6 +114,7 @@ class FitImages(ToolPanel):
         self.setup = SetupPicker()
         self.setup_section = forms.titled_section(self.setup)
         self.steps = StepsSection(FIT_STEPS)
+        self.instrument = InstrumentForm()
         self.options = OptionsForm(FitOptions, {"smoothness": 1.0, "margin": 16, "threads": 1})
         self.recipes = FitRecipeButton(self)
         self.cost = forms.wrapping_label()
@@ -133,6 +135,7 @@ class FitImages(ToolPanel):
             forms.labelled("Noise", self.noise),
             self.setup_section,
             self.steps,
+            forms.section("Instrument", self.instrument),
             forms.section("Options", self.options),
             side_by_side((self._last.keep_earlier, 1), (self.recipes, 0)),
             self.cost,
@@ -151,6 +154,7 @@ class FitImages(ToolPanel):
         self.brightness.currentIndexChanged.connect(self._show_beams)
         for signal in (
             self.source.changed,
+            self.instrument.changed,
             self.options.changed,
             self.setup.changed,
             self.steps.changed,
@@ -172,6 +176,7 @@ class FitImages(ToolPanel):
             "brightness": self.brightness,
             "noise": self.noise,
             "steps": self.steps,
+            "instrument": self.instrument,
             "options": self.options,
             "painted_is_unusable": self.masks,
         }
@@ -193,6 +198,7 @@ class FitImages(ToolPanel):
             steps=self.steps.steps(),
             source=self.source.chosen(),
             setup=self.setup.setup(),
+            instrument=self.instrument.model(),
             fit=choices,
         )
 
