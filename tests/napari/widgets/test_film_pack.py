@@ -116,11 +116,13 @@ def test_the_spectrum_follows_the_region(evaluated: Any, pack_doses: Any, qtbot:
     np.testing.assert_allclose(region.scale, scale)
     region.add_rectangles([[19.6, 29.6], [49.4, 59.4]])
     qtbot.waitUntil(
-        lambda: np.allclose(tool.plot.shown.fluence, mean(np.s_[20:50], np.s_[30:60])), timeout=5000
+        lambda: np.allclose(tool.plot.shown.fluence, mean(np.s_[20:50], np.s_[30:60])),
+        timeout=PATIENCE,
     )
     region.data = [region.data[0] + [10, 20]]
     qtbot.waitUntil(
-        lambda: np.allclose(tool.plot.shown.fluence, mean(np.s_[30:60], np.s_[50:80])), timeout=5000
+        lambda: np.allclose(tool.plot.shown.fluence, mean(np.s_[30:60], np.s_[50:80])),
+        timeout=PATIENCE,
     )
 
 
@@ -138,7 +140,7 @@ def test_corners_are_shown_dragged_and_used(
     moved = corners + np.array([[-2.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     tool.corners.polygon.data = [moved[1]]
     viewer.dims.set_current_step(0, 2)
-    qtbot.waitUntil(lambda: tool.corners.scan.name == "scan of film 3", timeout=5000)
+    qtbot.waitUntil(lambda: tool.corners.scan.name == "scan of film 3", timeout=PATIENCE)
     np.testing.assert_allclose(tool.corners.polygon.data[0], corners[2], atol=1e-4)
     tool.corners.polygon.data = [moved[2]]
     tool.run_again.click()

@@ -985,7 +985,7 @@ def test_run_is_in_view_at_once_and_the_verdict_at_the_end(
     qtbot.wait(100)
     tool.area.verticalScrollBar().setValue(0)
     show(tool, fitted)
-    qtbot.waitUntil(lambda: lies_in_view(tool, tool.view.verdict), timeout=5000)
+    qtbot.waitUntil(lambda: lies_in_view(tool, tool.view.verdict), timeout=PATIENCE)
     # What is not known yet has to be seen, and must not fold away while it is typed.
     window.layers.select_all()
     window.layers.remove_selected()

@@ -128,7 +128,7 @@ def test_closing_the_window_ends_the_run(
     viewer.close()
     qtbot.waitUntil(
         lambda: not any(thread.name == "shadowinv" for thread in threading.enumerate()),
-        timeout=5000,
+        timeout=PATIENCE,
     )
     qtbot.wait(100)
     assert messages == []

@@ -258,7 +258,7 @@ def test_closing_the_window_ends_the_run(
     prepared(widget, out).panel.button.click()
     qtbot.waitUntil(lambda: widget.panel.bar.value() == 2, timeout=PATIENCE)
     viewer.close()
-    qtbot.waitUntil(lambda: not running(), timeout=5000)
+    qtbot.waitUntil(lambda: not running(), timeout=PATIENCE)
     qtbot.wait(100)
     assert messages == []
     assert StackStore(out).statuses().tolist() == [DONE, DONE, PENDING, PENDING]

@@ -222,7 +222,9 @@ def test_first_shadowgram_is_clicked_to_its_end(
         on = profile.layers.item(item).text() == field.name
         state = Qt.CheckState.Checked if on else Qt.CheckState.Unchecked
         profile.layers.item(item).setCheckState(state)
-    qtbot.waitUntil(lambda: [one.name for one in profile.profiles] == [field.name], timeout=5000)
+    qtbot.waitUntil(
+        lambda: [one.name for one in profile.profiles] == [field.name], timeout=PATIENCE_MS
+    )
     flanks = np.array_split(profile.profiles[0].values, 2)
     for flank in flanks:
         assert np.nanmax(flank) == pytest.approx(9.7, rel=0.04)
@@ -410,7 +412,7 @@ def test_film_pack_is_clicked_to_its_end(
     whole = np.array(tool.plot.shown.fluence)
     press(tool, "✎")
     tool.regions.layer.add_rectangles([[20, 30], [49, 59]])
-    qtbot.waitUntil(lambda: (tool.plot.shown.fluence != whole).all(), timeout=5000)
+    qtbot.waitUntil(lambda: (tool.plot.shown.fluence != whole).all(), timeout=PATIENCE_MS)
 
     press(tool, "Show corners")
     corners = np.array(tool.corners.polygon.data[0])
