@@ -1,6 +1,6 @@
 """Inversions with an instrument that is not exact: the tables of docs/uncertainty.md.
 
-    python benchmarks/instrument.py [totals bands ranks cost] [--shots 210] [--side 128]
+    python benchmarks/instrument.py [totals bands ranks cost fits] [--shots 210] [--side 128]
 
 Each image is counted rays (`counted` of `fit.py`; the package's forward model is not used) of one
 of six objects, with an imperfection drawn from its stated prior: a beam of random waves, a
@@ -17,14 +17,19 @@ inversion's, and TARP, the rank of its distance from random points. The columns 
 truths within 68 and 95 %, and the probability of ranks as uneven if all were equally likely
 (Kolmogorov and Smirnov).
 Cost: samples a minute, and time and memory of the budget.
+Fits: the same for fits of one to four images, by the objects in turn, half of them folded, with
+3 % noise: the L2 error over the total of the report, and what is wrong though it is *determined*,
+by more than 5 % and three totals.
 """
 
 from __future__ import annotations
 
 import argparse
 import resource
+import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -34,14 +39,17 @@ from scipy.stats import kstest
 
 from fit import Beam, Field, blobs, counted
 from napari_shadowinv import (
+    FitOptions,
     Instrument,
     InversionOptions,
+    fit,
     invert,
     plan_sites,
     synthetic_image,
     uncertainty,
 )
 from napari_shadowinv._system.machine import available_threads
+from napari_shadowinv.facts import Verdict
 from reference import toroid_case
 
 FloatArray = NDArray[np.float64]
@@ -390,10 +398,131 @@ def table_of_cost() -> None:
         print(f"| {side}² | {stated:.2f} | {exact:.2f} | {memory:.1f} |", flush=True)
 
 
+FIT_STRENGTHS = 1.0, 0.69, 0.45, 0.3  # 14.7, 30, 70 and 130 MeV or so
+FIT_NOISE, FIT_BLUR_PX, FIT_RAYS = 0.03, 2.0, 20
+FOLDED = 2.2  # times the objects of inversions
+
+
+@dataclass
+class Imperfect:
+    """Images of an object at several energies while they are simulated."""
+
+    beam: float = 0.0  # r.m.s.
+    between: float = 0.0  # r.m.s., from image to image
+    background: float = 0.0  # share of the mean
+    gamma: float = 0.0
+    blur: float = FIT_BLUR_PX
+    absorption: float = 0.0
+
+    def images(self, shot: Shot, strengths: FloatArray) -> list[FloatArray]:
+        """Return the images, with noise."""
+        common = shot.waves(0.25)
+        images = []
+        y, x = np.indices((shot.side, shot.side), dtype=np.float64)
+        depth = np.hypot(*shot.displaced(y, x))
+        radius = np.sqrt((depth > 0.1 * depth.max()).sum() / np.pi)
+        wave = shot.waves(radius / shot.side)
+
+        def transmission(y: FloatArray, x: FloatArray) -> FloatArray:
+            size = np.maximum(np.hypot(*shot.displaced(y, x)) / depth.max(), 1e-9)
+            within = 1 / (1 + np.exp(-2 * (np.log(size) + np.log(10.0))))
+            return np.asarray(1 + self.absorption * within * wave(y, x))
+
+        for strength in strengths:
+            own = shot.waves(0.25)
+
+            def beam(y: FloatArray, x: FloatArray, own: Beam = own) -> FloatArray:
+                light = (1 + self.beam * common(y, x)) * (1 + self.between * own(y, x))
+                return np.asarray(light * transmission(y, x))
+
+            shape = shot.side, shot.side
+            image = counted([shot.displaced], np.array([strength]), beam, shape, FIT_RAYS)
+            image = gaussian_filter(image, self.blur, mode="nearest") if self.blur else image
+            image = image ** (1 + self.gamma)
+            image = (1 - self.background) * image + self.background * image.mean()
+            noise = FIT_NOISE * image.mean() * shot.rng.normal(size=shape)
+            images.append(image + noise)
+        return images
+
+
+def fit_cases(rng: np.random.Generator) -> dict[str, tuple[Imperfect, Instrument]]:
+    """Return imperfections drawn from what is stated of them."""
+    normal = lambda size: float(size * rng.normal())  # noqa: E731
+    blur = float(np.sqrt(max(FIT_BLUR_PX**2 + normal(1.66**2), 0.0)))
+    exact_beam = {"beam_rms": 0.0}
+    return {
+        "none": (Imperfect(), Instrument(**exact_beam)),
+        "beam 5 %": (Imperfect(beam=0.05), Instrument(beam_rms=0.05)),
+        "beam 2 %": (Imperfect(beam=0.02), Instrument(beam_rms=0.02)),
+        "beams 3 % between": (Imperfect(between=0.03), Instrument(beam_rms=0.0, beam_between=0.03)),
+        "beams 10 % between": (Imperfect(between=0.1), Instrument(beam_rms=0.0, beam_between=0.1)),
+        "background 10 %": (
+            Imperfect(background=normal(0.1)),
+            Instrument(background=0.1, **exact_beam),
+        ),
+        "gamma 0.15": (Imperfect(gamma=normal(0.15)), Instrument(gamma=0.15, **exact_beam)),
+        "blur 2 px ± 30 %": (Imperfect(blur=blur), Instrument(blur=1.66, **exact_beam)),
+        "absorption 5 %": (Imperfect(absorption=0.05), Instrument(absorption=0.05, **exact_beam)),
+        "beam 5 %, background 10 %, blur ± 30 %": (
+            Imperfect(beam=0.05, background=normal(0.1), blur=blur),
+            Instrument(beam_rms=0.05, background=0.1, blur=1.66),
+        ),
+    }
+
+
+def table_of_fits(side: int, shots: int, first_seed: int) -> None:
+    """Print a row for each imperfection, and each fit that is wrong though it is determined."""
+    names = list(objects(side))
+    rows: dict[str, list[tuple[float, float, bool]]] = {}
+    for number in range(shots):
+        cases = fit_cases(np.random.default_rng([first_seed + number, 30]))
+        title = list(cases)[number % len(cases)]
+        imperfect, instrument = cases[title]
+        round_number = number // len(cases)
+        # One energy in every eighth shot; the others have two, three or four.
+        count = 1 if number % 8 == 7 else 2 + round_number % 3
+        folded = FOLDED if round_number % 2 else 1.0
+        name = names[(number + round_number) % len(names)]
+        exact = scale_field(objects(side)[name], folded)
+        strengths = np.array(FIT_STRENGTHS[:count])
+        images = imperfect.images(Shot(side, exact, first_seed + number), strengths)
+        result = fit(
+            images,
+            strengths=strengths,
+            psf=FIT_BLUR_PX,
+            instrument=instrument,
+            options=FitOptions(samples=8),
+        )
+        exact_field = folded * truth(side, name)
+        error = length(result.fields[0].displacement - exact_field) / length(exact_field)
+        total, is_determined = result.report.total, result.verdict is Verdict.DETERMINED
+        rows.setdefault(title, []).append((error, error / total, is_determined))
+        is_wrong = is_determined and error > 0.05 and error > 3 * total
+        print(
+            f"{title}, {name} x {folded:g}, {count}: error {error:.1%}, total {total:.1%}, "
+            f"{result.verdict}{' WRONG' if is_wrong else ''}",
+            file=sys.stderr,
+            flush=True,
+        )
+    print("| stated | fits | determined | error over total | within 1, 2 totals | error |")
+    print("|---|---|---|---|---|---|")
+    for title, values in rows.items():
+        print(f"| {title} | {_fit_row(values)} |")
+    print(f"| all | {_fit_row([value for row in rows.values() for value in row])} |\n", flush=True)
+
+
+def _fit_row(values: list[tuple[float, float, bool]]) -> str:
+    errors, ratios, determined = (np.array(column) for column in zip(*values, strict=True))
+    return (
+        f"{len(values)} | {determined.sum()} | {np.sqrt((ratios**2).mean()):.2f} | "
+        f"{(ratios < 1).mean():.0%}, {(ratios < 2).mean():.0%} | {np.median(errors):.1%}"
+    )
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    tables = ["totals", "bands", "ranks", "cost"]
+    tables = ["totals", "bands", "ranks", "cost", "fits"]
     parser.add_argument("tables", nargs="*", choices=[*tables, []], default=tables)
     parser.add_argument("--shots", type=int, default=210)
     parser.add_argument("--side", type=int, default=128)
@@ -409,6 +538,8 @@ def main() -> None:
         table_of_ranks(*size, arguments.method)
     if "cost" in arguments.tables:
         table_of_cost()
+    if "fits" in arguments.tables:
+        table_of_fits(*size)
 
 
 if __name__ == "__main__":

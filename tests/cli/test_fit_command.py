@@ -109,7 +109,7 @@ def provenance_in(path: str) -> Provenance:
 
 
 def test_the_field_of_two_energies_is_found_and_written(folder: Path) -> None:
-    result = shadowinv(*PAIR, "--samples", 2, "--noise", 20, "--beam-variation", 0)
+    result = shadowinv(*PAIR, "--samples", 2, "--noise", 20, "--beam-rms", 0)
     assert result.exit_code == 0, result.output
     names = {"a.tif", "b.tif", "setup.toml", "a_fit.shadowinv", "a_fit.png"}
     assert set(content(folder)) == names
@@ -117,7 +117,7 @@ def test_the_field_of_two_energies_is_found_and_written(folder: Path) -> None:
     assert fit.verdict is Verdict.DETERMINED
     assert np.abs(fit.fields[0].displacement - TRUTH).max() < 0.2
     assert fit.setups == (FIRST, SECOND)
-    assert fit.options == FitOptions(samples=2, beam_variation=0)
+    assert fit.options == FitOptions(samples=2)
     assert setup_from_dataset(dataset) == FIRST
     output = flat(result.stdout)
     assert "verdict determined" in output

@@ -37,6 +37,8 @@ GOOD: dict[str, Any] = {
     "used": np.ones((48, 48), bool),
     "hidden": 0.0,
     "edge_is_free": False,
+    "parts": {},
+    "max_error": 0.05,
 }
 ALONE = {
     "chi2": np.array([1.0]),

@@ -72,12 +72,11 @@ def test_run_fit_equals_a_fit_of_the_prepared_images(images: list[FloatArray]) -
     after = [setup.model_copy(update={"pixel_size": 2e-5}) for setup in SETUPS]
     spread = 1e-5 * (1 - 1 / SETUPS[0].magnification) / 2e-5
     by_hand = fit(
-        np.stack([binned(image) for image in images]),
+        [FitShot(binned(image), mask=binned(mask) == 4) for image in images],
         setups=after,
         source=np.full((40, 40), 4.0),
         noise=0.04,
         psf=[spread, spread],
-        mask=binned(mask) == 4,
         brightness="free",
         options=HASTY,
     )
@@ -185,7 +184,14 @@ def test_fit_warns_of_broken_pixels_in_an_image(images: list[FloatArray], tmp_pa
     assert Fit.from_dataset(read(path)).warnings == result.warnings
 
 
-def test_a_fit_refuses_a_recipe_with_an_instrument() -> None:
-    recipe = Recipe(instrument=Instrument(gamma=0.1), fit=FitChoices())
-    with pytest.raises(InputError, match=r"instrument.*not those of fits.*variation of the beam"):
-        run_fit(recipe, [np.ones((32, 32))])
+def test_a_fit_takes_the_instrument_of_its_recipe(images: list[FloatArray]) -> None:
+    instrument = Instrument(background=0.05)
+    choices = FitChoices(noise=0.04, options=HASTY.model_copy(update={"samples": 2}))
+    shots = [
+        FitShot(image, setup, source=np.ones(SHAPE))
+        for image, setup in zip(images, SETUPS, strict=True)
+    ]
+    result = run_fit(Recipe(instrument=instrument, fit=choices), shots)
+    assert result.report.numbers.keys() == {"background"}
+    assert result.provenance is not None
+    assert result.provenance.recipe.instrument == instrument

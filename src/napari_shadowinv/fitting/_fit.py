@@ -85,7 +85,6 @@ def fit(
     source: ArrayLike | Literal["unknown"] | None = None,
     noise: ArrayLike | KindOfNoise | None = None,
     psf: Any = 0.0,
-    mask: ArrayLike | None = None,
     brightness: ArrayLike | Literal["known", "free"] = "known",
     instrument: Instrument | None = None,
     options: FitOptions | None = None,
@@ -102,9 +101,9 @@ def fit(
     ----------
     images : array_like of shape (L, H, W) or (H, W), mapping, or sequence of FitShot
         Images on one grid of pixels in the object plane: an array, a list of them, or a dict
-        whose keys name the images in messages. A `FitShot` is an image with all that is known of
-        it, such as its own noise, its name, fiducials, or a field to start from; a `Radiograph`
-        has its setup, source and mask.
+        whose keys name the images in messages; masked arrays where pixels cannot be used. A
+        `FitShot` is an image with all that is known of it, such as its mask, its own noise, its
+        name, fiducials, or a field to start from; a `Radiograph` has its setup, source and mask.
     strengths : array_like, shape (L,) or (L, M), optional
         Displacement of each image by each field, relative to the first image.
     setups : sequence of Setup, optional
@@ -123,8 +122,6 @@ def fit(
     psf : float or array_like, default 0
         Standard deviation in px of the point spread, or a kernel with odd sides; one, or one for
         each image. See `point_spread`.
-    mask : array_like of bool, shape (H, W) or (L, H, W), optional
-        The pixels to use. Default: all.
     brightness : "known", "free" or array_like, default "known"
         Brightness of each image relative to the source: factors, or "free" to fit them.
     instrument : Instrument, optional
@@ -171,7 +168,6 @@ def fit(
         source=source,
         noise=noise,
         psf=psf,
-        mask=mask,
         brightness=brightness,
         instrument=instrument,
         options=options,
@@ -224,7 +220,10 @@ def fit(
             pattern = replace(pattern, cause=cause)
     with _timed("samples", seconds):
         count = options.samples if options.samples > 1 else 0
-        samples = [posterior.draw_sample() for _ in range(count)]
+        # One image does not determine its instrument.
+        is_pushed = data.single and bool(imperfect.parts)
+        draw = posterior.draw_prior_sample if is_pushed else posterior.draw_sample
+        samples = [draw() for _ in range(count)]
         errors = errors_by_noise(scene, samples, data.size)
         by_part = errors_by_part(unsure, posterior, samples, data.size)
         by_beam = shifts_by_beam(data, unsure, posterior, samples, options)

@@ -121,6 +121,20 @@ class Posterior:
         weights = determined / determined.sum(axis=1, keepdims=True)
         return smoothness * np.exp(change), float((np.abs(change) * weights).sum(axis=1).max())
 
+    def draw_prior_sample(self) -> Sample:
+        """Return a random change by noise and by an instrument that the images do not determine.
+
+        Its numbers are drawn from their prior; fields and all other unknowns respond to them.
+        """
+        noise = self._rng.normal(size=self._scene.images.shape)
+        numbers = self._unknowns.zeros()._replace(
+            common=self._rng.normal(size=self._unknowns.common.shape),
+            separate=self._rng.normal(size=self._unknowns.separate.shape),
+        )
+        slope = self._linear.pull(noise - self._linear.push(numbers))
+        slope = slope.plus(self._scene.prior.draw(self._unknowns, self._rng))
+        return Sample(self._held._change(slope, _CLOSELY).plus(numbers), noise)
+
     def draw_sample(self, tolerance: float | None = None) -> Sample:
         """Return a random change of the unknowns, as large as the data leave possible."""
         if tolerance is None:
@@ -172,8 +186,7 @@ class Posterior:
         With J and B the derivatives of the residuals by the fields and by the numbers θ of an
         imperfection, and H the Hessian of the fields, it causes -H⁻¹JᵀBθ; noise causes the rest.
         """
-        held = copy(self)
-        held._scales = self._scales.held()
+        held = self._held
         rest, effects = sample.change, {}
         for part in self._scene.imperfect.parts:
             moved = sample.change.zeros()
@@ -188,6 +201,13 @@ class Posterior:
             minus = moved.like(-effects[part.key].flat())
             rest = rest.plus(minus)
         return {"noise": rest, **effects}
+
+    @property
+    def _held(self) -> Posterior:
+        """The same for an instrument that is known."""
+        held = copy(self)
+        held._scales = self._scales.held()
+        return held
 
     def count_determined(self, rng: np.random.Generator) -> float:
         """Estimate how many numbers the data determine: so much of Σχ² the fit absorbs of noise."""

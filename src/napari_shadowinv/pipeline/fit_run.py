@@ -122,7 +122,9 @@ def _instrument(inversion: Inversion) -> Instrument:
     errors = inversion.errors
     if errors is None or errors.beam is None:
         return inversion.instrument
-    return inversion.instrument.with_beam(BeamPrior(rms=errors.beam_variation, length=errors.beam_scale))
+    return inversion.instrument.with_beam(
+        BeamPrior(rms=errors.beam_variation, length=errors.beam_scale)
+    )
 
 
 def refinement_choices(inversion: Inversion, setup: Setup | None, psf: float = 0.0) -> FitChoices:

@@ -181,8 +181,8 @@ def test_what_is_asked_for_is_what_the_controls_show(window: Any, tool: Any) -> 
 
 
 def test_the_field_is_recovered_in_si_units(window: Any, tool: Any, run: Any, qtbot: Any) -> None:
-    flat = {"beam_variation": 0.0}
-    tool.options.set_values({"samples": 2, "max_iterations": 5, "spacing": 0.25} | flat)
+    tool.options.set_values({"samples": 2, "max_iterations": 5, "spacing": 0.25})
+    tool.instrument.set_values({"beam_rms": 0.0})
     result = run(tool)
     assert result.verdict is Verdict.DETERMINED
     error = result.fields[0].displacement - TRUTH

@@ -1,0 +1,212 @@
+"""An instrument that is not exact is fitted together with the fields, or enters their errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from helpers.fit_images import bump, counted, distance, noisy, on_pixels
+from napari_shadowinv import BeamPrior, Instrument
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.facts import Verdict
+from napari_shadowinv.fitting import Fit, FitOptions, fit
+from napari_shadowinv.fitting.descent import coarser
+from napari_shadowinv.fitting.instrument import (
+    Imperfect,
+    Shapes,
+    imperfect_instrument,
+    number_text,
+    widen,
+    widening,
+)
+from napari_shadowinv.fitting.measurements import collect_data
+from napari_shadowinv.fitting.posterior import Posterior
+
+SIZE = (48, 56)
+STRENGTHS = [1, 0.6]
+NOISE = 0.03
+RING = bump(3.0, 5.5, (23, 29), tall=1.2)
+FEW = FitOptions(samples=4, max_iterations=20, spacing=0.25, threads=1)
+EXACT_BEAM = {"beam_rms": 0.0}
+
+
+def shots(background: float = 0.0, gamma: float = 0.0, blur: float = 0.0) -> FloatArray:
+    images = [
+        counted(lambda y, x, a=a: a * RING(y, x), SIZE, blur=blur, margin=12) for a in STRENGTHS
+    ]
+    recorded = np.stack(images) ** (1 + gamma)
+    return noisy(list((1 - background) * recorded + background), NOISE)
+
+
+def fitted(images: FloatArray, instrument: Instrument | None, **keywords: object) -> Fit:
+    choices = {"strengths": STRENGTHS, "noise": NOISE, "options": FEW} | keywords
+    return fit(images, instrument=instrument, **choices)
+
+
+def error(result: Fit) -> float:
+    return distance(result.fields[0].displacement, on_pixels(RING, SIZE))
+
+
+@pytest.mark.parametrize(
+    ("imperfection", "instrument", "key"),
+    [
+        ({"background": 0.15}, {"background": 0.1}, "background"),
+        ({"gamma": -0.15}, {"gamma": 0.1}, "gamma"),
+    ],
+)
+def test_two_energies_determine_what_is_stated(
+    imperfection: dict[str, float], instrument: dict[str, float], key: str
+) -> None:
+    images = shots(**imperfection)
+    blind = fitted(images, Instrument(**EXACT_BEAM))
+    aware = fitted(images, Instrument(**EXACT_BEAM, **instrument))
+    assert error(aware) < 0.5 * error(blind)
+    assert error(aware) < 0.05
+    for value, deviation in aware.report.numbers[key]:
+        assert abs(value - imperfection[key]) < max(4 * deviation, 0.02)
+    assert (aware.chi2 < blind.chi2).all()
+    assert aware.report.uncertainty > aware.report.parts["noise"] > 0
+
+
+def test_a_point_spread_wider_than_stated_is_found() -> None:
+    images = shots(blur=1.6)
+    aware = fitted(images, Instrument(**EXACT_BEAM, blur=1.3), psf=1.0)
+    ((variance, deviation),) = aware.report.numbers["blur"]
+    assert abs(variance - (1.6**2 - 1)) < max(4 * deviation, 0.3)
+    assert error(aware) < 0.05 < error(fitted(images, Instrument(**EXACT_BEAM), psf=1.0))
+
+
+def test_an_instrument_without_numbers_changes_no_bit() -> None:
+    images = shots()
+    plain, exact, energy = (
+        fitted(images, instrument) for instrument in (None, Instrument(), Instrument(energy=0.05))
+    )
+    for other in (exact, energy):
+        np.testing.assert_array_equal(other.fields[0].displacement, plain.fields[0].displacement)
+        assert (other.verdict, other.report.total) == (plain.verdict, plain.report.total)
+
+
+def test_one_image_keeps_its_field_and_gets_larger_errors() -> None:
+    """It cannot tell the instrument from the object."""
+    image = shots()[1]
+    source = np.ones(SIZE)
+    keywords = {"strengths": None, "source": source}
+    exact = fitted(image, Instrument(), **keywords)
+    unsure = fitted(image, Instrument(beam_rms=0.05, background=0.1), **keywords)
+    np.testing.assert_array_equal(unsure.fields[0].displacement, exact.fields[0].displacement)
+    assert unsure.verdict is Verdict.UNCERTAIN
+    assert "beam" in unsure.explanation
+    # A beam 1 % off would move the field by so much; the instrument's numbers stay as stated.
+    assert exact.report.beam is not None
+    assert unsure.report.parts["beam"] == pytest.approx(5 * exact.report.beam.sensitivity, rel=0.5)
+    ((value, deviation),) = unsure.report.numbers["background"]
+    assert value == 0
+    assert 0.03 < deviation < 0.3
+
+
+def test_errors_have_a_part_for_all_that_is_stated() -> None:
+    instrument = Instrument(beam=BeamPrior(rms=0.02, length=0.5, between=0.01), background=0.02)
+    result = fitted(shots(), instrument)
+    parts = result.report.parts
+    assert parts.keys() == {"noise", "beam", "beam_between", "background"}
+    assert list(parts.values()) == sorted(parts.values(), reverse=True)
+    facts = {fact.title: fact.text for fact in result.facts}
+    assert facts["Errors"].startswith(f"{result.report.total:.2%} of the displacement (r.m.s.): ")
+    assert all(title in facts["Errors"] for title in ("noise", "beam between energies"))
+    assert "background" in facts["Instrument"]
+    restored = Fit.from_dataset(result.to_dataset())
+    assert restored.report.parts == parts
+    assert restored.report.numbers == result.report.numbers
+
+
+def test_the_largest_allowed_error_decides_what_is_determined() -> None:
+    images = shots()
+    total = fitted(images, Instrument()).report.total
+    for factor, is_determined in ((1.1, True), (0.9, False)):
+        options = FEW.model_copy(update={"max_error": factor * total})
+        result = fitted(images, Instrument(), options=options)
+        assert (result.verdict is Verdict.DETERMINED) == is_determined
+
+
+def test_effects_of_noise_and_instrument_add_to_each_sample() -> None:
+    data = collect_data(
+        shots(),
+        strengths=STRENGTHS,
+        noise=NOISE,
+        instrument=Instrument(beam_rms=0.05, background=0.1, gamma=0.1),
+        options=FEW,
+    )
+    scene = coarser(data.scene_with(100.0), 2)
+    posterior = Posterior(scene, scene.nothing(), np.random.default_rng(0))
+    sample = posterior.draw_sample()
+    effects = posterior.effects(sample)
+    assert effects.keys() == {"noise", "gamma", "background", "beam"}
+    total = sum(effect.potentials for effect in effects.values())
+    np.testing.assert_allclose(total, sample.change.potentials, atol=1e-12)
+    assert not any(effect.common.any() for key, effect in effects.items() if key != "noise")
+
+
+def test_a_source_that_was_recorded_is_exact_unless_stated() -> None:
+    keywords = {"strengths": STRENGTHS, "noise": NOISE, "options": FEW}
+    for source, rms in ((None, 0.05), (np.ones(SIZE), 0.0)):
+        data = collect_data(shots(), source=source, **keywords)
+        assert data.beam.rms == rms
+        assert data.scene.imperfect.is_exact
+        assert data.common
+
+
+# Numbers and their effects
+
+
+def test_widening_is_the_derivative_of_a_wider_image() -> None:
+    image = np.random.default_rng(0).random((24, 30))
+    slope = (widen(image, 1.3 + 1e-4) - widen(image, 1.3 - 1e-4)) / 2e-4
+    np.testing.assert_allclose(widening(image, 1.3), slope, atol=1e-8)
+    assert widen(image, 2.0).sum() == pytest.approx(image.sum())
+    np.testing.assert_array_equal(widen(image, 0.0), image)
+
+
+def test_what_a_detector_adds_is_taken_from_its_beam() -> None:
+    imperfect = Imperfect(gamma=0.1, background=0.05)
+    common, separate = np.array([2.0]), np.array([3.0])
+    light = np.linspace(0.5, 2, 12).reshape(3, 4)
+    recorded = light ** imperfect.exponent(common) + imperfect.offset(separate)
+    np.testing.assert_allclose(imperfect.entering(recorded, common, separate), light)
+
+
+def test_numbers_keep_their_places_in_larger_pixels() -> None:
+    shapes = np.random.default_rng(1).random((3, 8, 8))
+    fine = Imperfect(gamma=0.1, blur=4.0, background=0.1, shapes=(Shapes("beam", shapes),))
+    coarse = fine.coarsen(2)
+    assert coarse.parts == fine.parts
+    assert fine.counts == (5, 1)
+    assert coarse.blur == 1.0
+    (part,) = coarse.shapes
+    np.testing.assert_allclose(part.values.mean(axis=(1, 2)), shapes.mean(axis=(1, 2)))
+
+
+def test_beams_vary_as_far_as_stated() -> None:
+    used = np.ones((40, 52), bool)
+    imperfect = imperfect_instrument(
+        Instrument(),
+        BeamPrior(rms=0.04, length=0.3, between=0.02),
+        np.ones((2, 40, 52)),
+        used,
+        ((4, 4), (4, 6)),
+        is_common=True,
+        is_unknown=False,
+        other_strengths=None,
+    )
+    for shapes, rms in zip(imperfect.shapes, (0.04, 0.02), strict=True):
+        inside = shapes.values[:, 4:-4, 4:-6]
+        assert np.sqrt((inside**2).sum(axis=0).mean()) == pytest.approx(rms, rel=0.01)
+        np.testing.assert_allclose(inside.mean(axis=(1, 2)), 0, atol=1e-12)
+
+
+def test_numbers_are_written_with_the_digits_of_their_errors() -> None:
+    assert number_text("gamma", [[-0.1034, 0.0123]]) == "gamma 0.897 ± 0.012"
+    assert (
+        number_text("background", [[0.1, 0.004], [0.02, 0.03]])
+        == "background 10.00 ± 0.40, 2.0 ± 3.0 %"
+    )
+    assert number_text("blur", [[2.76, 0.31]]) == "variance of the point spread +2.76 ± 0.31 px²"
