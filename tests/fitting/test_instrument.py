@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.fit_images import bump, counted, distance, noisy, on_pixels
-from napari_shadowinv import BeamPrior, Instrument
+from napari_shadowinv import BeamPrior, Instrument, ProtonSetup
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Fit, FitOptions, fit
@@ -21,6 +21,7 @@ from napari_shadowinv.fitting.instrument import (
 )
 from napari_shadowinv.fitting.measurements import collect_data
 from napari_shadowinv.fitting.posterior import Posterior
+from napari_shadowinv.physics.units import shown_fields
 
 SIZE = (48, 56)
 STRENGTHS = [1, 0.6]
@@ -126,6 +127,53 @@ def test_the_largest_allowed_error_decides_what_is_determined() -> None:
         options = FEW.model_copy(update={"max_error": factor * total})
         result = fitted(images, Instrument(), options=options)
         assert (result.verdict is Verdict.DETERMINED) == is_determined
+
+
+def test_energy_adds_to_the_errors_of_fields_in_si_units_alone() -> None:
+    setups = [
+        ProtonSetup(
+            energy=energy, source_object_distance=0.01, object_image_distance=0.2, pixel_size=1e-5
+        )
+        for energy in (3.0, 8.0)
+    ]
+    images = noisy([counted(lambda y, x, a=a: a * RING(y, x), SIZE) for a in (1, 0.61)], NOISE)
+    keywords = {"strengths": None, "setups": setups}
+    result = fitted(images, Instrument(energy=0.1), **keywords)
+    (field,) = result.fields
+    (pixels,) = shown_fields([field.displacement], None)
+    (si,) = shown_fields([field.displacement], setups[0])
+    in_pixels, in_si = (result.peak_error(field, shown) for shown in (pixels, si))
+    assert in_pixels is not None
+    assert in_si is not None
+    # ∫B dz is proportional to the momentum, nearly the root of the energy.
+    assert in_si.share == pytest.approx(np.hypot(in_pixels.share, 0.05), rel=0.01)
+    assert in_si.cause == "energy, 10 %"
+    assert "energy" not in in_pixels.cause
+    assert Fit.from_dataset(result.to_dataset()).instrument == result.instrument
+
+
+def test_stated_correlation_of_noise_widens_the_errors() -> None:
+    images = shots()
+    white, correlated = (
+        fitted(images, Instrument(noise_correlation=width)) for width in (0.0, 1.0)
+    )
+    assert correlated.report.uncertainty == pytest.approx(
+        np.sqrt(4 * np.pi) * white.report.uncertainty
+    )
+
+
+def test_each_fit_states_its_sensitivities() -> None:
+    """By as much as fits of changed images move."""
+    plain = fitted(shots(), Instrument(**EXACT_BEAM))
+    assert plain.report.sensitivities.keys() == {"gamma", "blur", "background", "absorption"}
+    with_background = fitted(shots(background=0.05), Instrument(**EXACT_BEAM))
+    moved = with_background.fields[0].displacement - plain.fields[0].displacement
+    size = np.sqrt((moved**2).mean() / (plain.fields[0].displacement ** 2).mean())
+    assert plain.report.sensitivities["background"] == pytest.approx(size, rel=0.35)
+    text = {fact.title: fact.text for fact in plain.facts}["Sensitivity"]
+    assert "(background, 5 %)" in text
+    unsure = fitted(shots(), Instrument(**EXACT_BEAM, background=0.05))
+    assert "background" not in {fact.title: fact.text for fact in unsure.facts}["Sensitivity"]
 
 
 def test_effects_of_noise_and_instrument_add_to_each_sample() -> None:

@@ -19,7 +19,13 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.descent import coarser, finer
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.instrument import EXACT, absorption_shapes, numbers_in_units
+from napari_shadowinv.fitting.instrument import (
+    EXACT,
+    Imperfect,
+    Shapes,
+    absorption_shapes,
+    numbers_in_units,
+)
 from napari_shadowinv.fitting.measurements import FitData, collect_data
 from napari_shadowinv.fitting.pattern import (
     Pattern,
@@ -54,6 +60,7 @@ from napari_shadowinv.fitting.shots import Images, list_shots
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.fitting.verdict import assess_verdict, hidden_contrast
 from napari_shadowinv.inversion import invert
+from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions, KindOfNoise
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.poisson import border_mean
@@ -203,7 +210,8 @@ def fit(
     with _timed("residual", seconds):
         # A fit of one image absorbs too much of its noise for the counts to be tested.
         is_counted = data.counted and not data.single
-        pattern = find_pattern(fine, unknowns, data.size, is_counted=is_counted)
+        stated = data.instrument.noise_correlation
+        pattern = find_pattern(fine, unknowns, data.size, is_counted=is_counted, correlation=stated)
         unsure = replace(scene, imperfect=imperfect)
         middle = replace(coarser(unsure, MIDDLE), spacing=_SPACING_OF_SAMPLES)
         ends = _with_numbers(unsure, best).unknowns
@@ -227,6 +235,16 @@ def fit(
         errors = errors_by_noise(scene, samples, data.size)
         by_part = errors_by_part(unsure, posterior, samples, data.size)
         by_beam = shifts_by_beam(data, unsure, posterior, samples, options)
+        sensitivities = {}
+        if samples:
+            tested = replace(unsure, imperfect=_tested_instrument(data, best))
+            middle = replace(coarser(tested, MIDDLE), spacing=_SPACING_OF_SAMPLES)
+            plain = best.unknowns._replace(
+                common=np.zeros(0), separate=np.zeros((len(scene.images), 0))
+            )
+            ends = _with_numbers(tested, replace(best, unknowns=plain)).unknowns
+            response = Posterior(middle, ends, rng, lambda: on_step("samples", value))
+            sensitivities = response.sensitivities(np.random.default_rng(options.seed))
         evidence = float("nan")
         if options.evidence:
             evidence = log_evidence(scene, best, fields, options, on_step)
@@ -245,9 +263,10 @@ def fit(
         added=_added_light(data, fine, unknowns, samples, amplification),
         numbers=numbers_in_units(
             imperfect,
-            finer(ends) if data.single else unknowns,
+            _with_numbers(unsure, best).unknowns if data.single else unknowns,
             [sample.change for sample in samples],
         ),
+        sensitivities=sensitivities,
     )
     return _result(
         data,
@@ -372,13 +391,29 @@ def _transport_potential(
 
 def _with_absorption(data: FitData, scene: Scene, minimum: Minimum) -> Scene:
     """Return the scene with an unknown transmission of the object that was found."""
+    shapes = _absorption(data, minimum, data.instrument.absorption)
+    imperfect = replace(scene.imperfect, shapes=(*scene.imperfect.shapes, shapes))
+    return replace(scene, imperfect=imperfect)
+
+
+def _absorption(data: FitData, minimum: Minimum, rms: float) -> Shapes:
     height, width = data.size
     coarse = minimum.displacement.sum(axis=0)
     displacement = coarse.repeat(MIDDLE, axis=1).repeat(MIDDLE, axis=2)[:, :height, :width]
-    used = np.asarray((scene.weights[:, :height, :width] > 0).any(axis=0))
-    shapes = absorption_shapes(data.instrument.absorption, displacement, used, data.around)
-    imperfect = replace(scene.imperfect, shapes=(*scene.imperfect.shapes, shapes))
-    return replace(scene, imperfect=imperfect)
+    used = np.asarray((data.scene.weights[:, :height, :width] > 0).any(axis=0))
+    return absorption_shapes(rms, displacement, used, data.around)
+
+
+def _tested_instrument(data: FitData, minimum: Minimum) -> Imperfect:
+    """Return the imperfections to which each fit states its sensitivity."""
+    sizes = {each.key: each.tested for each in IMPERFECTIONS if each.tested}
+    shapes = _absorption(data, minimum, sizes.pop("absorption"))
+    return Imperfect(
+        gamma=sizes["gamma"],
+        blur=sizes["blur"] ** 2,
+        background=sizes["background"],
+        shapes=(shapes,),
+    )
 
 
 def _with_numbers(scene: Scene, minimum: Minimum) -> Minimum:
@@ -546,6 +581,7 @@ def _result(
         explanation=explanation,
         report=report,
         options=options,
+        instrument=data.instrument,
         setups=data.setups or (),
     )
 

@@ -255,11 +255,17 @@ class Pattern:
 
 
 def find_pattern(
-    scene: Scene, unknowns: Unknowns, size: tuple[int, int], *, is_counted: bool = False
+    scene: Scene,
+    unknowns: Unknowns,
+    size: tuple[int, int],
+    *,
+    is_counted: bool = False,
+    correlation: float | None = None,
 ) -> Pattern:
     """Test the residuals of all images, the first `size` pixels of the scene, for structure.
 
-    Of images that `is_counted` calls counts, the noise is tested, too.
+    Of images that `is_counted` calls counts, the noise is tested, too. Their `correlation` in px is
+    measured unless it is stated.
     """
     height, width = size
     counts = scene.ray_counts(unknowns)
@@ -267,7 +273,8 @@ def find_pattern(
     models = scene.model(unknowns, counts)[:, :height, :width]
     residuals = roots * (scene.images[:, :height, :width] - models)
     used = roots > 0
-    correlation = max(map(correlation_length, residuals, used))
+    if correlation is None:
+        correlation = max(map(correlation_length, residuals, used))
     strengths = [
         pattern_strength(residual, use, correlation)
         for residual, use in zip(residuals, used, strict=True)

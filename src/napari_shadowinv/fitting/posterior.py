@@ -202,6 +202,27 @@ class Posterior:
             rest = rest.plus(minus)
         return {"noise": rest, **effects}
 
+    def sensitivities(self, rng: np.random.Generator) -> dict[str, float]:
+        """Return how far each imperfection would move the displacement, as a share of it (r.m.s.).
+
+        By one standard deviation; of smooth fields by a random one.
+        """
+        held, shares = self._held, {}
+        displacements = self._displacements(self._unknowns)
+        for part in self._scene.imperfect.parts:
+            numbers = self._unknowns.zeros()
+            values = numbers.common if part.is_common else numbers.separate
+            size = part.places.stop - part.places.start
+            values[..., part.places] = rng.normal(size=size) if size > 1 else 1.0
+            pull = self._linear.pull(-self._linear.push(numbers))
+            moved = self._displacements(held._change(pull, _ROUGHLY))
+            shares[part.key] = largest_share(moved, displacements)
+        return shares
+
+    def _displacements(self, unknowns: Unknowns) -> FloatArray:
+        """Displacement of each field, (M, 2, H, W), px of the scene."""
+        return np.stack([self._scene.rays.displacement(each) for each in unknowns.potentials])
+
     @property
     def _held(self) -> Posterior:
         """The same for an instrument that is known."""

@@ -29,13 +29,14 @@ from napari_shadowinv.facts import (
 )
 from napari_shadowinv.fitting.instrument import TITLES, number_text
 from napari_shadowinv.fitting.posterior import BeamError
+from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.inversion.variables import (
     BEAM_UNCERTAINTY,
     UNCERTAINTY,
     belongs,
     dataset_from_field,
 )
-from napari_shadowinv.options import FitOptions
+from napari_shadowinv.options import FitOptions, Instrument
 from napari_shadowinv.physics.setup import Setup, deflector_titles, setup_from_dict
 from napari_shadowinv.physics.units import (
     FLUX_DENSITY,
@@ -190,6 +191,9 @@ class FitReport:
     numbers : dict of str to list
         Numbers of the instrument as fitted, by their names in `Instrument`, each with its standard
         deviation, for all images or for each; see `numbers_in_units`.
+    sensitivities : dict of str to float
+        R.m.s. change of the displacement, as a share of it, by imperfections of the instrument of
+        the tested sizes in `IMPERFECTIONS`.
     """
 
     objective: float
@@ -204,6 +208,7 @@ class FitReport:
     added: dict[str, list[list[list[float]]]] = dataclasses.field(default_factory=dict)
     parts: dict[str, float] = dataclasses.field(default_factory=dict)
     numbers: dict[str, list[list[float]]] = dataclasses.field(default_factory=dict)
+    sensitivities: dict[str, float] = dataclasses.field(default_factory=dict)
 
     @property
     def total(self) -> float:
@@ -260,6 +265,8 @@ class Fit:
         Time and convergence.
     options : FitOptions
         The options used.
+    instrument : Instrument
+        How well beam, detector and alignment were stated to be known.
     setups : tuple of Setup
         The experiment of each image, if they are known.
     provenance : Provenance or None
@@ -284,6 +291,7 @@ class Fit:
     explanation: str
     report: FitReport
     options: FitOptions
+    instrument: Instrument = dataclasses.field(default_factory=Instrument)
     setups: tuple[Setup, ...] = ()
     provenance: Provenance | None = None
 
@@ -302,15 +310,28 @@ class Fit:
             return [
                 ("errors", f"{report.total:.2%} of the displacement (r.m.s.): {report.ranking}"),
                 ("instrument", "; ".join(number_text(*each) for each in report.numbers.items())),
+                *self._sensitivity_rows,
             ]
         text = f"{report.uncertainty:.2%} of the displacement by noise (r.m.s.)"
         if report.noise_correlation > 0:
             text += f", which is correlated over {report.noise_correlation:.1f} px"
         if report.beam is None:
-            return [("error bars", text)]
+            return [("error bars", text), *self._sensitivity_rows]
         if report.beam.variation:
             text = f"{report.total:.2%} of the displacement in total (r.m.s.); {text}"
-        return [("error bars", text), ("beam", report.beam.text)]
+        return [("error bars", text), ("beam", report.beam.text), *self._sensitivity_rows]
+
+    @property
+    def _sensitivity_rows(self) -> list[tuple[str, str]]:
+        """Sensitivities to what is not stated of the instrument, in words."""
+        names = {each.key: each.name(each.tested) for each in IMPERFECTIONS}
+        effects = ", ".join(
+            f"{share:.2g} ({names[key]})" if share > 1 else f"{share:.2%} ({names[key]})"
+            for key, share in self.report.sensitivities.items()
+            if key not in self.report.parts
+        )
+        text = f"the displacement would move by (r.m.s.): {effects}"
+        return [("sensitivity", text)] if effects else []
 
     @property
     def warnings(self) -> tuple[Caution, ...]:
@@ -382,7 +403,13 @@ class Fit:
         share = field.error_at(*shown.peak)
         if np.isnan(share):
             return None
-        return PeakError(share, self.report.error_name)
+        by_energy, setup = 0.0, self.setup
+        if shown.unit != "px" and setup is not None and self.instrument.energy:
+            main = setup.other_fields.get(deflector_titles()[field.name], setup.main_field)
+            by_energy = self.instrument.energy * abs(setup.sensitivity_to_beam(main.name))
+        cause = f"energy, {100 * self.instrument.energy:.2g} %"
+        cause = cause if by_energy > share else self.report.error_name
+        return PeakError(float(np.hypot(share, by_energy)), cause)
 
     @property
     def _origins(self) -> tuple[ImageOrigin, ...]:
@@ -409,9 +436,18 @@ class Fit:
 
     def _field_fact(self, field: FittedField) -> Fact:
         setup, deflector = self.setup, deflector_titles()[field.name]
-        (pixels,) = shown_fields([field.displacement], None, mask=self.used)
-        error = self.peak_error(field, pixels)
-        peaks = peak_facts(field.displacement, setup, deflector, mask=self.used, error=error)
+        errors = []
+        for frame in (None, setup):
+            (shown,) = shown_fields([field.displacement], frame, deflector, mask=self.used)
+            errors.append(self.peak_error(field, shown))
+        peaks = peak_facts(
+            field.displacement,
+            setup,
+            deflector,
+            mask=self.used,
+            error=errors[0],
+            field_error=errors[1],
+        )
         text = "; ".join(fact.text for fact in peaks)
         return Fact(f"field_{field.name}", f"Field {field.name}", text)
 
@@ -455,6 +491,7 @@ class Fit:
         history = {
             "format": self.kind.value,
             "options": self.options.model_dump_json(),
+            "instrument": self.instrument.model_dump_json(),
             "report": json.dumps(dataclasses.asdict(self.report)),
             "verdict": self.verdict.value,
             "explanation": self.explanation,
@@ -549,6 +586,7 @@ class Fit:
             explanation=str(attributes["explanation"]),
             report=FitReport(**{name: content[name] for name in fit_fields & content.keys()}),
             options=FitOptions.model_validate_json(attributes["options"]),
+            instrument=Instrument.model_validate_json(attributes.get("instrument", "{}")),
             setups=tuple(
                 setup_from_dict(values, "the dataset's setups")
                 for values in json.loads(attributes["setups"])

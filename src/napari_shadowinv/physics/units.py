@@ -155,6 +155,7 @@ def peak_facts(
     *,
     mask: BoolArray | None = None,
     error: PeakError | None = None,
+    field_error: PeakError | None = None,
 ) -> list[Fact]:
     """Return the strongest point of a field as facts.
 
@@ -170,6 +171,8 @@ def peak_facts(
         Pixels that count.
     error : PeakError, optional
         Standard error of the peak.
+    field_error : PeakError, optional
+        Standard error of the peak in SI units, if it differs.
     """
     (pixels,) = shown_fields([displacement], None, mask=mask)
     row, column = pixels.peak
@@ -177,8 +180,9 @@ def peak_facts(
     if setup is None:
         return [Fact("displacement", "Displacement", text, short=pixels.short_peak_text(error))]
     (field,) = shown_fields([displacement], setup, deflector, mask=mask)
+    of_field = field_error or error
     return [
-        Fact("field", "Field", field.peak_text(error), short=field.short_peak_text(error)),
+        Fact("field", "Field", field.peak_text(of_field), short=field.short_peak_text(of_field)),
         Fact("displacement", "Displacement", text),
     ]
 
