@@ -109,12 +109,13 @@ def test_errors_have_a_part_for_all_that_is_stated() -> None:
     instrument = Instrument(beam=BeamPrior(rms=0.02, length=0.5, between=0.01), background=0.02)
     result = fitted(shots(), instrument)
     parts = result.report.parts
-    assert parts.keys() == {"noise", "beam", "beam_between", "background"}
+    assert parts.keys() == {"noise", "beam", "background"}
     assert list(parts.values()) == sorted(parts.values(), reverse=True)
     facts = {fact.title: fact.text for fact in result.facts}
     assert facts["Errors"].startswith(f"{result.report.total:.2%} of the displacement (r.m.s.): ")
-    assert all(title in facts["Errors"] for title in ("noise", "beam between energies"))
+    assert all(title in facts["Errors"] for title in ("noise", "beam", "background"))
     assert "background" in facts["Instrument"]
+    assert "beam between energies" in facts["Instrument"]
     restored = Fit.from_dataset(result.to_dataset())
     assert restored.report.parts == parts
     assert restored.report.numbers == result.report.numbers

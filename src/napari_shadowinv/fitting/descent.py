@@ -195,7 +195,7 @@ _FEW = 10  # steps, after which the numbers of rays still fit
 _MOST_NEWTON, _MOST_SHORTENED, _SHARES_OF_STEP = 8, 2, (1.0, 0.5, 0.25)  # of Gauss and Newton
 _NEWTON, _MOST_SOLVING = 0.02, 200  # how exactly each is found, and in how many steps
 # Fields and numbers of an instrument that explain an image alike lie along a flat valley.
-_NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 1e-3, 600, 0.05
+_NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 2e-3, 400, 0.1
 _MOST_PIXELS = 2_000_000  # of all images
 
 

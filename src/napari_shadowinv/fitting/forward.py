@@ -19,7 +19,7 @@ from scipy.signal import oaconvolve
 from scipy.sparse import csc_array, csr_array
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
-from napari_shadowinv.fitting.instrument import DARKEST, EXACT, Imperfect, widen, widening
+from napari_shadowinv.fitting.instrument import DARKEST, EXACT, Imperfect, Part, widen, widening
 from napari_shadowinv.fitting.rays import RayModel, at_rest
 from napari_shadowinv.fitting.unknowns import AdditiveBlock, Fiducials, Prior, Unknowns
 
@@ -204,7 +204,8 @@ class Scene:
                 of_frame=k > 0 and bool(self.free_frames.any()),
             )
             self._add_potential_pulls(slope, unknowns, k, pulls.potential)
-            of_shape += self._add_beam_pulls(slope, unknowns, k, pulls.beam)
+            entering = self._entering(unknowns, k)
+            of_shape += self._add_beam_pulls(slope, k, pulls.beam, entering)
             slope.frames[k] += pulls.frame
         slope.beam[:] += self._of_modes(of_shape * self._beam_shape(unknowns))
         return value, self._only_free(slope)
@@ -358,21 +359,28 @@ class Scene:
             along = np.einsum("m,myx,yx->", other[k], unknowns.potentials, pull)
             slope.common[self.imperfect.place("other_field")] += along
 
+    def _entering(self, unknowns: Unknowns, k: int) -> _Entering:
+        """The light of an image's beam, and its relative changes by the instrument's numbers."""
+        imperfect, numbers = self.imperfect, (unknowns.common, unknowns.separate[k])
+        light = self._light(unknowns, k)
+        if not imperfect.changes_beam:
+            return _Entering(light, light, [])
+        effects = list(imperfect.entering_changes(self.beams[k], *numbers))
+        return _Entering(light, light * self._beam_shape(unknowns), effects)
+
     def _add_beam_pulls(
-        self, slope: Unknowns, unknowns: Unknowns, k: int, pull: FloatArray
+        self, slope: Unknowns, k: int, pull: FloatArray, entering: _Entering
     ) -> FloatArray:
         """Add derivatives by the light that enters; return those by the beam's modes."""
         if not self._has_beam:
             return pull
-        imperfect, numbers = self.imperfect, (unknowns.common, unknowns.separate[k])
-        light = self._light(unknowns, k)
-        if imperfect.changes_beam:
-            shaped = pull * light * self._beam_shape(unknowns)
-            for part, logarithm in imperfect.entering_changes(self.beams[k], *numbers):
+        if self.imperfect.changes_beam:
+            shaped = pull * entering.shaped
+            for part, logarithm in entering.effects:
                 derivatives = slope.common if part.is_common else slope.separate[k]
                 derivatives[part.places] += np.einsum("yx,yx", shaped, logarithm)
-            imperfect.pull_shapes(shaped, slope.common, slope.separate[k])
-        return pull * light
+            self.imperfect.pull_shapes(shaped, slope.common, slope.separate[k])
+        return pull * entering.light
 
     def _only_free(self, slope: Unknowns) -> Unknowns:
         frames = np.where(self.free_frames, slope.frames, 0.0)
@@ -440,6 +448,14 @@ class _Shot(NamedTuple):
     frame: FloatArray
 
 
+class _Entering(NamedTuple):
+    """Light of a beam by its source, and with unknown modes; changes of its logarithm by numbers."""
+
+    light: FloatArray
+    shaped: FloatArray
+    effects: list[tuple[Part, FloatArray]]
+
+
 @dataclass(frozen=True, eq=False)
 class _Seen:
     """An image without its brightness.
@@ -502,7 +518,9 @@ class Linear:
         for k, (jacobian, seen) in enumerate(zip(self.jacobians, self.seen, strict=True)):
             columns = potentials[k].ravel()
             if self._has_others:
-                of_beam = self._lights[k] * (self._beam_shape * self._beam_change(change, k))
+                of_beam = self._entering[k].light * (
+                    self._beam_shape * self._beam_change(change, k)
+                )
                 columns = np.concatenate([columns, of_beam.ravel(), change.frames[k]])
             landed = (jacobian @ columns).reshape(scene.rays.seen)
             spread = scene._inner(scene._spread(k, landed, self.unknowns))
@@ -529,7 +547,7 @@ class Linear:
             scene._add_potential_pulls(slope, self.unknowns, k, psi)
             if self._has_others:
                 of_beam = of_instrument[:-6].reshape(of_shape.shape)
-                of_shape += scene._add_beam_pulls(slope, self.unknowns, k, of_beam)
+                of_shape += scene._add_beam_pulls(slope, k, of_beam, self._entering[k])
                 slope.frames[k] = of_instrument[-6:]
         if self._has_others:
             slope.beam[:] = scene._of_modes(of_shape * self._beam_shape)
@@ -572,8 +590,7 @@ class Linear:
         """Relative change of the light that enters for an image."""
         scene, imperfect = self.scene, self.scene.imperfect
         total = scene._modes(change.beam)
-        numbers = self.unknowns.common, self.unknowns.separate[k]
-        for part, logarithm in imperfect.entering_changes(scene.beams[k], *numbers):
+        for part, logarithm in self._entering[k].effects:
             changes = change.common if part.is_common else change.separate[k]
             total = total + changes[part.places] * logarithm
         if imperfect.shapes:
@@ -594,8 +611,8 @@ class Linear:
         return self.scene._beam_shape(self.unknowns)
 
     @cached_property
-    def _lights(self) -> list[FloatArray]:
-        return [self.scene._light(self.unknowns, k) for k in range(len(self.jacobians))]
+    def _entering(self) -> list[_Entering]:
+        return [self.scene._entering(self.unknowns, k) for k in range(len(self.jacobians))]
 
     @cached_property
     def _roots(self) -> FloatArray:

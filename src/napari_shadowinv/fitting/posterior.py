@@ -183,23 +183,24 @@ class Posterior:
     def effects(self, sample: Sample) -> dict[str, Unknowns]:
         """Return a sample's change by each imperfection of the instrument, and by the noise.
 
+        Common and separate changes of the beams are one.
+
         With J and B the derivatives of the residuals by the fields and by the numbers θ of an
         imperfection, and H the Hessian of the fields, it causes -H⁻¹JᵀBθ; noise causes the rest.
         """
         held = self._held
-        rest, effects = sample.change, {}
+        numbers: dict[str, Unknowns] = {}
         for part in self._scene.imperfect.parts:
-            moved = sample.change.zeros()
-            numbers, values = (
-                (moved.common, sample.change.common)
-                if part.is_common
-                else (moved.separate, sample.change.separate)
-            )
-            numbers[..., part.places] = values[..., part.places]
+            # A change of all beams is common, or one of each.
+            key = "beam" if part.key == "beam_between" else part.key
+            moved = numbers.setdefault(key, sample.change.zeros())
+            name = "common" if part.is_common else "separate"
+            getattr(moved, name)[..., part.places] = getattr(sample.change, name)[..., part.places]
+        rest, effects = sample.change, {}
+        for key, moved in numbers.items():
             pull = self._linear.pull(-self._linear.push(moved))
-            effects[part.key] = held._change(pull, _PARTS)
-            minus = moved.like(-effects[part.key].flat())
-            rest = rest.plus(minus)
+            effects[key] = held._change(pull, _PARTS)
+            rest = rest.plus(moved.like(-effects[key].flat()))
         return {"noise": rest, **effects}
 
     def sensitivities(self, rng: np.random.Generator) -> dict[str, float]:

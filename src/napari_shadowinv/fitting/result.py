@@ -301,6 +301,23 @@ class Fit:
         return np.asarray(self.mask.any(axis=0))
 
     @property
+    def total_error(self) -> float | None:
+        """Total error as a share of the displacement (r.m.s.); None if not computed."""
+        total = self.report.total
+        return None if np.isnan(total) else total
+
+    @property
+    def limited_by(self) -> str | None:
+        """Largest part of the error with its share, such as "beam 3 %"; None if not computed."""
+        if self.total_error is None:
+            return None
+        parts = self.report.parts or {"noise": self.report.uncertainty}
+        if self.report.beam is not None:
+            parts = {"beam": self.report.beam.share, **parts}
+        key = max(parts, key=lambda part: parts[part])
+        return f"{TITLES[key]} {100 * parts[key]:.2g} %"
+
+    @property
     def _error_rows(self) -> list[tuple[str, str]]:
         """The errors of the displacement in words: names and texts."""
         report = self.report

@@ -196,6 +196,16 @@ class Inversion:
         return self.errors.with_scale(f"{noun}, {100 * error:.2g} %", error, share)
 
     @property
+    def total_error(self) -> float | None:
+        """Total error as a share of the displacement (r.m.s.); None if not estimated."""
+        return None if self.errors is None else self.errors.share
+
+    @property
+    def limited_by(self) -> str | None:
+        """Largest part of the error with its share, such as "beam 23 %"; None if not estimated."""
+        return None if self.errors is None else self.errors.limited_by
+
+    @property
     def cautions(self) -> tuple[Caution, ...]:
         """Reasons to doubt the result."""
         return self.report.warnings
