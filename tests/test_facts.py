@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -78,3 +80,16 @@ def test_facts_of_a_fit_name_images_fields_and_the_verdict(image):
         result.explanation,
     ]
     assert {fact.level for fact in facts if fact.key == "verdict"} == {Level.DOUBTFUL}
+
+
+def test_each_fitted_field_has_its_significance(image):
+    options = FitOptions(samples=3, max_iterations=20, spacing=0.25)
+    result = fit([image, image[::-1]], strengths=[1, 0.8], noise=0.01, options=options)
+    (fact,) = [fact for fact in result.facts if fact.key == "significance_B"]
+    structures = result.structures(result.fields[0])
+    assert fact.text.startswith(f"{len(structures.peaks)} structure")
+    assert f"up to {structures.peaks[0]:.3g} σ (σ by noise; beam assumed, 5 %)" in fact.text
+    assert dict(table_rows(result.facts))["significance B"] == fact.text
+    assert dict(window_rows(result.facts))["Significance B"] == fact.text
+    field = dataclasses.replace(result.fields[0], uncertainty=None)
+    assert "significance_B" not in texts_by_key(dataclasses.replace(result, fields=(field,)).facts)

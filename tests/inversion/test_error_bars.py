@@ -23,7 +23,7 @@ from napari_shadowinv import (
     write,
 )
 from napari_shadowinv.geometry.interpolation import WIDTH
-from napari_shadowinv.inversion import error_bars, samples
+from napari_shadowinv.inversion import Inversion, error_bars, samples
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.poisson import border_mean
 
@@ -337,6 +337,26 @@ def test_a_file_keeps_the_error_bars(tmp_path: Path, result, optical_setup: Opti
     np.testing.assert_array_equal(dataset["displacement_std"], result.displacement_std)
     np.testing.assert_array_equal(dataset["potential"], result.inversion.potential)
     assert json.loads(dataset.attrs["uncertainty"])["noise"] == "Poisson, 1 per quantum"
+
+
+def test_significance_is_a_fact_also_of_the_file(tmp_path: Path, result):
+    (fact,) = [fact for fact in result.inversion.facts if fact.key == "significance"]
+    assert fact.text.startswith(("1 structure", "2 structures", "no structure stands above 2 σ"))
+    assert "(σ by noise)" in fact.text
+    path = write(tmp_path / "shot.shadowinv", result)
+    restored = Inversion.from_dataset(read(path))
+    assert restored.pixel_errors is not None
+    np.testing.assert_array_equal(restored.pixel_errors.std, result.displacement_std)
+    assert fact in restored.facts
+    write(path, restored, overwrite=True)
+    assert fact in Inversion.from_dataset(read(path)).facts
+
+
+def test_a_damaged_standard_deviation_is_refused(result):
+    dataset = result.to_dataset()
+    dataset["displacement_std"] = dataset["displacement_std"].isel(component=0, drop=True)
+    with pytest.raises(InputError, match="displacement_std has shape"):
+        Inversion.from_dataset(dataset)
 
 
 def test_the_page_about_error_bars_works_as_it_stands_there(tmp_path: Path, monkeypatch):

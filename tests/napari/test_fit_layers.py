@@ -22,7 +22,7 @@ from napari_shadowinv._napari.layer_metadata import (
     role_of,
     unit_of,
 )
-from napari_shadowinv._napari.layers import add_layers
+from napari_shadowinv._napari.layers import add_layers, outline
 from napari_shadowinv._napari.result_files import missing_layers
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Verdict
@@ -100,6 +100,7 @@ def test_a_file_of_the_command_shows_all_of_a_fit(
     layers = opened(viewer, write(tmp_path / "pack.shadowinv", two_fields))
     layers = more(viewer, layers)
     in_each = ["potential", "field y", "field x", "field", "uncertainty", "arrows"]
+    in_each += ["significance", "structures"]
     of_fields = ["field arrows", *(f"{role}{part}" for role in in_each for part in ("", " E"))]
     of_answers = [f"{role} {name} 1" for role in ("field", "arrows") for name in "BE"]
     of_images = ["image", "reprojection", "residual"]
@@ -188,3 +189,38 @@ def test_a_beam_is_shown_once_unless_images_have_different_ones(doubtful: Fit) -
     np.testing.assert_array_equal(beam(replace(doubtful, source=proportional)), uneven)
     different = np.stack([uneven, uneven[:, ::-1]])
     np.testing.assert_array_equal(beam(replace(doubtful, source=different)), different)
+
+
+def test_significance_and_structures_are_among_the_other_layers(
+    viewer: ViewerModel, two_fields: Fit, tmp_path: Path
+) -> None:
+    layers = opened(viewer, write(tmp_path / "pack.shadowinv", two_fields))
+    assert not {"significance", "structures"} & set(layers)
+    layers = more(viewer, layers)
+    for part, fitted_field in zip(("", " E"), two_fields.fields, strict=True):
+        length = np.hypot(*fitted_field.displacement)
+        std = fitted_field.total_uncertainty
+        along = np.hypot(*(fitted_field.displacement * std)) / length
+        np.testing.assert_allclose(layers[f"significance{part}"].data, length / along)
+        structures = two_fields.structures(fitted_field)
+        assert structures is not None
+        np.testing.assert_array_equal(layers[f"structures{part}"].data, outline(structures.labels))
+        assert structures.labels.any()
+    assert layers["significance"].name.startswith("|d|/σ – pack")
+
+
+def test_the_map_of_a_fit_is_that_of_its_total_error(two_fields: Fit) -> None:
+    field, *_ = two_fields.fields
+    assert field.uncertainty is not None
+    by_beam = replace(field, beam_uncertainty=np.sqrt(3) * field.uncertainty)
+    result = Result(replace(two_fields, fields=(by_beam,)), SETUPS[0])
+    usual = Result(replace(two_fields, fields=(replace(field, beam_uncertainty=None),)), SETUPS[0])
+    maps = [
+        next(data for data, keywords, _ in fit_layers(each, Frame(), "") if is_map(keywords))
+        for each in (result, usual)
+    ]
+    np.testing.assert_allclose(2 * maps[0], maps[1])
+
+
+def is_map(keywords: dict[str, Any]) -> bool:
+    return role_of(keywords) == "significance"

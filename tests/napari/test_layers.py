@@ -22,6 +22,7 @@ from napari_shadowinv._napari.layer_metadata import (
 from napari_shadowinv._napari.layers import inversion_layers, power_cells, sample_arrows
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.physics.significance import PixelErrors
 
 
 def by_role(layers: list[Any]) -> dict[str, Any]:
@@ -358,3 +359,22 @@ def test_doubtful_result_has_the_doubt_in_its_names(solved: Inversion) -> None:
             keywords["name"] for _, keywords, _ in inversion_layers(replace(solved, report=report))
         ]
         assert f"|d| (px){mark}" in names
+
+
+def test_structures_of_an_inversion_are_outlined_on_its_significance(
+    viewer: ViewerModel, solved: Inversion
+) -> None:
+    std = np.full_like(solved.displacement, 0.05)
+    certain = replace(solved, pixel_errors=PixelErrors(std, ("noise",)))
+    layers = by_role(add_inversion(viewer, certain, all_layers=True))
+    expected = np.hypot(*solved.displacement) / 0.05
+    np.testing.assert_allclose(layers["significance"].data, expected)
+    structures = layers["structures"]
+    regions = certain.structures
+    assert regions is not None
+    assert 0 < (structures.data > 0).sum() < (regions.labels > 0).sum()
+    for row, column in np.argwhere(structures.data > 0):
+        around = regions.labels[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        assert structures.data[row, column] == regions.labels[row, column]
+        assert (around == 0).any()
+    assert not {"significance", "structures"} & set(by_role(add_inversion(viewer, certain)))

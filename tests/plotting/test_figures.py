@@ -1,6 +1,7 @@
 import dataclasses
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Fit, FitWindows, LeaveOneOut
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+from napari_shadowinv.physics.significance import PixelErrors
 from napari_shadowinv.physics.units import shown_fields
 from napari_shadowinv.plotting import (
     comparison_figure,
@@ -25,6 +27,7 @@ from napari_shadowinv.plotting import (
     save_figure,
     windows_figure,
 )
+from napari_shadowinv.plotting._panels import ALARM_COLOUR
 
 Make = Callable[..., Inversion]
 
@@ -360,3 +363,39 @@ def test_fields_of_windows_are_side_by_side_on_one_scale(
         np.asarray(panels(figure)[2].images[0].get_array()).max()
     )
     assert_nothing_overlaps(figure)
+
+
+def hatched(axes: Any) -> list[Any]:
+    """Filled contours with hatches, and the note in the corner."""
+    return [each for each in axes.collections if getattr(each, "hatches", None) == ["///"]]
+
+
+def test_pixels_outside_structures_are_hatched(inversion: Inversion, make_fit: MakeFit) -> None:
+    std = np.full_like(inversion.displacement, 0.02)
+    certain = replace(inversion, pixel_errors=PixelErrors(std))
+    fit = make_fit()
+    for figure, number, structures in (
+        (report_figure(certain), 2, certain.structures),
+        (fit_figure(fit), 6, fit.structures(fit.fields[0])),
+    ):
+        assert structures is not None
+        assert 0 < structures.share < 1
+        axes = panels(figure)[number]
+        (region,) = hatched(axes)
+        (path,) = region.get_paths()
+        for row, column in ((2, 3), np.argwhere(structures.labels > 0)[len(std)]):
+            assert path.contains_point((column, row)) == (structures.labels[row, column] == 0)
+        assert "hatched: no structure above 2 σ" in [text.get_text() for text in axes.texts]
+        assert len([axes for axes in panels(figure) if hatched(axes)]) == 1
+
+
+def test_nothing_is_hatched_without_errors_of_pixels(inversion: Inversion) -> None:
+    assert inversion.pixel_errors is None
+    assert not any(hatched(axes) for axes in panels(report_figure(inversion)))
+
+
+def test_a_field_within_its_errors_is_an_alarm_below_the_figure(inversion: Inversion) -> None:
+    std = np.full_like(inversion.displacement, 100.0)
+    figure = report_figure(replace(inversion, pixel_errors=PixelErrors(std)))
+    (text,) = [each for each in figure.texts if "no structure stands above 2 σ" in each.get_text()]
+    assert text.get_color() == ALARM_COLOUR

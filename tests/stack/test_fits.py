@@ -17,6 +17,7 @@ from helpers.command_line import flat, shadowinv
 from helpers.store_content import content
 from napari_shadowinv import InputError, Recipe, RunOptions, run_stack, synthetic_image
 from napari_shadowinv.fitting import FitShot
+from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.io import read
 from napari_shadowinv.io.store import StackStore
 from napari_shadowinv.options import FitChoices, FitOptions
@@ -139,6 +140,9 @@ def test_error_bars_are_stored_if_they_are_made(images: Any, out: Path) -> None:
     assert store["displacement_uncertainty"].attrs["units"] == "pixel"
     assert float(store["displacement_uncertainty"].min()) > 0
     assert float(store["uncertainty"][0]) == run_fit(recipe, [images[0]]).report.uncertainty
+    shot = RetrievedField(store.isel(shot=0))
+    fact = next(fact for fact in shot.facts if fact.key == "significance")
+    assert "(σ by noise and stated instrument, without an assumed beam)" in fact.text
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {

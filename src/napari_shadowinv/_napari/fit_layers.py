@@ -17,7 +17,12 @@ from napari_shadowinv._napari.layer_metadata import (
     metadata_for,
     role_of,
 )
-from napari_shadowinv._napari.layers import FullLayerData, dataset_layers, symmetric_limits
+from napari_shadowinv._napari.layers import (
+    FullLayerData,
+    dataset_layers,
+    significance_variables,
+    symmetric_limits,
+)
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import intensity_limits
@@ -54,6 +59,8 @@ def fit_layers(
         }
         if fit.mask.shape[1:] == field.potential.shape:
             variables["mask"] = ("y", "x"), fit.mask.any(axis=0)
+        errors, structures = fit.pixel_errors(field), fit.structures(field)
+        variables |= significance_variables(field.displacement, errors, structures)
         if field.uncertainty is not None:
             variables["displacement_uncertainty"] = ("component", "y", "x"), field.uncertainty
         title = f"{_field_title(name, fit, field)}{verdict_suffix(fit)}"

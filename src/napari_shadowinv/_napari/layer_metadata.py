@@ -169,6 +169,8 @@ KINDS = (
         main=True,
         shown_of="shot",
     ),
+    Kind("significance", "significance", "|d|/σ", "1", "cividis", shown_of="shot"),
+    Kind("structures", "structures", "structures above 2 σ", "1", type="labels", shown_of="shot"),
     Kind("caustic", "caustic", "caustics", type="labels", main=True),
     Kind("field arrows", "displacement", "{arrows}", type="vectors", shown_of="shot"),
     Kind(
@@ -185,7 +187,7 @@ KINDS = (
 )
 _MAIN_ROLES = {kind.role for kind in KINDS if kind.main}
 MASKED_ROLES = {"reprojection", "residual", "potential", "field y", "field x", "field"}
-MASKED_ROLES |= {"uncertainty"}
+MASKED_ROLES |= {"uncertainty", "significance"}
 
 
 def main_layers(layer_data: Sequence[_LayerData], also: Collection[str] = ()) -> list[_LayerData]:

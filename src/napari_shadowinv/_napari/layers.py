@@ -28,6 +28,7 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.variables import VARIABLES
 from napari_shadowinv.io.store import of_each_setup
+from napari_shadowinv.physics.significance import PixelErrors, Structures, significance
 from napari_shadowinv.physics.units import (
     ShownField,
     intensity_limits,
@@ -48,6 +49,7 @@ Limits = tuple[float, float]
 
 # Both stand out from all colours of the field's map.
 _CAUSTIC_COLOUR = "#5dff5d"
+_STRUCTURE_COLOUR = "#ff3d7f"
 _ARROW_COLOURS = {"arrows": "#00c8ff", "field arrows": "#ffffff"}
 
 _FIELD_VARIABLES = ("displacement", "potential")
@@ -56,6 +58,7 @@ _MIN_ARROW_LENGTH = 0.05  # relative to the longest
 _MAX_SHOWN_SITES = 200_000
 _LIMITS_PERCENTILE = 99.7
 _LIMITS_SAMPLE_SIZE = 100_000  # pixels
+_MIN_SIGNIFICANCE_LIMIT = 4.0  # σ, so that a map of noise looks like noise
 
 
 def inversion_layers(
@@ -155,7 +158,24 @@ def field_layers(
     """Describe the layers of a field without images."""
     dataset = result.content.dataset
     field = dataset[[variable for variable in _FIELD_VARIABLES if variable in dataset]]
+    content = result.content
+    field = field.assign(
+        significance_variables(content.displacement, content.pixel_errors, content.structures)
+    )
     return dataset_layers(field, result.setup, frame, name, _shared_metadata(result, name))
+
+
+def significance_variables(
+    displacement: FloatArray, errors: PixelErrors | None, structures: Structures | None
+) -> dict[str, tuple[tuple[str, ...], AnyArray]]:
+    """Return the map |d|/σ and the structures in it as variables; none without errors."""
+    if errors is None or structures is None:
+        return {}
+    return {
+        "displacement_uncertainty": (("component", "y", "x"), errors.std),
+        "significance": (("y", "x"), significance(displacement, errors.std)),
+        "structures": (("y", "x"), structures.labels),
+    }
 
 
 def _shared_metadata(result: Result[AnyResult], name: str) -> dict[str, Any]:
@@ -171,6 +191,9 @@ def result_layers(
     content = result.content
     dataset = xr.Dataset(
         {name: (dims, getattr(content, name)) for name, (dims, _, _) in VARIABLES.items()}
+    )
+    dataset = dataset.assign(
+        significance_variables(content.displacement, content.pixel_errors, content.structures)
     )
     diagram = power_cells(content) if cells else None
     layer_data = dataset_layers(
@@ -345,6 +368,10 @@ def _image(view: _View, kind: Kind) -> Content:
         data = view.per_pixel * np.hypot(*view.plane(kind.variable))
         words = {"unit": view.field.unit, "symbol": view.field.symbol}
         limits = 0.0, float(np.percentile(data[view.used], _LIMITS_PERCENTILE))
+    elif kind.role == "significance":
+        finite = data[view.used & np.isfinite(data)]
+        highest = np.percentile(finite, _LIMITS_PERCENTILE) if finite.size else 0.0
+        limits = 0.0, max(_MIN_SIGNIFICANCE_LIMIT, float(highest))
     elif kind.variable == "displacement":
         data, limits, words = _field(view, kind.role)
     elif kind.role == "potential":
@@ -392,9 +419,19 @@ def _where(condition: Any, value: float, data: Any) -> Any:
     return array.where(condition, value, data)
 
 
-def _caustics(view: _View, kind: Kind) -> Content:
+def _labels(view: _View, kind: Kind) -> Content:
+    if kind.role == "structures":
+        look = {"colormap": label_colours(_STRUCTURE_COLOUR), "opacity": 1.0}
+        return outline(view.dataset["structures"].data), {}, look
     look = {"colormap": label_colours(_CAUSTIC_COLOUR), "opacity": 0.5}
     return view.dataset["caustic"].data.astype(np.uint8), {}, look
+
+
+def outline(labels: AnyArray) -> AnyArray:
+    """Return the pixels of labelled regions with a neighbour outside; the map stays visible."""
+    from scipy.ndimage import binary_erosion
+
+    return np.where(binary_erosion(labels > 0, border_value=1), 0, labels)
 
 
 def label_colours(*colours: str) -> Any:
@@ -482,7 +519,7 @@ def _cells(view: _View, kind: Kind) -> Content:
 
 _CONTENTS: dict[str, Callable[[_View, Kind], Content]] = {
     "image": _image,
-    "labels": _caustics,
+    "labels": _labels,
     "vectors": _arrows,
     "points": _sites,
     "shapes": _cells,

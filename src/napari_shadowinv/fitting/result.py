@@ -38,6 +38,13 @@ from napari_shadowinv.inversion.variables import (
 )
 from napari_shadowinv.options import FitOptions, Instrument
 from napari_shadowinv.physics.setup import Setup, deflector_titles, setup_from_dict
+from napari_shadowinv.physics.significance import (
+    PixelErrors,
+    Structures,
+    deviation_along,
+    significance_fact,
+    structures_of,
+)
 from napari_shadowinv.physics.units import (
     FLUX_DENSITY,
     PIXEL,
@@ -125,7 +132,7 @@ class FittedField:
         length = np.hypot(*move)
         if self.total_uncertainty is None or not length > 0:
             return float("nan")
-        error = np.hypot(*(move / length * self.total_uncertainty[:, row, column]))
+        error = deviation_along(move, self.total_uncertainty[:, row, column])
         return float(error / length)
 
 
@@ -410,10 +417,33 @@ class Fit:
             *caution_facts(self.warnings),
             *self._image_facts(names),
             *(self._field_fact(field) for field in self.fields),
+            *self._significance_facts(),
             *(error_fact(name, text) for name, text in self._error_rows),
             *self._solution_facts(),
             time_fact(self.report.seconds),
         )
+
+    def pixel_errors(self, field: FittedField) -> PixelErrors | None:
+        """Return the total error of a field in every pixel with its causes; None if not known."""
+        std, report = field.total_uncertainty, self.report
+        if std is None:
+            return None
+        causes = [TITLES[key] for key in report.parts] or ["noise"]
+        if report.beam is not None and report.beam.variation:
+            causes.append(report.beam.name)
+        return PixelErrors(std, tuple(causes))
+
+    def structures(self, field: FittedField) -> Structures | None:
+        """Return the regions where a field stands above its error; None if that is not known."""
+        errors = self.pixel_errors(field)
+        return None if errors is None else structures_of(field.displacement, errors, self.used)
+
+    def _significance_facts(self) -> Iterator[Fact]:
+        for field in self.fields:
+            errors, structures = self.pixel_errors(field), self.structures(field)
+            if errors is not None and structures is not None:
+                key, name = f"significance_{field.name}", field.name
+                yield significance_fact(structures, errors, key=key, name=name)
 
     def peak_error(self, field: FittedField, shown: ShownField) -> PeakError | None:
         """Return the total error of the largest magnitude of a field; None if not known."""

@@ -54,6 +54,7 @@ from napari_shadowinv.inversion.samples import (
 )
 from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.options import BeamPrior, Instrument, InversionOptions
+from napari_shadowinv.physics.significance import PixelErrors
 from napari_shadowinv.physics.units import label
 from napari_shadowinv.transport.sites import SitePlan
 
@@ -134,7 +135,7 @@ class Uncertainty:
     Attributes
     ----------
     inversion : Inversion
-        Of the image itself.
+        Of the image itself, with `displacement_std` as its pixel errors.
     potential_mean, potential_std : ndarray, shape (H, W)
         Mean and standard deviation of the samples' potentials, px². As each potential is zero
         in the mean over the border, the deviation refers to the difference to the border.
@@ -435,8 +436,9 @@ def uncertainty(
         )
         warnings = (Caution("samples", text), *warnings)
     values = measure(np.zeros_like(image_fields))
+    names = () if draws is None else draws.names
     return Uncertainty(
-        inversion=inversion,
+        inversion=replace(inversion, pixel_errors=PixelErrors(std[1:], ("noise", *names))),
         potential_mean=mean[0],
         potential_std=std[0],
         displacement_mean=mean[1:],
@@ -447,7 +449,7 @@ def uncertainty(
         nonlinearity=check.nonlinearity,
         spread_ratio=check.spread_ratio,
         mean_shift=check.mean_shift,
-        imperfections=() if draws is None else draws.names,
+        imperfections=names,
         quantities={
             name: Quantity(value, np.array([sample[name] for sample in scatter.quantities]))
             for name, value in values.items()

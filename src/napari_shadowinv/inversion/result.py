@@ -30,8 +30,19 @@ from napari_shadowinv.facts import (
 )
 from napari_shadowinv.inversion.budget import Errors
 from napari_shadowinv.inversion.solution_checks import Assessment, assess_verdict, image_residual
-from napari_shadowinv.inversion.variables import VARIABLES, dataset_from_field, setup_from_dataset
+from napari_shadowinv.inversion.variables import (
+    DISPLACEMENT_STD,
+    VARIABLES,
+    dataset_from_field,
+    setup_from_dataset,
+)
 from napari_shadowinv.options import Instrument, InversionOptions
+from napari_shadowinv.physics.significance import (
+    PixelErrors,
+    Structures,
+    significance_fact,
+    structures_of,
+)
 from napari_shadowinv.physics.units import label, numbers_of, peak_facts, shown_fields
 from napari_shadowinv.provenance import Provenance
 
@@ -150,6 +161,8 @@ class Inversion:
         How well the experiment is known, which the errors hold.
     provenance : Provenance or None
         Recipe and input files, if it was made by a recipe.
+    pixel_errors : PixelErrors or None
+        Standard deviation of the displacement in every pixel, if `uncertainty` computed it.
     """
 
     kind: ClassVar = ResultKind.INVERSION
@@ -171,6 +184,7 @@ class Inversion:
     options: InversionOptions
     instrument: Instrument = field(default_factory=Instrument)
     provenance: Provenance | None = None
+    pixel_errors: PixelErrors | None = None
 
     @property
     def errors(self) -> Errors | None:
@@ -209,6 +223,21 @@ class Inversion:
     def cautions(self) -> tuple[Caution, ...]:
         """Reasons to doubt the result."""
         return self.report.warnings
+
+    @property
+    def structures(self) -> Structures | None:
+        """Regions where the displacement stands above its error; None without pixel errors."""
+        element = self.displacement[0].size / len(self.sites)
+        errors = self.pixel_errors
+        if errors is None:
+            return None
+        return structures_of(self.displacement, errors, self.mask, element=element)
+
+    def _significance_facts(self) -> list[Fact]:
+        errors, structures = self.pixel_errors, self.structures
+        if errors is None or structures is None:
+            return []
+        return [significance_fact(structures, errors)]
 
     @property
     def error_rows(self) -> list[tuple[str, str]]:
@@ -319,6 +348,7 @@ class Inversion:
                 f"{100 * report.image_residual:.3g} % of the mean (r.m.s.)",
                 short=f"residual {100 * report.image_residual:.3g} %",
             ),
+            *self._significance_facts(),
             *(error_fact(name, text) for name, text in self._error_rows(errors)),
             Fact("caustics", "Caustics", f"{self.caustic.mean():.2%} of the pixels"),
             *masked_fact(self.mask),
@@ -399,6 +429,8 @@ class Inversion:
         if self.provenance is not None:
             history["provenance"] = self.provenance.to_json()
             setup = self.setup if setup is None else setup
+        if self.pixel_errors is not None:
+            history["error_causes"] = json.dumps(self.pixel_errors.causes)
         errors, assessment = self.errors_in(setup), self.assess_in(setup)
         history |= {"verdict": assessment.verdict.value, "explanation": assessment.reason}
         if errors is not None and setup is not None:
@@ -410,6 +442,9 @@ class Inversion:
         dataset = dataset_from_field(
             self.displacement, self.potential, setup, attributes=history | dict(attributes or {})
         )
+        if self.pixel_errors is not None:
+            dims, *words = DISPLACEMENT_STD
+            dataset["displacement_std"] = dims, self.pixel_errors.std, label(*words)
         return dataset.assign(
             {
                 name: (dims, getattr(self, name), label(units, long_name))
@@ -455,12 +490,27 @@ class Inversion:
             options=InversionOptions.model_validate_json(dataset.attrs["options"]),
             instrument=Instrument.model_validate_json(dataset.attrs.get("instrument", "{}")),
             provenance=Provenance.of(dataset.attrs),
+            pixel_errors=_pixel_errors(dataset, "displacement_std"),
         )
+
+
+def _pixel_errors(dataset: xarray.Dataset, name: str) -> PixelErrors | None:
+    if name not in dataset:
+        return None
+    std, shape = numbers_of(dataset, name), dataset["displacement"].shape
+    if std.shape != shape:
+        raise ValueError(f"{name} has shape {std.shape}, displacement {shape}")
+    causes = json.loads(dataset.attrs.get("error_causes", "[]"))
+    return PixelErrors(std, tuple(map(str, causes)))
 
 
 def _tuples(value: Any) -> Any:
     # JSON knows lists only.
     return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+# A store does not keep the error by an assumed beam.
+_STORED_CAUSES = ("noise and stated instrument, without an assumed beam",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -500,8 +550,24 @@ class RetrievedField:
 
     @property
     def facts(self) -> tuple[Fact, ...]:
-        """The peak of the field in words."""
-        return tuple(peak_facts(self.displacement, self.setup))
+        """The peak of the field and its significance in words."""
+        facts = peak_facts(self.displacement, self.setup)
+        errors, structures = self.pixel_errors, self.structures
+        if errors is not None and structures is not None:
+            facts.append(significance_fact(structures, errors))
+        return tuple(facts)
+
+    @property
+    def pixel_errors(self) -> PixelErrors | None:
+        """Standard deviation of the displacement in every pixel, if the dataset contains it."""
+        errors = _pixel_errors(self.dataset, "displacement_uncertainty")
+        return errors and replace(errors, causes=_STORED_CAUSES)
+
+    @property
+    def structures(self) -> Structures | None:
+        """Regions where the displacement stands above its error; None without pixel errors."""
+        errors = self.pixel_errors
+        return None if errors is None else structures_of(self.displacement, errors)
 
     def to_dataset(self, *, attributes: Mapping[str, str] | None = None) -> xarray.Dataset:
         """Return the dataset with further attributes."""

@@ -55,6 +55,13 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "mask": (PLANE, "1", "Pixels that were used"),
 }
 
+DISPLACEMENT_STD = (
+    _VECTORS,
+    PIXEL,
+    f"{VARIABLES['displacement'][2]}, standard deviation of noisy samples",
+)
+"""Variable of an inversion whose samples have been drawn."""
+
 UNCERTAINTY = (_VECTORS, PIXEL, "Standard deviation of the displacement")
 """Variable of a fit in addition to potential and displacement."""
 

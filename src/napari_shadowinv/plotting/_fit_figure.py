@@ -19,6 +19,7 @@ from napari_shadowinv.fitting import Fit, FittedField, FitWindows, LeaveOneOut
 from napari_shadowinv.fitting.windows import image_numbers
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.setup import deflector_titles
+from napari_shadowinv.physics.significance import deviation_along
 from napari_shadowinv.physics.units import ShownField, intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._panels import (
@@ -33,6 +34,7 @@ from napari_shadowinv.plotting._panels import (
     draw_intensity,
     draw_potential,
     draw_side_by_side,
+    hatch_insignificant,
     level_colour,
     outline_caustics,
 )
@@ -153,6 +155,7 @@ def _draw_fitted(
             draw_potential(panel, potential, fit.setups[0] if fit.setups else None)
         elif content == "field":
             draw_field(panel, in_units, title)
+            hatch_insignificant(panel, fit.structures(field))
             outline_caustics(panel, _crossed_rays(fit))
         elif content == "error" and error is not None:
             limits = 0.0, error.largest or 1.0
@@ -176,8 +179,7 @@ def _magnitude_error(fit: Fit, field: FittedField) -> FloatArray | None:
     if field.uncertainty is None:
         return None
     length = np.sqrt((field.displacement**2).sum(axis=0))
-    along = np.sqrt(((field.displacement * field.uncertainty) ** 2).sum(axis=0))
-    pixels = along / np.maximum(length, 1e-12)
+    pixels = deviation_along(field.displacement, field.uncertainty)
     in_units, _ = _field_in_units(fit, field)
     strongest = in_units.peak
     # Displacements become fields by a factor.

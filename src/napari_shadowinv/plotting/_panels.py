@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import CAUTION_CODES
 from napari_shadowinv.facts import Level
+from napari_shadowinv.physics.significance import LEVEL
 from napari_shadowinv.physics.units import ShownField, prefix_for, shown_potential
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.facts import Fact, Headline
     from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.physics.significance import Structures
 
 
 _CUT_COLOURS = ("#1f9bff", "#18b368")
@@ -58,6 +60,18 @@ def draw_field(panel: Panel, field: ShownField, title: str = "") -> None:
     style: Any = {"linewidth": 1.0, "linestyle": (0, (5, 3))}
     panel.axes.axhline(row * panel.scale.pixel, color=_CUT_COLOURS[0], **style)
     panel.axes.axvline(column * panel.scale.pixel, color=_CUT_COLOURS[1], **style)
+
+
+def hatch_insignificant(panel: Panel, structures: Structures | None) -> None:
+    """Hatch the pixels outside structures, and say so in the corner."""
+    if structures is None:
+        return
+    outside = structures.labels == 0
+    if outside.any():
+        panel.hatch(outside, "white")
+    panel.note(
+        f"hatched: no structure above {LEVEL:g} σ" if outside.any() else f"all above {LEVEL:g} σ"
+    )
 
 
 def _strongest(field: ShownField) -> float:
@@ -331,7 +345,9 @@ def fact_line(facts: Iterable[Fact]) -> str:
 def footer_lines(facts: Iterable[Fact], headline: str, letters: int) -> list[tuple[str, str]]:
     """Return the facts that a headline does not contain as lines; long ones have their own."""
     shown = [fact for fact in facts if fact.key != "verdict" and fact.text not in headline]
-    warnings = [fact for fact in shown if fact.key in CAUTION_CODES]
+    warnings = [
+        fact for fact in shown if fact.key in CAUTION_CODES or fact.level is not Level.SOUND
+    ]
     quiet = [fact for fact in shown if fact not in warnings]
     is_long = {fact: len(fact.text) > letters // 2 for fact in quiet}
     paragraphs = [(fact_line([fact]), ALARM_COLOUR) for fact in warnings]
@@ -385,6 +401,22 @@ class Panel:
         """Hatch the background if it shows through a plane, where that is NaN."""
         if np.isnan(plane).any():
             self.axes.patch.set(facecolor="0.92", edgecolor="0.6", hatch="////")
+
+    def hatch(self, region: BoolArray, colour: str) -> None:
+        """Hatch a region of the picture with thin lines, through which it remains visible."""
+        from matplotlib.colors import to_rgba
+
+        place: Any = {"extent": self.scale.extent(region.shape), "origin": "upper"}
+        filled: Any = self.axes.contourf(
+            region.astype(np.float64), levels=[0.5, 1.5], colors="none", hatches=["///"], **place
+        )
+        filled.set(edgecolor=to_rgba(colour, 0.28), linewidth=0.0)
+
+    def note(self, text: str) -> None:
+        """Write a few words into the lower left corner of the picture."""
+        box = {"facecolor": "black", "alpha": 0.6, "linewidth": 0, "boxstyle": "square,pad=0.25"}
+        style: Any = {"transform": self.axes.transAxes, "fontsize": 7, "color": "white"}
+        self.axes.text(0.02, 0.02, text, bbox=box, va="bottom", zorder=5, **style)
 
     def contour(self, plane: AnyArray, levels: ArrayLike, colour: str, **style: Any) -> None:
         """Draw lines of equal value onto the picture."""

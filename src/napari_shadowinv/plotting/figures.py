@@ -27,6 +27,7 @@ from napari_shadowinv.plotting._panels import (
     draw_intensity,
     draw_potential,
     draw_side_by_side,
+    hatch_insignificant,
     outline_caustics,
 )
 
@@ -88,6 +89,7 @@ def report_figure(
         draw_potential(panels[1], blank_masked(inversion.potential), setup)
         outline_caustics(panels[1], inversion.caustic)
         draw_field(panels[2], field)
+        hatch_insignificant(panels[2], inversion.structures)
         outline_caustics(panels[2], inversion.caustic)
         reprojection = blank_masked(inversion.reprojection / mean)
         draw_intensity(panels[3], reprojection, "Re-projection", limits)

@@ -1,0 +1,221 @@
+"""How far a field stands above its standard deviation, pixel by pixel and in structures.
+
+- standard deviation of the length of the displacement: `deviation_along`
+- the map |d|/σ: `significance`
+- connected regions that errors alone do not explain: `find_structures`
+- all of it in words: `significance_fact`
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.facts import Fact, Level
+
+LEVEL = 2.0
+"""Standard deviations at which the border of a structure lies."""
+
+_FALSE_ALARM = 0.05  # probability that errors alone look like a structure anywhere in the image
+_MIN_ELEMENTS = 9  # resolution elements of the smallest structure
+
+
+@dataclass(frozen=True, eq=False)
+class PixelErrors:
+    """Standard deviation of a displacement in every pixel, and its causes.
+
+    Attributes
+    ----------
+    std : ndarray, shape (2, H, W)
+        Of each component, px.
+    causes : tuple of str
+        Errors that it contains, such as "noise" and "beam, 5 %"; empty if they are not known.
+    """
+
+    std: FloatArray
+    causes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Structures:
+    """Connected regions in which a field stands above its standard deviation.
+
+    Attributes
+    ----------
+    labels : ndarray of int, shape (H, W)
+        Number of the structure in each pixel, from 1 for the most significant; 0 outside.
+    peaks : tuple of float
+        Largest significance in each structure, in the same order.
+    share : float
+        Share of the used pixels that lie in a structure.
+    largest : float
+        Largest significance of any used pixel.
+    limit : float
+        Significance that errors alone exceed somewhere in the image with a probability of 5 %.
+    n_pixels : int
+        Number of used pixels.
+    """
+
+    labels: NDArray[np.int32]
+    peaks: tuple[float, ...]
+    share: float
+    largest: float
+    limit: float
+    n_pixels: int
+
+
+def deviation_along(displacement: FloatArray, std: FloatArray) -> FloatArray:
+    """Return the standard deviation of the length of a displacement.
+
+    Parameters
+    ----------
+    displacement, std : ndarray, shape (2, ...)
+        The displacement, and the standard deviation of each component, in the same unit. The errors
+        of the components count as independent.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        In the same unit, to first order in the errors; 0 where the displacement is 0, for which
+        there is no direction.
+
+    Examples
+    --------
+    >>> deviation_along(np.array([3.0, 4.0]), np.array([0.5, 0.5])).item()
+    0.5
+    """
+    length = np.hypot(*displacement)
+    across = np.hypot(*(displacement * std))
+    return np.asarray(np.divide(across, length, out=np.zeros_like(length), where=length > 0))
+
+
+def significance(displacement: FloatArray, std: FloatArray) -> FloatArray:
+    """Return how many standard deviations a displacement is away from zero, |d|/σ.
+
+    For errors alone, with independent normal components, it exceeds u with a probability of at most
+    exp(-u²/2): 14 % for 2, for which a component alone would have 5 %.
+
+    Parameters
+    ----------
+    displacement, std : ndarray, shape (2, ...)
+        As of `deviation_along`.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        0 where the displacement is 0; infinite where it is not, but has no error; NaN where it, or
+        its error, is NaN.
+
+    Examples
+    --------
+    >>> significance(np.array([3.0, 4.0]), np.array([0.5, 0.5])).item()
+    10.0
+    """
+    length, deviation = np.hypot(*displacement), deviation_along(displacement, std)
+    exact = np.where(length > 0, np.inf, length)
+    ratio = np.divide(length, deviation, out=np.asarray(exact), where=deviation > 0)
+    return np.where(np.isnan(length + std.sum(axis=0)), np.nan, ratio)
+
+
+def find_structures(
+    significant: FloatArray, mask: BoolArray | None = None, *, element: float = 1.0
+) -> Structures:
+    """Find the connected regions that stand above 2 σ and are not due to errors alone.
+
+    Among many pixels, errors alone take some far above 2 σ, and since they are correlated these
+    form patches. A region is a structure if it contains a pixel above the level that errors alone
+    exceed somewhere in the image with a probability of 5 %, √(2 ln(20 n)) for n pixels (4.4 σ for
+    1,000, 5.5 σ for a million), and covers at least nine resolution elements. The level holds
+    whether or not the errors of pixels are correlated.
+
+    Parameters
+    ----------
+    significant : ndarray, shape (H, W)
+        Map of `significance`.
+    mask : ndarray of bool, shape (H, W), optional
+        Pixels that count. Default: all.
+    element : float, optional
+        Area of a resolution element in pixels, such as pixels for each site.
+
+    Returns
+    -------
+    Structures
+    """
+    from scipy.ndimage import label
+
+    used = ~np.isnan(significant) & (True if mask is None else mask)
+    n_pixels = int(used.sum())
+    limit = math.sqrt(2 * math.log(max(n_pixels, 1) / _FALSE_ALARM))
+    regions, count = label(used & (significant > LEVEL), structure=np.ones((3, 3)))
+    peaks = np.zeros(count + 1)
+    np.maximum.at(peaks, regions, np.where(regions > 0, significant, 0.0))
+    sizes = np.bincount(regions.ravel(), minlength=count + 1)
+    # Small images of few sites are one structure at most.
+    smallest = min(_MIN_ELEMENTS * element, n_pixels / 2)
+    is_structure = (peaks > limit) & (sizes >= smallest)
+    is_structure[0] = False
+    ranked = np.flatnonzero(is_structure)
+    ranked = ranked[np.argsort(-peaks[ranked], kind="stable")]
+    numbers = np.zeros(count + 1, dtype=np.int32)
+    numbers[ranked] = np.arange(1, len(ranked) + 1)
+    labels = numbers[regions]
+    return Structures(
+        labels=labels,
+        peaks=tuple(float(peak) for peak in peaks[ranked]),
+        share=float((labels > 0).sum() / max(n_pixels, 1)),
+        largest=float(significant[used].max(initial=0.0)),
+        limit=limit,
+        n_pixels=n_pixels,
+    )
+
+
+def structures_of(
+    displacement: FloatArray,
+    errors: PixelErrors,
+    mask: BoolArray | None = None,
+    *,
+    element: float = 1.0,
+) -> Structures:
+    """Return the structures of a displacement; see `find_structures`."""
+    return find_structures(significance(displacement, errors.std), mask, element=element)
+
+
+def significance_fact(
+    structures: Structures, errors: PixelErrors, *, key: str = "significance", name: str = ""
+) -> Fact:
+    """Return the structures of a field in words.
+
+    Parameters
+    ----------
+    structures : Structures
+    errors : PixelErrors
+        Their causes are part of the sentence.
+    key : str, optional
+        Key of the fact.
+    name : str, optional
+        Name of the field, if there are several.
+    """
+    causes = f" (σ by {'; '.join(errors.causes)})" if errors.causes else ""
+    title = f"Significance {name}".strip()
+    if structures.peaks:
+        count = len(structures.peaks)
+        subject = "1 structure stands" if count == 1 else f"{count} structures stand"
+        strongest = structures.peaks[0]
+        peak = f"up to {strongest:.3g} σ" if math.isfinite(strongest) else "without any error"
+        text = f"{subject} above {LEVEL:g} σ, on {100 * structures.share:.2g} % of the pixels"
+        return Fact(key, title, f"{text}, {peak}{causes}")
+    text = f"no structure stands above {LEVEL:g} σ{causes}"
+    if structures.largest > structures.limit:
+        reason = f"{structures.largest:.3g} σ are reached, but by a few pixels only"
+    elif structures.largest > LEVEL:
+        reason = (
+            f"the field reaches {structures.largest:.2g} σ, errors alone up to "
+            f"{structures.limit:.2g} σ among {structures.n_pixels:,} pixels"
+        )
+    else:
+        reason = f"the field reaches {structures.largest:.2g} σ"
+    return Fact(key, title, f"{text}: {reason}", Level.DOUBTFUL)
