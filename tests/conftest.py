@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from helpers.public_data import public_file, public_names
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Basin, Fit, FitOptions, FitReport, FittedField
 from napari_shadowinv.inversion import Inversion, Report
 from napari_shadowinv.inversion.budget import ErrorEstimate, Errors
 from napari_shadowinv.inversion.solution_checks import image_residual
-from napari_shadowinv.io.public_images import BURNER_FILES, fetch_burner
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -78,9 +78,6 @@ def dots_per_inch() -> int:
     usual = figures.DOTS_PER_INCH
     figures.DOTS_PER_INCH = 40
     return usual
-
-
-SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
@@ -221,13 +218,6 @@ def optical_setup() -> OpticalSetup:
 
 
 @pytest.fixture
-def shared_data() -> Path:
-    if not SHARED_DATA.is_dir():
-        pytest.skip(f"no shared data at {SHARED_DATA}")
-    return SHARED_DATA
-
-
-@pytest.fixture
 def usual_ctrl_c() -> Iterator[None]:
     """Restore the usual Ctrl-C, which other packages or the shell may have changed."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -256,13 +246,7 @@ def small_disk(tmp_path: Path) -> Iterator[tuple[Path, Callable[[str], bool]]]:
 @pytest.fixture(scope="session")
 def burner() -> list[Path]:
     """Reference beam and frames of a real plume, next to the project or downloaded."""
-    folder = SHARED_DATA / "burner" / "data"
-    if folder.is_dir():
-        return [folder / name for name in BURNER_FILES]
-    try:
-        return fetch_burner(len(BURNER_FILES) - 1)
-    except OSError as error:
-        pytest.skip(str(error))
+    return [public_file(name) for name in public_names("burner")]
 
 
 @pytest.fixture

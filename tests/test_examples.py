@@ -15,6 +15,7 @@ import pytest
 import xarray as xr
 from typer.testing import CliRunner
 
+from helpers.public_data import load_donut, public_file
 from napari_shadowinv import read
 from napari_shadowinv.cli import app
 from napari_shadowinv.inversion.variables import setup_from_dataset
@@ -24,8 +25,6 @@ ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted(
     path.stem for path in (ROOT / "examples").glob("*.py") if not path.stem.startswith("napari_")
 )
-# Folder of the data that a script needs.
-DATA = {"burner_strip": "burner/data", "donut": "donut", "rcf_layers": "rcf"}
 
 Run = Callable[..., dict[str, Any]]
 
@@ -47,8 +46,10 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     return run_it
 
 
-def test_donut_beats_the_linear_inversion(run: Run, tmp_path: Path, shared_data: Path) -> None:
-    names = run("donut", shared_data / DATA["donut"])
+def test_donut_beats_the_linear_inversion(run: Run, tmp_path: Path) -> None:
+    for name, data in zip(("intensity", "displacement"), load_donut(), strict=True):
+        np.save(tmp_path / f"{name}.npy", data)
+    names = run("donut", tmp_path)
     errors = names["errors"]
     assert errors["Retrieved"] < 0.05
     assert errors["Linear (Poisson)"] > 0.5
@@ -115,8 +116,10 @@ def test_burner_strip_explains_every_frame(run: Run, burner: list[Path]) -> None
         assert strength[-10:, :10].max() < 0.2 * strength.max()
 
 
-def test_film_layers_give_dose_and_displacement(run: Run, shared_data: Path) -> None:
-    names = run("rcf_layers", shared_data / DATA["rcf_layers"])
+def test_film_layers_give_dose_and_displacement(run: Run) -> None:
+    needed = ["HDV2.tif", "HDV2_3_calibration.csv", *(f"RCF_18{letter}.tif" for letter in "HIJKL")]
+    paths = [public_file(f"rcf/{name}") for name in needed]
+    names = run("rcf_layers", paths[0].parent)
     means = [float(image.mean()) for image in names["doses"].values()]
     # Fewer protons have more energy.
     assert means[:4] == sorted(means[:4], reverse=True)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from helpers.public_data import public_file, public_names
 from napari_shadowinv import InversionOptions, invert, read
 from napari_shadowinv.cli import app
 
@@ -135,13 +136,11 @@ def test_two_energies_have_the_numbers_of_their_page(tmp_path, monkeypatch, caps
     )
 
 
-def test_the_film_pack_has_the_numbers_of_its_page(shared_data, tmp_path, monkeypatch):
-    data = shared_data / "rcf"
-    if not data.is_dir():
-        pytest.skip(f"no films at {data}")
+def test_the_film_pack_has_the_numbers_of_its_page(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for file in data.iterdir():
-        Path(file.name).symlink_to(file)
+    Path("stopping").mkdir()
+    for name in public_names("rcf"):
+        Path(name).relative_to("rcf").symlink_to(public_file(name))
     page = text_of("film-pack.md")
     films, summary, layers, *_ = re.findall(r"```text\n(.*?)```", page, re.DOTALL)
     (pack,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)

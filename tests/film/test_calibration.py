@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from helpers.public_data import public_file
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.film import Calibration, combined_dose, dose, net_optical_density
 
@@ -155,12 +156,12 @@ def test_mistakes_in_the_arguments_are_named(table: Path) -> None:
     ],
 )
 def test_real_film_has_its_dose_in_the_beam(
-    shared_data: Path, layer: str, beam: tuple[slice, ...], beside: tuple[slice, ...], channel: str
+    layer: str, beam: tuple[slice, ...], beside: tuple[slice, ...], channel: str
 ) -> None:
-    folder = shared_data / "rcf"
-    calibration = Calibration.from_csv(folder / "HDV2_3_calibration.csv", dose_range=(0, 2000))
-    unexposed = tifffile.imread(folder / "HDV2.tif")
-    scan = tifffile.imread(folder / f"{layer}.tif")
+    table = public_file("rcf/HDV2_3_calibration.csv")
+    calibration = Calibration.from_csv(table, dose_range=(0, 2000))
+    unexposed = tifffile.imread(public_file("rcf/HDV2.tif"))
+    scan = tifffile.imread(public_file(f"rcf/{layer}.tif"))
     film_dose = dose(scan, calibration, background=unexposed, channel=channel)
     assert film_dose.dose.shape == scan.shape[:2]
     assert np.median(film_dose.dose[beam]) > 5 * np.median(film_dose.dose[beside])
@@ -173,13 +174,11 @@ def test_real_film_has_its_dose_in_the_beam(
 @pytest.mark.parametrize(
     ("layer", "beam"), [("RCF_18H", np.s_[200:280, 350:450]), ("RCF_18K", np.s_[200:260, 260:340])]
 )
-def test_channels_of_a_real_film_agree(
-    shared_data: Path, layer: str, beam: tuple[slice, ...]
-) -> None:
-    folder = shared_data / "rcf"
-    calibration = Calibration.from_csv(folder / "HDV2_3_calibration.csv", dose_range=(0, 2000))
-    unexposed = tifffile.imread(folder / "HDV2.tif")
-    scan = tifffile.imread(folder / f"{layer}.tif")[beam]
+def test_channels_of_a_real_film_agree(layer: str, beam: tuple[slice, ...]) -> None:
+    table = public_file("rcf/HDV2_3_calibration.csv")
+    calibration = Calibration.from_csv(table, dose_range=(0, 2000))
+    unexposed = tifffile.imread(public_file("rcf/HDV2.tif"))
+    scan = tifffile.imread(public_file(f"rcf/{layer}.tif"))[beam]
     red, green = (
         dose(scan, calibration, background=unexposed, channel=channel).dose
         for channel in ("red", "green")
@@ -188,8 +187,8 @@ def test_channels_of_a_real_film_agree(
 
 
 @pytest.mark.parametrize("name", ["HDV2_3_calibration.csv", "EBT3_2_calibration.csv"])
-def test_real_tables_rise(shared_data: Path, name: str) -> None:
-    calibration = Calibration.from_csv(shared_data / "rcf" / name)
+def test_real_tables_rise(name: str) -> None:
+    calibration = Calibration.from_csv(public_file(f"rcf/{name}"))
     for channel in CHANNELS:
         density, doses = calibration.curve(channel)
         assert (np.diff(density) > 0).all()

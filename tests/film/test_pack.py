@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from helpers.public_data import public_file
 from helpers.srim import TABLES
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.film import Stopping
@@ -48,8 +49,8 @@ def test_other_tables_are_refused(tmp_path: Path, old: str, new: str, message: s
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_the_formula_agrees_with_srim(shared_data: Path, name: str) -> None:
-    table = Stopping.from_srim(shared_data / "rcf" / "stopping" / f"SRIM_{TABLES[name]}.txt")
+def test_the_formula_agrees_with_srim(name: str) -> None:
+    table = Stopping.from_srim(public_file(TABLES[name]))
     formula = MATERIALS[name].stopping()
     energies = np.array([1.0, 2, 5, 10, 30, 70])
     ratio = (formula.loss(energies) / formula.density) / (table.loss(energies) / table.density)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.ndimage import gaussian_filter
 
+from helpers.public_data import public_file
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film import Calibration
@@ -116,13 +117,12 @@ def slit_of(film: Array) -> tuple[float, float]:
     return end - 1 + (line[end - 1] - level) / (line[end - 1] - line[end]), x
 
 
-def test_real_films_lie_where_they_were_found_by_hand(shared_data: Path) -> None:
-    folder = shared_data / "rcf"
-    table = (folder / "Corner_Positions_Rectangle.csv").read_text().splitlines()
+def test_real_films_lie_where_they_were_found_by_hand() -> None:
+    table = public_file("rcf/Corner_Positions_Rectangle.csv").read_text().splitlines()
     rows = {row[1]: row[2:] for row in csv.reader(table) if row[0] == "19"}
     away, slits = [], []
     for number, letter in enumerate("ABCDEFGHIJKLMNOPQ"):
-        scan = tifffile.imread(folder / f"RCF_18{letter}.tif")
+        scan = tifffile.imread(public_file(f"rcf/RCF_18{letter}.tif"))
         (film,) = find_films(scan)
         by_hand = [float(rows[name][number]) for name in ("Y1", "X1", "Y2", "X2")]
         away.append(film[:2].ravel() - by_hand)
@@ -223,16 +223,15 @@ def test_marks_are_found(film: FloatArray, calibration: Calibration) -> None:
 
 
 @pytest.mark.parametrize("letter", "CGLMQ")
-def test_the_writing_on_real_films_is_found(shared_data: Path, letter: str) -> None:
-    folder = shared_data / "rcf"
+def test_the_writing_on_real_films_is_found(letter: str) -> None:
     kind, table = ("HDV2", "HDV2_3") if letter < "M" else ("EBT3", "EBT3_2")
-    blank = tifffile.imread(folder / f"{kind}.tif")
+    blank = tifffile.imread(public_file(f"rcf/{kind}.tif"))
     unexposed = straighten_film(blank, find_films(blank)[0])[60:-60, 60:-60].reshape(-1, 3)
-    scan = tifffile.imread(folder / f"RCF_18{letter}.tif")
+    scan = tifffile.imread(public_file(f"rcf/RCF_18{letter}.tif"))
     film = straighten_film(scan, find_films(scan)[0])
     usable = usable_pixels(
         film,
-        Calibration.from_csv(folder / f"{table}_calibration.csv"),
+        Calibration.from_csv(public_file(f"rcf/{table}_calibration.csv")),
         background=np.median(unexposed, axis=0),
     )
     # Letter and number in the lower corners; nothing in the middle.
@@ -272,11 +271,10 @@ def test_burnt_edges_are_not_seen_in_a_beam() -> None:
 
 
 @pytest.mark.parametrize("letter", "MP")
-def test_burnt_edges_of_real_films_are_masked(shared_data: Path, letter: str) -> None:
-    folder = shared_data / "rcf"
-    scan = tifffile.imread(folder / f"RCF_18{letter}.tif")
+def test_burnt_edges_of_real_films_are_masked(letter: str) -> None:
+    scan = tifffile.imread(public_file(f"rcf/RCF_18{letter}.tif"))
     red = straighten_film(scan, find_films(scan)[0], shape=(296, 590))[..., 0]
-    calibration = Calibration.from_csv(folder / "EBT3_2_calibration.csv")
+    calibration = Calibration.from_csv(public_file("rcf/EBT3_2_calibration.csv"))
     densities, doses = calibration.curve("red")
     dose = np.exp(np.interp(np.log10(calibration.background[0] / red), densities, np.log(doses)))
     burnt = burnt_edges(dose)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import csv
-from pathlib import Path
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from helpers.public_data import public_file
 from helpers.srim import TABLES
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film import Material, Pack, PackLayer, Response, Slab
@@ -16,9 +16,9 @@ from napari_shadowinv.film.unfolding import check_increasing, relative_strengths
 from napari_shadowinv.physics.setup import ProtonSetup
 
 
-def designed(folder: Path) -> tuple[list[PackLayer], np.ndarray]:
+def designed() -> tuple[list[PackLayer], np.ndarray]:
     """The pack as its makers describe it, and the energies that they give."""
-    rows = list(csv.reader((folder / "RCF_Stack_Design.csv").read_text().splitlines()))
+    rows = list(csv.reader(public_file("rcf/RCF_Stack_Design.csv").read_text().splitlines()))
     films, energies, materials, thicknesses = (row[1:] for row in rows[1:5])
     layers = [
         PackLayer(
@@ -34,13 +34,9 @@ def designed(folder: Path) -> tuple[list[PackLayer], np.ndarray]:
 
 
 @pytest.mark.parametrize("tables", [True, False])
-def test_a_real_pack_sees_the_energies_of_its_design(shared_data: Path, tables: bool) -> None:
-    folder = shared_data / "rcf"
-    layers, energies = designed(folder)
-    srim = {
-        name: Material(table=folder / "stopping" / f"SRIM_{file}.txt")
-        for name, file in TABLES.items()
-    }
+def test_a_real_pack_sees_the_energies_of_its_design(tables: bool) -> None:
+    layers, energies = designed()
+    srim = {name: Material(table=public_file(file)) for name, file in TABLES.items()}
     bands = Response.of(Pack(layers=tuple(layers), materials=srim if tables else {})).bands
     check_increasing(bands)
     peaks = np.array([band.peak for band in bands])

@@ -1,6 +1,6 @@
-"""Tables of SRIM among the shared data, by what the package calls the materials."""
+"""Names of the public tables by SRIM, by the package's names of the materials."""
 
-TABLES = {
+_FILES = {
     "Al": "Al",
     "Fe": "Fe",
     "Mylar": "Mylar",
@@ -8,3 +8,4 @@ TABLES = {
     "EBT active": "EBT2_Active_Layer",
     "HD active": "HDV2_Active_Layer",
 }
+TABLES = {name: f"rcf/stopping/SRIM_{file}.txt" for name, file in _FILES.items()}

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from helpers.public_data import load_donut
+from helpers.toroid import noisy_toroid_image, toroid_displacement, toroid_image
 from napari_shadowinv import (
     InputError,
     InversionCancelled,
@@ -452,18 +454,17 @@ def test_given_both_a_plan_and_a_source_it_asks_for_one():
 
 
 @pytest.mark.parametrize(
-    ("name", "peak_percent", "l2_percent"),
+    ("image_of", "peak_field", "peak_percent", "l2_percent"),
     [
-        ("dm024_noise", 3.5, 12),
-        ("dm097", 0.3, 0.3),
-        ("dm097_noise", 3, 4),
-        ("dm194", 0.5, 1.6),
-        ("dm194_noise", 1, 2.6),
+        (noisy_toroid_image, 24, 3.5, 12),
+        (toroid_image, 97, 0.3, 0.3),
+        (noisy_toroid_image, 97, 3, 4),
+        (toroid_image, 194, 0.5, 1.6),
+        (noisy_toroid_image, 194, 1, 2.6),
     ],
 )
-def test_the_papers_toroid_is_retrieved(shared_data, name, peak_percent, l2_percent):
-    image = np.load(shared_data / "toroid" / f"{name}.npy")
-    true = np.load(shared_data / "toroid" / f"{name.split('_')[0]}_displacement.npy")
+def test_the_papers_toroid_is_retrieved(image_of, peak_field, peak_percent, l2_percent):
+    image, true = image_of(peak_field), toroid_displacement(peak_field)
     options = InversionOptions(negative="clip", n_sites=image.size)
     inversion = invert(image, source=np.ones_like(image), options=options)
     assert inversion.report.converged
@@ -471,9 +472,8 @@ def test_the_papers_toroid_is_retrieved(shared_data, name, peak_percent, l2_perc
     assert 100 * relative_error(inversion.displacement, true) <= l2_percent
 
 
-def test_the_donut_is_retrieved(shared_data):
-    image = np.load(shared_data / "donut" / "intensity.npy")
-    true = np.load(shared_data / "donut" / "displacement.npy")
+def test_the_donut_is_retrieved():
+    image, true = load_donut()
     inversion = invert(image, options=InversionOptions(n_sites=image.size))
     assert inversion.report.converged
     assert 100 * abs(peak(inversion.displacement) / peak(true) - 1) <= 1.5

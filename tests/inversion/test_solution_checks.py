@@ -15,6 +15,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from helpers.public_data import load_donut, public_file, public_names
+from helpers.toroid import noisy_toroid_image, toroid_image
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.inversion import Inversion, Report, invert, solution_checks
 from napari_shadowinv.inversion.solution_checks import (
     image_residual,
@@ -344,17 +347,19 @@ def test_where_flux_may_cross_the_edge_or_the_edge_is_masked_nothing_is_said():
 # Good images
 
 
-@pytest.mark.parametrize("name", ["dm024", "dm097", "dm194"])
-@pytest.mark.parametrize("noise", ["", "_noise"])
-def test_the_papers_toroid_gets_no_doubts(shared_data: Path, name: str, noise: str):
-    assert signs(np.load(shared_data / "toroid" / f"{name}{noise}.npy")) == []
+@pytest.mark.parametrize("peak", [24, 97, 194])
+@pytest.mark.parametrize("image_of", [toroid_image, noisy_toroid_image])
+def test_the_papers_toroid_gets_no_doubts(peak: int, image_of: Callable[[float], FloatArray]):
+    assert signs(image_of(peak)) == []
 
 
-def test_other_reference_images_get_no_doubts(shared_data: Path):
-    assert signs(np.load(shared_data / "donut" / "intensity.npy")) == []
-    assert signs(np.loadtxt(shared_data / "prns" / "target-example.txt")) == []
-    for path in sorted((shared_data / "pradformat").glob("*.h5")):
-        assert signs(read(path).image) == []
+def test_the_donut_gets_no_doubts():
+    assert signs(load_donut()[0]) == []
+
+
+@pytest.mark.parametrize("name", public_names("prns") + public_names("pradformat"))
+def test_other_reference_images_get_no_doubts(name: str):
+    assert signs(read(public_file(name)).image) == []
 
 
 @pytest.mark.parametrize("number", [0, 4, 5])

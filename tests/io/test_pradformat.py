@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from helpers.public_data import public_file
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
@@ -96,10 +97,8 @@ def test_mistakes_in_the_file_are_named(tmp_path: Path) -> None:
         ("gaussian_charge_cylinder_mu_0p5_highres.h5", 150, 0.5333e-3, 10.6),
     ],
 )
-def test_published_examples(
-    shared_data: Path, name: str, side: int, width: float, mean: float
-) -> None:
-    radiograph = read_radiograph(shared_data / "pradformat" / name)
+def test_published_examples(name: str, side: int, width: float, mean: float) -> None:
+    radiograph = read_radiograph(public_file(f"pradformat/{name}"))
     geometry = radiograph.metadata["geometry"]
     assert radiograph.image.shape == (side, side)
     assert radiograph.image.mean() == pytest.approx(mean, rel=0.01)

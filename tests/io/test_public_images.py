@@ -1,20 +1,24 @@
-"""Images that are downloaded: kept, checked, and one sentence where there is no network."""
+"""Files that are downloaded: kept, checked, and one sentence where there is no network."""
 
 from __future__ import annotations
 
 import hashlib
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
 
+from helpers import public_data
+from helpers.public_data import SHARED_DATA, public_file
 from napari_shadowinv.io import public_images
-from napari_shadowinv.io.public_images import BURNER_FILES, fetch_burner
+from napari_shadowinv.io.public_images import PUBLIC_FILES, fetch_burner
 
-CONTENT = {name: f"frame {name}".encode() for name in list(BURNER_FILES)[:3]}
+NAMES = [name for name in PUBLIC_FILES if name.startswith("burner/")][:3]
+CONTENT = {name: f"frame {name}".encode() for name in NAMES}
 
 
 class CountingHandler(SimpleHTTPRequestHandler):
@@ -25,13 +29,10 @@ class CountingHandler(SimpleHTTPRequestHandler):
 
 
 @pytest.fixture
-def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, Path]]:
+def server(tmp_path: Path) -> Iterator[tuple[str, Path]]:
+    """Address and folder of a server of files."""
     folder = tmp_path / "public"
     folder.mkdir()
-    for name, content in CONTENT.items():
-        (folder / name).write_bytes(content)
-    checksums = {name: hashlib.sha256(content).hexdigest() for name, content in CONTENT.items()}
-    monkeypatch.setattr(public_images, "BURNER_FILES", checksums)
     CountingHandler.requests.clear()
     handler = partial(CountingHandler, directory=str(folder))
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as http:
@@ -42,27 +43,95 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[st
         thread.join()
 
 
-def test_a_file_is_downloaded_once(server: tuple[str, Path], tmp_path: Path) -> None:
+@pytest.fixture
+def published(server: tuple[str, Path], monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder of a server that has the first files of the burner with other content."""
+    address, folder = server
+    for name, content in CONTENT.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+        sha256 = hashlib.sha256(content).hexdigest()
+        file = replace(PUBLIC_FILES[name], sha256=sha256, address=address + name)
+        monkeypatch.setitem(public_images.PUBLIC_FILES, name, file)
+    return folder
+
+
+def test_a_file_is_downloaded_once(published: Path, tmp_path: Path) -> None:
     for _ in range(2):
-        paths = fetch_burner(2, url=server[0], cache=tmp_path / "cache")
-        assert {path.name: path.read_bytes() for path in paths} == CONTENT
+        paths = fetch_burner(2, cache=tmp_path / "cache")
+        assert [path.read_bytes() for path in paths] == list(CONTENT.values())
     assert CountingHandler.requests == [f"/{name}" for name in CONTENT]
 
 
-def test_a_changed_file_is_refused(server: tuple[str, Path], tmp_path: Path) -> None:
-    name = next(iter(CONTENT))
-    (server[1] / name).write_bytes(b"another frame")
-    with pytest.raises(OSError, match=rf"{name} could not be downloaded \(its checksum differs\)"):
-        fetch_burner(url=server[0], cache=tmp_path / "cache")
-    assert not [path for path in (tmp_path / "cache").iterdir() if path.stat().st_size]
+def test_a_changed_file_is_refused_and_not_kept(published: Path, tmp_path: Path) -> None:
+    (published / NAMES[0]).write_bytes(b"another frame")
+    with pytest.raises(OSError, match=r"could not be downloaded \(its checksum differs\)") as error:
+        fetch_burner(cache=tmp_path / "cache")
+    assert "\n" not in str(error.value)
+    assert NAMES[0] in str(error.value)
+    assert not [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
 
 
-def test_without_a_network_one_sentence_says_so(server: tuple[str, Path], tmp_path: Path) -> None:
-    with pytest.raises(OSError, match=r"\(no connection\): connect to the network") as error:
-        fetch_burner(url="http://127.0.0.1:9/", cache=tmp_path / "cache")
+def test_a_missing_file_is_said_to_be_missing(published: Path, tmp_path: Path) -> None:
+    (published / NAMES[0]).unlink()
+    with pytest.raises(OSError, match=r"\(the server answered 404\)"):
+        fetch_burner(cache=tmp_path / "cache")
+
+
+def test_without_a_network_one_sentence_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = NAMES[0]
+    file = replace(PUBLIC_FILES[name], address=f"http://127.0.0.1:9/{name}")
+    monkeypatch.setitem(public_images.PUBLIC_FILES, name, file)
+    with pytest.raises(OSError, match=r"\(no connection\): connect to the net") as error:
+        fetch_burner(cache=tmp_path / "cache")
     assert "\n" not in str(error.value)
 
 
-def test_the_cached_frames_are_those_published(burner: list[Path]) -> None:
-    for path in burner:
-        assert hashlib.sha256(path.read_bytes()).hexdigest() == BURNER_FILES[path.name]
+@pytest.fixture
+def only_downloads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache, and no data next to the project."""
+    cache = tmp_path / "cache"
+    monkeypatch.setattr(public_data, "SHARED_DATA", tmp_path / "absent")
+    monkeypatch.setattr(public_data, "_failures", [])
+    for module in (public_data, public_images):
+        monkeypatch.setattr(module, "cache_folder", lambda: cache)
+    return cache
+
+
+def test_tests_get_what_is_published(published: Path, only_downloads: Path) -> None:
+    path = public_file(NAMES[0])
+    assert path == only_downloads / NAMES[0]
+    assert path.read_bytes() == CONTENT[NAMES[0]]
+
+
+def test_tests_skip_with_the_sentence(published: Path, only_downloads: Path) -> None:
+    public_file(NAMES[1])
+    (published / NAMES[0]).unlink()
+    with pytest.raises(pytest.skip.Exception, match=rf"{NAMES[0]} could not be downloaded"):
+        public_file(NAMES[0])
+    # No other download is tried, but files in the cache are used.
+    with pytest.raises(pytest.skip.Exception, match=rf"{NAMES[0]} could not be downloaded"):
+        public_file(NAMES[2])
+    assert public_file(NAMES[1]).read_bytes() == CONTENT[NAMES[1]]
+
+
+def test_every_public_file_can_be_used() -> None:
+    for name, file in PUBLIC_FILES.items():
+        assert file.name == name
+        assert file.licence in {"MIT", "BSD-3-Clause"}
+        repository = "https://raw.githubusercontent.com/"
+        assert file.address.startswith(repository)
+        assert file.address.endswith(name.rsplit("/", 1)[1])
+        assert len(file.address.removeprefix(repository).split("/")[2]) == 40, "a fixed commit"
+
+
+def test_the_files_of_tests_are_those_published() -> None:
+    for folder in (SHARED_DATA, public_images.cache_folder()):
+        for name, file in PUBLIC_FILES.items():
+            if (folder / name).is_file():
+                content = (folder / name).read_bytes()
+                assert len(content) == file.size, name
+                assert hashlib.sha256(content).hexdigest() == file.sha256, name

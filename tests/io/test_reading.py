@@ -10,6 +10,9 @@ import pytest
 import tifffile
 from PIL import Image
 
+from helpers.public_data import load_donut, public_file, public_names
+from helpers.toroid import noisy_toroid_image, toroid_image
+from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io import read, read_dataset, read_radiograph, read_toml
 from napari_shadowinv.io.files import sha256
@@ -291,8 +294,8 @@ def test_import_is_light() -> None:
     assert result.stdout.strip() == "[]", result.stderr
 
 
-def test_real_film_scan(shared_data: Path) -> None:
-    path = shared_data / "rcf" / "RCF_18H.tif"
+def test_real_film_scan() -> None:
+    path = public_file("rcf/RCF_18H.tif")
     with pytest.raises(InputError, match="colour image with 3 channels"):
         read(path)
     red = read_radiograph(path, channel="red")
@@ -302,16 +305,25 @@ def test_real_film_scan(shared_data: Path) -> None:
     assert "wrong sign unless it is converted to dose first" in red.warnings[0].text
 
 
-def test_only_real_films_get_the_film_warning(shared_data: Path) -> None:
-    for path in (shared_data / "rcf").glob("*.tif"):
-        scan = tifffile.imread(path)
-        for grey in (scan[..., 0], scan[..., 2], (scan[..., 1] // 257).astype(np.uint8)):
-            assert film_warnings(grey, None), path
-    for path in [*shared_data.glob("toroid/dm*.npy"), shared_data / "donut" / "intensity.npy"]:
-        image = np.load(path)
-        if image.ndim == 2:  # dm194 and the donut are nearly empty in the middle
-            scaled = np.clip(image / image.max() * 65535, 0, None).astype(np.uint16)
-            assert not film_warnings(scaled, None), path
+@pytest.mark.parametrize("name", public_names("rcf", ".tif"))
+def test_real_films_get_the_film_warning(name: str) -> None:
+    scan = tifffile.imread(public_file(name))
+    for grey in (scan[..., 0], scan[..., 2], (scan[..., 1] // 257).astype(np.uint8)):
+        assert film_warnings(grey, None)
+
+
+def as_scan(image: FloatArray) -> AnyArray:
+    return np.clip(image / image.max() * 65535, 0, None).astype(np.uint16)
+
+
+@pytest.mark.parametrize("peak", [24, 97, 194])  # the last is nearly empty in the middle
+def test_the_toroid_gets_no_film_warning(peak: int) -> None:
+    for image in (toroid_image(peak), noisy_toroid_image(peak)):
+        assert not film_warnings(as_scan(image), None)
+
+
+def test_the_donut_gets_no_film_warning() -> None:
+    assert not film_warnings(as_scan(load_donut()[0]), None)
 
 
 def test_real_shadowgram(burner: list[Path]) -> None:

@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from helpers.public_data import public_file
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.io.formats import kind_of
@@ -192,8 +193,8 @@ def test_text_with_the_ending_of_a_picture_is_refused(tmp_path: Path) -> None:
         kind_of(lines(tmp_path / "shot.tif", "1 2", "3 4"))
 
 
-def test_published_example(shared_data: Path) -> None:
-    path = shared_data / "prns" / "target-example.txt"
+def test_published_example() -> None:
+    path = public_file("prns/target-example.txt")
     image = read_radiograph(path).image
     assert image.shape == (128, 128)
     assert image.mean() == pytest.approx(1, rel=1e-3)

@@ -13,6 +13,7 @@ import pytest
 import tifffile
 from scipy import ndimage
 
+from helpers.public_data import public_file
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
 from napari_shadowinv.film import Pack, move_corners, read_corners, write_corners
 from napari_shadowinv.film.scans import upright
@@ -477,14 +478,13 @@ def test_wrong_packs_are_refused(truth: Truth, changed, old: str, new: str, mess
         run_film(read_pack(changed((old, new))))
 
 
-def test_real_films_are_not_moved_by_lines_of_equal_dose(shared_data: Path) -> None:
-    folder = shared_data / "rcf"
+def test_real_films_are_not_moved_by_lines_of_equal_dose() -> None:
     film = {
-        "calibration": folder / "EBT3_2_calibration.csv",
-        "unexposed": folder / "EBT3.tif",
+        "calibration": public_file("rcf/EBT3_2_calibration.csv"),
+        "unexposed": public_file("rcf/EBT3.tif"),
     }
     layers = [
-        {"film": "EBT3", "filters": "750 um Fe", "file": folder / f"RCF_18{letter}.tif"}
+        {"film": "EBT3", "filters": "750 um Fe", "file": public_file(f"rcf/RCF_18{letter}.tif")}
         for letter in "OPQ"
     ]
     result = run_film(Pack.model_validate({"layers": layers, "films": {"EBT3": film}}))
