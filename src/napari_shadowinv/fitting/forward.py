@@ -449,7 +449,7 @@ class _Shot(NamedTuple):
 
 
 class _Entering(NamedTuple):
-    """Light of a beam by its source, and with unknown modes; changes of its logarithm by numbers."""
+    """Light of a beam by its source, and with unknown modes; changes of its log by numbers."""
 
     light: FloatArray
     shaped: FloatArray

@@ -14,6 +14,7 @@ from pydantic import (
 )
 
 from napari_shadowinv._system.validation import CheckedModel
+from napari_shadowinv.options._errors import MaxError
 from napari_shadowinv.physics.setup import deflector_titles
 
 __all__ = [
@@ -111,13 +112,7 @@ class FitOptions(CheckedModel):
         title="Beam modes",
         description="Number of cosine modes per axis for the logarithm of an unknown beam.",
     )
-    max_error: float = Field(
-        default=0.05,
-        gt=0,
-        lt=1,
-        title="Largest error",
-        description="Largest total error, as a share of the field (r.m.s.), of a determined fit.",
-    )
+    max_error: MaxError = 0.05
     samples: int = Field(
         default=6,
         ge=0,

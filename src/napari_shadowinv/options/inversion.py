@@ -7,6 +7,7 @@ from typing import Any, Literal, Self
 from pydantic import ConfigDict, Field, model_validator
 
 from napari_shadowinv._system.validation import CheckedModel
+from napari_shadowinv.options._errors import MaxError
 
 __all__ = ["MAX_DEFAULT_SITES", "InversionOptions"]
 
@@ -55,17 +56,7 @@ class InversionOptions(CheckedModel):
             "other than 'newton'."
         ),
     )
-    max_error: float = Field(
-        default=0.05,
-        gt=0,
-        le=1,
-        title="Largest error",
-        description=(
-            "Largest error of a determined field (relative r.m.s., sum of the error budget). With "
-            "a larger one the verdict is 'too uncertain'."
-        ),
-        json_schema_extra=_BUDGET,
-    )
+    max_error: MaxError = 0.05
     floor: float = Field(
         default=1e-3,
         gt=0,
