@@ -456,7 +456,8 @@ def test_given_both_a_plan_and_a_source_it_asks_for_one():
 @pytest.mark.parametrize(
     ("image_of", "peak_field", "peak_percent", "l2_percent"),
     [
-        (noisy_toroid_image, 24, 3.5, 12),
+        # In eight realisations, noise raises this low peak by 2.1 to 5.5 %.
+        (noisy_toroid_image, 24, 6, 12),
         (toroid_image, 97, 0.3, 0.3),
         (noisy_toroid_image, 97, 3, 4),
         (toroid_image, 194, 0.5, 1.6),
