@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field
 
-__all__ = ["MaxError"]
+__all__ = ["BUDGET_PANEL", "MaxError"]
+
+BUDGET_PANEL: Any = {"panel": "Error budget (docs/uncertainty.md)"}
+"""Panel of flags in the help of a command."""
 
 MaxError = Annotated[
     float,
@@ -15,5 +18,6 @@ MaxError = Annotated[
         lt=1,
         title="Largest error",
         description="Largest total error, as a share of the field (r.m.s.), of a determined field.",
+        json_schema_extra=BUDGET_PANEL,
     ),
 ]

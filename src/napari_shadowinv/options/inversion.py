@@ -7,14 +7,13 @@ from typing import Any, Literal, Self
 from pydantic import ConfigDict, Field, model_validator
 
 from napari_shadowinv._system.validation import CheckedModel
-from napari_shadowinv.options._errors import MaxError
+from napari_shadowinv.options._errors import BUDGET_PANEL, MaxError
 
 __all__ = ["MAX_DEFAULT_SITES", "InversionOptions"]
 
 MAX_DEFAULT_SITES = 1_000_000
 
 _MOVES_SITES: Any = {"moves_sites": True}
-_BUDGET: Any = {"panel": "Error budget (docs/uncertainty.md)"}
 _BOUNDARY: Any = {"panel": "Flux across the image edge (docs/boundary.md)"}
 
 
@@ -200,7 +199,7 @@ class InversionOptions(CheckedModel):
             "Standard deviation of the noise of one pixel of the inverted image, in its units, for "
             "the error budget. Default: measured from the differences between neighbouring pixels."
         ),
-        json_schema_extra=_BUDGET,
+        json_schema_extra=BUDGET_PANEL,
     )
     units_per_quantum: float | None = Field(
         default=None,
@@ -210,7 +209,7 @@ class InversionOptions(CheckedModel):
             "Image units per detected quantum, for the error budget: the noise is then Poisson "
             "noise."
         ),
-        json_schema_extra=_BUDGET,
+        json_schema_extra=BUDGET_PANEL,
     )
     seed: int = Field(
         default=0,
