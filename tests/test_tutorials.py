@@ -177,6 +177,11 @@ def assert_same_but_for_rounding(printed: str, shown: str) -> None:
         assert float(actual) == pytest.approx(float(expected), rel=0.05, abs=2 * unit)
 
 
+def without_solver(text: str) -> str:
+    """Leave out the error of the solver, which depends on the machine."""
+    return re.sub(r"solver [\d.e-]+ %", "solver", text)
+
+
 @pytest.mark.parametrize("page", sorted(FOLDER.glob("*.md")), ids=lambda page: page.stem)
 def test_the_pictures_and_pages_of_a_tutorial_exist(page):
     targets = re.findall(r"\]\((?!http)([^)#]+)\)", page.read_text(encoding="utf-8"))
@@ -209,3 +214,32 @@ def test_the_table_of_sources_is_as_the_inversions_say():
         assert 100 * inversion.report.image_residual == pytest.approx(float(residual), abs=0.06)
         codes = {caution.code for caution in inversion.report.warnings}
         assert ("closed-edge" in codes) == title.startswith("estimate"), title
+
+
+def test_the_film_without_reference_has_the_numbers_of_its_page(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    page = text_of("film-without-reference.md")
+    names = run_blocks("film-without-reference.md")
+    printed_by_command, printed, *_ = re.findall(r"```text\n(.*?)```", page, re.DOTALL)
+    assert_same_but_for_rounding(capsys.readouterr().out, printed)
+    result = names["result"]
+    assert result.verdict == "too uncertain"
+    away = names["strength"](result.displacement).max() - names["strength"](names["truth"]).max()
+    assert abs(away) < names["bar"], "the peak is right within its error"
+
+    (setup,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    Path("setup.toml").write_text(setup, encoding="utf-8")
+    line, fit_line = re.findall(r"^    shadowinv (.*)$", page, re.MULTILINE)
+    run = CliRunner().invoke(app, shlex.split(line), env={"COLUMNS": "300"})
+    assert run.exit_code == 0, run.output
+    rows = [" ".join(row.split()) for row in run.output.splitlines()]
+    expected_rows = [" ".join(row.split()) for row in printed_by_command.splitlines()]
+    starts = tuple(re.split(r"\s{2,}", row)[0] + " " for row in printed_by_command.splitlines())
+    rows = [row for row in rows if row.startswith(starts)]
+    assert_same_but_for_rounding(
+        without_solver("\n".join(rows)), without_solver("\n".join(expected_rows))
+    )
+    # The fit takes too long for a test; its flags must be those of the command.
+    assert fit_line.startswith("fit ")
+    listing = CliRunner().invoke(app, ["fit", "--help-all"], env={"COLUMNS": "200"}).output
+    assert set(re.findall(r"--[a-z-]+", fit_line)) <= set(re.findall(r"--[a-z-]+", listing))
