@@ -14,6 +14,7 @@ from qtpy import QtWidgets
 from qtpy.QtCore import Qt
 from typer.testing import CliRunner
 
+from napari_shadowinv import Instrument
 from napari_shadowinv._napari.layer_metadata import result_of, role_of, unit_of
 from napari_shadowinv._napari.viewer_sync import _text_overlay
 from napari_shadowinv._napari.widgets import _fitting
@@ -475,3 +476,36 @@ def test_stack_is_clicked_to_its_end(
     window.layers.clear()
     window.open(tmp_path / "night.shadowinv.zarr", plugin="napari-shadowinv")
     assert layer_of(window, "field").data.shape[0] == 20
+
+
+def test_film_without_reference_is_clicked_to_its_verdict(
+    window: Any,
+    choose: Any,
+    press: Any,
+    qtbot: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    text = page("film-without-reference.md")
+    monkeypatch.chdir(tmp_path)
+    block = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0]
+    exec(compile(block, "film-without-reference.md", "exec"), {})
+    window.open("8MeV.tif", plugin="napari")
+    choose(f"Plugins > {PLUGIN} > Invert shot")
+    tool = tool_of(window, "Invert shot")
+    select(tool, "particles (protons, …)")
+    for title, value in re.findall(r"^\| ([\w ]+) \| (?:check the box, )?`(.*?)` \|", text, re.M):
+        enter(tool, title, value)
+    press(tool, "Instrument")
+    for entry, title in re.findall(r"\*([\w ]+)\* under \*\*([\w ]+)\*\*", text):
+        editor = tool.instrument.editors[title.lower().replace(" ", "_")]
+        assert editor_of(tool, title)
+        editor.set_value(entry)
+    press(tool, "Run")
+    wait_for_layers(tool, qtbot)
+    assert tool.instrument.model() == Instrument.of("film", source="TNSA")
+    report = report_of(tool)
+    assert "too uncertain" in report
+    for number in ("1.75 ± 0.42 mT·m", "98 % of the field"):
+        assert number in text
+        assert number in report
