@@ -473,7 +473,7 @@ def fit_cases(rng: np.random.Generator) -> dict[str, tuple[Imperfect, Instrument
 def table_of_fits(side: int, shots: int, first_seed: int) -> None:
     """Print a row for each imperfection, and each fit that is wrong though it is determined."""
     names = list(objects(side))
-    rows: dict[str, list[tuple[float, float, bool]]] = {}
+    rows: dict[str, list[tuple[float, float, Verdict]]] = {}
     for number in range(shots):
         cases = fit_cases(np.random.default_rng([first_seed + number, 30]))
         title = list(cases)[number % len(cases)]
@@ -495,26 +495,32 @@ def table_of_fits(side: int, shots: int, first_seed: int) -> None:
         )
         exact_field = folded * truth(side, name)
         error = length(result.fields[0].displacement - exact_field) / length(exact_field)
-        total, is_determined = result.report.total, result.verdict is Verdict.DETERMINED
-        rows.setdefault(title, []).append((error, error / total, is_determined))
-        is_wrong = is_determined and error > 0.05 and error > 3 * total
+        total = result.report.total
+        rows.setdefault(title, []).append((error, error / total, result.verdict))
+        is_wrong = result.verdict is Verdict.DETERMINED and error > 0.05 and error > 3 * total
         print(
             f"{title}, {name} x {folded:g}, {count}: error {error:.1%}, total {total:.1%}, "
             f"{result.verdict}{' WRONG' if is_wrong else ''}",
             file=sys.stderr,
             flush=True,
         )
-    print("| stated | fits | determined | error over total | within 1, 2 totals | error |")
-    print("|---|---|---|---|---|---|")
+    heads = "determined | refused | error over total | within 1, 2 totals | error"
+    print(f"| stated | fits | {heads} |")
+    print("|---|---|---|---|---|---|---|")
     for title, values in rows.items():
         print(f"| {title} | {_fit_row(values)} |")
     print(f"| all | {_fit_row([value for row in rows.values() for value in row])} |\n", flush=True)
 
 
-def _fit_row(values: list[tuple[float, float, bool]]) -> str:
-    errors, ratios, determined = (np.array(column) for column in zip(*values, strict=True))
+def _fit_row(values: list[tuple[float, float, Verdict]]) -> str:
+    verdicts = [verdict for *_, verdict in values]
+    is_known = [verdict in (Verdict.DETERMINED, Verdict.UNCERTAIN) for verdict in verdicts]
+    counts = f"{len(values)} | {verdicts.count(Verdict.DETERMINED)} | {is_known.count(False)}"
+    if not any(is_known):
+        return f"{counts} | – | – | –"
+    errors, ratios = np.array([value[:2] for value in values])[np.array(is_known)].T
     return (
-        f"{len(values)} | {determined.sum()} | {np.sqrt((ratios**2).mean()):.2f} | "
+        f"{counts} | {np.sqrt((ratios**2).mean()):.2f} | "
         f"{(ratios < 1).mean():.0%}, {(ratios < 2).mean():.0%} | {np.median(errors):.1%}"
     )
 
