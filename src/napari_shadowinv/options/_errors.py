@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
 
-__all__ = ["BUDGET_PANEL", "MaxError"]
-
-BUDGET_PANEL: Any = {"panel": "Error budget (docs/uncertainty.md)"}
-"""Panel of flags in the help of a command."""
+__all__ = ["MaxError"]
 
 MaxError = Annotated[
     float,
@@ -18,6 +15,5 @@ MaxError = Annotated[
         lt=1,
         title="Largest error",
         description="Largest total error, as a share of the field (r.m.s.), of a determined field.",
-        json_schema_extra=BUDGET_PANEL,
     ),
 ]

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
 from napari_shadowinv._system.validation import CheckedModel
-from napari_shadowinv.options._errors import BUDGET_PANEL, MaxError
+from napari_shadowinv.options._errors import MaxError
 
 __all__ = ["MAX_DEFAULT_SITES", "InversionOptions"]
+
+_BUDGET: Any = {"panel": "Error budget (docs/uncertainty.md)"}
 
 MAX_DEFAULT_SITES = 1_000_000
 
@@ -55,7 +57,7 @@ class InversionOptions(CheckedModel):
             "other than 'newton'."
         ),
     )
-    max_error: MaxError = 0.05
+    max_error: Annotated[MaxError, Field(json_schema_extra=_BUDGET)] = 0.05
     floor: float = Field(
         default=1e-3,
         gt=0,
@@ -199,7 +201,7 @@ class InversionOptions(CheckedModel):
             "Standard deviation of the noise of one pixel of the inverted image, in its units, for "
             "the error budget. Default: measured from the differences between neighbouring pixels."
         ),
-        json_schema_extra=BUDGET_PANEL,
+        json_schema_extra=_BUDGET,
     )
     units_per_quantum: float | None = Field(
         default=None,
@@ -209,7 +211,7 @@ class InversionOptions(CheckedModel):
             "Image units per detected quantum, for the error budget: the noise is then Poisson "
             "noise."
         ),
-        json_schema_extra=BUDGET_PANEL,
+        json_schema_extra=_BUDGET,
     )
     seed: int = Field(
         default=0,
