@@ -83,8 +83,10 @@ _DEEP_FOLDS = 0.3  # of the object
 _BARS_DEEP_FOLDS, _BARS_DEEP_FOLDS_AND_BEAM = 1.4, 2.4
 _LOST = 0.01  # of the rays
 # Of beams 10 % off, 5 % between energies, fields of folded objects were off by 2 to 4 times their
-# error bars on 48 px and by 2 on 96 px; of beams 2 and 5 % off by 1.1 times.
-_FITTED_BEAM = 2.0
+# error bars on 48 px and by 2 on 96 px; of beams 2 and 5 % off by 1.1 times, of a gamma of 0.15
+# off by 2.0 (r.m.s.) and of absorption of 5 % by 2.4.
+_UNDERESTIMATED = {"beam", "gamma", "absorption"}
+_SAFETY = 2.0
 _MEASURE = "measure the {}, or add an image at another energy, which shows more of it"
 _ADVICE = {
     "noise": "average shots, or take images at energies that differ more",
@@ -219,12 +221,12 @@ def assess_verdict(
             f"up to {max(rivals):.0%} (r.m.s.); take another energy, or compare them with what is "
             "known"
         )
-    doubled = _FITTED_BEAM if "beam" in parts else 1.0
+    doubled = _SAFETY if _UNDERESTIMATED & parts.keys() else 1.0
     if parts and doubled * uncertainty > max_error:
         ranking = ", ".join(f"{TITLES[key]} {share:.1%}" for key, share in parts.items())
         text = f"errors of {uncertainty:.1%} of the displacement (r.m.s.): {ranking}; "
         if uncertainty <= max_error:
-            text += f"where a beam is fitted, they can be {doubled:g} times as large; "
+            text += f"where these are fitted, errors can be {doubled:g} times as large; "
         return Verdict.UNCERTAIN, (
             f"{text}{_ADVICE.get(next(iter(parts)), _MEASURE).format(TITLES[next(iter(parts))])}"
         )
