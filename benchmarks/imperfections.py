@@ -65,6 +65,7 @@ class Shots:
     brighter: float = 0.0
     quanta: float | None = COUNTS
     read_noise: float = READ_NOISE
+    mask: NDArray[np.bool_] | None = None
     keywords: dict[str, Any] = field(default_factory=dict)
 
     def strengths(self) -> FloatArray:
@@ -241,7 +242,7 @@ def hole(shots: Shots) -> None:
     """Mask a square in the object."""
     mask = np.ones((shots.side, shots.side), bool)
     mask[int(0.36 * shots.side) :, int(0.5 * shots.side) :][:24, :24] = False
-    shots.keywords["mask"] = mask
+    shots.mask = mask
 
 
 def unmeasured(shots: Shots) -> None:
@@ -415,8 +416,11 @@ def fitted_row(name: str, shots: Shots, seed: int, is_right: bool) -> tuple[str,
     """Fit one case; return its row of the table, its mark, and the result."""
     begun = time.perf_counter()
     setups = [paper_setup().model_copy(update={"energy": energy}) for energy in shots.energies]
+    images = shots.images(seed)
+    if shots.mask is not None:
+        images = np.ma.array(images, mask=np.broadcast_to(~shots.mask, np.shape(images)))
     result = fit(
-        shots.images(seed), setups=setups, noise="poisson" if shots.quanta else CONSTANT_NOISE,
+        images, setups=setups, noise="poisson" if shots.quanta else CONSTANT_NOISE,
         options=FitOptions(seed=seed), **shots.keywords,
     )  # fmt: skip
     seconds = time.perf_counter() - begun
