@@ -38,6 +38,7 @@ GOOD: dict[str, Any] = {
     "hidden": 0.0,
     "edge_is_free": False,
     "parts": {},
+    "beams_differ": False,
     "max_error": 0.05,
 }
 ALONE = {
@@ -46,6 +47,22 @@ ALONE = {
     "single": True,
     "pattern": Pattern(np.array([-1.0])),
 }
+
+
+@pytest.mark.parametrize(
+    ("part", "beams_differ", "safety"),
+    [("background", False, 1), ("gamma", False, 2), ("beam", False, 2), ("beam", True, 4)],
+)
+def test_errors_that_are_underestimated_need_a_margin(
+    part: str, beams_differ: bool, safety: float
+) -> None:
+    for factor, expected in ((0.9, Verdict.DETERMINED), (1.1, Verdict.UNCERTAIN)):
+        share = factor * 0.05 / safety
+        changes = {"uncertainty": share, "parts": {part: share}, "beams_differ": beams_differ}
+        verdict, why = assess_verdict(**GOOD | changes)
+        assert verdict is expected
+        if expected is Verdict.UNCERTAIN and safety > 1:
+            assert f"{safety} times as large" in why
 
 
 def test_images_that_are_explained_in_one_way_determine_the_field() -> None:

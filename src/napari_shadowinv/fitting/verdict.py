@@ -86,7 +86,7 @@ _LOST = 0.01  # of the rays
 # error bars on 48 px and by 2 on 96 px; of beams 2 and 5 % off by 1.1 times, of a gamma of 0.15
 # off by 2.0 (r.m.s.) and of absorption of 5 % by 2.4.
 _UNDERESTIMATED = {"beam", "gamma", "absorption"}
-_SAFETY = 2.0
+_SAFETY, _SAFETY_BETWEEN = 2.0, 4.0
 _MEASURE = "measure the {}, or add an image at another energy, which shows more of it"
 _ADVICE = {
     "noise": "average shots, or take images at energies that differ more",
@@ -122,6 +122,7 @@ def assess_verdict(
     hidden: float,
     edge_is_free: bool,
     parts: Mapping[str, float],
+    beams_differ: bool,
     max_error: float,
 ) -> tuple[Verdict, str]:
     """Return the verdict on a fit, and a sentence that says why.
@@ -160,6 +161,8 @@ def assess_verdict(
         Whether the field was let go on beyond the edge.
     parts : mapping of str to float
         What the uncertainty is made of, the largest first; empty without an instrument.
+    beams_differ : bool
+        Whether each image has a beam of its own that is fitted.
     max_error : float
         Largest total error of a determined fit, as a share of the displacement.
     """
@@ -221,12 +224,14 @@ def assess_verdict(
             f"up to {max(rivals):.0%} (r.m.s.); take another energy, or compare them with what is "
             "known"
         )
-    doubled = _SAFETY if _UNDERESTIMATED & parts.keys() else 1.0
-    if parts and doubled * uncertainty > max_error:
+    safety = _SAFETY if _UNDERESTIMATED & parts.keys() else 1.0
+    if beams_differ:
+        safety = _SAFETY_BETWEEN
+    if parts and safety * uncertainty > max_error:
         ranking = ", ".join(f"{TITLES[key]} {share:.1%}" for key, share in parts.items())
         text = f"errors of {uncertainty:.1%} of the displacement (r.m.s.): {ranking}; "
         if uncertainty <= max_error:
-            text += f"where these are fitted, errors can be {doubled:g} times as large; "
+            text += f"where these are fitted, errors can be {safety:g} times as large; "
         return Verdict.UNCERTAIN, (
             f"{text}{_ADVICE.get(next(iter(parts)), _MEASURE).format(TITLES[next(iter(parts))])}"
         )
