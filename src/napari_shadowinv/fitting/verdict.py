@@ -90,7 +90,6 @@ _SAFETY, _SAFETY_BETWEEN = 2.0, 4.0
 _MEASURE = "measure the {}, or add an image at another energy, which shows more of it"
 _ADVICE = {
     "noise": "average shots, or take images at energies that differ more",
-    "beam_between": "record the beam at each energy",
     "other_field": "fit both fields, with images at more energies",
     "registration": "align the images by marks on each of them",
 }
