@@ -191,8 +191,15 @@ def collect_data(
         is_unknown=unknown,
         other_strengths=_other_strengths(setups, fields, matrix),
     )
-    # Of a detector that is not linear, an assumed source does not have the image's mean.
-    is_dimmed = source is None and instrument.gamma > 0
+    spread = np.linalg.norm(matrix, axis=1)
+    single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
+    # Nor does a beam of another shape, or behind an object that absorbs, have a known mean; of a
+    # detector that is not linear, an assumed source does not have the image's.
+    is_dimmed = not single and (
+        bool(imperfect.shapes)
+        or instrument.absorption > 0
+        or (source is None and instrument.gamma > 0)
+    )
     align = "affine" if options.align == "none" and instrument.registration else options.align
     scene = Scene(
         images=np.pad(scaled, fill),
@@ -213,8 +220,6 @@ def collect_data(
         added=additive_blocks(options),
         imperfect=imperfect,
     )
-    spread = np.linalg.norm(matrix, axis=1)
-    single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
     return FitData(
         scene=scene,
         size=(height, width),
