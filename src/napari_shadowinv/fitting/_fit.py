@@ -17,7 +17,7 @@ from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.compilation import ensure_compiled
-from napari_shadowinv.fitting.descent import coarser, finer
+from napari_shadowinv.fitting.descent import coarser
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import (
     EXACT,
@@ -47,11 +47,11 @@ from napari_shadowinv.fitting.posterior import (
 )
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.search import (
-    MIDDLE,
     MIDDLE_SPACING,
     Minimum,
     Start,
     estimate_smoothness,
+    in_recorded_pixels,
     refine_minimum,
     search,
     settle_minimum,
@@ -79,6 +79,8 @@ _MIN_BLUR_SCORE = 4.0  # standard deviations
 _DARKEST = 1e-3  # of a beam's mean
 _MAX_RIVAL_CHI2 = 3.0  # a fit that ended further away is no start for a rival
 _SPACING_OF_SAMPLES = 1 / 3  # px
+# In pixels of two their objects are too rough for λ and for the errors of an instrument's numbers.
+_NEEDS_ALL_PIXELS = 80
 # Before a field has been found, they would take its place.
 _HELD_IN_SEARCH = frozenset({"gamma", "blur", "other_field"})
 
@@ -199,6 +201,8 @@ def fit(
             # One image cannot tell the instrument from the object: its numbers stay at 0.
             scene = replace(scene, imperfect=EXACT)
         minima = [_with_numbers(scene, minimum) for minimum in minima]
+        if scene.imperfect.parts and min(data.size) < _NEEDS_ALL_PIXELS:
+            minima = [in_recorded_pixels(scene, minimum) for minimum in minima]
     with _timed("smoothness", seconds):
         scene, best = estimate_smoothness(scene, minima[0], rng, on_step)
         if data.counted:
@@ -213,7 +217,7 @@ def fit(
         stated = data.instrument.noise_correlation
         pattern = find_pattern(fine, unknowns, data.size, is_counted=is_counted, correlation=stated)
         unsure = replace(scene, imperfect=imperfect)
-        middle = replace(coarser(unsure, MIDDLE), spacing=_SPACING_OF_SAMPLES)
+        middle = replace(coarser(unsure, best.bin), spacing=_SPACING_OF_SAMPLES)
         ends = _with_numbers(unsure, best).unknowns
         posterior = Posterior(middle, ends, rng, lambda: on_step("samples", value))
         if pattern.lacks_counts:
@@ -238,7 +242,7 @@ def fit(
         sensitivities = {}
         if samples:
             tested = replace(unsure, imperfect=_tested_instrument(data, best))
-            middle = replace(coarser(tested, MIDDLE), spacing=_SPACING_OF_SAMPLES)
+            middle = replace(coarser(tested, best.bin), spacing=_SPACING_OF_SAMPLES)
             plain = best.unknowns._replace(
                 common=np.zeros(0), separate=np.zeros((len(scene.images), 0))
             )
@@ -398,8 +402,9 @@ def _with_absorption(data: FitData, scene: Scene, minimum: Minimum) -> Scene:
 
 def _absorption(data: FitData, minimum: Minimum, rms: float) -> Shapes:
     height, width = data.size
-    coarse = minimum.displacement.sum(axis=0)
-    displacement = coarse.repeat(MIDDLE, axis=1).repeat(MIDDLE, axis=2)[:, :height, :width]
+    displacement, width_px = minimum.displacement.sum(axis=0), minimum.bin
+    displacement = displacement.repeat(width_px, axis=1).repeat(width_px, axis=2)
+    displacement = displacement[:, :height, :width]
     used = np.asarray((data.scene.weights[:, :height, :width] > 0).any(axis=0))
     return absorption_shapes(rms, displacement, used, data.around)
 
@@ -439,7 +444,7 @@ def _amplify_noise(
 
 def reweight_counts(data: FitData, scene: Scene, minimum: Minimum) -> Scene:
     """Return the weights of counts from the expected instead of the recorded counts."""
-    unknowns = finer(minimum.unknowns)
+    unknowns = minimum.in_pixels(1)
     expected = scene.model(unknowns, scene.ray_counts(unknowns))
     units = data.units[:, None, None]
     weights = units**2 / np.maximum(expected * units, 1.0)
@@ -454,7 +459,7 @@ def _basins(
     Smoother fields have decided which is best: the present λ favours what follows the
     noise.
     """
-    middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
+    middle = replace(coarser(scene, best.bin), spacing=MIDDLE_SPACING)
     ends = [
         best,
         *(settle_minimum(scene, minimum, on_step, "other starts") for minimum in others[:2]),

@@ -26,7 +26,6 @@ from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import strengths_of
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.search import (
-    MIDDLE,
     MIDDLE_SPACING,
     SMOOTHNESS_RATIO,
     Minimum,
@@ -342,12 +341,12 @@ def name_cause(
     on_step : callable
         Receives the stage and the objective.
     """
-    pixels = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
+    pixels = replace(coarser(scene, best.bin), spacing=MIDDLE_SPACING)
     misfit = pixels.chi2(best.unknowns, pixels.ray_counts(best.unknowns)) - 1
     excess = float((misfit * (pixels.weights > 0).sum(axis=(1, 2))).sum())
     gains = []
     for rival in _rivals(scene, best, names, setups):
-        start = Minimum(best.start, rival.unknowns, best.value, best.displacement)
+        start = replace(best, unknowns=rival.unknowns)
         end = settle_minimum(rival.scene, start, on_step, "rivals", steps=_STEPS)
         gains.append((2 * (best.value - end.value) - rival.free_numbers, rival.cause))
     gains.sort(reverse=True)
@@ -390,7 +389,7 @@ def log_evidence(
     if options.smoothness is None:
         scene = replace(scene, smoothness=scene.smoothness / SMOOTHNESS_RATIO)
     ended = settle_minimum(scene, best, on_step, "evidence", least_gain=0.1)
-    middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
+    middle = replace(coarser(scene, best.bin), spacing=MIDDLE_SPACING)
     chances = [np.random.default_rng([options.seed, crc32(name.encode())]) for name in names]
     report = partial(on_step, "evidence", ended.value)
     posterior = Posterior(middle, ended.unknowns, chances[0], report)

@@ -501,7 +501,9 @@ def _spread(
     height, across = size
     squares = np.zeros((scene.strengths.shape[1], 2, *scene.rays.size))
     for change in changes:
-        potentials = finer(change).potentials
+        potentials = change.potentials
+        if potentials.shape[1:] != scene.rays.shape:
+            potentials = finer(change).potentials
         squares += np.stack([scene.rays.displacement(p) for p in potentials]) ** 2
     smooth = gaussian_filter(squares / len(changes), (0, 0, width, width))
     return np.asarray(np.sqrt(smooth[..., :height, :across]))

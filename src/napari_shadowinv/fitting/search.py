@@ -26,6 +26,7 @@ __all__ = [
     "Minimum",
     "Start",
     "estimate_smoothness",
+    "in_recorded_pixels",
     "refine_minimum",
     "search",
     "settle_minimum",
@@ -42,6 +43,8 @@ _HELD_BEAM = 0.01  # spread of an unknown beam's cosines before the field has be
 _HOPELESS, _CONTINUED = 3.0, 3  # times the best objective; at most so many go on
 _COARSE_SPACING, MIDDLE_SPACING = 1 / 3, 0.25
 _SPACINGS, _EXPLAINED = (0.2, 0.14), 1.05  # px, and the χ² for which the first is dense enough
+# An instrument's numbers turn an error of the model that is far below the noise into a field.
+_SPACING_WITH_NUMBERS = 0.1
 _ROUNDS, _ROUND_STEPS, _SETTLED = 6, 40, 0.25  # of λ and κ; and by what share they may still change
 # An object's roughness is not spread evenly, as the likeliest λ and κ assume: they would round it
 # off where it is sharpest.
@@ -73,6 +76,13 @@ class Minimum:
     value: float
     displacement: FloatArray  # of all fields in the first image, px of the recorded image
     bin: int = 2
+
+    def in_pixels(self, bin: int) -> Unknowns:
+        """Return the unknowns in pixels as wide, or narrower."""
+        unknowns = self.unknowns
+        for _ in range(int(np.log2(self.bin // bin))):
+            unknowns = finer(unknowns)
+        return unknowns
 
     def distance(self, other: Minimum) -> float:
         """Return how far another displacement is from this one, relative to it (r.m.s.)."""
@@ -140,12 +150,9 @@ def _descend_stage(
 ) -> Minimum:
     factor, blur = stage
     now = replace(coarser(scene, factor), blur=blur)
-    unknowns = minimum.unknowns
-    for _ in range(int(np.log2(minimum.bin // factor))):
-        unknowns = finer(unknowns)
     unknowns, value, _ = descend(
         now,
-        unknowns,
+        minimum.in_pixels(factor),
         iterations=_COARSE_STEPS,
         least_gain=COARSE_GAIN,
         after_step=lambda now: on_step(minimum.start, now),
@@ -156,6 +163,12 @@ def _descend_stage(
 def _displacement(scene: Scene, unknowns: Unknowns) -> FloatArray:
     each = [scene.rays.displacement(potential) for potential in unknowns.potentials]
     return scene.bin * np.stack(each)
+
+
+def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
+    """Return a minimum in the pixels of the recorded images."""
+    unknowns = minimum.in_pixels(1)
+    return Minimum(minimum.start, unknowns, minimum.value, _displacement(scene, unknowns), 1)
 
 
 def estimate_smoothness(
@@ -169,18 +182,18 @@ def estimate_smoothness(
     if is_fixed:
         return scene, end
     for _ in range(_ROUNDS):
-        middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
+        middle = replace(coarser(scene, end.bin), spacing=MIDDLE_SPACING)
         value = end.value
         posterior = Posterior(middle, end.unknowns, rng, lambda: on_step("smoothness", value))  # noqa: B023
         likely, change = posterior.likely_smoothness()
         if change < _SETTLED:
             break
-        scene = replace(scene, smoothness=likely / smoothness_in_pixels(MIDDLE))
+        scene = replace(scene, smoothness=likely / smoothness_in_pixels(end.bin))
         end = settle_minimum(scene, end, on_step)
-    scene = replace(scene, smoothness=SMOOTHNESS_RATIO * likely / smoothness_in_pixels(MIDDLE))
+    scene = replace(scene, smoothness=SMOOTHNESS_RATIO * likely / smoothness_in_pixels(end.bin))
     end = settle_minimum(scene, end, on_step, least_gain=_LAST_GAIN)
     for _ in range(_TILTS if scene.imperfect.parts else 0):
-        middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
+        middle = replace(coarser(scene, end.bin), spacing=MIDDLE_SPACING)
         value = end.value
         posterior = Posterior(middle, end.unknowns, rng, lambda: on_step("smoothness", value))  # noqa: B023
         scene = replace(scene, tilt=posterior.tilt(_VOLUME_PROBES))
@@ -197,7 +210,7 @@ def settle_minimum(
     steps: int = _ROUND_STEPS,
 ) -> Minimum:
     """Return where a descent ends with other λ and κ, in pixels of two and without blur."""
-    middle = replace(coarser(scene, MIDDLE), spacing=MIDDLE_SPACING)
+    middle = replace(coarser(scene, minimum.bin), spacing=MIDDLE_SPACING)
     unknowns, value, _, _ = settle(
         middle,
         minimum.unknowns,
@@ -205,7 +218,7 @@ def settle_minimum(
         least_gain=least_gain,
         after_step=lambda now: on_step(name, now),
     )
-    return Minimum(minimum.start, unknowns, value, _displacement(middle, unknowns))
+    return Minimum(minimum.start, unknowns, value, _displacement(middle, unknowns), minimum.bin)
 
 
 def refine_minimum(
@@ -215,8 +228,12 @@ def refine_minimum(
 
     Also returns the number of steps, and whether it converged within the allowed number.
     """
-    unknowns, steps = finer(minimum.unknowns), 0
-    denser = list(_SPACINGS) if options.spacing is None else [options.spacing]
+    unknowns, steps = minimum.in_pixels(scene.bin), 0
+    denser = list(_SPACINGS)
+    if scene.imperfect.parts:
+        denser = [_SPACING_WITH_NUMBERS]
+    if options.spacing is not None:
+        denser = [options.spacing]
     most = -(-options.max_iterations // len(denser))
     scene = replace(scene, spacing=denser.pop(0))
     while True:
