@@ -11,6 +11,7 @@ from scipy.fft import idctn
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.descent import descend
 from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.instrument import Imperfect
 from napari_shadowinv.fitting.posterior import Posterior, draw_variations
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import Unknowns
@@ -49,6 +50,24 @@ def half_log_determinant(matrix: FloatArray) -> float:
     """Without what nothing holds: fixed unknowns, and the potential's constant."""
     values = np.linalg.eigvalsh(matrix)
     return float(np.log(values[values > 1e-9 * values.max()]).sum() / 2)
+
+
+def test_a_blur_at_its_end_is_as_uncertain_as_before_the_images() -> None:
+    scene = replace(
+        weak_scene((12, 16), (30.0, 100.0)), psf=[1.5, 1.5], imperfect=Imperfect(blur=2.0)
+    )
+    y, x = np.indices(scene.rays.shape)
+    deviations = {}
+    for variance in (0.0, 1.5**2):
+        unknowns = scene.nothing()
+        unknowns.potentials[0] = 6 * np.exp(-((y - 6) ** 2 + (x - 7) ** 2) / 6)
+        unknowns.common[:] = (variance - 1.5**2) / 2.0
+        assert scene.is_sharpest(unknowns) is (variance == 0)
+        posterior = Posterior(scene, unknowns, np.random.default_rng(0))
+        numbers = [posterior.draw_sample().change.common for _ in range(DRAWS)]
+        deviations[variance] = float(np.sqrt(np.mean(np.square(numbers))))
+    assert abs(deviations[0.0] - 1) < 4 / np.sqrt(2 * DRAWS)
+    assert deviations[1.5**2] < 0.7
 
 
 @pytest.fixture(scope="module")

@@ -197,6 +197,7 @@ _NEWTON, _MOST_SOLVING = 0.02, 200  # how exactly each is found, and in how many
 # Fields and numbers of an instrument that explain an image alike lie along a flat valley.
 _NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 2e-3, 400, 0.1
 _MOST_PIXELS = 2_000_000  # of all images
+_ALL = slice(None)
 
 
 class Preconditioner:
@@ -235,13 +236,12 @@ class Preconditioner:
         common, separate = scene.number_scales()
         self._diagonals = [beam, common, brightness, frames, separate, *added]
 
-    def held(self) -> Preconditioner:
-        """Return scales in which the numbers of an instrument do not change."""
+    def held(self, common: slice = _ALL, separate: slice = _ALL) -> Preconditioner:
+        """Return scales in which numbers of an instrument do not change; by default, none does."""
         held = copy(self)
-        places = {1, 4}
-        held._diagonals = [
-            0 * scale if place in places else scale for place, scale in enumerate(self._diagonals)
-        ]
+        held._diagonals = [scale.copy() for scale in self._diagonals]
+        held._diagonals[1][common] = 0
+        held._diagonals[4][:, separate] = 0
         return held
 
     def damp(self, unknowns: Unknowns) -> Unknowns:

@@ -136,18 +136,28 @@ class Posterior:
         return Sample(self._held._change(slope, _CLOSELY).plus(numbers), noise)
 
     def draw_sample(self, tolerance: float | None = None) -> Sample:
-        """Return a random change of the unknowns, as large as the data leave possible."""
+        """Return a random change of the unknowns, as large as the data leave possible.
+
+        A blur that has reached its end says nothing about its error: it is drawn from its prior.
+        """
         if tolerance is None:
             tolerance = _IN_VALLEY if self._scene.imperfect.parts else _CLOSELY
         noise = self._rng.normal(size=self._scene.images.shape)
-        slope = self._linear.pull(noise)
+        posterior, numbers, moved = self, self._unknowns.zeros(), noise
+        if self._scene.is_sharpest(self._unknowns):
+            place = self._scene.imperfect.place("blur")
+            assert place is not None
+            numbers.common[place] = self._rng.normal()
+            posterior = self._with(self._scales.held(common=place, separate=slice(0)))
+            moved = noise - self._linear.push(numbers)
+        slope = self._linear.pull(moved)
         slope = slope.plus(self._scene.prior.draw(self._unknowns, self._rng))
         if self._scene.tilt is not None:
             common, separate = self._scene.tilt
             sign = self._rng.normal()
             tilted = slope.zeros()._replace(common=sign * common, separate=sign * separate)
             slope = slope.plus(tilted)
-        return Sample(self._change(slope, tolerance), noise)
+        return Sample(posterior._change(slope, tolerance).plus(numbers), noise)
 
     def tilt(self, probes: int) -> tuple[FloatArray, FloatArray]:
         """Return what makes up for how the instrument changes the volume of likely fields.
@@ -227,9 +237,12 @@ class Posterior:
     @property
     def _held(self) -> Posterior:
         """The same for an instrument that is known."""
-        held = copy(self)
-        held._scales = self._scales.held()
-        return held
+        return self._with(self._scales.held())
+
+    def _with(self, scales: Preconditioner) -> Posterior:
+        other = copy(self)
+        other._scales = scales
+        return other
 
     def count_determined(self, rng: np.random.Generator) -> float:
         """Estimate how many numbers the data determine: so much of Σχ² the fit absorbs of noise."""
