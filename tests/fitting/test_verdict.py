@@ -38,7 +38,6 @@ GOOD: dict[str, Any] = {
     "hidden": 0.0,
     "edge_is_free": False,
     "parts": {},
-    "beams_differ": False,
     "max_error": 0.05,
 }
 ALONE = {
@@ -50,15 +49,16 @@ ALONE = {
 
 
 @pytest.mark.parametrize(
-    ("part", "beams_differ", "safety"),
-    [("background", False, 1), ("gamma", False, 2), ("beam", False, 2), ("beam", True, 4)],
+    ("part", "side", "safety"),
+    [("background", 80, 1), ("beam", 80, 1), ("gamma", 80, 2), ("blur", 80, 2), ("beam", 79, 2)],
 )
-def test_errors_that_are_underestimated_need_a_margin(
-    part: str, beams_differ: bool, safety: float
-) -> None:
+def test_errors_that_are_underestimated_need_a_margin(part: str, side: int, safety: float) -> None:
     for factor, expected in ((0.9, Verdict.DETERMINED), (1.1, Verdict.UNCERTAIN)):
         share = factor * 0.05 / safety
-        changes = {"uncertainty": share, "parts": {part: share}, "beams_differ": beams_differ}
+        displacement = np.pad(blob((24, 24)), ((0, 0), (20, side - 68), (20, 28)))
+        used = np.ones((side, 96), bool)
+        changes = {"displacement": displacement, "used": used}
+        changes |= {"uncertainty": share, "parts": {part: share}}
         verdict, why = assess_verdict(**GOOD | changes)
         assert verdict is expected
         if expected is Verdict.UNCERTAIN and safety > 1:

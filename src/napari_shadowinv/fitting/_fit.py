@@ -567,7 +567,6 @@ def _result(
         hidden=hidden_contrast(model / np.maximum(beams, _DARKEST * units) - 1, used),
         edge_is_free=options.boundary == "free",
         parts=parts,
-        beams_differ=scene.imperfect.place("beam_between") is not None,
         max_error=options.max_error,
     )
     return Fit(
