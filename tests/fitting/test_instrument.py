@@ -105,6 +105,17 @@ def test_one_image_keeps_its_field_and_gets_larger_errors() -> None:
     assert 0.03 < deviation < 0.3
 
 
+@pytest.mark.parametrize("instrument", [{"beam_rms": 0.05}, {**EXACT_BEAM, "absorption": 0.05}])
+def test_the_mean_of_an_inexact_beam_is_not_known(instrument: dict[str, float]) -> None:
+    """Images 2 % brighter than their source would pass for another field."""
+    keywords = {"source": np.ones(SIZE), "options": FEW.model_copy(update={"samples": 0})}
+    fields = [
+        fitted(factor * shots(), Instrument(**instrument), **keywords).fields[0].displacement
+        for factor in (1.0, 1.02)
+    ]
+    assert distance(fields[1], fields[0]) < 0.01
+
+
 def test_errors_have_a_part_for_all_that_is_stated() -> None:
     instrument = Instrument(beam=BeamPrior(rms=0.02, length=0.5, between=0.01), background=0.02)
     result = fitted(shots(), instrument)
