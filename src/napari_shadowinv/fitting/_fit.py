@@ -133,6 +133,7 @@ def fit(
         each image. See `point_spread`.
     brightness : "known", "free" or array_like, default "known"
         Brightness of each image relative to the source: factors, or "free" to fit them.
+        Fitted in any case where the instrument leaves beam or transmission open.
     instrument : Instrument, optional
         How well beam, detector and alignment are known. What is stated is fitted together with the
         fields; what the images leave open of it enters the error bars. One image does not determine
