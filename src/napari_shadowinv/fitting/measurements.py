@@ -193,13 +193,10 @@ def collect_data(
     )
     spread = np.linalg.norm(matrix, axis=1)
     single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
-    # Nor does a beam of another shape, or behind an object that absorbs, have a known mean; of a
-    # detector that is not linear, an assumed source does not have the image's.
-    is_dimmed = not single and (
-        bool(imperfect.shapes)
-        or instrument.absorption > 0
-        or (source is None and instrument.gamma > 0)
-    )
+    # Of a detector that is not linear, an assumed source does not have the image's mean.
+    is_dimmed = source is None and instrument.gamma > 0
+    # A beam of another shape, or behind an object that absorbs, does not have its source's.
+    is_dimmed |= not single and (bool(imperfect.shapes) or instrument.absorption > 0)
     align = "affine" if options.align == "none" and instrument.registration else options.align
     scene = Scene(
         images=np.pad(scaled, fill),
