@@ -58,7 +58,7 @@ from napari_shadowinv.fitting.search import (
 )
 from napari_shadowinv.fitting.shots import Images, list_shots
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.fitting.verdict import assess_verdict, hidden_contrast
+from napari_shadowinv.fitting.verdict import SMALL_PX, assess_verdict, hidden_contrast
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions, KindOfNoise
@@ -79,8 +79,6 @@ _MIN_BLUR_SCORE = 4.0  # standard deviations
 _DARKEST = 1e-3  # of a beam's mean
 _MAX_RIVAL_CHI2 = 3.0  # a fit that ended further away is no start for a rival
 _SPACING_OF_SAMPLES = 1 / 3  # px
-# In pixels of two their objects are too rough for λ and for the errors of an instrument's numbers.
-_NEEDS_ALL_PIXELS = 80
 # Before a field has been found, they would take its place.
 _HELD_IN_SEARCH = frozenset({"gamma", "blur", "other_field"})
 
@@ -202,7 +200,8 @@ def fit(
             # One image cannot tell the instrument from the object: its numbers stay at 0.
             scene = replace(scene, imperfect=EXACT)
         minima = [_with_numbers(scene, minimum) for minimum in minima]
-        if scene.imperfect.parts and min(data.size) < _NEEDS_ALL_PIXELS:
+        if scene.imperfect.parts and min(data.size) < SMALL_PX:
+            # In pixels of two, λ and the errors of the instrument's numbers come out too small.
             minima = [in_recorded_pixels(scene, minimum) for minimum in minima]
     with _timed("smoothness", seconds):
         scene, best = estimate_smoothness(scene, minima[0], rng, on_step)
@@ -403,9 +402,8 @@ def _with_absorption(data: FitData, scene: Scene, minimum: Minimum) -> Scene:
 
 def _absorption(data: FitData, minimum: Minimum, rms: float) -> Shapes:
     height, width = data.size
-    displacement, width_px = minimum.displacement.sum(axis=0), minimum.bin
-    displacement = displacement.repeat(width_px, axis=1).repeat(width_px, axis=2)
-    displacement = displacement[:, :height, :width]
+    blocks = np.ones((1, minimum.bin, minimum.bin))
+    displacement = np.kron(minimum.displacement.sum(axis=0), blocks)[:, :height, :width]
     used = np.asarray((data.scene.weights[:, :height, :width] > 0).any(axis=0))
     return absorption_shapes(rms, displacement, used, data.around)
 

@@ -237,12 +237,12 @@ class Preconditioner:
         self._diagonals = [beam, common, brightness, frames, separate, *added]
 
     def held(self, common: slice = _ALL, separate: slice = _ALL) -> Preconditioner:
-        """Return scales in which numbers of an instrument do not change; by default, none does."""
-        held = copy(self)
-        held._diagonals = [scale.copy() for scale in self._diagonals]
-        held._diagonals[1][common] = 0
-        held._diagonals[4][:, separate] = 0
-        return held
+        """Return scales in which some numbers of an instrument do not change, by default all."""
+        scales = copy(self)
+        scales._diagonals = [scale.copy() for scale in self._diagonals]
+        scales._diagonals[1][common] = 0
+        scales._diagonals[4][:, separate] = 0
+        return scales
 
     def damp(self, unknowns: Unknowns) -> Unknowns:
         """Return unknowns without the finest waves, which knots further apart leave behind."""

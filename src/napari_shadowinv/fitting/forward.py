@@ -26,7 +26,7 @@ from napari_shadowinv.fitting.unknowns import AdditiveBlock, Fiducials, Prior, U
 __all__ = ["Linear", "Scene", "blurred"]
 
 _SIGMAS = 4.0  # how far Gaussians reach
-_SHARPEST = 0.05  # of the variance of a point spread that is likely before the images
+_SHARPEST = 0.05  # variance of a fitted point spread over that expected of it
 
 
 @dataclass(frozen=True)
@@ -255,12 +255,12 @@ class Scene:
         return Linear(self, unknowns, jacobians, [self._seen(unknowns, shot) for shot in shots])
 
     def is_sharpest(self, unknowns: Unknowns) -> bool:
-        """Return whether an unknown blur has reached its end, an image without any."""
+        """Return whether an unknown blur has reached its limit: images that are not blurred."""
         if not self.imperfect.blur:
             return False
-        least = min(self._variance(k) for k in range(len(self.psf)))
-        left = least + self.imperfect.variance(unknowns.common)
-        return left < _SHARPEST * (least + self.imperfect.blur)
+        stated = min(self._variance(k) for k in range(len(self.psf)))
+        fitted = stated + self.imperfect.variance(unknowns.common)
+        return fitted < _SHARPEST * (stated + self.imperfect.blur)
 
     def number_scales(self) -> tuple[FloatArray, FloatArray]:
         """Return approximate standard deviations of the instrument's numbers, (n,) and (L, n)."""

@@ -327,13 +327,13 @@ def name_cause(
 ) -> str:
     """Return the likeliest reason why a fit leaves a pattern, as a clause; "" if none is likely.
 
-    Each rival frees or changes one assumption, and is fitted from the best unknowns in pixels of
-    two. The one that lowers Σχ² most, beyond one for each of its numbers, is named.
+    Each rival frees or changes one assumption, and is fitted from the best unknowns. The one
+    that lowers Σχ² most, beyond one for each of its numbers, is named.
 
     Parameters
     ----------
     scene, best
-        The fit that leaves a pattern, in pixels of two.
+        The fit that leaves a pattern.
     names : sequence of str
         The fields.
     setups : sequence of Setup, optional
@@ -378,7 +378,7 @@ def log_evidence(
     Parameters
     ----------
     scene, best
-        The fit, in pixels of two.
+        The fit.
     names : sequence of str
         The fields, whose random probes are the same for all models.
     options : FitOptions

@@ -138,19 +138,19 @@ class Posterior:
     def draw_sample(self, tolerance: float | None = None) -> Sample:
         """Return a random change of the unknowns, as large as the data leave possible.
 
-        A blur that has reached its end says nothing about its error: it is drawn from its prior.
+        A blur at its limit has no normal error: it is drawn from its prior.
         """
         if tolerance is None:
             tolerance = _IN_VALLEY if self._scene.imperfect.parts else _CLOSELY
         noise = self._rng.normal(size=self._scene.images.shape)
-        posterior, numbers, moved = self, self._unknowns.zeros(), noise
+        posterior, numbers, residuals = self, self._unknowns.zeros(), noise
         if self._scene.is_sharpest(self._unknowns):
             place = self._scene.imperfect.place("blur")
             assert place is not None
             numbers.common[place] = self._rng.normal()
             posterior = self._with(self._scales.held(common=place, separate=slice(0)))
-            moved = noise - self._linear.push(numbers)
-        slope = self._linear.pull(moved)
+            residuals = noise - self._linear.push(numbers)
+        slope = self._linear.pull(residuals)
         slope = slope.plus(self._scene.prior.draw(self._unknowns, self._rng))
         if self._scene.tilt is not None:
             common, separate = self._scene.tilt
@@ -240,9 +240,9 @@ class Posterior:
         return self._with(self._scales.held())
 
     def _with(self, scales: Preconditioner) -> Posterior:
-        other = copy(self)
-        other._scales = scales
-        return other
+        posterior = copy(self)
+        posterior._scales = scales
+        return posterior
 
     def count_determined(self, rng: np.random.Generator) -> float:
         """Estimate how many numbers the data determine: so much of Σχ² the fit absorbs of noise."""

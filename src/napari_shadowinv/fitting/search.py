@@ -43,8 +43,8 @@ _HELD_BEAM = 0.01  # spread of an unknown beam's cosines before the field has be
 _HOPELESS, _CONTINUED = 3.0, 3  # times the best objective; at most so many go on
 _COARSE_SPACING, MIDDLE_SPACING = 1 / 3, 0.25
 _SPACINGS, _EXPLAINED = (0.2, 0.14), 1.05  # px, and the χ² for which the first is dense enough
-# An instrument's numbers turn an error of the model that is far below the noise into a field.
-_SPACING_WITH_NUMBERS = 0.1
+# With an instrument's numbers, an error of the model far below the noise changes the field.
+_SPACING_WITH_NUMBERS = 0.1  # px
 _ROUNDS, _ROUND_STEPS, _SETTLED = 6, 40, 0.25  # of λ and κ; and by what share they may still change
 # An object's roughness is not spread evenly, as the likeliest λ and κ assume: they would round it
 # off where it is sharpest.
@@ -78,7 +78,7 @@ class Minimum:
     bin: int = 2
 
     def in_pixels(self, bin: int) -> Unknowns:
-        """Return the unknowns in pixels as wide, or narrower."""
+        """Return the unknowns in pixels `bin` wide, which is no wider than they are."""
         unknowns = self.unknowns
         for _ in range(int(np.log2(self.bin // bin))):
             unknowns = finer(unknowns)
@@ -166,7 +166,7 @@ def _displacement(scene: Scene, unknowns: Unknowns) -> FloatArray:
 
 
 def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
-    """Return a minimum in the pixels of the recorded images."""
+    """Return a minimum of a scene in the pixels of the recorded images."""
     unknowns = minimum.in_pixels(1)
     return Minimum(minimum.start, unknowns, minimum.value, _displacement(scene, unknowns), 1)
 
@@ -209,7 +209,7 @@ def settle_minimum(
     least_gain: float = COARSE_GAIN,
     steps: int = _ROUND_STEPS,
 ) -> Minimum:
-    """Return where a descent ends with other λ and κ, in pixels of two and without blur."""
+    """Return where a descent ends with other λ and κ, in the minimum's pixels, without blur."""
     middle = replace(coarser(scene, minimum.bin), spacing=MIDDLE_SPACING)
     unknowns, value, _, _ = settle(
         middle,
@@ -229,11 +229,8 @@ def refine_minimum(
     Also returns the number of steps, and whether it converged within the allowed number.
     """
     unknowns, steps = minimum.in_pixels(scene.bin), 0
-    denser = list(_SPACINGS)
-    if scene.imperfect.parts:
-        denser = [_SPACING_WITH_NUMBERS]
-    if options.spacing is not None:
-        denser = [options.spacing]
+    usual = [_SPACING_WITH_NUMBERS] if scene.imperfect.parts else list(_SPACINGS)
+    denser = usual if options.spacing is None else [options.spacing]
     most = -(-options.max_iterations // len(denser))
     scene = replace(scene, spacing=denser.pop(0))
     while True:

@@ -24,7 +24,9 @@ from napari_shadowinv.inversion.solution_checks import (
     turning_displacement,
 )
 
-__all__ = ["assess_verdict", "hidden_contrast"]
+__all__ = ["SMALL_PX", "assess_verdict", "hidden_contrast"]
+
+SMALL_PX = 80  # shorter side of images with too few pixels for an instrument's numbers
 
 
 _MIN_HOLE_RADIUS_PX = 6.0
@@ -85,7 +87,7 @@ _LOST = 0.01  # of the rays
 # Of 52 fits on 96 px, fields were off by up to 1.5 times their total where beams or backgrounds
 # are fitted, by up to 1.9 where a gamma, a blur or a transmission is; on 64 px by up to 5.7.
 _UNDERESTIMATED = {"blur", "gamma", "absorption"}
-_SAFETY, _SMALL = 2.0, 80
+_SAFETY = 2.0
 _MEASURE = "measure the {}, or add an image at another energy, which shows more of it"
 _ADVICE = {
     "noise": "average shots, or take images at energies that differ more",
@@ -219,7 +221,7 @@ def assess_verdict(
             f"up to {max(rivals):.0%} (r.m.s.); take another energy, or compare them with what is "
             "known"
         )
-    is_small = min(used.shape) < _SMALL
+    is_small = min(used.shape) < SMALL_PX
     safety = _SAFETY if is_small or _UNDERESTIMATED & parts.keys() else 1.0
     if parts and safety * uncertainty > max_error:
         ranking = ", ".join(f"{TITLES[key]} {share:.1%}" for key, share in parts.items())
