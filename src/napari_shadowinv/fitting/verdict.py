@@ -227,7 +227,9 @@ def assess_verdict(
         ranking = ", ".join(f"{TITLES[key]} {share:.1%}" for key, share in parts.items())
         text = f"errors of {uncertainty:.1%} of the displacement (r.m.s.): {ranking}; "
         if uncertainty <= max_error:
-            text += f"where these are fitted, errors can be {safety:g} times as large; "
+            small = f"with fewer than {SMALL_PX} px along a side"
+            where = small if is_small else "where these are fitted"
+            text += f"{where}, errors can be {safety:g} times as large; "
         return Verdict.UNCERTAIN, (
             f"{text}{_ADVICE.get(next(iter(parts)), _MEASURE).format(TITLES[next(iter(parts))])}"
         )
