@@ -9,7 +9,7 @@ import pytest
 from scipy.fft import idctn
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.descent import descend
+from napari_shadowinv.fitting.descent import descend, settle
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import Imperfect
 from napari_shadowinv.fitting.posterior import Posterior, draw_variations
@@ -52,22 +52,74 @@ def half_log_determinant(matrix: FloatArray) -> float:
     return float(np.log(values[values > 1e-9 * values.max()]).sum() / 2)
 
 
-def test_a_blur_at_its_end_is_as_uncertain_as_before_the_images() -> None:
+def imperfect_scene() -> tuple[Scene, Unknowns]:
+    """Two images of a lens that focuses, with a background and a blur; the fields and numbers."""
     scene = replace(
-        weak_scene((12, 16), (30.0, 100.0)), psf=[1.5, 1.5], imperfect=Imperfect(blur=2.0)
+        weak_scene((20, 24), (30.0, 100.0)),
+        weights=np.full((2, 20, 24), 1e4),
+        psf=[1.0, 1.0],
+        beam_modes=0,
+        free_brightness=False,
+        free_frames=np.zeros(6, bool),
+        imperfect=Imperfect(blur=0.5, background=0.1),
+        held=frozenset({"blur", "background"}),
     )
+    unknowns = scene.nothing()
     y, x = np.indices(scene.rays.shape)
-    deviations = {}
-    for variance in (0.0, 1.5**2):
-        unknowns = scene.nothing()
-        unknowns.potentials[0] = 6 * np.exp(-((y - 6) ** 2 + (x - 7) ** 2) / 6)
-        unknowns.common[:] = (variance - 1.5**2) / 2.0
-        assert scene.is_sharpest(unknowns) is (variance == 0)
-        posterior = Posterior(scene, unknowns, np.random.default_rng(0))
-        numbers = [posterior.draw_sample().change.common for _ in range(DRAWS)]
-        deviations[variance] = float(np.sqrt(np.mean(np.square(numbers))))
-    assert abs(deviations[0.0] - 1) < 4 / np.sqrt(2 * DRAWS)
-    assert deviations[1.5**2] < 0.7
+    unknowns.potentials[0] = 12 * np.exp(-((y - 8) ** 2 + (x - 9) ** 2) / 12)
+    unknowns.common[:], unknowns.separate[:] = 0.5, [[1.0], [0.7]]
+    return scene, unknowns
+
+
+def numbers_of(scene: Scene, unknowns: Unknowns) -> FloatArray:
+    return np.array([unit.flat() @ unknowns.flat() for unit in scene.response_units()])
+
+
+def test_held_numbers_are_drawn_as_uncertain_as_they_are_said_to_be() -> None:
+    scene, unknowns = imperfect_scene()
+    root = np.array([[0.3, 0, 0], [0.1, 0.2, 0], [0.0, 0.1, 0.4]])
+    tolerance = 4 * np.sqrt(2 / DRAWS)
+    for spread, expected in ((None, np.eye(3)), (root, root @ root.T)):
+        posterior = Posterior(replace(scene, spread=spread), unknowns, np.random.default_rng(0))
+        draws = [numbers_of(scene, posterior.draw_sample(0.1).change) for _ in range(DRAWS)]
+        scales = np.sqrt(np.diag(expected))
+        difference = np.cov(np.array(draws).T) - expected
+        assert np.abs(difference / np.outer(scales, scales)).max() < tolerance
+
+
+def test_the_curvature_of_numbers_is_the_schur_complement_of_the_hessian() -> None:
+    scene, unknowns = imperfect_scene()
+    response = Posterior(scene, unknowns, np.random.default_rng(0)).response(1)
+    matrix, free = dense_hessian(replace(scene, held=frozenset()), unknowns)
+    numbers = [int(np.argmax(unit.flat())) for unit in scene.response_units()]
+    rest = np.setdiff1d(free, numbers)
+    inverse = np.linalg.pinv(matrix[np.ix_(rest, rest)], rcond=1e-12, hermitian=True)
+    beside = matrix[np.ix_(numbers, rest)]
+    exact = matrix[np.ix_(numbers, numbers)] - beside @ inverse @ beside.T - np.eye(len(numbers))
+    np.testing.assert_allclose(response.numbers, numbers_of(scene, unknowns))
+    np.testing.assert_allclose(
+        response.curvature, exact, rtol=0.05, atol=0.02 * np.abs(exact).max()
+    )
+
+
+def test_the_expected_slopes_are_those_of_fits_at_the_true_numbers() -> None:
+    """Fields that are fitted to noise, and are smoothed, make a sharper instrument likelier."""
+    scene, unknowns = imperfect_scene()
+    model = scene.model(unknowns, scene.ray_counts(unknowns))
+    rng = np.random.default_rng(4)
+    slopes, deviations = [], []
+    for _ in range(24):
+        shot = replace(scene, images=model + 0.01 * rng.normal(size=model.shape))
+        ended, *_ = settle(shot, unknowns, steps=8, least_gain=0.01)
+        response = Posterior(shot, ended, np.random.default_rng(0)).response(2)
+        slopes.append([response.slopes, response.slopes - response.expected])
+        deviations.append(np.sqrt(np.diag(response.curvature)))
+    errors = np.mean(deviations, axis=0) / np.sqrt(len(slopes))
+    plain, corrected = np.mean(slopes, axis=0) / errors
+    assert abs(plain[0]) > 10
+    # A fit is not certain of about as large a share as is left.
+    assert abs(corrected[0]) < 0.35 * abs(plain[0])
+    assert np.abs(corrected[1:]).max() < 3.5
 
 
 @pytest.fixture(scope="module")

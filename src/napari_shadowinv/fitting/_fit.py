@@ -52,13 +52,14 @@ from napari_shadowinv.fitting.search import (
     Start,
     estimate_smoothness,
     in_recorded_pixels,
+    needs_recorded_pixels,
     refine_minimum,
     search,
     settle_minimum,
 )
 from napari_shadowinv.fitting.shots import Images, list_shots
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.fitting.verdict import SMALL_PX, assess_verdict, hidden_contrast
+from napari_shadowinv.fitting.verdict import assess_verdict, hidden_contrast
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions, KindOfNoise
@@ -190,8 +191,9 @@ def fit(
         report("fit", steps, None, stage, objective)
 
     with _timed("starts", seconds):
-        held = EXACT if data.single else scene.imperfect.held(_HELD_IN_SEARCH)
-        rough = replace(scene, imperfect=held)
+        rough = replace(scene, held=_HELD_IN_SEARCH)
+        if data.single:
+            rough = replace(scene, imperfect=EXACT)
         minima = search(rough, collect_starts(data, on_step, should_stop), on_step)
         if data.instrument.absorption:
             scene = _with_absorption(data, scene, minima[0])
@@ -200,9 +202,8 @@ def fit(
             # One image cannot tell the instrument from the object: its numbers stay at 0.
             scene = replace(scene, imperfect=EXACT)
         minima = [_with_numbers(scene, minimum) for minimum in minima]
-        if scene.imperfect.parts and min(data.size) < SMALL_PX:
-            # In pixels of two, λ and the errors of the instrument's numbers come out too small.
-            minima = [in_recorded_pixels(scene, minimum) for minimum in minima]
+        if scene.imperfect.parts and needs_recorded_pixels(scene, data.size):
+            minima[0] = in_recorded_pixels(scene, minima[0])
     with _timed("smoothness", seconds):
         scene, best = estimate_smoothness(scene, minima[0], rng, on_step)
         if data.counted:
@@ -216,7 +217,10 @@ def fit(
         is_counted = data.counted and not data.single
         stated = data.instrument.noise_correlation
         pattern = find_pattern(fine, unknowns, data.size, is_counted=is_counted, correlation=stated)
-        unsure = replace(scene, imperfect=imperfect)
+        unsure = scene
+        if data.single:
+            # One image does not determine its instrument.
+            unsure = replace(scene, imperfect=imperfect, held=imperfect.keys)
         middle = replace(coarser(unsure, best.bin), spacing=_SPACING_OF_SAMPLES)
         ends = _with_numbers(unsure, best).unknowns
         posterior = Posterior(middle, ends, rng, lambda: on_step("samples", value))
@@ -232,10 +236,7 @@ def fit(
             pattern = replace(pattern, cause=cause)
     with _timed("samples", seconds):
         count = options.samples if options.samples > 1 else 0
-        # One image does not determine its instrument.
-        is_pushed = data.single and bool(imperfect.parts)
-        draw = posterior.draw_prior_sample if is_pushed else posterior.draw_sample
-        samples = [draw() for _ in range(count)]
+        samples = [posterior.draw_sample() for _ in range(count)]
         errors = errors_by_noise(scene, samples, data.size)
         by_part = errors_by_part(unsure, posterior, samples, data.size)
         by_beam = shifts_by_beam(data, unsure, posterior, samples, options)
@@ -459,10 +460,12 @@ def _basins(
     noise.
     """
     middle = replace(coarser(scene, best.bin), spacing=MIDDLE_SPACING)
-    ends = [
-        best,
-        *(settle_minimum(scene, minimum, on_step, "other starts") for minimum in others[:2]),
-    ]
+    ends = [best]
+    for minimum in others[:2]:
+        same = minimum if minimum.bin == best.bin else in_recorded_pixels(scene, minimum)
+        now, numbers = same.unknowns, best.unknowns
+        now = now._replace(common=numbers.common, separate=numbers.separate)
+        ends.append(settle_minimum(scene, replace(same, unknowns=now), on_step, "other starts"))
     chi2 = [
         middle.chi2(minimum.unknowns, middle.ray_counts(minimum.unknowns)).mean()
         for minimum in ends

@@ -197,7 +197,6 @@ _NEWTON, _MOST_SOLVING = 0.02, 200  # how exactly each is found, and in how many
 # Fields and numbers of an instrument that explain an image alike lie along a flat valley.
 _NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 2e-3, 400, 0.1
 _MOST_PIXELS = 2_000_000  # of all images
-_ALL = slice(None)
 
 
 class Preconditioner:
@@ -236,12 +235,12 @@ class Preconditioner:
         common, separate = scene.number_scales()
         self._diagonals = [beam, common, brightness, frames, separate, *added]
 
-    def held(self, common: slice = _ALL, separate: slice = _ALL) -> Preconditioner:
-        """Return scales in which some numbers of an instrument do not change, by default all."""
+    def held(self) -> Preconditioner:
+        """Return scales in which the numbers of an instrument do not change."""
         scales = copy(self)
         scales._diagonals = [scale.copy() for scale in self._diagonals]
-        scales._diagonals[1][common] = 0
-        scales._diagonals[4][:, separate] = 0
+        scales._diagonals[1][:] = 0
+        scales._diagonals[4][:] = 0
         return scales
 
     def damp(self, unknowns: Unknowns) -> Unknowns:
@@ -353,7 +352,7 @@ def settle(
         Whether steps were left.
     """
     tolerance, solving = _NEWTON, _MOST_SOLVING
-    if scene.imperfect.parts:
+    if scene.has_free_numbers:
         tolerance, solving = _NEWTON_IN_VALLEY, _MOST_IN_VALLEY
         least_gain *= _GAIN_IN_VALLEY
     scales = Preconditioner(scene)

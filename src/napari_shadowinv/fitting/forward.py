@@ -26,7 +26,6 @@ from napari_shadowinv.fitting.unknowns import AdditiveBlock, Fiducials, Prior, U
 __all__ = ["Linear", "Scene", "blurred"]
 
 _SIGMAS = 4.0  # how far Gaussians reach
-_SHARPEST = 0.05  # variance of a fitted point spread over that expected of it
 
 
 @dataclass(frozen=True)
@@ -65,8 +64,10 @@ class Scene:
         Unknown light that adds to each image.
     imperfect : Imperfect
         Standard deviations of an instrument that is not exact.
-    tilt : tuple of ndarray or None
-        See `Prior`.
+    held : frozenset of str
+        Imperfections whose numbers do not change.
+    spread : ndarray, shape (n, n), or None
+        Root of the covariance of those of `response_units`. Default: as before the images.
     """
 
     images: FloatArray
@@ -90,7 +91,8 @@ class Scene:
     threads: int | None = None
     added: tuple[AdditiveBlock, ...] = ()
     imperfect: Imperfect = EXACT
-    tilt: tuple[FloatArray, FloatArray] | None = None
+    held: frozenset[str] = frozenset()
+    spread: FloatArray | None = None
 
     def only(self, numbers: Sequence[int]) -> Scene:
         """Return some of the images, in this order; fields stay in the same unit."""
@@ -103,7 +105,6 @@ class Scene:
             beams=self.beams[chosen],
             psf=[self.psf[k] for k in chosen],
             imperfect=self.imperfect.only(chosen),
-            tilt=None if self.tilt is None else (self.tilt[0], self.tilt[1][chosen]),
         )
 
     @cached_property
@@ -128,7 +129,6 @@ class Scene:
             bin=self.bin,
             shift_spread=self.shift_spread,
             added=self.added,
-            tilt=self.tilt,
         )
 
     def nothing(self) -> Unknowns:
@@ -254,13 +254,32 @@ class Scene:
                 jacobian.resize(jacobian.shape[0], columns)
         return Linear(self, unknowns, jacobians, [self._seen(unknowns, shot) for shot in shots])
 
-    def is_sharpest(self, unknowns: Unknowns) -> bool:
-        """Return whether an unknown blur has reached its limit: images that are not blurred."""
-        if not self.imperfect.blur:
-            return False
+    @property
+    def has_free_numbers(self) -> bool:
+        """Whether numbers of the instrument may change."""
+        return bool(self.imperfect.keys - self.held)
+
+    def response_units(self) -> list[Unknowns]:
+        """Return a change by each number on which the response to fields depends: by 1."""
+        units = []
+        for part in self.imperfect.parts:
+            if part.key not in self.imperfect.of_response:
+                continue
+            for k in range(1 if part.is_common else len(self.images)):
+                unit = self.nothing().zeros()
+                (unit.common if part.is_common else unit.separate[k])[part.places] = 1
+                units.append(unit)
+        return units
+
+    def least_numbers(self) -> FloatArray:
+        """Return the least value of each number of `response_units`: no image is sharpened."""
         stated = min(self._variance(k) for k in range(len(self.psf)))
-        fitted = stated + self.imperfect.variance(unknowns.common)
-        return fitted < _SHARPEST * (stated + self.imperfect.blur)
+        least = []
+        for part in self.imperfect.parts:
+            if part.key in self.imperfect.of_response:
+                end = -stated / self.imperfect.blur if part.key == "blur" else -np.inf
+                least += [end] * (1 if part.is_common else len(self.images))
+        return np.array(least)
 
     def number_scales(self) -> tuple[FloatArray, FloatArray]:
         """Return approximate standard deviations of the instrument's numbers, (n,) and (L, n)."""
@@ -288,6 +307,8 @@ class Scene:
                 common[part.places] = 1 / np.sqrt(1 + curvature.sum(axis=0))
             else:
                 separate[:, part.places] = 1 / np.sqrt(1 + curvature)
+            if part.key in self.held:
+                (common if part.is_common else separate)[..., part.places] = 0
         return common, separate
 
     @property
@@ -561,30 +582,6 @@ class Linear:
         if self._has_others:
             slope.beam[:] = scene._of_modes(of_shape * self._beam_shape)
         return scene._only_free(slope)
-
-    def sensitivity_slopes(self, residuals: FloatArray) -> dict[str, FloatArray]:
-        """Return how the response of residuals to fields changes with numbers of the instrument.
-
-        For numbers that change it in proportion, in each pixel: derivatives of the Jacobian's rows
-        times residuals, (L, H, W) for each imperfection.
-        """
-        scene, imperfect = self.scene, self.scene.imperfect
-        common, separate = self.unknowns.common, self.unknowns.separate
-        slopes = {}
-        if imperfect.gamma:
-            exponent = imperfect.exponent(common)
-            logs = np.stack([np.log(np.maximum(seen.bare, DARKEST)) for seen in self.seen])
-            # The light that enters is a root of the beam.
-            slopes["gamma"] = imperfect.gamma * (1 / exponent + logs) * residuals
-        if imperfect.blur:
-            slopes["blur"] = imperfect.blur / 2 * np.stack([laplace(plane) for plane in residuals])
-        if imperfect.background:
-            offsets = np.array([imperfect.offset(row) for row in separate])
-            slopes["background"] = -imperfect.background / (1 - offsets)[:, None, None] * residuals
-        if imperfect.other_strengths is not None:
-            ratio = imperfect.other_strengths[:, 0] / scene.strengths_with(self.unknowns)[:, 0]
-            slopes["other_field"] = ratio[:, None, None] * residuals
-        return slopes
 
     def _potential_changes(self, change: Unknowns) -> FloatArray:
         scene, imperfect = self.scene, self.scene.imperfect

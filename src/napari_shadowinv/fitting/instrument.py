@@ -32,7 +32,7 @@ __all__ = ["DARKEST", "EXACT", "Imperfect", "Part", "Shapes", "widen", "widening
 
 DARKEST = 1e-4  # of a beam, for a logarithm
 _LEAST_EXPONENT = 0.2
-_HELD = 1e-3  # of the standard deviation of numbers that are not yet fitted
+_OF_RESPONSE = frozenset({"gamma", "blur", "background", "other_field"})
 _DIMMEST = 1e-2  # of a beam's mean, for a relative change
 
 
@@ -107,6 +107,16 @@ class Imperfect:
             for kind in (True, False)
         )
         return common, separate
+
+    @property
+    def keys(self) -> frozenset[str]:
+        """The imperfections."""
+        return frozenset(part.key for part in self.parts)
+
+    @property
+    def of_response(self) -> frozenset[str]:
+        """The imperfections that change how images respond to a field, not the light before it."""
+        return self.keys & _OF_RESPONSE
 
     @property
     def is_exact(self) -> bool:
@@ -193,19 +203,6 @@ class Imperfect:
         for part, each in self._shape_parts():
             slope = common if part.is_common else separate
             slope[part.places] += np.einsum("yx,kyx->k", pull, each.values)
-
-    def held(self, keys: frozenset[str]) -> Imperfect:
-        """Return the same numbers without most of the effect of some imperfections."""
-        shapes = tuple(
-            replace(each, values=_HELD * each.values) if each.key in keys else each
-            for each in self.shapes
-        )
-        held = replace(self, shapes=shapes)
-        for key in keys & {"gamma", "blur", "background"}:
-            held = replace(held, **{key: _HELD * getattr(held, key)})
-        if "other_field" in keys and held.other_strengths is not None:
-            held = replace(held, other_strengths=_HELD * held.other_strengths)
-        return held
 
     def _shape_parts(self) -> Iterator[tuple[Part, Shapes]]:
         places = {part.key: part for part in self.parts}

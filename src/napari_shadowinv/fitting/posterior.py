@@ -1,6 +1,6 @@
 """Uncertainty of the best unknowns by the Gauss-Newton Hessian, and the error bars from it.
 
-- random changes that the data leave open, and the evidence: `Posterior`, `Sample`
+- random changes that the data leave open, and the evidence: `Posterior`, `Sample`, `Response`
 - error bars by the noise: `errors_by_noise`
 - by an unmeasured or inexact beam: `shifts_by_beam`, `BeamError`, `draw_variations`
 
@@ -14,7 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.fft import dctn, idctn
@@ -22,7 +23,7 @@ from scipy.linalg import eigh_tridiagonal
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.descent import Preconditioner, finer, product, solve
+from napari_shadowinv.fitting.descent import Preconditioner, finer, product, settle, solve
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import FitData
 from napari_shadowinv.fitting.unknowns import Unknowns
@@ -32,6 +33,7 @@ __all__ = [
     "BeamError",
     "BeamShifts",
     "Posterior",
+    "Response",
     "Sample",
     "draw_variations",
     "errors_by_noise",
@@ -46,7 +48,8 @@ _IN_VALLEY = 1e-4
 _OPEN_BEAMS = 0.05
 _MOVED_BY_BEAMS = 0.01
 _BEAM_MODES = 8
-_VOLUME_SEED = 2
+_RESPONSE, _RESPONSE_SEED = 0.01, 2  # of fields to numbers of an instrument
+_REFITTED, _REFITTED_GAIN = 3, 0.3  # steps
 _MOST_STEPS = 600
 _PROBES, _LANCZOS = 8, 25
 _LEAST_DETERMINED = 1e-3  # coefficients
@@ -62,6 +65,21 @@ class Sample:
 
     change: Unknowns
     noise: FloatArray
+
+
+class Response(NamedTuple):
+    """How well images determine n numbers of an instrument that change the response to fields.
+
+    `changes` of all unknowns by each number, the `numbers`, the derivatives of the misfit by them
+    (`slopes`) and what is `expected` of these if the numbers are right, and the misfit's
+    `curvature` (n, n).
+    """
+
+    changes: list[Unknowns]
+    numbers: FloatArray
+    slopes: FloatArray
+    expected: FloatArray
+    curvature: FloatArray
 
 
 class Posterior:
@@ -121,74 +139,70 @@ class Posterior:
         weights = determined / determined.sum(axis=1, keepdims=True)
         return smoothness * np.exp(change), float((np.abs(change) * weights).sum(axis=1).max())
 
-    def draw_prior_sample(self) -> Sample:
-        """Return a random change by noise and by an instrument that the images do not determine.
-
-        Its numbers are drawn from their prior; fields and all other unknowns respond to them.
-        """
-        noise = self._rng.normal(size=self._scene.images.shape)
-        numbers = self._unknowns.zeros()._replace(
-            common=self._rng.normal(size=self._unknowns.common.shape),
-            separate=self._rng.normal(size=self._unknowns.separate.shape),
-        )
-        slope = self._linear.pull(noise - self._linear.push(numbers))
-        slope = slope.plus(self._scene.prior.draw(self._unknowns, self._rng))
-        return Sample(self._held._change(slope, _CLOSELY).plus(numbers), noise)
-
     def draw_sample(self, tolerance: float | None = None) -> Sample:
         """Return a random change of the unknowns, as large as the data leave possible.
 
-        A blur at its limit has no normal error: it is drawn from its prior.
+        Numbers of the instrument that are held are drawn first; all other unknowns respond to them.
         """
         if tolerance is None:
-            tolerance = _IN_VALLEY if self._scene.imperfect.parts else _CLOSELY
+            tolerance = _IN_VALLEY if self._scene.has_free_numbers else _CLOSELY
         noise = self._rng.normal(size=self._scene.images.shape)
-        posterior, numbers, residuals = self, self._unknowns.zeros(), noise
-        if self._scene.is_sharpest(self._unknowns):
-            place = self._scene.imperfect.place("blur")
-            assert place is not None
-            numbers.common[place] = self._rng.normal()
-            posterior = self._with(self._scales.held(common=place, separate=slice(0)))
+        numbers, residuals = self._unknowns.zeros(), noise
+        if self._scene.held:
+            numbers = self._draw_held()
             residuals = noise - self._linear.push(numbers)
         slope = self._linear.pull(residuals)
         slope = slope.plus(self._scene.prior.draw(self._unknowns, self._rng))
-        if self._scene.tilt is not None:
-            common, separate = self._scene.tilt
-            sign = self._rng.normal()
-            tilted = slope.zeros()._replace(common=sign * common, separate=sign * separate)
-            slope = slope.plus(tilted)
-        return Sample(posterior._change(slope, tolerance).plus(numbers), noise)
+        return Sample(self._change(slope, tolerance).plus(numbers), noise)
 
-    def tilt(self, probes: int) -> tuple[FloatArray, FloatArray]:
-        """Return what makes up for how the instrument changes the volume of likely fields.
+    def _draw_held(self) -> Unknowns:
+        """Random numbers of the instrument: as uncertain as the scene says, or as stated."""
+        scene, numbers = self._scene, self._unknowns.zeros()
+        if scene.spread is not None:
+            units = np.stack([unit.flat() for unit in scene.response_units()])
+            drawn = scene.spread @ self._rng.normal(size=len(units))
+            return numbers.like(np.einsum("n,nx->x", drawn, units))
+        for part in scene.imperfect.parts:
+            if part.key in scene.held:
+                block = numbers.common if part.is_common else numbers.separate
+                block[..., part.places] = self._rng.normal(size=block[..., part.places].shape)
+        return numbers
 
-        Fields and numbers together are likeliest for the instrument through which the fewest
-        details are fitted to the noise. The numbers alone are likeliest where the objective plus
-        half the log-determinant of the Hessian is least, if all fields are alike before the
-        images; real objects lie between. The tilt is half that derivative, and as uncertain:
-        `draw_sample` adds its effect.
+    def response(self, pairs: int) -> Response:
+        """Return how well the images determine numbers that change the response to fields.
 
-        Returns
-        -------
-        tuple of ndarray, shapes (n,) and (L, n)
-            Derivatives by an instrument's numbers; 0 for beams, which hardly change the volume.
+        Fields and such numbers together are likeliest for the instrument through which the fewest
+        details are fitted to the noise, and for the weakest fields. How far that shifts the
+        derivative of the objective, least for all else, is found from fits to images of the
+        present unknowns with fresh noise: pairs of opposite noise, which leaves out its mean.
         """
-        common, separate = (
-            np.zeros_like(self._unknowns.common),
-            np.zeros_like(self._unknowns.separate),
+        scene, unknowns = self._scene, self._unknowns
+        rng = np.random.default_rng(_RESPONSE_SEED)
+        units = scene.response_units()
+        changes = [
+            self._change(self._linear.pull(-self._linear.push(unit)), _RESPONSE).plus(unit)
+            for unit in units
+        ]
+        pushed = np.stack([self._linear.push(change).ravel() for change in changes])
+        curvature = np.einsum("ix,jx->ij", pushed, pushed)
+        model = scene.model(unknowns, self._counts)
+        deviations = np.divide(
+            1, np.sqrt(scene.weights), out=np.zeros_like(model), where=scene.weights > 0
         )
-        rng = np.random.default_rng(_VOLUME_SEED)
-        for _ in range(probes):
-            signs = rng.choice([-1.0, 1.0], self._scene.images.shape)
-            moved = self._linear.push(self._change(self._linear.pull(signs), _ROUGHLY))
-            for key, changed in self._linear.sensitivity_slopes(signs).items():
-                each = np.einsum("lyx,lyx->l", moved, changed) / probes / 2
-                place = self._scene.imperfect.place(key)
-                if key == "background":
-                    separate[:, place] += each[:, None]
-                else:
-                    common[place] += each.sum()
-        return common, separate
+        expected = np.zeros(len(units))
+        for _ in range(pairs):
+            noise = deviations * rng.normal(size=model.shape)
+            for sign in (1, -1):
+                again = replace(scene, images=model + sign * noise)
+                refitted, *_ = settle(again, unknowns, steps=_REFITTED, least_gain=_REFITTED_GAIN)
+                expected += _slopes(again, refitted, units) / (2 * pairs)
+        return Response(
+            changes,
+            numbers=np.array([product(unit.flat(), unknowns.flat()) for unit in units]),
+            slopes=_slopes(scene, unknowns, units),
+            expected=expected,
+            curvature=curvature,
+        )
 
     def effects(self, sample: Sample) -> dict[str, Unknowns]:
         """Return a sample's change by each imperfection of the instrument, and by the noise.
@@ -237,11 +251,8 @@ class Posterior:
     @property
     def _held(self) -> Posterior:
         """The same for an instrument that is known."""
-        return self._with(self._scales.held())
-
-    def _with(self, scales: Preconditioner) -> Posterior:
         posterior = copy(self)
-        posterior._scales = scales
+        posterior._scales = self._scales.held()
         return posterior
 
     def count_determined(self, rng: np.random.Generator) -> float:
@@ -471,6 +482,13 @@ def draw_variations(
         field -= field[inside].mean()
         field /= np.sqrt((field[inside] ** 2).mean())
     return fields
+
+
+def _slopes(scene: Scene, unknowns: Unknowns, units: Sequence[Unknowns]) -> FloatArray:
+    """Derivatives of the misfit by numbers of the instrument, without their prior."""
+    _, slope = scene.value_and_gradient(unknowns, scene.ray_counts(unknowns))
+    flat = slope.flat() - scene.prior.times(unknowns).flat()
+    return np.array([product(unit.flat(), flat) for unit in units])
 
 
 _PART_SAMPLES, _PARTS = 3, 0.02

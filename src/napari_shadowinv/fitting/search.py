@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.descent import coarser, descend, finer, settle, smoothness_in_pixels
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.posterior import Posterior
+from napari_shadowinv.fitting.posterior import Posterior, Response
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions
@@ -22,11 +22,13 @@ __all__ = [
     "FIRST_SMOOTHNESS",
     "MIDDLE",
     "MIDDLE_SPACING",
+    "SMALL_PX",
     "SMOOTHNESS_RATIO",
     "Minimum",
     "Start",
     "estimate_smoothness",
     "in_recorded_pixels",
+    "needs_recorded_pixels",
     "refine_minimum",
     "search",
     "settle_minimum",
@@ -45,11 +47,14 @@ _COARSE_SPACING, MIDDLE_SPACING = 1 / 3, 0.25
 _SPACINGS, _EXPLAINED = (0.2, 0.14), 1.05  # px, and the χ² for which the first is dense enough
 # With an instrument's numbers, an error of the model far below the noise changes the field.
 _SPACING_WITH_NUMBERS = 0.1  # px
+SMALL_PX = 80  # shorter side of images with too few pixels for an instrument's numbers
+_MOST_RECORDED = 300_000  # pixels of all images
 _ROUNDS, _ROUND_STEPS, _SETTLED = 6, 40, 0.25  # of λ and κ; and by what share they may still change
 # An object's roughness is not spread evenly, as the likeliest λ and κ assume: they would round it
 # off where it is sharpest.
 SMOOTHNESS_RATIO = 0.1  # of them
-_TILTS, _VOLUME_PROBES = 2, 4
+_PAIRS, _UNSURE_SLOPES = 2, 0.25
+_RESPONSE_ROUNDS, _NUMBERS_SETTLED = 8, 0.05  # squared distance in standard deviations
 _SAME_FIELD = 0.03  # of the displacement, r.m.s.
 
 
@@ -171,34 +176,89 @@ def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
     return Minimum(minimum.start, unknowns, minimum.value, _displacement(scene, unknowns), 1)
 
 
+def needs_recorded_pixels(scene: Scene, size: tuple[int, int]) -> bool:
+    """Return whether larger pixels would hide what tells an instrument's numbers from the fields.
+
+    In pixels of two, λ and the errors of numbers of small images come out too small, and fine
+    structure that tells a blur from a smooth object is lost.
+    """
+    is_small = scene.images.size <= _MOST_RECORDED
+    return min(size) < SMALL_PX or (bool(scene.imperfect.of_response) and is_small)
+
+
 def estimate_smoothness(
     scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep
 ) -> tuple[Scene, Minimum]:
-    """Find λ and κ, unless they are given, and the unknowns that belong to them."""
-    is_fixed = bool(scene.smoothness.any())
-    if not is_fixed:
-        scene = replace(scene, smoothness=np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1)))
+    """Find λ and κ, unless they are given, and the unknowns that belong to them.
+
+    So are found numbers of an instrument that change the response to fields; they are held then.
+    """
+    given = scene.smoothness if scene.smoothness.any() else None
+    smoothness = np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1)) if given is None else given
+    response = scene.imperfect.of_response
+    scene = replace(scene, smoothness=smoothness, held=scene.held | response)
     end = settle_minimum(scene, end, on_step)
-    if is_fixed:
+    if given is not None and not response:
         return scene, end
+    if given is None:
+        smoothness, scene, end = _settle_smoothness(scene, end, rng, on_step)
+    smoothness = smoothness if given is not None else SMOOTHNESS_RATIO * smoothness
+    scene = replace(scene, smoothness=smoothness)
+    end = settle_minimum(scene, end, on_step, least_gain=_LAST_GAIN)
+    return _settle_response(scene, end, rng, on_step) if response else (scene, end)
+
+
+def _settle_smoothness(
+    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep
+) -> tuple[FloatArray, Scene, Minimum]:
+    """Find the likeliest λ and κ; also returns the scene and the minimum of the last before."""
     for _ in range(_ROUNDS):
-        middle = replace(coarser(scene, end.bin), spacing=MIDDLE_SPACING)
-        value = end.value
-        posterior = Posterior(middle, end.unknowns, rng, lambda: on_step("smoothness", value))  # noqa: B023
-        likely, change = posterior.likely_smoothness()
+        likely, change = _posterior(scene, end, rng, on_step).likely_smoothness()
+        smoothness = likely / smoothness_in_pixels(end.bin)
         if change < _SETTLED:
             break
-        scene = replace(scene, smoothness=likely / smoothness_in_pixels(end.bin))
+        scene = replace(scene, smoothness=smoothness)
         end = settle_minimum(scene, end, on_step)
-    scene = replace(scene, smoothness=SMOOTHNESS_RATIO * likely / smoothness_in_pixels(end.bin))
-    end = settle_minimum(scene, end, on_step, least_gain=_LAST_GAIN)
-    for _ in range(_TILTS if scene.imperfect.parts else 0):
-        middle = replace(coarser(scene, end.bin), spacing=MIDDLE_SPACING)
-        value = end.value
-        posterior = Posterior(middle, end.unknowns, rng, lambda: on_step("smoothness", value))  # noqa: B023
-        scene = replace(scene, tilt=posterior.tilt(_VOLUME_PROBES))
+    return smoothness, scene, end
+
+
+def _settle_response(
+    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep
+) -> tuple[Scene, Minimum]:
+    """Find the numbers that change the response to fields, and how uncertain they are."""
+    for _ in range(_RESPONSE_ROUNDS):
+        response = _posterior(scene, end, rng, on_step).response(_PAIRS)
+        mean, precision = _mean_of_numbers(response)
+        step = np.maximum(mean, scene.least_numbers()) - response.numbers
+        is_settled = step @ precision @ step < _NUMBERS_SETTLED
+        step /= max(1.0, float(np.abs(step).max()))
+        unknowns = end.unknowns
+        for each, share in zip(response.changes, step, strict=True):
+            unknowns = unknowns.plus(unknowns.like(share * each.flat()))
+        end = replace(end, unknowns=unknowns)
         end = settle_minimum(scene, end, on_step, least_gain=_LAST_GAIN)
-    return scene, end
+        if is_settled:
+            break
+    return replace(scene, spread=np.linalg.cholesky(np.linalg.inv(precision))), end
+
+
+def _mean_of_numbers(response: Response) -> tuple[FloatArray, FloatArray]:
+    """The likeliest numbers of an instrument, and the inverse of their covariance.
+
+    The derivatives that are expected are taken as known to a share.
+    """
+    unit = np.eye(len(response.numbers))
+    curvature = response.curvature + 1e-9 * (1 + np.trace(response.curvature)) * unit
+    unsure = _UNSURE_SLOPES * response.expected
+    weights = curvature @ np.linalg.inv(curvature + np.outer(unsure, unsure))
+    pull = curvature @ response.numbers - (response.slopes - response.expected)
+    precision = unit + weights @ curvature
+    return np.linalg.solve(precision, weights @ pull), precision
+
+
+def _posterior(scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep) -> Posterior:
+    middle = replace(coarser(scene, end.bin), spacing=MIDDLE_SPACING)
+    return Posterior(middle, end.unknowns, rng, lambda: on_step("smoothness", end.value))
 
 
 def settle_minimum(

@@ -206,8 +206,6 @@ class Prior:
         Standard deviation of an image's shift, px of the recorded image.
     added : tuple of AdditiveBlock
         Unknown light that adds to each image.
-    tilt : tuple of ndarray, shapes (n,) and (L, n)
-        What is added to the derivatives by the common and the separate numbers of an instrument.
     """
 
     rays: RayModel
@@ -221,7 +219,6 @@ class Prior:
     bin: int
     shift_spread: float = 5.0
     added: tuple[AdditiveBlock, ...] = ()
-    tilt: tuple[FloatArray, FloatArray] | None = None
 
     def value_and_slope(self, unknowns: Unknowns) -> tuple[float, Unknowns]:
         """Return the sum of all terms, and its derivatives."""
@@ -229,13 +226,6 @@ class Prior:
         slope = self.times(about_rest)
         pairs = zip(slope.blocks, about_rest.blocks, strict=True)
         value = sum(float(np.sum(a * b)) for a, b in pairs) / 2
-        if self.tilt is not None:
-            for numbers, derivatives, tilt in zip(
-                (unknowns.common, unknowns.separate), (slope.common, slope.separate), self.tilt,
-                strict=True,
-            ):  # fmt: skip
-                value += float(np.sum(tilt * numbers))
-                derivatives += tilt
         if self.fiducials is None:
             return value, slope
         weights = 1 / self.fiducials.errors[:, None] ** 2

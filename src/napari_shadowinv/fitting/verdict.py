@@ -18,15 +18,14 @@ from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting.instrument import TITLES
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
 from napari_shadowinv.fitting.posterior import BeamError
+from napari_shadowinv.fitting.search import SMALL_PX
 from napari_shadowinv.inversion.solution_checks import (
     TURNED_BACK,
     inner_sides,
     turning_displacement,
 )
 
-__all__ = ["SMALL_PX", "assess_verdict", "hidden_contrast"]
-
-SMALL_PX = 80  # shorter side of images with too few pixels for an instrument's numbers
+__all__ = ["assess_verdict", "hidden_contrast"]
 
 
 _MIN_HOLE_RADIUS_PX = 6.0
