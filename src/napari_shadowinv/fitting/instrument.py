@@ -33,6 +33,8 @@ __all__ = ["DARKEST", "EXACT", "Imperfect", "Part", "Shapes", "widen", "widening
 DARKEST = 1e-4  # of a beam, for a logarithm
 _LEAST_EXPONENT = 0.2
 _OF_RESPONSE = frozenset({"gamma", "blur", "background", "other_field"})
+# What modes leave out of a beam must be far below the noise of all pixels together.
+_FITTED_VARIANCE = 0.99999
 _DIMMEST = 1e-2  # of a beam's mean, for a relative change
 
 
@@ -340,11 +342,11 @@ def imperfect_instrument(
             shapes.append(Shapes(key, beyond, common))
 
     if beam.rms and not is_unknown:
-        excess = BeamExcess(beam, weights)
+        excess = BeamExcess(beam, weights, _FITTED_VARIANCE)
         patterns = beam.rms * np.stack([excess.of(unit) for unit in np.eye(excess.count)])
         add("beam", patterns, common=is_common)
     if beam.between and len(sources) > 1:
-        smooth = SmoothField(beam.length * min(weights.shape), weights)
+        smooth = SmoothField(beam.length * min(weights.shape), weights, _FITTED_VARIANCE)
         patterns = beam.between * np.stack([smooth.of(unit) for unit in np.eye(smooth.count)])
         add("beam_between", patterns, common=False)
     if instrument.registration and is_common:
@@ -371,7 +373,7 @@ def absorption_shapes(
 ) -> Shapes:
     """Return the transmission of an object with a displacement in px, (2, H, W)."""
     scene = Scene(displacement, used.astype(np.float64), used)
-    envelope, _ = scene.object_region
-    smooth = scene.transmission
+    envelope, radius = scene.object_region
+    smooth = SmoothField(radius, scene.source, _FITTED_VARIANCE)
     patterns = np.stack([envelope * smooth.of(unit) for unit in np.eye(smooth.count)])
     return Shapes("absorption", np.pad(rms * patterns, ((0, 0), *around)))

@@ -97,7 +97,7 @@ class SolvedShot:
 class SmoothField:
     """Random field on the pixels, whose correlation falls with distance as a Gaussian.
 
-    It is the sum of a few smooth modes times independent normal numbers: 99.9 % of the variance.
+    It is the sum of a few smooth modes times independent normal numbers.
 
     Parameters
     ----------
@@ -105,6 +105,8 @@ class SmoothField:
         Standard deviation of the Gaussian, px.
     weights : ndarray, shape (H, W)
         Weights of the pixels. The weighted mean of each field is 0, its expected square 1.
+    share : float, default 0.999
+        Of the variance that the modes hold.
 
     Attributes
     ----------
@@ -112,15 +114,15 @@ class SmoothField:
         Number of modes.
     """
 
-    def __init__(self, length: float, weights: FloatArray) -> None:
-        self._modes = [_line_modes(size, length) for size in weights.shape]
+    def __init__(self, length: float, weights: FloatArray, share: float = _VARIANCE) -> None:
+        self._modes = [_line_modes(size, length, share) for size in weights.shape]
         weights = weights / weights.sum()
         along_y, along_x = self._modes
         means = along_y @ weights @ along_x.T
         squares = along_y**2 @ weights @ (along_x**2).T - means**2
         order = np.argsort(squares, axis=None)[::-1]
-        share = np.cumsum(squares.ravel()[order]) / squares.sum()
-        self.count = int(np.searchsorted(share, _VARIANCE)) + 1
+        held = np.cumsum(squares.ravel()[order]) / squares.sum()
+        self.count = int(np.searchsorted(held, share)) + 1
         self._chosen = order[: self.count]
         self._means = means.ravel()[self._chosen]
         self._size = 1 / np.sqrt(squares.ravel()[self._chosen].sum())
@@ -134,14 +136,14 @@ class SmoothField:
         return np.asarray(self._size * field)
 
 
-def _line_modes(size: int, length: float) -> FloatArray:
+def _line_modes(size: int, length: float, share: float) -> FloatArray:
     """Return principal components of a random field along a line of pixels, (k, size)."""
     places = np.linspace(0, size - 1, min(size, _MAX_MODE_PLACES))
     squares = (places[:, None] - places) ** 2
     variances, vectors = np.linalg.eigh(np.exp(-squares / (2 * length**2)))
     variances, vectors = np.maximum(variances[::-1], 0), vectors[:, ::-1]
-    share = np.cumsum(variances) / variances.sum()
-    count = int(np.searchsorted(share, 1 - (1 - _VARIANCE) / 10)) + 1
+    held = np.cumsum(variances) / variances.sum()
+    count = int(np.searchsorted(held, 1 - (1 - share) / 10)) + 1
     modes = (np.sqrt(variances) * vectors).T[:count]
     return np.array([np.interp(np.arange(size), places, mode) for mode in modes])
 
@@ -411,8 +413,8 @@ class BeamExcess:
         Number of independent normal numbers.
     """
 
-    def __init__(self, beam: BeamPrior, source: FloatArray) -> None:
-        self._rest = SmoothField(beam.length * min(source.shape), source)
+    def __init__(self, beam: BeamPrior, source: FloatArray, share: float = _VARIANCE) -> None:
+        self._rest = SmoothField(beam.length * min(source.shape), source, share)
         self._rest_share, self._shapes = 1.0, np.empty((0, *source.shape))
         if beam.components is not None:
             block = beam.components.block
