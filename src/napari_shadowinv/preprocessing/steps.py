@@ -242,13 +242,14 @@ class Step(Choice):
 
 
 def _as_level(value: Any) -> Any:
-    """Read a number, or else the name of a file."""
-    if not isinstance(value, str):
-        return value
+    """Read a finite number, or else the name of a file."""
     try:
-        return float(value)
-    except ValueError:
+        number = float(value)
+    except (TypeError, ValueError):
         return value
+    if not math.isfinite(number):
+        raise ValueError("expected a finite number of counts, or the name of a file")
+    return number
 
 
 def _as_plain(level: float | Path) -> float | str:
@@ -256,7 +257,7 @@ def _as_plain(level: float | Path) -> float | str:
 
 
 Level = Annotated[
-    Annotated[float, Field(allow_inf_nan=False)] | Path,
+    float | Path,
     BeforeValidator(_as_level),
     PlainSerializer(_as_plain, when_used="json"),
 ]
