@@ -329,12 +329,12 @@ def test_wrong_tables_are_refused(
 
 MISTAKES = {
     "fit a.tif b.tif": ("neither strengths nor setups",),
-    "fit a.tif b.tif --energies 3": ("2 images and 1 values of energy",),
+    "fit a.tif b.tif --energies 3": ("2 images and 1 values of --energies",),
     "fit a.tif b.tif --energies 3,5": ("an energy of 3 MeV and no setup", "--setup"),
     "fit a.tif b.tif --setup setup.toml": ("'energy' is missing",),
-    "fit a.tif b.tif --strengths 1,two": ("b.tif: 'strength' is 'two'",),
+    "fit a.tif b.tif --strengths 1,two": ("b.tif: --strengths is 'two'",),
     "fit a.tif small.tif --strengths 1,2": ("small.tif has shape (40, 40), a.tif (48, 56)",),
-    "fit a.tif --psf 1 --resolution 1e-5": ("point spread of 1 px", "resolution in m"),
+    "fit a.tif --psf 1 --resolution 1e-5": ("--psf, a point spread in px", "--resolution in m"),
     "fit a.tif --resolution 1e-5": ("no setup", "--psf"),
     "fit a.tif --source nothing.tif": ("nothing.tif does not exist",),
     "fit a.tif --source small.tif": ("a.tif: source has shape (40, 40)",),
@@ -344,10 +344,10 @@ MISTAKES = {
         "holds one field, received B and E",
     ),
     "fit a.tif --out setup.shadowinv --figure setup.toml": (".toml", "expected one of"),
-    "fit a.tif --boundary soft": ("'boundary' is 'soft'", "'fading' or 'free'"),
+    "fit a.tif --boundary soft": ("--boundary is 'soft'", "'fading' or 'free'"),
     "fit shots.csv --energies 3": ("column 'energy'",),
-    "fit a.tif --options setup.toml": ("setup.toml: unknown key 'kind'",),
-    "fit a.tif b.tif --brightness 1,0 --strengths 1,2": ("b.tif: 'brightness' is '0'",),
+    "fit a.tif --options setup.toml": ("unknown key 'kind' in setup.toml",),
+    "fit a.tif b.tif --brightness 1,0 --strengths 1,2": ("b.tif: --brightness is '0'",),
 }
 
 
@@ -553,7 +553,7 @@ def test_the_source_can_be_estimated_by_the_recipe(fit_arguments: dict[str, Any]
 RECIPES = {
     '[[steps]]\nstep = "low-pass"\n': ("low-pass", "what the forward model is fitted to"),
     '[fit]\nbeam = "unknown"\n[source]\nmethod = "gaussian"\n': ("source and a fit with an unk",),
-    "[fit]\npsf = 1\nresolution = 1e-5\n": ("r.toml", "point spread of 1 px"),
+    "[fit]\npsf = 1\nresolution = 1e-5\n": ("r.toml", "'fit.psf'", "'fit.resolution'"),
     "[fit]\nfield = 3\n": ("r.toml: unknown key 'fit.field', did you mean 'fields'?",),
     "[fit.options]\nsamples = -2\n": ("r.toml: 'fit.options.samples' is -2",),
 }

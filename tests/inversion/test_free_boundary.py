@@ -157,8 +157,8 @@ def test_the_source_continues_beyond_masked_pixels_at_the_edge():
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"flux": "known"}, "flux is 'known' and boundary 'closed'"),
-        ({"boundary": "free", "solver": "lbfgs"}, "solver is 'lbfgs' and boundary 'free'"),
+        ({"flux": "known"}, "'flux' is 'known' and 'boundary' is 'closed'"),
+        ({"boundary": "free", "solver": "lbfgs"}, "'solver' is 'lbfgs' and 'boundary' is 'free'"),
     ],
 )
 def test_choices_that_do_not_go_together_are_refused(options, says):

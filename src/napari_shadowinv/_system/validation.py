@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
 
@@ -34,7 +36,24 @@ class _CheckedMeta(ModelMetaclass):
             try:
                 return super().__call__(*args, **values)
             except ValidationError as error:
-                raise InputError(f"{self.__name__}: {_error_sentence(self, error)}") from error
+                raise InputError(_error_sentence(self, error, self.__name__, {})) from error
+
+
+class CombinationError(ValueError):
+    """Values of several fields that exclude each other.
+
+    Parameters
+    ----------
+    sentence : str
+        The mistake, with the keys of the fields in braces: "{flux} is 'known' and {boundary} is …".
+    """
+
+    def text(self, name_of: Callable[[str], str]) -> str:
+        """Return the sentence with the names of the fields in place of their keys."""
+        return re.sub(r"\{(\w+)\}", lambda key: name_of(key[1]), self.args[0])
+
+    def __str__(self) -> str:
+        return self.text(repr)
 
 
 class CheckedModel(BaseModel, metaclass=_CheckedMeta):
@@ -78,12 +97,11 @@ def validate(
     model_class: type[Model],
     mapping: Mapping[str, Any],
     where: str = "parameters",
-    *,
-    by_title: bool = False,
+    names: Mapping[str, str] | None = None,
 ) -> Model:
     """Make a model from a mapping, or raise an `InputError` that begins with `where`.
 
-    It names the fields by their keys, for a form by their titles.
+    It calls the fields by their keys, or by the names that a face has for them: flags, labels.
     """
     if not isinstance(mapping, Mapping):
         raise InputError(
@@ -92,7 +110,7 @@ def validate(
     try:
         return model_class.model_validate(mapping)
     except ValidationError as error:
-        raise InputError(f"{where}: {_error_sentence(model_class, error, by_title)}") from error
+        raise InputError(_error_sentence(model_class, error, where, names or {})) from error
 
 
 def map_paths(model: Model, move: Callable[[Path], Path]) -> Model:
@@ -125,7 +143,7 @@ def suggestion(name: str, choices: Collection[str]) -> str:
 
 
 def _error_sentence(
-    model_class: type[BaseModel], error: ValidationError, by_title: bool = False
+    model_class: type[BaseModel], error: ValidationError, where: str, names: Mapping[str, str]
 ) -> str:
     details = error.errors(include_url=False)
     intended = {
@@ -133,11 +151,12 @@ def _error_sentence(
         for detail in details
         if detail["type"] == "extra_forbidden"
     }
-    return "; ".join(
-        _error_clause(model_class, dict(detail), by_title)
+    text = "; ".join(
+        _error_clause(model_class, dict(detail), names)
         for detail in details
         if not (detail["type"] == "missing" and detail["loc"][-1] in intended)
     )
+    return f"{where}: {text}" if where else text
 
 
 def _locate(
@@ -171,32 +190,37 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
     return [model for part in get_args(annotation) for model in _models_in(part)]
 
 
-def _error_clause(model_class: type[BaseModel], detail: dict[str, Any], by_title: bool) -> str:
-    model, names = _locate(model_class, detail["loc"])
-    name = ".".join(names)
+def _error_clause(
+    model_class: type[BaseModel], detail: dict[str, Any], names: Mapping[str, str]
+) -> str:
+    def name_of(*path: str) -> str:
+        key = ".".join(path)
+        return names.get(key, f"'{key}'")
+
+    model, path = _locate(model_class, detail["loc"])
     kind, context = detail["type"], detail.get("ctx", {})
+    if isinstance(error := context.get("error"), CombinationError):
+        return error.text(partial(name_of, *path))
     tag_key = context.get("discriminator", "").strip("'")
     if kind == "extra_forbidden":
-        return f"unknown key '{name}', {suggestion(names[-1], model.model_fields)}"
+        return f"unknown key {name_of(*path)}, {suggestion(path[-1], model.model_fields)}"
     if kind == "union_tag_not_found":
-        return f"'{name}' has no '{tag_key}': give it, to say which"
+        return f"{name_of(*path)} has no '{tag_key}': give it, to say which"
     if kind.startswith("union_tag"):
         expected = [tag.strip("' ") for tag in context["expected_tags"].split(",")]
         hint = suggestion(str(context["tag"]), expected)
-        return f"'{name}.{tag_key}' is '{context['tag']}', {hint}"
-    field = model.model_fields.get(names[-1]) if names else None
-    title = "it"
-    if field is not None and field.title:
-        name, title = (field.title, title) if by_title else (name, _lower(field.title))
+        return f"{name_of(*path, tag_key)} is '{context['tag']}', {hint}"
+    message = str(context.get("error", detail["msg"]))
+    if not path:
+        return message
+    name, field = name_of(*path), model.model_fields.get(path[-1])
+    title = _lower(field.title) if field is not None and field.title and not names else "it"
     if kind == "missing":
-        return f"'{name}' is missing" + ("" if by_title else f", give the {title}")
-    if not name:
-        return str(context.get("error", detail["msg"]))
-    received = f"'{name}' is {_shorten(detail['input'])}"
+        return f"{name} is missing" + ("" if names else f", give the {title}")
+    received = f"{name} is {_shorten(detail['input'])}"
     if kind in _BOUNDS:
         key, words = _BOUNDS[kind]
         return f"{received}: {title} must be {words} {context[key]:g}"
-    message = str(context.get("error", detail["msg"]))
     if message.startswith(opening := "Input should be "):
         return f"{received}: {title} must be {message.removeprefix(opening)}"
     return f"{received}: {_lower(message)}"

@@ -197,6 +197,8 @@ def write_movie(
             "'napari-shadowinv[movie]', or write a .gif"
         )
     if not 0 < rate <= 120:
-        raise InputError(f"rate is {rate:g}: expected more than 0 and at most 120 frames a second")
+        raise InputError(
+            f"--rate is {rate:g}: expected more than 0 and at most 120 frames a second"
+        )
     frames = stack_frames(_open_shots(store, shots), variable, limits=limits)
     return write_film(out, frames, rate, overwrite=overwrite)

@@ -125,7 +125,8 @@ def fit(
     lists = {"energy": energies, "strength": strengths}
     if brightness not in (None, "known", "free"):
         lists["brightness"], brightness = brightness, None
-    rows = shot_rows(images, {"setup": setup}, lists)
+    list_flags = {"energy": "--energies", "strength": "--strengths", "brightness": "--brightness"}
+    rows = shot_rows(images, {"setup": setup}, lists, list_flags)
     first = rows[0].file
     target = Path(f"{first.stem}_fit{RESULT.suffix}") if out is None else out
     result, figure = _inputs.result_and_figure(first, target, figure)

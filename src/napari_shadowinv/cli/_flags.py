@@ -14,6 +14,7 @@ import re
 import shutil
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -22,7 +23,7 @@ from pydantic.fields import FieldInfo
 from typer import Argument, Option
 from typer.core import TyperCommand, TyperGroup
 
-from napari_shadowinv._system.validation import suggestion, validate
+from napari_shadowinv._system.validation import Model, suggestion, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import IMAGE_TITLES
 from napari_shadowinv.options import FitChoices, FitOptions, Instrument, InversionOptions
@@ -344,6 +345,24 @@ def _step_flag(step: type[Step], parameter: str) -> str:
     return step.name() if parameter == step.primary else f"{step.name()}-{parameter}"
 
 
+def _estimate_flag(parameter: str) -> str:
+    return f"source-{_option_flag(parameter)}"
+
+
+def _option_flag(name: str) -> str:
+    return name.replace("_", "-")
+
+
+def flag_names(model: type[BaseModel]) -> dict[str, str]:
+    """Return the flags of a model's fields, by which errors call them."""
+    flag: Callable[[str], str] = _option_flag
+    if issubclass(model, Step):
+        flag = partial(_step_flag, model)
+    elif model in ESTIMATES.values():
+        flag = _estimate_flag
+    return {name: f"--{flag(name)}" for name in model.model_fields}
+
+
 Flags = list[tuple[str, inspect.Parameter]]
 
 
@@ -367,7 +386,7 @@ def _option_flags(
         panel = extra.get("panel", default_panel) if isinstance(extra, dict) else default_panel
         flags.append(
             _flag(
-                name.replace("_", "-"),
+                _option_flag(name),
                 field,
                 None if panel is None else str(panel),
                 _field_help(field),
@@ -385,7 +404,7 @@ def _recipe_flags() -> Flags:
         fields = {key: method.parameters()[name] for key, method in _estimates_with(name).items()}
         text = " ".join(f"For {key}: {_lower_first(_field_help(f))}" for key, f in fields.items())
         field = next(iter(fields.values()))
-        flags.append(_flag(f"source-{name.replace('_', '-')}", field, _ESTIMATES, text))
+        flags.append(_flag(_estimate_flag(name), field, _ESTIMATES, text))
     flags += _option_flags(Instrument, _INSTRUMENT)
     return flags + _option_flags(InversionOptions, _OPTIONS)
 
@@ -446,7 +465,7 @@ def takes_run(
         @functools.wraps(command)
         def with_inputs(*, flags: dict[str, Any], **arguments: Any) -> None:
             chosen = {name: flags.pop(name) for name in of_run if name in flags}
-            run = validate(model, chosen, "flags")
+            run = validate(model, chosen, "", flag_names(model))
             files = {parameter.name: arguments.pop(parameter.name) for parameter in shared}
             command(**arguments, run=run, **inputs(**files, run=run, flags=flags))
 
@@ -491,12 +510,11 @@ def recipe_of(
     flags: Mapping[str, Any], base: Recipe, options: Mapping[str, Any], where: str = "options"
 ) -> Recipe:
     """Override a recipe with an options file, named `where`, and with flags."""
-    chosen = {**base.options.model_dump(exclude_unset=True), **options}
-    chosen |= {name: flags[name] for name in InversionOptions.model_fields if name in flags}
-    if "margin" in flags and chosen.get("boundary") != "free":
+    before = base.options.model_dump(exclude_unset=True)
+    inversion_options = _options(InversionOptions, flags, before, options, where)
+    if "margin" in flags and inversion_options.boundary != "free":
         raise InputError("received --margin: it needs --boundary free")
     steps, source = _steps(flags, base.steps), _estimate(flags, base)
-    inversion_options = validate(InversionOptions, chosen, where)
     changes = {
         "steps": steps,
         "source": source,
@@ -511,9 +529,8 @@ def fit_recipe_of(
 ) -> Recipe:
     """Override a recipe with an options file, named `where`, and with flags of a fit."""
     before = base.fit or FitChoices()
-    chosen = {**before.options.model_dump(exclude_unset=True), **options}
-    chosen |= {name: flags[name] for name in FitOptions.model_fields if name in flags}
-    fit_options = validate(FitOptions, chosen, where)
+    stated = before.options.model_dump(exclude_unset=True)
+    fit_options = _options(FitOptions, flags, stated, options, where)
     changes = {name: flags[name] for name in FitChoices.model_fields if name in flags}
     values = before.model_dump(exclude_none=True, exclude={"options"})
     in_metres = ("source_size", "resolution")
@@ -522,7 +539,9 @@ def fit_recipe_of(
         in_metres if "psf" in changes else ("psf",) if changes.keys() & set(in_metres) else ()
     )
     values = {name: value for name, value in values.items() if name not in replaced}
-    choices = validate(FitChoices, {**values, **changes, "options": fit_options}, "fit")
+    choices = validate(
+        FitChoices, {**values, **changes, "options": fit_options}, "", flag_names(FitChoices)
+    )
     changes = {
         "steps": _steps(flags, base.steps),
         "instrument": _instrument(flags, base),
@@ -531,10 +550,25 @@ def fit_recipe_of(
     return base.model_copy(update=changes)
 
 
+def _options(
+    model: type[Model],
+    flags: Mapping[str, Any],
+    before: Mapping[str, Any],
+    content: Mapping[str, Any],
+    where: str,
+) -> Model:
+    """Override options with the content of a file, and with flags."""
+    chosen = {name: flags[name] for name in model.model_fields if name in flags}
+    of_file = content.keys() - chosen.keys()
+    names = flag_names(model) | {name: f"'{name}' in {where}" for name in of_file}
+    return validate(model, {**before, **content, **chosen}, "", names)
+
+
 def _instrument(flags: Mapping[str, Any], base: Recipe) -> Instrument:
     """Return the recipe's instrument with the numbers that flags state."""
     changes = {name: flags[name] for name in Instrument.model_fields if name in flags}
-    return validate(Instrument, {**base.instrument.stated, **changes}, "instrument")
+    names = flag_names(Instrument)
+    return validate(Instrument, {**base.instrument.stated, **changes}, "", names)
 
 
 def _steps(flags: Mapping[str, Any], steps: tuple[Step, ...]) -> tuple[Step, ...]:
@@ -551,7 +585,7 @@ def _steps(flags: Mapping[str, Any], steps: tuple[Step, ...]) -> tuple[Step, ...
             flag = _step_flag(kind, next(iter(changes)))
             raise InputError(f"received --{flag}: it needs --{key}")
         before = {} if index is None else result[index].values()
-        step = validate(kind, {**before, **changes}, f"--{key}")
+        step = validate(kind, {**before, **changes}, "", flag_names(kind))
         if index is None:
             later = [i for i, s in enumerate(result) if order.index(s.name()) > order.index(key)]
             result.insert(later[0] if later else len(result), step)
@@ -579,6 +613,7 @@ def _estimate(flags: Mapping[str, Any], base: Recipe) -> Any:
         methods = _estimates_with(name)
         if method not in methods:
             choices = " or ".join(f"--source-from {key}" for key in methods)
-            raise InputError(f"received --source-{name.replace('_', '-')}: it needs {choices}")
+            raise InputError(f"received --{_estimate_flag(name)}: it needs {choices}")
     before = base.estimate.values() if base.estimate and base.estimate.name() == method else {}
-    return validate(ESTIMATES[method], {**before, **changes}, f"--source-from {method}")
+    estimate = ESTIMATES[method]
+    return validate(estimate, {**before, **changes}, "", flag_names(estimate))

@@ -321,9 +321,9 @@ def demo(
     about 185 MG·µm.
     """
     if not 0 <= noise < float("inf"):
-        raise InputError(f"noise is {noise:g}: it must be 0 or more, as a fraction of the mean")
+        raise InputError(f"--noise is {noise:g}: it must be 0 or more, as a fraction of the mean")
     if not math.isfinite(dm):
-        raise InputError(f"dm is {dm:g}: it must be a finite number, in MG·µm")
+        raise InputError(f"--dm is {dm:g}: it must be a finite number, in MG·µm")
     from napari_shadowinv.io.files import make_folder
 
     flags = {} if n_sites is None else {"n_sites": n_sites}

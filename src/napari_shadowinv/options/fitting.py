@@ -13,7 +13,7 @@ from pydantic import (
     model_validator,
 )
 
-from napari_shadowinv._system.validation import CheckedModel
+from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv.options._errors import MaxError
 from napari_shadowinv.physics.setup import deflector_titles
 
@@ -276,9 +276,12 @@ class FitChoices(CheckedModel):
 
     @model_validator(mode="after")
     def _check_point_spread(self) -> Self:
-        if self.psf is not None and (self.source_size, self.resolution) != (None, None):
-            raise ValueError(
-                f"received a point spread of {self.psf:g} px and a source size or resolution in m: "
-                "expected one or the other"
+        in_metres = [
+            name for name in ("source_size", "resolution") if getattr(self, name) is not None
+        ]
+        if self.psf is not None and in_metres:
+            raise CombinationError(
+                f"received {{psf}}, a point spread in px, and {{{in_metres[0]}}} in m: expected "
+                "one or the other"
             )
         return self

@@ -22,7 +22,7 @@ from pydantic import (
     model_validator,
 )
 
-from napari_shadowinv._system.validation import CheckedModel
+from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv.options.beam_prior import ASSUMED_BEAM, BeamComponents, BeamPrior
 
 __all__ = ["BEAM_SOURCES", "DETECTORS", "Instrument"]
@@ -259,11 +259,11 @@ class Instrument(CheckedModel):
             return values
         numbers = {name: value for name, value in values.items() if name != "beam"}
         if twice := {f"beam_{name}" for name in BeamPrior.model_fields} & numbers.keys():
-            raise ValueError(f"received beam and {min(twice)}, expected one of them")
-        if not isinstance(values["beam"], BeamPrior | dict):
-            raise ValueError(f"beam is {values['beam']!r}, expected a BeamPrior")
-        beam = BeamPrior.model_validate(values["beam"])
-        stated = beam.model_dump(exclude_unset=True)
+            raise CombinationError(f"received {{beam}} and {{{min(twice)}}}, expected one of them")
+        beam = values["beam"]
+        if not isinstance(beam, BeamPrior | dict):
+            raise ValueError(f"beam is {beam!r}, expected a BeamPrior")
+        stated = beam.model_dump(exclude_unset=True) if isinstance(beam, BeamPrior) else beam
         return numbers | {f"beam_{name}": value for name, value in stated.items()}
 
     @property

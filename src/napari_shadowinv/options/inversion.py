@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
-from napari_shadowinv._system.validation import CheckedModel
+from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv.options._errors import MaxError
 
 __all__ = ["MAX_DEFAULT_SITES", "InversionOptions"]
@@ -230,18 +230,18 @@ class InversionOptions(CheckedModel):
     @model_validator(mode="after")
     def _check_combination(self) -> Self:
         if self.boundary == "closed" and self.flux != "conserve":
-            raise ValueError(
-                f"flux is '{self.flux}' and boundary 'closed', expected 'conserve': a closed "
-                "boundary conserves the source's flux; use a free one"
+            raise CombinationError(
+                f"{{flux}} is '{self.flux}' and {{boundary}} is 'closed', expected 'conserve': a "
+                "closed boundary conserves the source's flux; use a free one"
             )
         if self.boundary == "free" and self.solver != "newton":
-            raise ValueError(
-                f"solver is '{self.solver}' and boundary 'free', expected the solver 'newton': "
-                "the others support closed boundaries only"
+            raise CombinationError(
+                f"{{solver}} is '{self.solver}' and {{boundary}} is 'free', expected 'newton': the "
+                "other solvers support closed boundaries only"
             )
         if self.noise_level is not None and self.units_per_quantum is not None:
-            raise ValueError(
-                f"the noise level is {self.noise_level:g} and the units per quantum are "
+            raise CombinationError(
+                f"{{noise_level}} is {self.noise_level:g} and {{units_per_quantum}} is "
                 f"{self.units_per_quantum:g}, expected one of them: units per quantum imply "
                 "Poisson noise"
             )

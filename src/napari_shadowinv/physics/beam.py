@@ -31,7 +31,7 @@ from pydantic import (
 )
 
 from napari_shadowinv._system.arrays import check_plane, plain_array, refuse_masked
-from napari_shadowinv._system.validation import CheckedModel
+from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 
@@ -235,9 +235,9 @@ class BeamSetup(CheckedModel):
         is_set = [self.pixel_size is not None, self.detector_pixel_size is not None]
         if sum(is_set) != 1:
             received = "both" if all(is_set) else "neither"
-            raise ValueError(
-                f"received {received} of pixel size (m, in the object plane) and detector pixel "
-                "size (m, in the detector plane): expected one of them"
+            raise CombinationError(
+                f"received {received} of {{pixel_size}} and {{detector_pixel_size}}, expected one "
+                "of them: the size of a pixel in the object plane or in the detector plane, in m"
             )
         return self
 

@@ -39,7 +39,7 @@ from pydantic_core import PydanticKnownError
 from scipy import constants
 
 from napari_shadowinv._system.arrays import VECTOR, plain_array
-from napari_shadowinv._system.validation import nearest, validate
+from napari_shadowinv._system.validation import CombinationError, nearest, validate
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.beam import (
@@ -198,8 +198,8 @@ class ProtonSetup(BeamSetup):
     @model_validator(mode="after")
     def _energy_in_range(self) -> ProtonSetup:
         if self.energy < _MIN_ENERGY_MEV:
-            raise ValueError(
-                f"'energy' is {self.energy:g} MeV, expected at least {_MIN_ENERGY_MEV:g} MeV: "
+            raise CombinationError(
+                f"{{energy}} is {self.energy:g} MeV, expected at least {_MIN_ENERGY_MEV:g} MeV: "
                 "check its unit"
             )
         return self

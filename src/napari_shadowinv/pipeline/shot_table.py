@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
@@ -147,7 +148,10 @@ class _Fiducial(CheckedModel):
 
 
 def shot_rows(
-    images: Sequence[Path], shared: Mapping[str, Any], lists: Mapping[str, str | None]
+    images: Sequence[Path],
+    shared: Mapping[str, Any],
+    lists: Mapping[str, str | None],
+    names: Mapping[str, str] = MappingProxyType({}),
 ) -> list[ShotRow]:
     """Describe the images of a fit.
 
@@ -159,13 +163,15 @@ def shot_rows(
         Defaults for all images, by the names of the columns.
     lists : mapping of str to str
         Numbers separated by commas, one for each image, by the names of the columns.
+    names : mapping of str to str, optional
+        Names of the lists in errors, by the names of the columns.
     """
     texts = {name: text for name, text in lists.items() if text is not None}
     if len(images) == 1 and is_table(images[0]):
         for name in texts:
             raise InputError(
-                f"received a list for each image, {texts[name]}, and the table {images[0]}: "
-                f"write it into its column '{name}'"
+                f"received {names.get(name, name)} {texts[name]} and the table {images[0]}: write "
+                f"it into the column '{name}'"
             )
         rows = list(_used_rows(images[0], shared).values())
         if len({row.shot for row in rows}) > 1:
@@ -178,14 +184,16 @@ def shot_rows(
     for name, parts in columns.items():
         if len(parts) != len(images):
             raise InputError(
-                f"received {len(images)} images and {len(parts)} values of {name} "
-                f"({texts[name]}): expected one for each image, separated by commas"
+                f"received {len(images)} images and {len(parts)} values of "
+                f"{names.get(name, name)} ({texts[name]}): expected one for each image, separated "
+                "by commas"
             )
     return [
         validate(
             ShotRow,
             _drop_none({"file": image, **shared, **{name: columns[name][k] for name in columns}}),
             str(image),
+            names,
         )
         for k, image in enumerate(images)
     ]

@@ -172,7 +172,8 @@ def check_window(size: int, count: int) -> None:
     if not 1 <= size <= count:
         raise InputError(
             f"received {count} image{'s' * (count != 1)} and windows of {size}: expected windows "
-            f"of 1 to {count} image{'s' * (count != 1)}"
+            f"of 1 to {count} image{'s' * (count != 1)}",
+            option="energy_window",
         )
 
 

@@ -7,16 +7,26 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import BaseModel
 from qtpy.QtWidgets import QFileDialog
 
 from napari_shadowinv import InputError, InversionOptions, OpticalSetup, ProtonSetup
-from napari_shadowinv._napari.widgets._forms import ModelForm, ModelPicker, dump_toml, kinds_of
+from napari_shadowinv._napari.widgets._forms import (
+    ModelForm,
+    ModelPicker,
+    dump_toml,
+    kinds_of,
+    labels_of,
+)
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._qt import StateKeeper
+from napari_shadowinv._system.validation import validate
 from napari_shadowinv.cli._inputs import recipe_from
 from napari_shadowinv.io import read_toml
+from napari_shadowinv.options import FitOptions, Instrument
 from napari_shadowinv.pipeline.files import setup_from
-from napari_shadowinv.preprocessing import ESTIMATES
+from napari_shadowinv.preprocessing import ESTIMATES, STEPS
 
 CHANGED = {
     "n_sites": 1234,
@@ -191,3 +201,30 @@ def test_mistakes_name_the_fields_by_their_labels(qtbot: Any) -> None:
     assert "'Source to object (m)' is missing" in text
     assert "'Kinetic energy (MeV)' is 14700000.0: it must be at most" in text
     assert not any(key in text for key in ("source_object_distance", "'energy'"))
+
+
+def test_contradictions_name_the_fields_by_their_labels(qtbot: Any) -> None:
+    form = the_form(qtbot, InversionOptions)
+    form.set_values({"flux": "known"})
+    with pytest.raises(InputError, match="'Flux' is 'known' and 'Boundary' is 'closed'"):
+        form.model()
+
+
+@pytest.mark.parametrize("model", [InversionOptions, FitOptions, Instrument, *STEPS.values()])
+def test_bounds_name_each_field_by_its_label(model: type[BaseModel]) -> None:
+    for key, field in model.model_fields.items():
+        if not any(isinstance(bound, Ge | Gt | Le | Lt) for bound in field.metadata):
+            continue
+        bad = next(value for value in (-1, 10**9) if is_refused(model, {key: value}))
+        with pytest.raises(InputError) as refused:
+            validate(model, {key: bad}, names=labels_of(model))
+        assert f"'{field.title}' is {bad}" in str(refused.value)
+        assert f"'{key}'" not in str(refused.value)
+
+
+def is_refused(model: type[BaseModel], values: dict[str, Any]) -> bool:
+    try:
+        validate(model, values)
+    except InputError:
+        return True
+    return False

@@ -145,7 +145,7 @@ def test_mistakes_are_told(tool: Any, qtbot: Any, messages: list[str]) -> None:
     expect("'film1.npy': 'much' is not a number")
     write(tool, 1, ENERGY, "")
     write(tool, 1, GAIN, "-1")
-    expect("'film1.npy': 'brightness' is -1.0: brightness must be greater than 0")
+    expect("'film1.npy': 'Brightness' is -1.0: it must be greater than 0")
     write(tool, 1, GAIN, "")
     for row in range(3):
         use(tool, row, used=False)

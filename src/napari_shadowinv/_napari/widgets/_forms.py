@@ -182,7 +182,7 @@ class ModelForm(QtWidgets.QWidget):
     def model(self) -> BaseModel:
         """Return the validated model, or raise an `InputError`."""
         name = getattr(self._model_class, "title", "options")
-        return validate(self._model_class, self.values(), name, by_title=True)
+        return validate(self._model_class, self.values(), name, labels_of(self._model_class))
 
     def _on_change(self) -> None:
         self._keep_one_alternative()
@@ -203,6 +203,12 @@ class ModelForm(QtWidgets.QWidget):
             unchecked = checked[0] if self.sender() is checked[1] else checked[1]
             with QSignalBlocker(unchecked):
                 unchecked.set_value(None)
+
+
+def labels_of(model_class: type[BaseModel]) -> dict[str, str]:
+    """Return the labels of a model's fields in quotes, by which errors call them."""
+    fields = model_class.model_fields
+    return {name: f"'{field.title}'" for name, field in fields.items() if field.title}
 
 
 def kinds_of(models: Mapping[str, Any]) -> Kinds:

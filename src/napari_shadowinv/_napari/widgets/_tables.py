@@ -461,7 +461,8 @@ class ShotTable(QWidget):
         if not mask or row.mask is None or mask != row.mask.name:
             changes["mask"] = self._folder / mask if mask else None
         entries = row.model_dump(exclude={"strength"})  # tables have another form of it
-        edited = validate(ShotRow, {**entries, **changes}, f"'{row.file.name}'")
+        names = {spec.name: f"'{spec.title}'" for spec in self._columns}
+        edited = validate(ShotRow, {**entries, **changes}, f"'{row.file.name}'", names)
         return edited.model_copy(update={"strength": row.strength})
 
     @property

@@ -357,8 +357,11 @@ class FitImages(ToolPanel):
     def _setup_of(self, row: ImageRow, setup: Setup) -> Setup:
         """Return the setup of an image, its own or the reference's, with the beam of its row."""
         base = self._base_setup(row, setup)
-        values = {**base.model_dump(), self.images.beam.name: self.images.beam_value(row)}
-        return validate(SETUPS[setup.kind], values, f"the setup of '{row.name}'")
+        beam = self.images.beam
+        values = {**base.model_dump(), beam.name: self.images.beam_value(row)}
+        model_class = SETUPS[setup.kind]
+        names = forms.labels_of(model_class) | {beam.name: f"'{beam.title}'"}
+        return validate(model_class, values, f"the setup of '{row.name}'", names)
 
     def _base_setup(self, row: ImageRow, setup: Setup) -> Setup:
         row_setup = row.setup if row.plane is None and row != self.images.reference else None
