@@ -14,6 +14,7 @@ from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Fit, FitOptions, FitShot, compare, fit
 from napari_shadowinv.fitting.measurements import strengths_of
 from napari_shadowinv.physics.setup import ProtonSetup
+from napari_shadowinv.plotting import fit_figure
 
 SIZE = (48, 56)
 STRENGTHS = [1, 0.6]
@@ -94,6 +95,35 @@ def test_strong_rays_first_or_weak_ones_makes_no_difference(
     turned = fit(noisy(folded_shots, NOISE)[::-1], strengths=[0.6, 1], noise=NOISE, options=PLAIN)
     forwards, backwards = found.fields[0].displacement, turned.fields[0].displacement / 0.6
     assert distance(backwards, forwards) < 0.04
+
+
+def test_the_noise_of_a_fit_is_that_of_its_chi2(found: Fit) -> None:
+    assert found.noise is not None
+    np.testing.assert_allclose(found.noise, NOISE)
+    squares = np.nanmean(found.normalised_residual**2, axis=(1, 2))
+    np.testing.assert_allclose(squares, found.chi2)
+
+
+@pytest.mark.parametrize("noise", ["proportional", "poisson", "pixels"])
+def test_the_drawn_residual_is_as_even_as_the_noise(noise: str) -> None:
+    """The variance is 1 in the dark and in the bright half, as far as so many pixels show it."""
+    beam = 400 * np.exp(np.linspace(-1.5, 1.5, SIZE[1])) * np.ones(SIZE)  # 20 times as bright
+    clean = np.stack(shots_of(WEAK, beam=lambda y, x: 400 * np.exp(3 * x / (SIZE[1] - 1) - 1.5)))
+    rng = np.random.default_rng(5)
+    deviations = {"proportional": 0.05 * clean, "pixels": 0.01 * clean**1.2}.get(noise)
+    chance = rng.normal(size=clean.shape)
+    images = rng.poisson(clean) if deviations is None else clean + deviations * chance
+    stated: Any = deviations if noise == "pixels" else noise
+    result = fit(images, strengths=STRENGTHS, source=beam, noise=stated, options=PLAIN)
+    assert result.noise is not None
+    assert result.noise.shape == images.shape
+    panels = [axes for axes in fit_figure(result).axes if "Residual" in axes.get_title(loc="left")]
+    assert len(panels) == 2
+    middle = SIZE[1] // 2
+    for panel in panels:
+        drawn = np.asarray(panel.images[0].get_array())
+        for half in (drawn[:, :middle], drawn[:, middle:]):
+            assert half.var() == pytest.approx(1, abs=4 * np.sqrt(2 / half.size))
 
 
 def test_two_energies_tell_an_unknown_beam_from_the_field() -> None:

@@ -177,9 +177,27 @@ def test_images_without_energies_are_told() -> None:
         checked(noisy([np.ones(SHAPE)] * 5, NOISE), setups=None)
 
 
+def test_the_noise_is_that_of_chi2(static: LeaveOneOut) -> None:
+    squares = np.nanmean(static.normalised_residual**2, axis=(1, 2))
+    np.testing.assert_allclose(squares, static.chi2)
+    part = static.only([2, 0])
+    np.testing.assert_array_equal(part.normalised_residual, static.normalised_residual[[2, 0]])
+
+
 def test_it_survives_its_dataset(static: LeaveOneOut) -> None:
     again = LeaveOneOut.from_dataset(static.to_dataset())
-    for name in ("predicted", "residual", "chi2", "alone", "limit", "rms", "brightness", "mask"):
+    names = (
+        "predicted",
+        "residual",
+        "chi2",
+        "alone",
+        "limit",
+        "rms",
+        "brightness",
+        "mask",
+        "noise",
+    )
+    for name in names:
         np.testing.assert_array_equal(getattr(again, name), getattr(static, name))
     assert again.explanation == static.explanation
     with pytest.raises(InputError, match="left_out_chi2"):

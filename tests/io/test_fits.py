@@ -58,6 +58,29 @@ def read_back(path: Path, fit: Fit) -> xr.Dataset:
     return dataset
 
 
+@pytest.mark.parametrize("noise", [None, "images", "pixels"])
+def test_file_gives_back_the_noise(tmp_path: Path, make_fit: MakeFit, noise: str | None) -> None:
+    fit = make_fit()
+    rng = np.random.default_rng(0)
+    shape = fit.images.shape if noise == "pixels" else fit.images.shape[:1]
+    values = None if noise is None else rng.uniform(0.01, 0.1, shape)
+    if noise == "pixels":
+        values = np.where(fit.mask, values, np.nan)
+    fit = dataclasses.replace(fit, noise=values)
+    dataset = read_back(tmp_path / "fit.shadowinv", fit)
+    assert ("noise" in dataset) == (noise is not None)
+    again = Fit.from_dataset(dataset)
+    assert_same(fit, again)
+    np.testing.assert_array_equal(again.normalised_residual, fit.normalised_residual)
+
+
+def test_noise_of_another_shape_is_refused(make_fit: MakeFit) -> None:
+    dataset = make_fit(noise=np.ones(2)).to_dataset()
+    dataset["noise"] = ("field",), np.ones(1)
+    with pytest.raises(InputError, match="noise has shape"):
+        Fit.from_dataset(dataset)
+
+
 @pytest.mark.parametrize("names", [("B",), ("B", "E")])
 @pytest.mark.parametrize("setups", [(), (protons(14.7), protons(1 / 3)), (LIGHT, LIGHT)])
 def test_file_gives_back_every_bit(

@@ -253,6 +253,19 @@ def test_residuals_of_a_fit_are_in_units_of_the_noise(make_fit: MakeFit) -> None
         np.testing.assert_allclose(residual, expected)
 
 
+def test_residuals_are_over_the_noise_of_each_image_or_pixel(make_fit: MakeFit) -> None:
+    fit = make_fit()
+    pixels = np.linspace(0.01, 0.1, fit.images.size).reshape(fit.images.shape)
+    for noise, sigma in ((np.array([0.02, 0.04]), [0.02, 0.04]), (pixels, pixels)):
+        for name, whole in (("fit", fit), ("left out", left_out_of(fit, limit=2.0))):
+            known = dataclasses.replace(whole, noise=noise)
+            figure = fit_figure(known) if name == "fit" else left_out_figure(known)
+            for k, index in enumerate((2, 5)):
+                drawn = np.ma.filled(panels(figure)[index].images[0].get_array(), np.nan)
+                expected = np.where(fit.mask[k], fit.residual[k] / sigma[k], np.nan)
+                np.testing.assert_allclose(drawn, expected)
+
+
 def test_fields_and_error_bars_of_a_fit_are_in_si(
     make_fit: MakeFit, proton_setup: ProtonSetup
 ) -> None:
@@ -339,8 +352,8 @@ def test_each_image_left_out_has_its_prediction_and_its_residual(
     for k in range(count):
         place = panel_titles.index(f"Image {k + 1}: {3 + k} MeV proton")
         assert panel_titles[place + 2].startswith(f"Residual: χ² {fit.chi2[k]:.3g}")
-        residual = np.asarray(panels(figure)[place + 2].images[0].get_array())
-        np.testing.assert_allclose(residual, fit.residual[k] / 0.05)
+        residual = np.ma.filled(panels(figure)[place + 2].images[0].get_array(), np.nan)
+        np.testing.assert_allclose(residual, np.where(fit.mask[k], fit.residual[k] / 0.05, np.nan))
     assert sum(title.endswith("not explained") for title in panel_titles) == 1
     assert "a sentence" in [text.get_text() for text in figure.texts]
     assert_nothing_overlaps(figure)

@@ -590,6 +590,7 @@ def _result(
         options=options,
         instrument=data.instrument,
         setups=data.setups or (),
+        noise=data.noise_of(scene.weights),
     )
 
 

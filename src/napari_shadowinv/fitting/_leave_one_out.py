@@ -121,6 +121,7 @@ class _Prediction:
     """The prediction of an image by others, in units of its beam, and the limit of its χ²."""
 
     image: FloatArray
+    weights: FloatArray
     brightness: float
     chi2: float
     alone: float
@@ -287,7 +288,7 @@ class _Work:
         variance += _RAY_VARIANCE_RATIO * _chi2(brightness * image, brightness * rough, weights)
         limit = _MAX_NOISE_RATIO + _MAX_VARIANCE_RATIO * variance
         return _Prediction(
-            brightness * image, brightness, chi2, own_fit.chi2, limit * own_fit.noise_chi2
+            brightness * image, weights, brightness, chi2, own_fit.chi2, limit * own_fit.noise_chi2
         )
 
     def _fit_alone(self, scene: Scene, k: int, common: Minimum) -> _OwnFit:
@@ -405,4 +406,5 @@ def _result(
         explanation=explanation_of(chi2, limit, data.setups, data.names),
         setups=data.setups or (),
         names=data.names or (),
+        noise=data.noise_of(np.stack([each.weights for each in predictions])),
     )

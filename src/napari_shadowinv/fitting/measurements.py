@@ -106,6 +106,26 @@ class FitData:
         )
         return before_y, before_x
 
+    def noise_of(self, weights: FloatArray) -> FloatArray:
+        """Return the standard deviation of each image's noise, or of each pixel's if it varies.
+
+        Parameters
+        ----------
+        weights : ndarray, shape (L, H', W')
+            Of the pixels of a scene, 0 where masked.
+
+        Returns
+        -------
+        ndarray, shape (L,) or (L, H, W)
+            In the unit of the images; NaN where masked.
+        """
+        height, width = self.size
+        weights = weights[:, :height, :width]
+        roots = np.sqrt(np.where(weights > 0, weights, np.nan))
+        noise = self.units[:, None, None] / roots
+        least, largest = (limit(noise, axis=(1, 2)) for limit in (np.nanmin, np.nanmax))
+        return noise if (least < largest).any() else np.asarray(least)
+
     def scene_with(self, smoothness: float | None) -> Scene:
         """Return the scene with λ as it was given, or none yet, for each field."""
         fields = self.scene.strengths.shape[1]

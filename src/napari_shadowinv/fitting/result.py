@@ -260,6 +260,9 @@ class Fit:
         The images as explained, and data minus that; the residual is 0 where masked.
     chi2 : ndarray, shape (L,)
         Mean of (residual / σ)² over each image.
+    noise : ndarray, shape (L,) or (L, H, W), or None
+        Standard deviation σ of the noise in each image, or in each pixel if it varies, then NaN
+        where masked; None in files of earlier versions.
     basins : tuple of Basin
         Where the starts have led, the best first.
     folded : float
@@ -301,6 +304,12 @@ class Fit:
     instrument: Instrument = dataclasses.field(default_factory=Instrument)
     setups: tuple[Setup, ...] = ()
     provenance: Provenance | None = None
+    noise: FloatArray | None = None
+
+    @property
+    def normalised_residual(self) -> FloatArray:
+        """The residual over σ, shape (L, H, W); NaN where masked."""
+        return normalise_residual(self.residual, self.mask, self.noise, self.chi2)
 
     @property
     def used(self) -> BoolArray:
@@ -575,6 +584,8 @@ class Fit:
         for name, values in self._arrays().items():
             dims, units, text = _VARIABLES[name]
             merged[name] = dims, values, label(units, text)
+        if self.noise is not None:
+            merged["noise"] = noise_variable(self.noise)
         return merged
 
     @classmethod
@@ -639,6 +650,7 @@ class Fit:
                 for values in json.loads(attributes["setups"])
             ),
             provenance=Provenance.of(attributes),
+            noise=noise_in(dataset, "noise"),
         )
 
     def _arrays(self) -> dict[str, AnyArray]:
@@ -659,6 +671,35 @@ class Fit:
             "basin_distance": np.array([basin.distance for basin in self.basins]),
             "basin_displacement": np.stack([basin.displacement for basin in self.basins]),
         }
+
+
+def normalise_residual(
+    residual: FloatArray, mask: BoolArray, noise: FloatArray | None, chi2: FloatArray
+) -> FloatArray:
+    """Return a residual over the noise, NaN where masked; see `Fit` for the shapes.
+
+    Without the noise, as in files of earlier versions, over its r.m.s. by χ² in each image.
+    """
+    if noise is None:
+        squares = (residual**2).sum(axis=(1, 2)) / mask.sum(axis=(1, 2))
+        noise = np.sqrt(np.divide(squares, chi2, out=np.ones_like(chi2), where=chi2 > 0))
+    noise = noise if noise.ndim == residual.ndim else noise[:, None, None]
+    return np.where(mask, residual / noise, np.nan)
+
+
+def noise_variable(noise: FloatArray) -> tuple[tuple[str, ...], FloatArray, dict[str, str]]:
+    """Return the variable of the noise of images, or of their pixels, in a dataset."""
+    return _IMAGES[: noise.ndim], noise, label(FLUX_DENSITY, "Standard deviation of the noise")
+
+
+def noise_in(dataset: xarray.Dataset, name: str) -> FloatArray | None:
+    """Return the noise in a dataset; None if it has none, as in files of earlier versions."""
+    if name not in dataset:
+        return None
+    noise, shape = numbers_of(dataset, name), dataset["images"].shape
+    if noise.shape not in (shape, shape[:1]):
+        raise ValueError(f"{name} has shape {noise.shape}, expected {shape[:1]} or {shape}")
+    return noise
 
 
 def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArray) -> FittedField:

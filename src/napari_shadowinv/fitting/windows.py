@@ -16,7 +16,12 @@ import numpy as np
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level, Verdict
-from napari_shadowinv.fitting.result import Fit
+from napari_shadowinv.fitting.result import (
+    Fit,
+    noise_in,
+    noise_variable,
+    normalise_residual,
+)
 from napari_shadowinv.inversion.variables import UNCERTAINTY, belongs, dataset_from_field
 from napari_shadowinv.physics.setup import (
     BeamQuantity,
@@ -61,6 +66,7 @@ _VARIABLES: dict[str, tuple[str, tuple[str, ...], str, str]] = {
     "rms": ("left_out_rms", ("image",), "1", "R.m.s. residual over the image's mean"),
 }
 _SENTENCE = "left_out"
+_NOISE = "left_out_noise"
 _LARGE = 100.0
 _LEAST_IMAGES = 3
 
@@ -94,6 +100,8 @@ class LeaveOneOut:
         The experiment of each image, if they are known.
     names : tuple of str
         The names of the images, if they have any.
+    noise : ndarray, shape (L,) or (L, H, W), or None
+        Standard deviation σ of the noise, as in `Fit`.
     """
 
     images: FloatArray
@@ -108,6 +116,12 @@ class LeaveOneOut:
     explanation: str
     setups: tuple[Setup, ...] = ()
     names: tuple[str, ...] = ()
+    noise: FloatArray | None = None
+
+    @property
+    def normalised_residual(self) -> FloatArray:
+        """The residual over σ, shape (L, H, W); NaN where masked."""
+        return normalise_residual(self.residual, self.mask, self.noise, self.chi2)
 
     @property
     def explained(self) -> BoolArray:
@@ -123,6 +137,7 @@ class LeaveOneOut:
             explanation=self.explanation,
             setups=tuple(self.setups[k] for k in chosen if self.setups),
             names=tuple(self.names[k] for k in chosen if self.names),
+            noise=None if self.noise is None else self.noise[chosen],
         )
 
     @property
@@ -153,6 +168,8 @@ class LeaveOneOut:
             variable: (dims, getattr(self, name), label(units, text))
             for name, (variable, dims, units, text) in _VARIABLES.items()
         }
+        if self.noise is not None:
+            variables[_NOISE] = noise_variable(self.noise)
         return xr.Dataset(variables, attrs={_SENTENCE: self.explanation})
 
     @classmethod
@@ -181,6 +198,7 @@ class LeaveOneOut:
             explanation=str(dataset.attrs[_SENTENCE]),
             setups=_setups_of(dataset),
             names=names if all(names) else (),
+            noise=noise_in(dataset, _NOISE),
         )
 
 

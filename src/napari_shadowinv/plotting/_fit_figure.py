@@ -53,7 +53,7 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
     """Show a whole fit on a page, with its verdict on top.
 
     For each image: the beam unless it is uniform, the image, its re-projection, and the residual
-    in units of the noise's r.m.s. standard deviation. Below for each field: its potential where
+    over the standard deviation of each pixel's noise. Below for each field: its potential where
     there is room, the field with arrows, the standard deviation that the noise leaves, and
     profiles along the dashed lines on the field. White outlines mark where rays have crossed in
     any image; masked pixels are hatched.
@@ -122,10 +122,7 @@ def _field_in_units(fit: Fit, field: FittedField) -> tuple[ShownField, ShownFiel
 def _draw_image(panel: Panel, fit: Fit, k: int, kind: str, fact: Fact) -> None:
     mean = float(fit.source[k].mean())
     if kind == "Residual":
-        used = fit.residual[k][fit.mask[k]]
-        noise = float(np.sqrt((used**2).mean() / fit.chi2[k])) if fit.chi2[k] > 0 else 1.0
-        title = f"Residual: {fact.short}"
-        residual = np.where(fit.mask[k], fit.residual[k] / noise, np.nan)
+        title, residual = f"Residual: {fact.short}", fit.normalised_residual[k]
         draw_differences(panel, residual, title, "Residual (σ)", _MAX_RESIDUAL_SIGMA)
         return
     plane = {"Beam": fit.source, "Image": fit.images, "Re-projection": fit.reprojection}[kind][k]
@@ -194,8 +191,8 @@ _PAGE_ASPECT = 1.6
 def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figure:
     """Show how well the others predict each image that was left out.
 
-    Each row has the image, the prediction of the others, and the residual in units of the noise's
-    r.m.s. standard deviation. On top: the images that one static field does not explain.
+    Each row has the image, the prediction of the others, and the residual over the standard
+    deviation of each pixel's noise. On top: the images that one static field does not explain.
 
     Parameters
     ----------
@@ -312,15 +309,13 @@ def _draw_left_out(
     used = left_out.mask[k]
     mean = float(left_out.images[k][used].mean())
     limits = intensity_limits(left_out.images[k] / mean)
-    residual = left_out.residual[k]
-    chi2 = left_out.chi2[k]
-    noise = float(np.sqrt((residual[used] ** 2).mean() / chi2)) if chi2 else 1.0
+    residual = left_out.normalised_residual[k]
     draw_intensity(panels[0], left_out.images[k] / mean, name, limits, label="Intensity / mean")
     draw_intensity(
         panels[1], left_out.predicted[k] / mean, "Prediction", limits, "Intensity / mean"
     )
     title = f"Residual: {fact.short}"
-    draw_differences(panels[2], residual / noise, title, "Residual (σ)", _MAX_RESIDUAL_SIGMA)
+    draw_differences(panels[2], residual, title, "Residual (σ)", _MAX_RESIDUAL_SIGMA)
     if fact.level is not Level.SOUND:
         panels[2].axes.set_title(title, color=ALARM_COLOUR)
 
