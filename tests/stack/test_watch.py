@@ -450,7 +450,7 @@ def test_wrong_folder_or_pattern_is_refused_at_once(folder, out, tmp_path):
     (tmp_path / "file").touch()
     refused(names="is a file: expected a folder", place=tmp_path / "file")
     refused("--pattern", "inner/*.tif", names="the pattern is 'inner/*.tif'")
-    refused("--idle", "0", names="'idle' is 0.0: idle time (s) must be greater than 0")
+    refused("--idle", "0", names="--idle is 0.0: it must be greater than 0")
     refused("--source", tmp_path / "none.tif", names="none.tif")
     sources = np.stack([SOURCE, SOURCE])
     with pytest.raises(InputError, match="got 2 sources, and the shots are still to arrive"):
