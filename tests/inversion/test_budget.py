@@ -25,9 +25,17 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.budget import Budget, ErrorEstimate
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import prepare
+from napari_shadowinv.options import ASSUMED_BEAM
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.pipeline import run
-from napari_shadowinv.preprocessing import LowPassFilter, PolynomialEstimate, Recipe
+from napari_shadowinv.preprocessing import (
+    ESTIMATES,
+    LowPassFilter,
+    PolynomialEstimate,
+    Radiograph,
+    Recipe,
+    polynomial_source,
+)
 from napari_shadowinv.stack import invert_stack, run_stack
 
 SIDE = 96
@@ -565,6 +573,43 @@ def test_every_way_to_an_inversion_knows_whether_the_beam_was_measured(tmp_path)
         store = run_stack(image[None], out, Recipe(options=options), **beam)
         (report,) = (json.loads(str(text)) for text in store.report.values)
         assert (report["errors"]["beam"] is None) == is_measured
+
+
+@pytest.mark.parametrize("method", ESTIMATES)
+def test_each_estimate_of_a_source_is_a_beam_that_nobody_measured(method, tmp_path):
+    """In one shot and in a stack; a prediction from bare pixels has its own error."""
+    setup = ProtonSetup(
+        energy=14.7, source_object_distance=0.01, object_image_distance=1.3, pixel_size=20e-6
+    )
+    blob = phantoms.gaussian_blob((64, 64), -6.0, 5.0)
+    image = np.random.default_rng(0).poisson(500 * synthetic_image(blob.displacement)).astype(float)
+    estimate = ESTIMATES[method]()
+    bare = np.hypot(*(np.indices(image.shape) - 31.5)) > 20 if estimate.uses_mask else None
+    recipe = Recipe(source=estimate, setup=setup, options=InversionOptions(n_sites=400))
+    shot = run(recipe, Radiograph(image, source_mask=bare)).errors
+    store = run_stack(image[None], tmp_path / "s.shadowinv.zarr", recipe, source_mask=bare)
+    of_stack = json.loads(str(store.report.values[0]))["errors"]
+    if method == "kriged":
+        assert shot.beam_basis == of_stack["beam_basis"] == "outside"
+        return
+    variation = (shot.beam_basis, shot.beam_variation, shot.beam_scale)
+    assert (
+        variation == ("assumed", ASSUMED_BEAM.rms, ASSUMED_BEAM.length) == ("assumed", 0.05, 0.25)
+    )
+    assert shot.parts["beam assumed, 5 %"].rms > shot.noise.rms
+    assert (of_stack["beam_basis"], of_stack["beam_variation"]) == ("assumed", 0.05)
+
+
+def test_an_estimate_passed_as_an_array_is_declared(image):
+    estimated = polynomial_source(image)
+    options = InversionOptions(n_sites=900)
+    errors = invert(image, source=estimated, options=options, measured=False).errors
+    assert errors.beam_basis == "assumed"
+    assert errors.beam == pytest.approx(np.multiply(5, errors.beam_sensitivity), rel=1e-6)
+    plan = plan_sites(estimated, options, measured=False)
+    assert errors == invert(image, plan=plan, options=options).errors
+    with pytest.raises(InputError, match=r"plan_sites\(source, measured=False\)"):
+        invert(image, plan=plan_sites(estimated, options), options=options, measured=False)
 
 
 def test_threads_change_neither_the_answer_nor_its_errors(image):

@@ -170,6 +170,7 @@ def invert(
     instrument: Instrument | None = None,
     plan: SitePlan | None = None,
     start: Inversion | None = None,
+    measured: bool = True,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Inversion:
@@ -199,6 +200,9 @@ def invert(
         solver starts from its weights and, if the images are similar, needs only a few
         iterations; if it stalls, it restarts from scratch. The result is the same within the
         tolerance.
+    measured : bool, default True
+        Whether the source was recorded. If it is an estimate, the errors include the effect of
+        another beam.
     on_progress : callable, optional
         Called regularly with a `Progress`.
     should_stop : callable, optional
@@ -243,6 +247,11 @@ def invert(
                     "got a plan together with a source or mask, expected only one: a plan "
                     "contains its own source and mask"
                 )
+            if not measured and plan.measured:
+                raise InputError(
+                    "got measured=False and a plan of a measured source: make the plan by "
+                    "plan_sites(source, measured=False)"
+                )
             _check_boundary(plan, options)
             image = _unmasked_values(image, plan.mask)
             source, mask = plan.source, plan.mask
@@ -252,7 +261,7 @@ def invert(
         report("prepare", 1, 1)
     with _measure_time("sites", seconds):
         if plan is None:
-            plan = _plan(prepared.source, options, mask, source is not None)
+            plan = _plan(prepared.source, options, mask, measured and source is not None)
         levels = plan.levels.with_reporter(report)
     with _measure_time("transport", seconds):
         if plan.margin is not None and options.flux == "fit":
