@@ -9,9 +9,15 @@ from typing import Any
 import pytest
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
-from qtpy.QtWidgets import QFileDialog
+from qtpy.QtWidgets import QFileDialog, QLineEdit
 
-from napari_shadowinv import InputError, InversionOptions, OpticalSetup, ProtonSetup
+from napari_shadowinv import (
+    InputError,
+    Instrument,
+    InversionOptions,
+    OpticalSetup,
+    ProtonSetup,
+)
 from napari_shadowinv._napari.widgets._forms import (
     ModelForm,
     ModelPicker,
@@ -19,12 +25,12 @@ from napari_shadowinv._napari.widgets._forms import (
     kinds_of,
     labels_of,
 )
-from napari_shadowinv._napari.widgets._inputs import SetupPicker
+from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
 from napari_shadowinv._napari.widgets._qt import StateKeeper
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.cli._inputs import recipe_from
 from napari_shadowinv.io import read_toml
-from napari_shadowinv.options import FitOptions, Instrument
+from napari_shadowinv.options import FitOptions
 from napari_shadowinv.pipeline.files import setup_from
 from napari_shadowinv.preprocessing import ESTIMATES, STEPS
 
@@ -92,6 +98,53 @@ def test_only_one_pixel_size_is_given(qtbot: Any, proton_setup: ProtonSetup) -> 
     assert not form.editors["pixel_size"].checked
     assert form.values()["detector_pixel_size"] == 145e-6
     assert "pixel_size" not in form.values()
+
+
+def placeholders(form: InstrumentForm) -> dict[str, str]:
+    """Return the texts in grey of the numbers that are empty."""
+    editors = {name: form.editors[name].inner for name in Instrument.model_fields}
+    lines = {name: inner for name, inner in editors.items() if isinstance(inner, QLineEdit)}
+    return {name: line.placeholderText() for name, line in lines.items() if not line.text()}
+
+
+def test_an_instrument_shows_its_defaults_in_grey(qtbot: Any) -> None:
+    form = InstrumentForm()
+    qtbot.addWidget(form)
+    exact = placeholders(form)
+    assert exact.keys() == Instrument.model_fields.keys() - {"detector", "beam_source"}
+    assert exact["beam_rms"] == "0.05, or 0 if recorded"
+    assert exact["noise_correlation"] == "measured in the image"
+    assert (exact["blur"], exact["beam_length"]) == ("0 px", "0.25")
+    assert form.values() == {}
+    form.editors["detector"].set_value("image plate")
+    form.editors["beam_source"].set_value("TNSA")
+    shown = placeholders(form)
+    assert (shown["blur"], shown["beam_rms"]) == ("1.5 px (image plate)", "0.1 (TNSA)")
+    assert shown["absorption"] == "0"
+    form.editors["blur"].set_value(2.0)
+    assert "blur" not in placeholders(form)
+    form.editors["detector"].set_value("camera")
+    assert form.model() == Instrument.of("camera", source="TNSA", blur=2)
+    form.editors["blur"].set_value(None)
+    for kind in ("detector", "beam_source"):
+        form.editors[kind].set_value(None)
+    assert placeholders(form) == exact
+    assert form.model() == Instrument()
+
+
+@pytest.mark.parametrize("values", ["stated", "all"])
+def test_an_instrument_is_shown_by_what_is_stated(qtbot: Any, values: str) -> None:
+    """Earlier versions saved all numbers."""
+    form = InstrumentForm()
+    qtbot.addWidget(form)
+    instrument = Instrument.of("film", source="laser", gamma=0, noise_correlation=0)
+    form.restore(instrument.stated if values == "stated" else instrument.model_dump())
+    assert form.model() == instrument
+    assert form.state() == instrument.stated
+    assert {"gamma", "noise_correlation"}.isdisjoint(placeholders(form))
+    form.restore({"detector": "film", "blur": -1, "gamma": 0.1})
+    with pytest.raises(InputError, match="Blur"):
+        form.model()
 
 
 def test_an_empty_setup_says_what_is_missing(qtbot: Any) -> None:

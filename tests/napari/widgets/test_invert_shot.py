@@ -15,6 +15,7 @@ import dask.array
 import numpy as np
 import pytest
 from napari.utils import progress
+from qtpy.QtWidgets import QComboBox
 
 from napari_shadowinv import Instrument, InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari import jobs
@@ -28,8 +29,10 @@ from napari_shadowinv._napari.layer_metadata import (
 from napari_shadowinv._napari.widgets import _panels
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.cautions import Caution
+from napari_shadowinv.options import BEAM_SOURCES, DETECTORS
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.preprocessing import STEPS, Crop, LowPassFilter, PolynomialEstimate, Recipe
 from napari_shadowinv.provenance import Provenance
 
@@ -642,14 +645,26 @@ def test_camera_fits_after_units_change(
     assert window.camera.zoom == pytest.approx(zoom)
 
 
-def test_a_detector_sets_the_numbers_of_the_instrument(tool: Any) -> None:
+def test_detector_and_beam_source_are_chosen_in_the_window(tool: Any) -> None:
     form = tool.instrument
-    form.editors["detector"].set_value("film")
-    form.editors["beam_source"].set_value("laser")
-    assert form.model() == Instrument.of("film", source="laser")
-    form.editors["gamma"].set_value(0.2)
-    saved = form.model()
-    assert saved == Instrument.of("film", source="laser", gamma=0.2)
-    form.editors["detector"].set_value("camera")
-    form.set_values(saved.model_dump())
-    assert form.model() == saved
+    for kind, choices in (("detector", DETECTORS), ("beam_source", BEAM_SOURCES)):
+        box = form.editors[kind].inner
+        assert isinstance(box, QComboBox)
+        assert [box.itemText(k) for k in range(box.count())] == ["", *choices]
+        assert box.currentText() == ""
+    assert tool.recipe().instrument == Instrument()
+    form.editors["detector"].inner.setCurrentText("film")
+    form.editors["beam_source"].inner.setCurrentText("laser")
+    assert tool.recipe().instrument == Instrument.of("film", source="laser")
+
+
+def test_a_recipe_keeps_detector_and_beam_source(tool: Any, tmp_path: Path) -> None:
+    stated = Instrument.of("film", source="TNSA", gamma=0.2, noise_correlation=1)
+    tool.instrument.set_values(stated.stated)
+    tool.recipes.save(tmp_path / "recipe.toml")
+    assert read_recipe(tmp_path / "recipe.toml").instrument == stated
+    tool.instrument.set_values({})
+    assert tool.instrument.model() == Instrument()
+    tool.recipes.load(tmp_path / "recipe.toml")
+    assert tool.instrument.model() == stated
+    assert tool.instrument.state() == stated.stated

@@ -130,19 +130,20 @@ class _Flag(Editor):
 
 
 class _Choice(Editor):
+    """A choice, of which None is an empty entry."""
+
     def __init__(self, choices: tuple[Any, ...]) -> None:
         super().__init__(SteadyComboBox())
-        for choice in choices:
-            self.inner.addItem(str(choice), choice)
+        self._choices = choices
+        self.inner.addItems(["" if choice is None else str(choice) for choice in choices])
         self.inner.currentIndexChanged.connect(self.changed)
 
     def value(self) -> Any:
-        return self.inner.currentData()
+        return self._choices[self.inner.currentIndex()]
 
     def set_value(self, value: Any) -> None:
-        index = self.inner.findData(value)
-        if index >= 0:
-            self.inner.setCurrentIndex(index)
+        if value in self._choices:
+            self.inner.setCurrentIndex(self._choices.index(value))
 
 
 class _Integer(Editor):
@@ -294,10 +295,17 @@ class _Optional(Editor):
         self.changed.emit()
 
 
-def editor_for(field: FieldInfo, initial: Any = None) -> Editor:
-    """Create the editor of a field; `initial` is an optional field's value when first checked."""
+def editor_for(field: FieldInfo, initial: Any = None, *, leave_empty: bool = False) -> Editor:
+    """Create the editor of a field; `initial` is an optional field's value when first checked.
+
+    With `leave_empty` the editor of a number or an optional field is empty until it is set.
+    """
     kind, is_optional = _without_none(field.annotation)
+    if get_origin(kind) is Literal and is_optional:
+        return _Choice((None, *get_args(kind)))
     editor = _plain_editor(kind, field)
+    if leave_empty:
+        return editor
     if is_optional:
         if initial is not None:
             editor.set_value(initial)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
 from qtpy.QtGui import QColor
@@ -129,7 +130,7 @@ class ModelForm(QtWidgets.QWidget):
             if get_origin(field.annotation) is Literal and len(get_args(field.annotation)) == 1:
                 self._fixed[name] = get_args(field.annotation)[0]
                 continue
-            editor = editor_for(field, (initial or {}).get(name))
+            editor = self._make_editor(field, (initial or {}).get(name))
             title = field.title or name
             unit = unit_in_title(title) if editor.shows_unit else ""
             label = QtWidgets.QLabel(title.removesuffix(f" ({unit})"))
@@ -164,8 +165,7 @@ class ModelForm(QtWidgets.QWidget):
         """Show values; missing fields get their defaults."""
         with QSignalBlocker(self):
             for name, editor in self.editors.items():
-                field = self._model_class.model_fields[name]
-                default = None if field.is_required() else field.get_default()
+                default = self._default_of(name)
                 value = values.get(name, default)
                 if value is None and default is not None:
                     continue
@@ -183,6 +183,13 @@ class ModelForm(QtWidgets.QWidget):
         """Return the validated model, or raise an `InputError`."""
         name = getattr(self._model_class, "title", "options")
         return validate(self._model_class, self.values(), name, labels_of(self._model_class))
+
+    def _make_editor(self, field: FieldInfo, initial: Any) -> Editor:
+        return editor_for(field, initial)
+
+    def _default_of(self, name: str) -> Any:
+        field = self._model_class.model_fields[name]
+        return None if field.is_required() else field.get_default()
 
     def _on_change(self) -> None:
         self._keep_one_alternative()

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QWidget
 
@@ -18,7 +19,12 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.shots import radiograph_of, source_of_shot
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
-from napari_shadowinv._napari.widgets._editors import SteadyComboBox
+from napari_shadowinv._napari.widgets._editors import (
+    Editor,
+    SteadyComboBox,
+    editor_for,
+    format_number,
+)
 from napari_shadowinv._napari.widgets._files import RecipeButton
 from napari_shadowinv._napari.widgets._forms import StepsSection
 from napari_shadowinv._napari.widgets._qt import column
@@ -26,7 +32,14 @@ from napari_shadowinv._napari.widgets._results import Origins
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.options import BEAM_SOURCES, DETECTORS, Instrument, InversionOptions
+from napari_shadowinv.options import (
+    ASSUMED_BEAM,
+    BEAM_SOURCES,
+    DETECTORS,
+    Instrument,
+    InversionOptions,
+)
+from napari_shadowinv.physics.beam import unit_in_title
 from napari_shadowinv.physics.setup import (
     SETUPS,
     Setup,
@@ -37,6 +50,13 @@ from napari_shadowinv.physics.setup import (
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
 
 _NONE = "none"
+_INSTRUMENT_KINDS = ("detector", "beam_source")
+_KINDS: Mapping[Any, Mapping[str, float]] = {**DETECTORS, **BEAM_SOURCES}
+# Numbers of an instrument without a default.
+_UNSTATED = {
+    "beam_rms": f"{ASSUMED_BEAM.rms:g}, or 0 if recorded",
+    "noise_correlation": "measured in the image",
+}
 _CHANGED = ", changed by hand"
 _EARLIER = ", in an earlier session"
 UNIFORM, LAYER, FILE, SUPPLIED, UNKNOWN = "uniform", "layer", "file", "own", "unknown"
@@ -456,16 +476,40 @@ class OptionsForm(forms.ModelForm):
 
 
 class InstrumentForm(forms.ModelForm):
-    """A form of an instrument, in which a detector and a source of the beam set their numbers."""
+    """A form of an instrument; its empty numbers show their defaults in grey."""
 
     def __init__(self) -> None:
         super().__init__(Instrument)
-        for kind, table in (("detector", DETECTORS), ("beam_source", BEAM_SOURCES)):
-            self.editors[kind].changed.connect(partial(self._set_numbers, kind, table))
+        for kind in _INSTRUMENT_KINDS:
+            self.editors[kind].changed.connect(self._show_defaults)
+        self._show_defaults()
 
-    def _set_numbers(self, kind: str, table: Mapping[Any, Mapping[str, float]]) -> None:
-        for name, value in table.get(self.editors[kind].value(), {}).items():
-            self.editors[name].set_value(value)
+    def set_values(self, values: Mapping[str, Any]) -> None:
+        """Show the values that differ from their defaults."""
+        with suppress(InputError):  # of another version, whose values are shown one by one
+            values = validate(Instrument, values, "instrument").stated
+        super().set_values(values)
+
+    restore = set_values
+
+    def _make_editor(self, field: FieldInfo, initial: Any) -> Editor:
+        return editor_for(field, initial, leave_empty=True)
+
+    def _default_of(self, name: str) -> Any:
+        return None
+
+    def _show_defaults(self) -> None:
+        """Show the defaults of the chosen detector and beam source, with their names."""
+        kinds = {kind: self.editors[kind].value() for kind in _INSTRUMENT_KINDS}
+        usual = Instrument(**kinds)
+        for name, editor in self.editors.items():
+            if name in kinds:
+                continue
+            value = getattr(usual, name)
+            unit = unit_in_title(Instrument.model_fields[name].title)
+            text = _UNSTATED[name] if value is None else format_number(value, unit)
+            origin = next((kind for kind in kinds.values() if name in _KINDS.get(kind, ())), None)
+            editor.inner.setPlaceholderText(f"{text} ({origin})" if origin else text)
 
 
 class InversionInputs:
