@@ -202,12 +202,15 @@ def _estimate_beam(selection: _Selection, should_stop: ShouldStop) -> list[resul
     from napari_shadowinv.preprocessing import total_variation_source
 
     source = total_variation_source(selection.image, should_stop=should_stop)
-    return [
-        _filtered_layer(replace(selection, role=about.SOURCE), source, "source by total variation")
-    ]
+    made_from = {"image": selection.name, "estimate": "total variation"}
+    selection = replace(selection, role=about.SOURCE)
+    title = "source by total variation"
+    return [_filtered_layer(selection, source, title, made_from=made_from)]
 
 
-def _filtered_layer(selection: _Selection, image: FloatArray, title: str) -> results.FullLayerData:
+def _filtered_layer(
+    selection: _Selection, image: FloatArray, title: str, **metadata: Any
+) -> results.FullLayerData:
     return shot_layer(
         image,
         f"{selection.name} {title}",
@@ -216,4 +219,5 @@ def _filtered_layer(selection: _Selection, image: FloatArray, title: str) -> res
         selection.role,
         frame=selection.frame,
         setup_origin=selection.setup_origin or None,
+        **metadata,
     )

@@ -292,6 +292,11 @@ def may_be_source(layer: Any) -> bool:
     return role_of(layer) in (None, SHOT, SOURCE)
 
 
+def is_estimate(layer: Any) -> bool:
+    """Whether a layer is a source that was estimated from a shot."""
+    return role_of(layer) == SOURCE and "estimate" in metadata_of(layer).get("made_from", {})
+
+
 def may_be_mask(layer: Any) -> bool:
     """Whether a layer may be a painted mask, unlike the labels of a result."""
     return role_of(layer) in (None, MASK)

@@ -668,3 +668,23 @@ def test_a_recipe_keeps_detector_and_beam_source(tool: Any, tmp_path: Path) -> N
     tool.recipes.load(tmp_path / "recipe.toml")
     assert tool.instrument.model() == stated
     assert tool.instrument.state() == stated.stated
+
+
+def test_a_layer_of_an_estimated_source_was_not_measured(
+    tool: Any, window: Any, open_widget: Any, run: Any
+) -> None:
+    """An estimate has the error of an unmeasured beam; a layer that was opened has not."""
+    estimate = open_widget("Estimate source")
+    estimate.method.set_kind("polynomial")
+    estimate.image.layer = window.layers["shot"]
+    run(estimate)
+    (source,) = (layer for layer in window.layers if "source" in layer.name)
+    tool.source.picker.set_kind("layer")
+    tool.source.layers.layer = source
+    assert tool.recipe().instrument == Instrument(beam_rms=0.05)
+    tool.instrument.editors["beam_source"].set_value("laser")
+    tool.instrument.editors["beam_rms"].set_value(0.01)
+    assert tool.recipe().instrument == Instrument.of(source="laser", beam_rms=0.01)
+    tool.instrument.set_values({})
+    tool.source.layers.layer = window.add_image(source.data, name="recorded")
+    assert tool.recipe().instrument == Instrument()

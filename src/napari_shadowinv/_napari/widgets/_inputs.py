@@ -579,9 +579,17 @@ class InversionInputs:
             steps=self.all_steps(),
             source=self.source.chosen(),
             setup=self.setup.setup(),
-            instrument=self.instrument.model(),
+            instrument=self._instrument(),
             options=self.options.model(),
         )
+
+    def _instrument(self) -> Instrument:
+        """Return the instrument; a layer of an estimated source has the error of an estimate."""
+        instrument: Any = self.instrument.model()
+        source = self.source.layer
+        if source is None or not about.is_estimate(source) or instrument.beam_rms is not None:
+            return instrument
+        return Instrument(**instrument.stated, beam_rms=ASSUMED_BEAM.rms)
 
     def companions(self, image: Any, *others: Any) -> tuple[Any, ...]:
         """Return the layers that lie on an image: masks, source and others, if chosen."""
