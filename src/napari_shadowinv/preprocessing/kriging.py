@@ -27,7 +27,7 @@ from napari_shadowinv.preprocessing.pixels import beam_pixels, with_flux_of
 
 _GRID = 48  # blocks along the longer side
 _DOMAIN = 1.5  # sides of the image
-_LENGTHS = np.geomspace(0.1, 1.2, 6)  # shorter sides
+_LENGTHS = np.geomspace(0.1, 1.2, 12)  # shorter sides; errors are too small with half of them
 _SHORTEST_WAVE = 3.6  # in units of 1/L: the spectrum has fallen to 1/650
 _RATIOS = np.geomspace(1e-4, 1e8, 97)  # variance of the beam over the noise of a block
 _MIN_WEIGHT = 0.02  # of a length, to count
