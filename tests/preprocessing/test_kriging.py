@@ -4,11 +4,17 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from helpers.fit_images import bump, counted
 from napari_shadowinv import InputError, Instrument, Recipe
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.pipeline import run
-from napari_shadowinv.preprocessing import Radiograph, kriged_source
+from napari_shadowinv.preprocessing import (
+    Radiograph,
+    kriged_source,
+    polynomial_source,
+    uniform_source,
+)
 from napari_shadowinv.preprocessing.kriging import kriged_beam
 
 SIDE = 128
@@ -73,9 +79,101 @@ def test_the_variance_is_largest_behind_the_object():
 
 def test_an_image_without_bare_pixels_is_refused():
     mask = np.zeros((SIDE, SIDE), bool)
+    with pytest.raises(InputError, match=r"^no pixel is free of the object, so the beam behind"):
+        kriged_source(np.ones((SIDE, SIDE)), mask)
+    with pytest.raises(InputError, match=r"^the mask hides no pixel, so the object would be"):
+        kriged_source(np.ones((SIDE, SIDE)), ~mask)
     mask[:8] = True
     with pytest.raises(InputError, match=r"7% of the image is free of the object, too little"):
         kriged_source(np.ones((SIDE, SIDE)), mask)
+
+
+def random_waves(rng, length, rms):
+    """Return a beam of 48 plane waves with a correlation of exp(-r²/2 length²)."""
+    numbers = rng.normal(size=(48, 2)) / (length * SIDE)
+    phases = rng.uniform(0, 2 * np.pi, 48)
+
+    def brightness(y, x):
+        terms = zip(numbers, phases, strict=True)
+        waves = sum(
+            np.cos(along_y * y + along_x * x + phase) for (along_y, along_x), phase in terms
+        )
+        return 1 + rms * waves / np.sqrt(24)
+
+    return brightness
+
+
+def traced_shot(seed, width=0.06, length=0.25, rms=0.03):
+    """Return counts of traced rays around an object, and its beam."""
+    rng = np.random.default_rng(seed)
+    brightness = random_waves(rng, length, rms)
+    middle = (SIDE / 2, SIDE / 2)
+    flux = counted(bump(0.6, width * SIDE, middle), (SIDE, SIDE), beam=brightness, rays=4)
+    return rng.poisson(1000 * flux).astype(float), brightness(*np.indices((SIDE, SIDE)))
+
+
+def test_random_waves_behind_a_traced_object_are_predicted_within_their_error():
+    """Random waves of 3 % over a quarter of the image, behind a quarter of its area."""
+    bare = np.hypot(Y, X) > 0.28
+    errors = {"uniform": [], "polynomial": [], "kriged": []}
+    ratios, lengths = [], []
+    for seed in range(16):
+        image, true = traced_shot(seed)
+        source, prior = kriged_beam(image, bare)
+        sources = {
+            "uniform": uniform_source(image),
+            "polynomial": polynomial_source(image, mask=bare),
+            "kriged": source,
+        }
+        for name, estimate in sources.items():
+            error = np.log(estimate / true)
+            error -= error[bare].mean()
+            errors[name].append(np.sqrt((error[~bare] ** 2).mean()))
+        places = np.s_[prior.components.block // 2 :: prior.components.block]
+        deviations = np.sqrt((prior.components.patterns**2).sum(axis=0))
+        hidden = ~bare[places, places]
+        deviations = deviations[: hidden.shape[0], : hidden.shape[1]]
+        ratios.append(error[places, places][hidden] / deviations[hidden])  # of kriged, the last
+        lengths.append(prior.length)
+    rms = {name: np.sqrt(np.mean(np.square(each))) for name, each in errors.items()}
+    assert rms["kriged"] < 0.3 * rms["polynomial"] < 0.3 * rms["uniform"]
+    assert max(errors["kriged"]) < 0.5 * max(errors["polynomial"])
+    ratio = np.abs(np.concatenate(ratios))
+    assert 0.55 < (ratio < 1).mean() < 0.8
+    assert 0.85 < (ratio < 2).mean() < 0.99
+    assert np.sqrt((ratio**2).mean()) < 1.3
+    assert np.median(lengths) == pytest.approx(0.25, rel=0.15)
+
+
+@pytest.mark.parametrize("width", [0.06, 0.09])
+def test_a_mask_that_leaves_a_halo_is_named(width):
+    """At its rim the object changes the image by less than 1e-4, or by 2 %."""
+    bare = np.hypot(Y, X) > 0.28
+    warned = []
+    for seed in range(4):
+        image, _ = traced_shot(seed, width)
+        cautions = []
+        kriged_source(image, bare, on_caution=cautions.append)
+        warned.append([caution.code for caution in cautions])
+        assert all("may not cover the object with its halo" in each.text for each in cautions)
+    assert warned == 4 * ([["source"]] if width == 0.09 else [[]])
+
+
+def test_an_image_of_the_beam_alone_leaves_its_prediction_as_it_is():
+    """No false alarm in 60 beams of any length."""
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        true = random_waves(rng, (0.15, 0.25, 0.5, 1.0)[seed % 4], 0.03)(*np.indices((SIDE, SIDE)))
+        cautions = []
+        kriged_source(rng.poisson(1000 * true), BARE, on_caution=cautions.append)
+        assert not cautions
+
+
+def test_the_report_names_a_mask_that_leaves_a_halo():
+    image, _ = traced_shot(0, 0.09)
+    recipe = Recipe(source={"method": "kriged"}, options={"n_sites": 300})
+    result = run(recipe, Radiograph(image, source_mask=np.hypot(Y, X) > 0.28))
+    assert any("next to the source mask" in each.text for each in result.report.warnings)
 
 
 def shot_of_a_blob():

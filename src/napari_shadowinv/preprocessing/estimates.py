@@ -353,9 +353,18 @@ class KrigedEstimate(Estimate):
 
     needs_mask = True
     title = "predicted under the mask"
-    function = staticmethod(kriged_source)
     place = 80
     method: Literal["kriged"] = "kriged"
+
+    def _source(
+        self,
+        image: FloatArray,
+        mask: BoolArray | None,
+        should_stop: ShouldStop | None,
+        on_caution: OnCaution | None,
+    ) -> FloatArray:
+        assert mask is not None
+        return kriged_source(image, mask, should_stop=should_stop, on_caution=on_caution)
 
     def beam_prior(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None

@@ -16,11 +16,14 @@ from functools import cached_property
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
+from scipy.ndimage import distance_transform_edt
+from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from napari_shadowinv._system.arrays import block_means
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution, OnCaution, warn_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import BeamComponents, BeamPrior
 from napari_shadowinv.preprocessing.pixels import beam_pixels, with_flux_of
@@ -36,6 +39,11 @@ _MIN_USED_SHARE = 0.5  # of a block's pixels
 _DIMMEST = 1e-2  # of the mean
 _MIN_BARE_SHARE = 0.1  # of the blocks
 _MIN_BLOCKS = 20
+_RIM_SHARE = 0.15  # of the largest distance to a hidden block
+_MIN_RIM_BLOCKS = 1.5
+_SHARE_OF_CHANGE, _MAX_CHANGES = 0.9, 6  # of the variance, in this number of shapes
+_MAX_PLACES = 400
+_MAX_CHANCE = 1e-4
 
 
 def kriged_source(
@@ -43,11 +51,12 @@ def kriged_source(
     mask: ArrayLike,
     *,
     should_stop: ShouldStop | None = None,
+    on_caution: OnCaution | None = None,
 ) -> FloatArray:
     """Beam predicted from the pixels without the object, as a Gaussian process.
 
     It is an estimate as in `napari_shadowinv.preprocessing.estimates`; an `InputError` also refuses
-    an image in which hardly a pixel is free of the object.
+    an image in which hardly a pixel is free of the object, or every one.
 
     Parameters
     ----------
@@ -55,8 +64,18 @@ def kriged_source(
     mask : array_like of bool, shape (H, W)
         True where the image shows the bare beam, False where the object or its halo is.
     should_stop : callable, optional
+    on_caution : callable, optional
+        Receives a `Caution` if the beam next to the masked pixels is not as the pixels farther
+        away predict it. Default: `warnings.warn` with its text.
     """
-    return kriged_beam(image, mask, should_stop=should_stop)[0]
+    blocks = _Blocks.of(image, mask)
+    with _one_thread():
+        fits = blocks.fits(Reporter(None, should_stop))
+        caution = _halo_caution(blocks, max(fits, key=lambda fit: fit.evidence))
+        beam, _, _, _ = _joint(fits)
+    if caution is not None:
+        (on_caution or warn_of)(caution)
+    return blocks.source(beam)
 
 
 def kriged_beam(
@@ -66,37 +85,107 @@ def kriged_beam(
     should_stop: ShouldStop | None = None,
 ) -> tuple[FloatArray, BeamPrior]:
     """Return the beam of `kriged_source`, and the prior of its error."""
-    report = Reporter(None, should_stop)
-    values, usable = beam_pixels(image, mask)
-    block = -(-max(values.shape) // _GRID)
-    share = block_means(usable.astype(np.float64), block)
-    means = block_means(np.where(usable, values, 0.0), block) / np.maximum(share, 1e-300)
-    bare = share > _MIN_USED_SHARE
-    if bare.any():
-        bare &= means > _DIMMEST * means[bare].mean()
-    if bare.sum() < max(_MIN_BARE_SHARE * bare.size, _MIN_BLOCKS):
-        raise InputError(
-            f"{bare.mean():.0%} of the image is free of the object, too little to predict the "
-            "beam behind it: mask less, or choose another estimate"
-        )
-    level = float(means[bare].mean())
-    logs = np.log(means[bare] / level)
-    counts = share[bare] * means[bare] / level
-    fits = []
+    blocks = _Blocks.of(image, mask)
     with _one_thread():
-        for length in _LENGTHS:
-            report("source", 0)
-            waves = _Waves(values.shape, block, length * min(values.shape))
-            fits.append(_Fit.to(waves, bare, logs, counts))
-        beam, light, patterns, weights = _joint(fits)
-    source = with_flux_of(level * np.exp(beam), values, usable)
+        beam, light, patterns, weights = _joint(blocks.fits(Reporter(None, should_stop)))
     variance = (patterns**2).sum(axis=0)
     rms = math.sqrt(float((light * variance).sum() / light.sum()))
-    size = (values.shape[0], values.shape[1])
-    components = BeamComponents(patterns, block, size, 0.0, "outside")
+    height, width = blocks.values.shape
+    components = BeamComponents(patterns, blocks.block, (height, width), 0.0, "outside")
     length = float(np.exp(weights @ np.log(_LENGTHS)))
     prior = BeamPrior(rms=min(rms, 0.99), length=min(length, 1.0)).with_components(components)
-    return source, prior
+    return blocks.source(beam), prior
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Means of an image over square blocks of pixels, and which show the bare beam."""
+
+    values: FloatArray
+    usable: BoolArray
+    block: int  # px
+    bare: BoolArray  # (h, w)
+    level: float
+    logs: FloatArray  # (h, w), of the means over the level, 0 elsewhere
+    counts: FloatArray  # (h, w), weights by the light
+
+    @classmethod
+    def of(cls, image: ArrayLike, mask: ArrayLike) -> _Blocks:
+        """Return the blocks, or raise an `InputError` if too few of them show the beam."""
+        if not np.any(mask):
+            raise InputError(
+                "no pixel is free of the object, so the beam behind it cannot be predicted: mask "
+                "less, or choose another estimate"
+            )
+        values, usable = beam_pixels(image, mask)
+        if usable.all():
+            raise InputError(
+                "the mask hides no pixel, so the object would be taken for the beam: mask the "
+                "object with its halo"
+            )
+        block = -(-max(values.shape) // _GRID)
+        share = block_means(usable.astype(np.float64), block)
+        means = block_means(np.where(usable, values, 0.0), block) / np.maximum(share, 1e-300)
+        bare = share > _MIN_USED_SHARE
+        if bare.any():
+            bare &= means > _DIMMEST * means[bare].mean()
+        if bare.sum() < _least_blocks(bare):
+            raise InputError(
+                f"{bare.mean():.0%} of the image is free of the object, too little to predict the "
+                "beam behind it: mask less, or choose another estimate"
+            )
+        level = float(means[bare].mean())
+        logs = np.log(np.where(bare, means / level, 1.0))
+        return cls(values, usable, block, bare, level, logs, share * means / level)
+
+    def fits(self, report: Reporter) -> list[_Fit]:
+        """Return the process of each length."""
+        fits = []
+        for length in _LENGTHS:
+            report("source", 0)
+            waves = _Waves(self.values.shape, self.block, length * min(self.values.shape))
+            fits.append(_Fit.to(waves, self.bare, self.logs[self.bare], self.counts[self.bare]))
+        return fits
+
+    def source(self, beam: FloatArray) -> FloatArray:
+        """Return the source of a beam's logarithm."""
+        return with_flux_of(self.level * np.exp(beam), self.values, self.usable)
+
+
+def _least_blocks(bare: BoolArray) -> float:
+    return max(_MIN_BARE_SHARE * bare.size, _MIN_BLOCKS)
+
+
+def _halo_caution(blocks: _Blocks, fit: _Fit) -> Caution | None:
+    """Warn if blocks next to the hidden ones change their prediction by more than its variance."""
+    hidden = ~blocks.bare
+    if not hidden.any():
+        return None
+    rows, columns = np.nonzero(hidden)
+    step = -(-len(rows) // _MAX_PLACES)
+    places = rows[::step], columns[::step]
+    reach = _RIM_SHARE * float(distance_transform_edt(hidden).max())
+    farther = blocks.bare & (distance_transform_edt(blocks.bare) > max(reach, _MIN_RIM_BLOCKS))
+    if farther.sum() < _least_blocks(farther):
+        return None
+    without_rim = _Fit.to(fit.waves, farther, blocks.logs[farther], blocks.counts[farther])
+    change = (fit.mean - without_rim.mean)[places]
+    # Of nested data, the change of a mean has the variance that the data take away.
+    spread, wider = (each.rows[places] @ each.spread for each in (fit, without_rim))
+    powers, shapes = scipy.linalg.eigh(wider @ wider.T - spread @ spread.T)
+    powers, shapes = powers[::-1], shapes[:, ::-1]
+    share = np.cumsum(np.maximum(powers, 0)) / max(float(powers[powers > 0].sum()), 1e-300)
+    count = min(int(np.searchsorted(share, _SHARE_OF_CHANGE)) + 1, _MAX_CHANGES)
+    amplitudes = shapes[:, :count].T @ change
+    square = float((amplitudes**2 / np.maximum(powers[:count], 1e-300)).sum())
+    if chi2.sf(square, count) > _MAX_CHANCE:
+        return None
+    text = (
+        "the image next to the source mask is not as the beam farther away predicts it, by "
+        f"{math.sqrt(square / count):.1f} standard deviations: the mask may not cover the object "
+        "with its halo, or the beam is not smooth; mask more, or compare with another estimate"
+    )
+    return Caution("source", text)
 
 
 @dataclass(frozen=True, eq=False)
