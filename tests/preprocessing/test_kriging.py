@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from helpers.fit_images import bump, counted
-from napari_shadowinv import InputError, Instrument, Recipe
+from napari_shadowinv import InputError, Instrument, InversionOptions, Recipe, invert
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.pipeline import run
@@ -174,6 +174,21 @@ def test_the_report_names_a_mask_that_leaves_a_halo():
     recipe = Recipe(source={"method": "kriged"}, options={"n_sites": 300})
     result = run(recipe, Radiograph(image, source_mask=np.hypot(Y, X) > 0.28))
     assert any("next to the source mask" in each.text for each in result.report.warnings)
+
+
+@pytest.mark.parametrize("rms", [0.0, 0.03])
+def test_random_waves_are_seen_around_a_traced_object(rms):
+    """With a recorded source that is even; without waves there is nothing to see."""
+    variations, deviations = [], []
+    for seed in range(6):
+        image, true = traced_shot(seed, rms=rms)
+        source = np.full(image.shape, 1000.0)
+        errors = invert(image, source=source, options=InversionOptions(n_sites=300)).errors
+        assert (errors.beam is None) == (rms == 0)
+        variations.append(errors.beam_variation)
+        deviations.append((true / true.mean()).std())
+        assert variations[-1] == pytest.approx(deviations[-1], rel=0.4)
+    assert np.mean(variations) == pytest.approx(np.mean(deviations), rel=0.15)
 
 
 def shot_of_a_blob():
