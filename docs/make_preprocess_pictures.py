@@ -20,8 +20,9 @@ from _drawing import BLUE, DARK, HERE, ORANGE, FloatArray, save
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
-from napari_shadowinv import invert, read, synthetic_image
+from napari_shadowinv import BeamPrior, invert, read, synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.preprocessing import (
     butterworth,
@@ -38,6 +39,7 @@ from napari_shadowinv.preprocessing import (
     uniform_source,
 )
 from napari_shadowinv.preprocessing.estimates import point_distance
+from napari_shadowinv.preprocessing.kriging import kriged_beam
 
 SHOT = "Image_20241017221829851.bmp"
 SHAPE = (160, 200)
@@ -133,9 +135,14 @@ def range_of(image: FloatArray, share: float = 0.5) -> tuple[float, float]:
 
 
 def source_picture(
-    name: str, title: str, shot: Scene, source: FloatArray, mask: NDArray[np.bool_] | None = None
+    name: str,
+    title: str,
+    shot: Scene,
+    source: FloatArray,
+    mask: NDArray[np.bool_] | None = None,
+    deviation: FloatArray | None = None,
 ) -> None:
-    """Shot, estimate, their ratio, and a cut with the true beam."""
+    """Shot, estimate, their ratio, and a cut with the true beam and two relative deviations."""
     figure, axes = page(title, [1, 1, 1, 1.15])
     mean = shot.shot.mean()
     limits = range_of(shot.shot / mean)
@@ -146,9 +153,13 @@ def source_picture(
         image.axhline(shot.row, color=ORANGE, lw=1, ls="--")
         if mask is not None:
             image.contour(mask, [0.5], colors=[BLUE], linewidths=1.3)
-    x = np.arange(SHAPE[1])
+    x, width = np.arange(SHAPE[1]), 3.0 if deviation is None else 1.5
     axes[3].plot(x, shot.shot[shot.row] / mean, color="0.7", lw=1, label="shot")
-    axes[3].plot(x, source[shot.row] / mean, color=ORANGE, lw=3, label="estimate")
+    axes[3].plot(x, source[shot.row] / mean, color=ORANGE, lw=width, label="estimate")
+    if deviation is not None:
+        low, high = (source[shot.row] / mean * (1 + k * deviation[shot.row]) for k in (-2, 2))
+        label = "± 2 standard deviations"
+        axes[3].fill_between(x, low, high, color=ORANGE, alpha=0.35, lw=0, label=label)
     axes[3].plot(x, shot.beam[shot.row] / mean, color=DARK, lw=1.3, ls="--", label="true beam")
     axes[3].set_ylim(0, 1.15 * max(limits[1], float((shot.beam / mean).max())))
     tidy(axes[3], f"Cut at y = {shot.row} px", "x (px)", "Intensity / mean")
@@ -205,6 +216,17 @@ def source_pictures() -> None:
         interpolated_source(covered.shot, mask, width=8.0),
         mask,
     )
+    uneven = scene(patchy_beam(18, seed=9), big_object())
+    source, prior = kriged_beam(uneven.shot, mask)
+    source_picture("kriged", "kriged_source", uneven, source, mask, on_pixels(prior))
+
+
+def on_pixels(prior: BeamPrior) -> FloatArray:
+    """Return the standard deviation of a prior of blocks on the pixels."""
+    assert prior.components is not None
+    blocks = np.sqrt((prior.components.patterns**2).sum(axis=0))
+    places = (np.indices(SHAPE) + 0.5) / prior.components.block - 0.5
+    return np.asarray(map_coordinates(blocks, places, order=1, mode="nearest"))
 
 
 def burner_sources_picture(folder: Path) -> None:
