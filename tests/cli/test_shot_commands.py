@@ -682,6 +682,11 @@ def test_sources_are_estimated_as_the_library_does(folder: Path) -> None:
             ["--source-width", 2, *bare_file, *mask_file],
             sources.interpolated_source(image, bare & mask, width=2.0),
         ),
+        (
+            "kriged",
+            bare_file,
+            sources.kriged_source(image, bare, on_caution=lambda caution: None),
+        ),
     )
     for name, flags, expected in choices:
         result = shadowinv("invert", "shot.npy", "--source-from", name, *flags, "--overwrite")
@@ -695,6 +700,8 @@ def test_sources_are_estimated_as_the_library_does(folder: Path) -> None:
         assert provenance.recipe.estimate.name() == name
         text = " ".join(result.stdout.split())
         assert f"source {provenance.recipe.estimate.summary}" in text
+        basis = "measured outside the object" if name == "kriged" else "assumed"
+        assert f"beam {basis}" in text
 
 
 def test_filters_match_the_library(folder: Path) -> None:

@@ -31,7 +31,7 @@ from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.options import BEAM_SOURCES, DETECTORS
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup, toroid
 from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.preprocessing import STEPS, Crop, LowPassFilter, PolynomialEstimate, Recipe
 from napari_shadowinv.provenance import Provenance
@@ -688,3 +688,20 @@ def test_a_layer_of_an_estimated_source_was_not_measured(
     tool.instrument.set_values({})
     tool.source.layers.layer = window.add_image(source.data, name="recorded")
     assert tool.recipe().instrument == Instrument()
+
+
+def test_the_beam_under_a_painted_mask_is_predicted_with_its_error(
+    window: Any, open_widget: Any, run: Any
+) -> None:
+    blob = gaussian_blob((64, 64), -6.0, 4.0)
+    window.add_image(np.random.default_rng(0).poisson(500 * synthetic_image(blob.displacement)))
+    tool = open_widget("Invert shot")
+    tool.options.set_values(FEW)
+    tool.source.picker.set_kind("kriged")
+    assert tool.source.picker.choice.currentText() == "estimate: predicted under the mask"
+    tool.source_masks.paint()
+    tool.source_masks.layer.data = (np.hypot(*(np.indices((64, 64)) - 31.5)) < 20).astype(int)
+    run(tool)
+    result = next(result for layer in window.layers if (result := result_of(layer)))
+    assert result.content.errors.beam_basis == "outside"
+    assert result.content.errors.beam_variation < 0.01
