@@ -18,7 +18,7 @@ from napari_shadowinv import (
     invert,
 )
 from napari_shadowinv._napari import commands
-from napari_shadowinv._napari.layer_metadata import role_of, setup_of
+from napari_shadowinv._napari.layer_metadata import is_estimate, role_of, setup_of
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair
@@ -80,6 +80,7 @@ def test_the_estimate_is_a_source_of_the_same_flux(
 ) -> None:
     ((data, keywords, _),) = commands.estimate_source(add_shot(viewer, shot, proton_setup))
     assert role_of(keywords) == "source"
+    assert is_estimate(keywords)
     assert setup_of(keywords) == proton_setup
     assert data.sum() == pytest.approx(shot.sum())
     assert data.std() < 0.5 * shot.std()

@@ -145,6 +145,25 @@ def test_random_waves_behind_a_traced_object_are_predicted_within_their_error():
     assert np.median(lengths) == pytest.approx(0.25, rel=0.15)
 
 
+@pytest.mark.parametrize("length", [0.13, 0.35])
+def test_the_error_of_a_prediction_has_its_size_at_any_length(length):
+    """R.m.s. of error over deviation; 1.5 if the compared lengths lie too far apart."""
+    ratios = []
+    for seed in range(24):
+        rng = np.random.default_rng(seed)
+        true = random_waves(rng, length, 0.03)(*np.indices((SIDE, SIDE)))
+        source, prior = kriged_beam(hidden(rng.poisson(1000 * true)), BARE)
+        error = np.log(source / true)
+        error -= error[BARE].mean()
+        places = np.s_[prior.components.block // 2 :: prior.components.block]
+        behind = ~BARE[places, places]
+        deviations = np.sqrt((prior.components.patterns**2).sum(axis=0))
+        deviations = deviations[: behind.shape[0], : behind.shape[1]]
+        ratios.append(error[places, places][behind] / deviations[behind])
+    rms = np.sqrt(np.square(np.concatenate(ratios)).mean())
+    assert 0.85 < rms < 1.3
+
+
 @pytest.mark.parametrize("width", [0.06, 0.09])
 def test_a_mask_that_leaves_a_halo_is_named(width):
     """At its rim the object changes the image by less than 1e-4, or by 2 %."""
