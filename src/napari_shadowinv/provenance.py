@@ -90,6 +90,8 @@ class ImageOrigin(Origin):
     strength, brightness, psf, noise
         Values of this image; None where the recipe counts. An image to invert was divided by its
         brightness.
+    measured : bool
+        Whether the source of an image of a fit was recorded, as `FitShot.measured`.
     notes : tuple of str
         Notes of the steps, for people.
     warnings : tuple of Caution
@@ -105,6 +107,7 @@ class ImageOrigin(Origin):
     brightness: float | None = None
     psf: float | None = None
     noise: Noise | None = None
+    measured: bool = True
     notes: tuple[str, ...] = ()
     warnings: tuple[Annotated[Caution, BeforeValidator(Caution.from_json)], ...] = ()
 

@@ -10,7 +10,7 @@ import pytest
 import tifffile
 
 from helpers.fit_images import of_each
-from napari_shadowinv import Fit, InputError, Instrument, ProtonSetup, fit
+from napari_shadowinv import Fit, InputError, Instrument, ProtonSetup, fit, rerun
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.io import read, write
@@ -195,3 +195,27 @@ def test_a_fit_takes_the_instrument_of_its_recipe(images: list[FloatArray]) -> N
     assert result.report.numbers.keys() == {"background"}
     assert result.provenance is not None
     assert result.provenance.recipe.instrument == instrument
+
+
+def test_a_source_declared_as_an_estimate_is_one_after_a_repeat(
+    images: list[FloatArray], tmp_path: Path
+) -> None:
+    files = [tmp_path / f"{k}.npy" for k in range(2)]
+    for file, image in zip(files, images, strict=True):
+        np.save(file, image)
+    np.save(tmp_path / "beam.npy", np.ones(SHAPE))
+    choices = FitChoices(noise=0.04, options=HASTY.model_copy(update={"samples": 2}))
+    are_assumed: dict[bool, bool] = {}
+    for measured in (True, False):
+        shots = [
+            FitShot(file, setup, source=tmp_path / "beam.npy", measured=measured)
+            for file, setup in zip(files, SETUPS, strict=True)
+        ]
+        result = run_fit(Recipe(fit=choices), shots)
+        assert result.report.beam is not None
+        are_assumed[measured] = result.report.beam.assumed
+        assert result.provenance is not None
+        assert [image.measured for image in result.provenance.images] == 2 * [measured]
+    assert are_assumed == {True: False, False: True}
+    write(tmp_path / "fit.shadowinv", result)
+    assert rerun(tmp_path / "fit.shadowinv").is_identical

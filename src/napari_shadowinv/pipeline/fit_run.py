@@ -192,7 +192,7 @@ class FitInputs:
     def images(self) -> list[FitShot]:
         """The images after the steps, with all that is known of them."""
         is_known = self.choices.beam == "known"
-        is_measured = self.provenance.recipe.estimate is None
+        may_be_measured = self.provenance.recipe.estimate is None
         images = [
             FitShot(
                 shot.image,
@@ -204,7 +204,7 @@ class FitInputs:
                 psf=self._point_spread(k),
                 noise=recorded.noise,
                 name=self.names[k],
-                measured=is_measured,
+                measured=may_be_measured and recorded.measured,
             )
             for k, (recorded, shot) in enumerate(zip(self.recorded, self.shots, strict=True))
         ]
@@ -467,7 +467,7 @@ def _image_origins(
     origins, masks = [], []
     for row, inputs, shot in zip(recorded, collected, ready, strict=True):
         before = inputs.provenance
-        names = ("strength", "brightness", "psf", "noise")
+        names = ("strength", "brightness", "psf", "noise", "measured")
         entries: dict[str, Any] = {name: getattr(row, name) for name in names}
         entries["setup"] = inputs.shot.setup
         entries |= {"notes": shot.notes, "warnings": shot.warnings}

@@ -434,6 +434,7 @@ class _Reader:
             brightness=origin.brightness,
             psf=origin.psf,
             noise=origin.noise,
+            measured=origin.measured,
         )
 
     def _mask(

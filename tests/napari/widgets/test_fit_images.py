@@ -285,6 +285,10 @@ def test_an_unknown_beam_is_fitted_and_shown(window: Any, tool: Any, run: Any) -
     assert "beam" not in texts(tool, 0)
     for source in of_each(inputs_of(tool).images, "source"):
         np.testing.assert_array_equal(source, 300 * beam)
+    assert all(of_each(inputs_of(tool).images, "measured"))
+    made_from = {"image": "14.7 MeV", "estimate": "fitted polynomial"}
+    measured.metadata.update(metadata_for("source", "", made_from=made_from))
+    assert not any(of_each(inputs_of(tool).images, "measured"))
 
 
 def test_steps_are_done_to_all_images_first(window: Any, tool: Any) -> None:

@@ -304,6 +304,7 @@ class FitImages(ToolPanel):
                 strength=(self.images.beam_value(row),) if setup is None else None,
                 brightness=factor,
                 psf=self.images.psf(row),
+                measured=self.source.layer is None or not about.is_estimate(self.source.layer),
             )
             for row, image, source, factor in zip(rows, images, sources, factors, strict=True)
         )
