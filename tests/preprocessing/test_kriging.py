@@ -186,6 +186,8 @@ def test_an_image_of_the_beam_alone_leaves_its_prediction_as_it_is():
         cautions = []
         kriged_source(rng.poisson(1000 * true), BARE, on_caution=cautions.append)
         assert not cautions
+    kriged_source(np.ones((SIDE, SIDE)), BARE, on_caution=cautions.append)
+    assert not cautions
 
 
 def test_the_report_names_a_mask_that_leaves_a_halo():

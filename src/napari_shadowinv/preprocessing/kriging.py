@@ -16,8 +16,6 @@ from functools import cached_property
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
-from scipy.ndimage import distance_transform_edt
-from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from napari_shadowinv._system.arrays import block_means
@@ -43,6 +41,7 @@ _RIM_SHARE = 0.15  # of the largest distance to a hidden block
 _MIN_RIM_BLOCKS = 1.5
 _SHARE_OF_CHANGE, _MAX_CHANGES = 0.9, 6  # of the variance, in this number of shapes
 _MAX_PLACES = 400
+_MIN_CHANGE = 1e-4  # of the logarithm, r.m.s.
 _MAX_CHANCE = 1e-4
 
 
@@ -164,8 +163,8 @@ def _halo_caution(blocks: _Blocks, fit: _Fit) -> Caution | None:
     rows, columns = np.nonzero(hidden)
     step = -(-len(rows) // _MAX_PLACES)
     places = rows[::step], columns[::step]
-    reach = _RIM_SHARE * float(distance_transform_edt(hidden).max())
-    farther = blocks.bare & (distance_transform_edt(blocks.bare) > max(reach, _MIN_RIM_BLOCKS))
+    depth, distance = (scipy.ndimage.distance_transform_edt(part) for part in (hidden, ~hidden))
+    farther = blocks.bare & (distance > max(_RIM_SHARE * float(depth.max()), _MIN_RIM_BLOCKS))
     if farther.sum() < _least_blocks(farther):
         return None
     without_rim = _Fit.to(fit.waves, farther, blocks.logs[farther], blocks.counts[farther])
@@ -177,8 +176,10 @@ def _halo_caution(blocks: _Blocks, fit: _Fit) -> Caution | None:
     share = np.cumsum(np.maximum(powers, 0)) / max(float(powers[powers > 0].sum()), 1e-300)
     count = min(int(np.searchsorted(share, _SHARE_OF_CHANGE)) + 1, _MAX_CHANGES)
     amplitudes = shapes[:, :count].T @ change
-    square = float((amplitudes**2 / np.maximum(powers[:count], 1e-300)).sum())
-    if chi2.sf(square, count) > _MAX_CHANCE:
+    least = _MIN_CHANGE**2 * len(change)  # of an image without noise
+    square = float((amplitudes**2 / np.maximum(powers[:count], least)).sum())
+    chance = scipy.special.gammaincc(count / 2, square / 2)  # of a larger χ²
+    if chance > _MAX_CHANCE:
         return None
     text = (
         "the image next to the source mask is not as the beam farther away predicts it, by "
