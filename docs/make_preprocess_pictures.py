@@ -216,7 +216,7 @@ def source_pictures() -> None:
         interpolated_source(covered.shot, mask, width=8.0),
         mask,
     )
-    uneven = scene(patchy_beam(18, seed=9), big_object())
+    uneven = scene(patchy_beam(22, seed=9), big_object())
     source, prior = kriged_beam(uneven.shot, mask)
     source_picture("kriged", "kriged_source", uneven, source, mask, on_pixels(prior))
 

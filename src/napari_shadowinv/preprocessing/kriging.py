@@ -2,7 +2,8 @@
 
 The logarithm of the beam is a Gaussian process: smooth, random, correlated by exp(-r²/2L²). Blocks
 of pixels without the object give its r.m.s., its length L and the noise by their marginal
-likelihood; lengths count in proportion to it. The conditional mean is the source, the conditional
+likelihood; lengths count in proportion to it, as does a quadratic about which the process may vary,
+such as the logarithm of a Gaussian spot. The conditional mean is the source, the conditional
 variance the prior of the error that remains. The process is a sum of cosines over a domain half as
 large again as the image, so that the border needs no slope of its own.
 """
@@ -26,14 +27,18 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import BeamComponents, BeamPrior
 from napari_shadowinv.preprocessing.pixels import beam_pixels, with_flux_of
 
-_GRID = 48  # blocks along the longer side
+_GRID = 64  # blocks along the longer side
 _DOMAIN = 1.5  # sides of the image
 _LENGTHS = np.geomspace(0.1, 1.2, 12)  # shorter sides; errors are too small with half of them
 _SHORTEST_WAVE = 3.6  # in units of 1/L: the spectrum has fallen to 1/650
 _RATIOS = np.geomspace(1e-4, 1e8, 97)  # variance of the beam over the noise of a block
+_TREND = 1.0  # expected size of the terms of a quadratic in the logarithm
+_LOG_2PI = math.log(2 * math.pi)
+_TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of y and x
+_MIN_NOISE = 1e-4  # of a block: smooth beams are no exact sums of waves
 _MIN_WEIGHT = 0.02  # of a length, to count
 _MAX_COMPONENTS, _LEFT_OUT = 32, 1e-3  # share of the variance
-_MIN_USED_SHARE = 0.5  # of a block's pixels
+_COMPLETE, _MIN_USED_SHARE = 0.999, 0.5  # of a block's pixels
 _DIMMEST = 1e-2  # of the mean
 _MIN_BARE_SHARE = 0.1  # of the blocks
 _MIN_BLOCKS = 20
@@ -91,7 +96,7 @@ def kriged_beam(
     rms = math.sqrt(float((light * variance).sum() / light.sum()))
     height, width = blocks.values.shape
     components = BeamComponents(patterns, blocks.block, (height, width), 0.0, "outside")
-    length = float(np.exp(weights @ np.log(_LENGTHS)))
+    length = float(np.exp(weights @ np.log(np.repeat(_LENGTHS, 2))))
     prior = BeamPrior(rms=min(rms, 0.99), length=min(length, 1.0)).with_components(components)
     return blocks.source(beam), prior
 
@@ -125,7 +130,13 @@ class _Blocks:
         block = -(-max(values.shape) // _GRID)
         share = block_means(usable.astype(np.float64), block)
         means = block_means(np.where(usable, values, 0.0), block) / np.maximum(share, 1e-300)
-        bare = share > _MIN_USED_SHARE
+        # A part of a block has another middle.
+        bare = share > _COMPLETE
+        for axis, side in enumerate(values.shape):
+            if side % block:
+                bare[(slice(None),) * axis + (-1,)] = False
+        if bare.sum() < _least_blocks(bare):
+            bare = share > _MIN_USED_SHARE
         if bare.any():
             bare &= means > _DIMMEST * means[bare].mean()
         if bare.sum() < _least_blocks(bare):
@@ -142,8 +153,10 @@ class _Blocks:
         fits = []
         for length in _LENGTHS:
             report("source", 0)
-            waves = _Waves(self.values.shape, self.block, length * min(self.values.shape))
-            fits.append(_Fit.to(waves, self.bare, self.logs[self.bare], self.counts[self.bare]))
+            for terms in (1, len(_TERMS)):
+                side = min(self.values.shape)
+                waves = _Waves(self.values.shape, self.block, length * side, terms)
+                fits.append(_Fit.to(waves, self.bare, self.logs[self.bare], self.counts[self.bare]))
         return fits
 
     def source(self, beam: FloatArray) -> FloatArray:
@@ -170,7 +183,7 @@ def _halo_caution(blocks: _Blocks, fit: _Fit) -> Caution | None:
     without_rim = _Fit.to(fit.waves, farther, blocks.logs[farther], blocks.counts[farther])
     change = (fit.mean - without_rim.mean)[places]
     # Of nested data, the change of a mean has the variance that the data take away.
-    spread, wider = (each.rows[places] @ each.spread for each in (fit, without_rim))
+    spread, wider = (each.deviations[places] for each in (fit, without_rim))
     powers, shapes = scipy.linalg.eigh(wider @ wider.T - spread @ spread.T)
     powers, shapes = powers[::-1], shapes[:, ::-1]
     share = np.cumsum(np.maximum(powers, 0)) / max(float(powers[powers > 0].sum()), 1e-300)
@@ -196,6 +209,7 @@ class _Waves:
     shape: tuple[int, ...]
     block: int
     length: float
+    terms: int  # of a quadratic about which they vary
 
     @cached_property
     def _numbers(self) -> list[FloatArray]:
@@ -222,79 +236,133 @@ class _Waves:
         cosines = np.cos(np.outer(places + 0.5 + beyond, numbers))
         return np.asarray(np.where(numbers > 0, math.sqrt(2), 1.0) * cosines)
 
+    def _middles(self, side: int) -> FloatArray:
+        """Return the middles of blocks along a side, px."""
+        count = -(-side // self.block)
+        return np.asarray(self.block * (np.arange(count, dtype=np.float64) + 0.5) - 0.5)
+
     @cached_property
     def at_blocks(self) -> FloatArray:
         """Waves of one standard deviation at the middles of blocks, shape (h, w, waves)."""
         along_y, along_x = (
-            self._cosines(
-                axis, self.block * (np.arange(-(-side // self.block), dtype=np.float64) + 0.5) - 0.5
-            )
-            for axis, side in enumerate(self.shape)
+            self._cosines(axis, self._middles(side)) for axis, side in enumerate(self.shape)
         )
         rows, columns = np.nonzero(self._spectrum)
         waves = along_y[:, None, rows] * along_x[None, :, columns]
         return np.asarray(waves * np.sqrt(self._spectrum[rows, columns]))
 
-    def at_pixels(self, coefficients: FloatArray) -> FloatArray:
-        """Return the sum of the waves at all pixels."""
+    @cached_property
+    def terms_at_blocks(self) -> FloatArray:
+        """Terms of a quadratic at the middles of blocks, shape (h, w, terms)."""
+        along_y, along_x = (_powers(self._middles(side), side) for side in self.shape)
+        powers = _TERMS[: self.terms]
+        return np.stack([np.outer(along_y[:, i], along_x[:, j]) for i, j in powers], axis=2)
+
+    def at_pixels(self, coefficients: FloatArray, trend: FloatArray) -> FloatArray:
+        """Return the sum of the waves and a quadratic at all pixels."""
         table = np.sqrt(self._spectrum)
         table[table > 0] *= coefficients
         along_y, along_x = (
             self._cosines(axis, np.arange(side, dtype=np.float64))
             for axis, side in enumerate(self.shape)
         )
-        return np.asarray(along_y @ table @ along_x.T)
+        waves = along_y @ table @ along_x.T
+        table = np.zeros((3, 3))
+        table[tuple(np.transpose(_TERMS[: self.terms]))] = trend
+        along_y, along_x = (_powers(np.arange(side, dtype=np.float64), side) for side in self.shape)
+        return np.asarray(waves + along_y @ table @ along_x.T)
+
+
+def _powers(places: FloatArray, side: int) -> FloatArray:
+    """Return the powers 0 to 2 of places in pixels, from -1 to 1 over a side, (places, 3)."""
+    return np.asarray(((2 * places + 1) / side - 1)[:, None] ** np.arange(3))
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Process of one length, conditioned on the blocks without the object."""
+    """Process of one length about a constant or a quadratic, conditioned on the bare blocks."""
 
     waves: _Waves
-    level: float  # mean of the logarithms
-    middle: FloatArray  # (waves,), their mean, in which the level replaces them
+    trend: FloatArray  # (terms,), of the logarithms
+    trend_of_waves: FloatArray  # (terms, waves), which the quadratic takes from them
     coefficients: FloatArray  # (waves,), mean amplitudes, in standard deviations of the waves
     spread: FloatArray  # (waves, waves), columns whose squares sum to the amplitudes' covariance
+    trend_spread: FloatArray  # (terms, terms), columns of the quadratic's covariance likewise
     evidence: float  # logarithm of the marginal likelihood, up to a constant
 
     @property
     def mean(self) -> FloatArray:
         """Mean of the logarithm of the beam in each block."""
-        return np.asarray(self.rows @ self.coefficients + self.level)
+        return np.asarray(self.rows @ self.coefficients + self.waves.terms_at_blocks @ self.trend)
 
     @property
     def rows(self) -> FloatArray:
-        """Waves in each block, less their mean."""
-        return np.asarray(self.waves.at_blocks - self.middle)
+        """Waves in each block, less their quadratics."""
+        return np.asarray(self.waves.at_blocks - self.waves.terms_at_blocks @ self.trend_of_waves)
+
+    @property
+    def deviations(self) -> FloatArray:
+        """Shapes whose squares sum to the variance in each block, (h, w, waves + terms)."""
+        parts = [self.rows @ self.spread, self.waves.terms_at_blocks @ self.trend_spread]
+        return np.concatenate(parts, axis=2)
+
+    @property
+    def at_pixels(self) -> FloatArray:
+        """Mean of the logarithm of the beam in each pixel."""
+        trend = self.trend - self.trend_of_waves @ self.coefficients
+        return self.waves.at_pixels(self.coefficients, trend)
 
     @classmethod
     def to(cls, waves: _Waves, bare: BoolArray, logs: FloatArray, counts: FloatArray) -> _Fit:
         """Fit the logarithms of bare blocks, whose noise has a variance of σ² / counts."""
-        rows = waves.at_blocks[bare]
-        counts = counts / counts.mean()
-        middle, level = (counts @ rows) / counts.sum(), float(counts @ logs / counts.sum())
-        roots = np.sqrt(counts)
-        data = roots * (logs - level)
-        centred = roots[:, None] * (rows - middle)
+        rows, terms = waves.at_blocks[bare], waves.terms_at_blocks[bare]
+        roots = np.sqrt(counts / counts.mean())[:, None]
+        inverse = np.linalg.pinv(roots * terms)
+        by_terms = inverse * roots[:, 0]
+        trend, trend_of_waves = by_terms @ logs, by_terms @ rows
+        data = roots[:, 0] * (logs - terms @ trend)
+        centred = roots * (rows - terms @ trend_of_waves)
         powers, turned = scipy.linalg.eigh(centred.T @ centred)
         powers = np.maximum(powers, 0.0)
         pull = turned.T @ (centred.T @ data)
         gain = _RATIOS[:, None] / (1 + _RATIOS[:, None] * powers)
-        noise = (data @ data - gain @ pull**2) / (len(data) - 1)
-        noise = np.maximum(noise, 1e-12)
+        freedom = len(data) - terms.shape[1]
+        noise = (data @ data - gain @ pull**2) / freedom
+        noise = np.maximum(noise, _MIN_NOISE**2)
         evidences = -0.5 * (
-            np.log1p(_RATIOS[:, None] * powers).sum(axis=1) + (len(data) - 1) * np.log(noise)
+            np.log1p(_RATIOS[:, None] * powers).sum(axis=1)
+            + freedom * (np.log(noise) + 1 + _LOG_2PI)
         )
         best = int(evidences.argmax())
         coefficients = turned @ (gain[best] * pull)
+        evidence = evidences[best] + _evidence_of_trend(
+            roots * terms, trend - trend_of_waves @ coefficients
+        )
         return cls(
             waves,
-            level,
-            middle,
+            trend,
+            trend_of_waves,
             coefficients,
             turned * np.sqrt(noise[best] * gain[best]),
-            float(evidences[best]),
+            _square_root(noise[best] * (inverse @ inverse.T)),
+            float(evidence),
         )
+
+
+def _evidence_of_trend(terms: FloatArray, trend: FloatArray) -> float:
+    """Return the logarithm of the density of a trend's data, less that of the constant."""
+    constant, slopes = terms[:, :1], terms[:, 1:]
+    slopes = slopes - constant @ (constant.T @ slopes) / (constant**2).sum()
+    _, log_volume = np.linalg.slogdet(_TREND**2 * slopes.T @ slopes)
+    count = slopes.shape[1]
+    square = float((trend[1:] ** 2).sum()) / _TREND**2
+    return float(-0.5 * (log_volume + count * _LOG_2PI + square))
+
+
+def _square_root(covariance: FloatArray) -> FloatArray:
+    """Return columns whose squares sum to a covariance."""
+    powers, shapes = scipy.linalg.eigh(covariance)
+    return np.asarray(shapes * np.sqrt(np.maximum(powers, 0.0)))
 
 
 def _joint(fits: list[_Fit]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -304,10 +372,7 @@ def _joint(fits: list[_Fit]) -> tuple[FloatArray, FloatArray, FloatArray, FloatA
     weights[weights < _MIN_WEIGHT * weights.sum()] = 0.0
     weights /= weights.sum()
     likely = [(weight, fit) for weight, fit in zip(weights, fits, strict=True) if weight]
-    beam = sum(
-        weight * (fit.waves.at_pixels(fit.coefficients) - fit.middle @ fit.coefficients)
-        for weight, fit in likely
-    )
+    beam = sum(weight * fit.at_pixels for weight, fit in likely)
     light = np.exp(sum(weight * fit.mean for weight, fit in likely))
     return np.asarray(beam), np.asarray(light), _components(likely), weights
 
@@ -323,7 +388,7 @@ def _components(fits: list[tuple[float, _Fit]]) -> FloatArray:
     """Return shapes whose squares sum to the variance of the beam in each block, (k, h, w)."""
     mean = sum(weight * fit.mean for weight, fit in fits)
     columns = [
-        math.sqrt(weight) * np.concatenate([fit.rows @ fit.spread, shift], axis=2)
+        math.sqrt(weight) * np.concatenate([fit.deviations, shift], axis=2)
         for weight, fit in fits
         for shift in [(fit.mean - mean)[..., None]]
     ]
