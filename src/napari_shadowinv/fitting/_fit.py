@@ -48,11 +48,11 @@ from napari_shadowinv.fitting.posterior import (
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.search import (
     MIDDLE_SPACING,
+    SMALL_PX,
     Minimum,
     Start,
     estimate_smoothness,
     in_recorded_pixels,
-    needs_recorded_pixels,
     refine_minimum,
     search,
     settle_minimum,
@@ -202,7 +202,8 @@ def fit(
             # One image cannot tell the instrument from the object: its numbers stay at 0.
             scene = replace(scene, imperfect=EXACT)
         minima = [_with_numbers(scene, minimum) for minimum in minima]
-        if scene.imperfect.parts and needs_recorded_pixels(scene, data.size):
+        if scene.imperfect.parts and min(data.size) < SMALL_PX:
+            # In pixels of two, λ and the errors of the instrument's numbers come out too small.
             minima[0] = in_recorded_pixels(scene, minima[0])
     with _timed("smoothness", seconds):
         scene, best = estimate_smoothness(scene, minima[0], rng, on_step)

@@ -23,7 +23,7 @@ from scipy.linalg import eigh_tridiagonal
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.descent import Preconditioner, finer, product, settle, solve
+from napari_shadowinv.fitting.descent import Preconditioner, finer, product, solve
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import FitData
 from napari_shadowinv.fitting.unknowns import Unknowns
@@ -49,7 +49,7 @@ _OPEN_BEAMS = 0.05
 _MOVED_BY_BEAMS = 0.01
 _BEAM_MODES = 8
 _RESPONSE, _RESPONSE_SEED = 0.01, 2  # of fields to numbers of an instrument
-_REFITTED, _REFITTED_GAIN = 3, 0.3  # steps
+_REFITTED = 0.02
 _MOST_STEPS = 600
 _PROBES, _LANCZOS = 8, 25
 _LEAST_DETERMINED = 1e-3  # coefficients
@@ -175,6 +175,9 @@ class Posterior:
         details are fitted to the noise, and for the weakest fields. How far that shifts the
         derivative of the objective, least for all else, is found from fits to images of the
         present unknowns with fresh noise: pairs of opposite noise, which leaves out its mean.
+
+        Derivatives are taken along a number and what responds to it, so that it matters little
+        whether the rest has settled; one linear step is enough for each of these fits.
         """
         scene, unknowns = self._scene, self._unknowns
         rng = np.random.default_rng(_RESPONSE_SEED)
@@ -184,24 +187,33 @@ class Posterior:
             for unit in units
         ]
         pushed = np.stack([self._linear.push(change).ravel() for change in changes])
-        curvature = np.einsum("ix,jx->ij", pushed, pushed)
+        numbers = np.array([product(unit.flat(), unknowns.flat()) for unit in units])
+
+        def slopes(images: FloatArray, at: Unknowns) -> tuple[FloatArray, Unknowns]:
+            again = replace(scene, images=images)
+            _, slope = again.value_and_gradient(at, self._counts)
+            along = [product(change.flat(), slope.flat()) for change in changes]
+            # Their prior has the derivative that is equal to them.
+            return np.array(along) - numbers, slope
+
         model = scene.model(unknowns, self._counts)
-        deviations = np.divide(
-            1, np.sqrt(scene.weights), out=np.zeros_like(model), where=scene.weights > 0
-        )
+        roots = np.sqrt(scene.weights)
+        deviations = np.divide(1, roots, out=np.zeros_like(roots), where=roots > 0)
         expected = np.zeros(len(units))
         for _ in range(pairs):
             noise = deviations * rng.normal(size=model.shape)
             for sign in (1, -1):
-                again = replace(scene, images=model + sign * noise)
-                refitted, *_ = settle(again, unknowns, steps=_REFITTED, least_gain=_REFITTED_GAIN)
-                expected += _slopes(again, refitted, units) / (2 * pairs)
+                images = model + sign * noise
+                _, slope = slopes(images, unknowns)
+                step = self._change(slope, _REFITTED)
+                refitted = unknowns.plus(unknowns.like(-step.flat()))
+                expected += slopes(images, refitted)[0] / (2 * pairs)
         return Response(
             changes,
-            numbers=np.array([product(unit.flat(), unknowns.flat()) for unit in units]),
-            slopes=_slopes(scene, unknowns, units),
+            numbers=numbers,
+            slopes=slopes(scene.images, unknowns)[0],
             expected=expected,
-            curvature=curvature,
+            curvature=np.einsum("ix,jx->ij", pushed, pushed),
         )
 
     def effects(self, sample: Sample) -> dict[str, Unknowns]:
@@ -482,13 +494,6 @@ def draw_variations(
         field -= field[inside].mean()
         field /= np.sqrt((field[inside] ** 2).mean())
     return fields
-
-
-def _slopes(scene: Scene, unknowns: Unknowns, units: Sequence[Unknowns]) -> FloatArray:
-    """Derivatives of the misfit by numbers of the instrument, without their prior."""
-    _, slope = scene.value_and_gradient(unknowns, scene.ray_counts(unknowns))
-    flat = slope.flat() - scene.prior.times(unknowns).flat()
-    return np.array([product(unit.flat(), flat) for unit in units])
 
 
 _PART_SAMPLES, _PARTS = 3, 0.02

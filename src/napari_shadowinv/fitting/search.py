@@ -28,7 +28,6 @@ __all__ = [
     "Start",
     "estimate_smoothness",
     "in_recorded_pixels",
-    "needs_recorded_pixels",
     "refine_minimum",
     "search",
     "settle_minimum",
@@ -176,16 +175,6 @@ def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
     return Minimum(minimum.start, unknowns, minimum.value, _displacement(scene, unknowns), 1)
 
 
-def needs_recorded_pixels(scene: Scene, size: tuple[int, int]) -> bool:
-    """Return whether larger pixels would hide what tells an instrument's numbers from the fields.
-
-    In pixels of two, λ and the errors of numbers of small images come out too small, and fine
-    structure that tells a blur from a smooth object is lost.
-    """
-    is_small = scene.images.size <= _MOST_RECORDED
-    return min(size) < SMALL_PX or (bool(scene.imperfect.of_response) and is_small)
-
-
 def estimate_smoothness(
     scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep
 ) -> tuple[Scene, Minimum]:
@@ -204,6 +193,9 @@ def estimate_smoothness(
         smoothness, scene, end = _settle_smoothness(scene, end, rng, on_step)
     smoothness = smoothness if given is not None else SMOOTHNESS_RATIO * smoothness
     scene = replace(scene, smoothness=smoothness)
+    if response and scene.images.size <= _MOST_RECORDED:
+        # In larger pixels fine structure is lost by which a blur differs from a smooth object.
+        end = in_recorded_pixels(scene, end)
     end = settle_minimum(scene, end, on_step, least_gain=_LAST_GAIN)
     return _settle_response(scene, end, rng, on_step) if response else (scene, end)
 
