@@ -14,6 +14,7 @@ from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import Imperfect
 from napari_shadowinv.fitting.posterior import Posterior, draw_variations
 from napari_shadowinv.fitting.rays import KNOT
+from napari_shadowinv.fitting.search import Minimum, estimate_smoothness
 from napari_shadowinv.fitting.unknowns import Unknowns
 
 DRAWS = 160
@@ -336,3 +337,21 @@ def test_draw_variations_have_unit_rms_inside_and_the_length() -> None:
     for axis in (1, 2):
         slope = np.sqrt((np.gradient(inside, axis=axis) ** 2).mean())
         assert slope == pytest.approx(1 / length, rel=0.1)
+
+
+def test_numbers_that_begin_far_away_end_within_their_errors() -> None:
+    """A search with smooth fields can carry a background many deviations away."""
+    scene, truth = imperfect_scene()
+    model = scene.model(truth, scene.ray_counts(truth))
+    noise = 0.01 * np.random.default_rng(5).normal(size=model.shape)
+    shot = replace(scene, images=model + noise, held=frozenset())
+    far = truth._replace(separate=np.full((2, 1), -9.0))
+    rng = np.random.default_rng(0)
+    start = Minimum("far", far, np.inf, np.zeros((1, 2, 20, 24)), 1)
+    settled, end = estimate_smoothness(shot, start, rng, lambda *_: None)
+    assert settled.held == {"blur", "background"}
+    assert settled.spread is not None
+    off = np.linalg.solve(
+        settled.spread, numbers_of(scene, end.unknowns) - numbers_of(scene, truth)
+    )
+    assert np.abs(off).max() < 3

@@ -9,7 +9,14 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.descent import coarser, descend, finer, settle, smoothness_in_pixels
+from napari_shadowinv.fitting.descent import (
+    coarser,
+    descend,
+    finer,
+    product,
+    settle,
+    smoothness_in_pixels,
+)
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.posterior import Posterior, Response
 from napari_shadowinv.fitting.rays import KNOT
@@ -52,8 +59,11 @@ _ROUNDS, _ROUND_STEPS, _SETTLED = 6, 40, 0.25  # of λ and κ; and by what share
 # An object's roughness is not spread evenly, as the likeliest λ and κ assume: they would round it
 # off where it is sharpest.
 SMOOTHNESS_RATIO = 0.1  # of them
+# Of opposite noise; and the share of the expected slopes that is uncertain: objects whose fields
+# are smoothed twice show it to a fifth.
 _PAIRS, _UNSURE_SLOPES = 2, 0.25
 _RESPONSE_ROUNDS, _NUMBERS_SETTLED = 8, 0.05  # squared distance in standard deviations
+_LIKELY_NUMBER = 1.0  # where numbers begin, at most
 _SAME_FIELD = 0.03  # of the displacement, r.m.s.
 
 
@@ -186,7 +196,7 @@ def estimate_smoothness(
     smoothness = np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1)) if given is None else given
     response = scene.imperfect.of_response
     scene = replace(scene, smoothness=smoothness, held=scene.held | response)
-    end = settle_minimum(scene, end, on_step)
+    end = settle_minimum(scene, _with_likely_numbers(scene, end), on_step)
     if given is not None and not response:
         return scene, end
     if given is None:
@@ -214,6 +224,16 @@ def _settle_smoothness(
     return smoothness, scene, end
 
 
+def _with_likely_numbers(scene: Scene, end: Minimum) -> Minimum:
+    """Move numbers of the response, which a search with smooth fields carries far away, nearer."""
+    unknowns = end.unknowns
+    for unit in coarser(scene, end.bin).response_units():
+        number = product(unit.flat(), unknowns.flat())
+        shift = float(np.clip(number, -_LIKELY_NUMBER, _LIKELY_NUMBER)) - number
+        unknowns = unknowns.plus(unknowns.like(shift * unit.flat()))
+    return replace(end, unknowns=unknowns)
+
+
 def _settle_response(
     scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep
 ) -> tuple[Scene, Minimum]:
@@ -223,7 +243,8 @@ def _settle_response(
         mean, precision = _mean_of_numbers(response)
         step = np.maximum(mean, scene.least_numbers()) - response.numbers
         is_settled = step @ precision @ step < _NUMBERS_SETTLED
-        step /= max(1.0, float(np.abs(step).max()))
+        whole = step
+        step = step / max(1.0, float(np.abs(step).max()))
         unknowns = end.unknowns
         for each, share in zip(response.changes, step, strict=True):
             unknowns = unknowns.plus(unknowns.like(share * each.flat()))
@@ -231,14 +252,13 @@ def _settle_response(
         end = settle_minimum(scene, end, on_step, least_gain=_LAST_GAIN)
         if is_settled:
             break
-    return replace(scene, spread=np.linalg.cholesky(np.linalg.inv(precision))), end
+    # Numbers that have not settled are at least as uncertain as they would still have moved.
+    covariance = np.linalg.inv(precision) + np.outer(whole, whole)
+    return replace(scene, spread=np.asarray(np.linalg.cholesky(covariance))), end
 
 
 def _mean_of_numbers(response: Response) -> tuple[FloatArray, FloatArray]:
-    """The likeliest numbers of an instrument, and the inverse of their covariance.
-
-    The derivatives that are expected are taken as known to a share.
-    """
+    """The likeliest numbers of an instrument, and the inverse of their covariance."""
     unit = np.eye(len(response.numbers))
     curvature = response.curvature + 1e-9 * (1 + np.trace(response.curvature)) * unit
     unsure = _UNSURE_SLOPES * response.expected
