@@ -262,24 +262,25 @@ class Scene:
     def response_units(self) -> list[Unknowns]:
         """Return a change by each number on which the response to fields depends: by 1."""
         units = []
-        for part in self.imperfect.parts:
-            if part.key not in self.imperfect.of_response:
-                continue
-            for k in range(1 if part.is_common else len(self.images)):
-                unit = self.nothing().zeros()
-                (unit.common if part.is_common else unit.separate[k])[part.places] = 1
-                units.append(unit)
+        for part, k in self._response_numbers():
+            unit = self.nothing().zeros()
+            (unit.common if part.is_common else unit.separate[k])[part.places] = 1
+            units.append(unit)
         return units
 
     def least_numbers(self) -> FloatArray:
         """Return the least value of each number of `response_units`: no image is sharpened."""
         stated = min(self._variance(k) for k in range(len(self.psf)))
-        least = []
+        sharpest = -stated / self.imperfect.blur if self.imperfect.blur else -np.inf
+        keys = [part.key for part, _ in self._response_numbers()]
+        return np.array([sharpest if key == "blur" else -np.inf for key in keys])
+
+    def _response_numbers(self) -> Iterator[tuple[Part, int]]:
+        """The imperfection of each number of `response_units`, and its image."""
         for part in self.imperfect.parts:
             if part.key in self.imperfect.of_response:
-                end = -stated / self.imperfect.blur if part.key == "blur" else -np.inf
-                least += [end] * (1 if part.is_common else len(self.images))
-        return np.array(least)
+                for k in range(1 if part.is_common else len(self.images)):
+                    yield part, k
 
     def number_scales(self) -> tuple[FloatArray, FloatArray]:
         """Return approximate standard deviations of the instrument's numbers, (n,) and (L, n)."""

@@ -189,12 +189,13 @@ class Posterior:
         pushed = np.stack([self._linear.push(change).ravel() for change in changes])
         numbers = np.array([product(unit.flat(), unknowns.flat()) for unit in units])
 
-        def slopes(images: FloatArray, at: Unknowns) -> tuple[FloatArray, Unknowns]:
-            again = replace(scene, images=images)
-            _, slope = again.value_and_gradient(at, self._counts)
-            along = [product(change.flat(), slope.flat()) for change in changes]
+        def gradient(images: FloatArray, at: Unknowns) -> Unknowns:
+            return replace(scene, images=images).value_and_gradient(at, self._counts)[1]
+
+        def along(slope: Unknowns) -> FloatArray:
             # Their prior has the derivative that is equal to them.
-            return np.array(along) - numbers, slope
+            forces = np.array([product(change.flat(), slope.flat()) for change in changes])
+            return np.asarray(forces - numbers)
 
         model = scene.model(unknowns, self._counts)
         roots = np.sqrt(scene.weights)
@@ -204,14 +205,13 @@ class Posterior:
             noise = deviations * rng.normal(size=model.shape)
             for sign in (1, -1):
                 images = model + sign * noise
-                _, slope = slopes(images, unknowns)
-                step = self._change(slope, _REFITTED)
+                step = self._change(gradient(images, unknowns), _REFITTED)
                 refitted = unknowns.plus(unknowns.like(-step.flat()))
-                expected += slopes(images, refitted)[0] / (2 * pairs)
+                expected += along(gradient(images, refitted)) / (2 * pairs)
         return Response(
             changes,
             numbers=numbers,
-            slopes=slopes(scene.images, unknowns)[0],
+            slopes=along(gradient(scene.images, unknowns)),
             expected=expected,
             curvature=np.einsum("ix,jx->ij", pushed, pushed),
         )

@@ -67,6 +67,7 @@ class Estimate(Choice):
     function: ClassVar[Callable[..., FloatArray]]
     needs_mask: ClassVar[bool] = False  # does it nothing without a mask
     uses_mask: ClassVar[bool] = True  # does it anything with one
+    is_checked: ClassVar[bool] = False  # does its function know `on_caution`
 
     def adapt_to(
         self, setup: Setup | None, shape: tuple[int, int], matrix: FloatArray | None = None
@@ -104,7 +105,10 @@ class Estimate(Choice):
         should_stop: ShouldStop | None,
         on_caution: OnCaution | None,
     ) -> FloatArray:
-        return self.function(image, mask=mask, should_stop=should_stop, **self.values())
+        values = self.values()
+        if self.is_checked:
+            values["on_caution"] = on_caution
+        return self.function(image, mask=mask, should_stop=should_stop, **values)
 
     def beam_prior(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
@@ -352,19 +356,11 @@ class KrigedEstimate(Estimate):
     """A smooth random beam, predicted from around the object with its error."""
 
     needs_mask = True
+    is_checked = True
     title = "predicted under the mask"
+    function = staticmethod(kriged_source)
     place = 80
     method: Literal["kriged"] = "kriged"
-
-    def _source(
-        self,
-        image: FloatArray,
-        mask: BoolArray | None,
-        should_stop: ShouldStop | None,
-        on_caution: OnCaution | None,
-    ) -> FloatArray:
-        assert mask is not None
-        return kriged_source(image, mask, should_stop=should_stop, on_caution=on_caution)
 
     def beam_prior(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
@@ -379,23 +375,6 @@ _NOTABLE_EXTRAPOLATION = 1.5  # times the brightest pixel seen
 # Of a fitted Gaussian: height over the image's mean, and sides from the image's middle.
 _MAX_HEIGHT = 1e3
 _MAX_DISTANCE = 3.0
-
-
-class GaussianEstimate(Estimate):
-    """A fitted elliptical spot."""
-
-    title = "fitted Gaussian"
-    place = 30
-    method: Literal["gaussian"] = "gaussian"
-
-    def _source(
-        self,
-        image: FloatArray,
-        mask: BoolArray | None,
-        should_stop: ShouldStop | None,
-        on_caution: OnCaution | None,
-    ) -> FloatArray:
-        return gaussian_source(image, mask=mask, should_stop=should_stop, on_caution=on_caution)
 
 
 def gaussian_source(
@@ -453,6 +432,16 @@ def gaussian_source(
         )
         report_caution(Caution("source", text))
     return pixels.with_flux_of(mean * beam, values, usable)
+
+
+class GaussianEstimate(Estimate):
+    """A fitted elliptical spot."""
+
+    is_checked = True
+    title = "fitted Gaussian"
+    function = staticmethod(gaussian_source)
+    place = 30
+    method: Literal["gaussian"] = "gaussian"
 
 
 def _block_samples(
