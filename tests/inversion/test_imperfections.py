@@ -251,7 +251,7 @@ def test_a_larger_image_has_the_same_relative_effects():
         ({"beam_length": 0.0}, "beam_length"),
         ({"blur": float("nan")}, "blur"),
         ({"bakground": 0.1}, "background"),
-        ({"beam": BeamPrior(rms=0.1), "beam_rms": 0.2}, "beam and beam_rms"),
+        ({"beam": BeamPrior(rms=0.1), "beam_rms": 0.2}, "'beam' and 'beam_rms'"),
         ({"beam": 0.1}, "beam is 0.1"),
         ({"beam": {"rms": 2}}, "rms"),
     ],
