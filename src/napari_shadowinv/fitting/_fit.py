@@ -463,10 +463,12 @@ def _basins(
     middle = replace(coarser(scene, best.bin), spacing=MIDDLE_SPACING)
     ends = [best]
     for minimum in others[:2]:
-        same = minimum if minimum.bin == best.bin else in_recorded_pixels(scene, minimum)
-        now, numbers = same.unknowns, best.unknowns
-        now = now._replace(common=numbers.common, separate=numbers.separate)
-        ends.append(settle_minimum(scene, replace(same, unknowns=now), on_step, "other starts"))
+        rival = minimum if minimum.bin == best.bin else in_recorded_pixels(scene, minimum)
+        unknowns = rival.unknowns._replace(
+            common=best.unknowns.common, separate=best.unknowns.separate
+        )
+        rival = replace(rival, unknowns=unknowns)
+        ends.append(settle_minimum(scene, rival, on_step, "other starts"))
     chi2 = [
         middle.chi2(minimum.unknowns, middle.ray_counts(minimum.unknowns)).mean()
         for minimum in ends

@@ -190,19 +190,20 @@ def estimate_smoothness(
 ) -> tuple[Scene, Minimum]:
     """Find λ and κ, unless they are given, and the unknowns that belong to them.
 
-    So are found numbers of an instrument that change the response to fields; they are held then.
+    Numbers of an instrument that change the response to fields are found, too, and held.
     """
-    given = scene.smoothness if scene.smoothness.any() else None
-    smoothness = np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1)) if given is None else given
+    is_fixed = bool(scene.smoothness.any())
+    smoothness = scene.smoothness
+    if not is_fixed:
+        smoothness = np.tile(FIRST_SMOOTHNESS, (len(smoothness), 1))
     response = scene.imperfect.of_response
     scene = replace(scene, smoothness=smoothness, held=scene.held | response)
     end = settle_minimum(scene, _with_likely_numbers(scene, end), on_step)
-    if given is not None and not response:
+    if is_fixed and not response:
         return scene, end
-    if given is None:
+    if not is_fixed:
         smoothness, scene, end = _settle_smoothness(scene, end, rng, on_step)
-    smoothness = smoothness if given is not None else SMOOTHNESS_RATIO * smoothness
-    scene = replace(scene, smoothness=smoothness)
+        scene = replace(scene, smoothness=SMOOTHNESS_RATIO * smoothness)
     if response and scene.images.size <= _MOST_RECORDED:
         # In larger pixels fine structure is lost by which a blur differs from a smooth object.
         end = in_recorded_pixels(scene, end)
@@ -243,7 +244,7 @@ def _settle_response(
         mean, precision = _mean_of_numbers(response)
         step = np.maximum(mean, scene.least_numbers()) - response.numbers
         is_settled = step @ precision @ step < _NUMBERS_SETTLED
-        whole = step
+        remaining = step
         step = step / max(1.0, float(np.abs(step).max()))
         unknowns = end.unknowns
         for each, share in zip(response.changes, step, strict=True):
@@ -253,7 +254,7 @@ def _settle_response(
         if is_settled:
             break
     # Numbers that have not settled are at least as uncertain as they would still have moved.
-    covariance = np.linalg.inv(precision) + np.outer(whole, whole)
+    covariance = np.linalg.inv(precision) + np.outer(remaining, remaining)
     return replace(scene, spread=np.asarray(np.linalg.cholesky(covariance))), end
 
 
