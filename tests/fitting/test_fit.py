@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from helpers.fit_images import Displacement, bump, counted, distance, noisy, on_pixels, together
 from napari_shadowinv._typing import FloatArray
@@ -13,6 +14,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Fit, FitOptions, FitShot, compare, fit
 from napari_shadowinv.fitting.measurements import strengths_of
+from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.plotting import fit_figure
 
@@ -47,6 +49,22 @@ def found(folded_shots: list[FloatArray]) -> Fit:
         noise=NOISE,
         options=FitOptions(samples=4, threads=1),
     )
+
+
+def test_sampled_potentials_spread_as_far_as_the_total_error(found: Fit) -> None:
+    images = noisy([counted(WEAK, SIZE)], NOISE)
+    assumed = fit(images, strengths=[1], noise=NOISE, options=FitOptions(samples=12, threads=1))
+    assert assumed.report.beam is not None
+    assert assumed.report.beam.share > 2 * assumed.report.uncertainty
+    for result in (found, assumed):
+        (field,) = result.fields
+        assert field.samples is not None
+        moves = [displacement_from_potential(change) for change in np.float64(field.samples)]
+        spread = np.sqrt((np.stack(moves) ** 2).mean(axis=0).mean())
+        expected = np.sqrt((np.square(field.total_uncertainty)).mean())
+        assert spread == pytest.approx(expected, rel=0.2)
+        (restored,) = Fit.from_dataset(result.to_dataset()).fields
+        assert_array_equal(restored.samples, field.samples)
 
 
 def test_two_energies_tell_a_field_whose_rays_cross(found: Fit) -> None:

@@ -43,6 +43,7 @@ from napari_shadowinv.fitting.posterior import (
     errors_by_noise,
     errors_by_part,
     largest_share,
+    sampled_potentials,
     shifts_by_beam,
 )
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
@@ -255,8 +256,12 @@ def fit(
         if options.evidence:
             evidence = log_evidence(scene, best, fields, options, on_step)
         amplification = noise_amplification(pattern.correlation)
+        potentials = None
         if errors is not None:
-            errors = _amplify_noise(errors, by_part, amplification)
+            potentials = sampled_potentials(scene, samples, by_beam, data.size, options.seed)
+            amplified = _amplify_noise(errors, by_part, amplification)
+            potentials *= np.float32(np.linalg.norm(amplified) / np.linalg.norm(errors))
+            errors = amplified
     found_by = FitReport(
         objective=value,
         iterations=taken,
@@ -282,6 +287,7 @@ def fit(
         options,
         basins,
         errors,
+        potentials,
         by_part,
         by_beam,
         found_by,
@@ -507,6 +513,7 @@ def _result(
     options: FitOptions,
     basins: tuple[Basin, ...],
     errors: FloatArray | None,
+    samples: FloatArray | None,
     by_part: Mapping[str, FloatArray],
     by_beam: BeamShifts | None,
     report: FitReport,
@@ -531,7 +538,13 @@ def _result(
         smooth = (float(scene.smoothness[m, 0]), float(scene.smoothness[m, 1]))
         fields.append(
             FittedField(
-                name, potential - border_mean(potential), displacement, error, smooth, beam_error
+                name,
+                potential - border_mean(potential),
+                displacement,
+                error,
+                smooth,
+                beam_error,
+                None if samples is None else samples[m],
             )
         )
     displacements = np.stack([field.displacement for field in fields])

@@ -3,6 +3,7 @@
 - random changes that the data leave open, and the evidence: `Posterior`, `Sample`, `Response`
 - error bars by the noise: `errors_by_noise`
 - by an unmeasured or inexact beam: `shifts_by_beam`, `BeamError`, `draw_variations`
+- fields that noise, beam and instrument leave possible: `sampled_potentials`
 
 References
 ----------
@@ -28,6 +29,7 @@ from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import FitData
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions
+from napari_shadowinv.physics.poisson import border_mean
 
 __all__ = [
     "BeamError",
@@ -38,6 +40,7 @@ __all__ = [
     "draw_variations",
     "errors_by_noise",
     "largest_share",
+    "sampled_potentials",
     "shifts_by_beam",
 ]
 
@@ -497,7 +500,8 @@ def draw_variations(
 
 
 _PART_SAMPLES, _PARTS = 3, 0.02
-_BEAM_SAMPLES, _OPEN_BEAM_SAMPLES, _BEAM_SEED = 2, 3, 1
+_BEAM_SAMPLES, _OPEN_BEAM_SAMPLES, _BEAM_SEED = 2, 3, 1  # least numbers of changes
+_SAMPLES_PER_BEAM = 2
 _SMOOTHED_ERRORS = 4.0  # px
 
 
@@ -550,12 +554,13 @@ class BeamShifts:
     """Standard deviations of each field's displacement by its beam in px, (M, 2, H, W).
 
     `by_percent` is for beams that vary by 1 %. `errors` is for beams that vary by `variation`, as
-    far as the images do not exclude them.
+    far as the images do not exclude them, of which `changes` are random examples.
     """
 
     variation: float
     by_percent: FloatArray
     errors: FloatArray
+    changes: tuple[Unknowns, ...] = ()
 
 
 def shifts_by_beam(
@@ -576,21 +581,77 @@ def shifts_by_beam(
     rng = np.random.default_rng([options.seed, _BEAM_SEED])
     length = data.beam.length * min(data.size)
     count = 1 if data.common else len(scene.images)
+    has_open_beam = data.common and variation > 0
+    enough = len(samples) // _SAMPLES_PER_BEAM
     variations = [
         np.broadcast_to(
             draw_variations(middle, length / middle.bin, count, rng), middle.beams.shape
         )
-        for _ in range(_BEAM_SAMPLES)
+        for _ in range(_BEAM_SAMPLES if has_open_beam else max(_BEAM_SAMPLES, enough))
     ]
     changes = [posterior.moved_by_beams(0.01 * each) for each in variations]
     by_percent = _spread(scene, changes, data.size, length / 3)
     if not variation:
         return BeamShifts(variation, by_percent, 0 * by_percent)
     if not data.common:
-        return BeamShifts(variation, by_percent, 100 * variation * by_percent)
+        scale = 100 * variation
+        scaled = tuple(change.like(scale * change.flat()) for change in changes)
+        return BeamShifts(variation, by_percent, scale * by_percent, scaled)
     # Several images exclude most of the beams that would move the field far.
-    changes = posterior.open_beams(variation, samples[:_OPEN_BEAM_SAMPLES], rng)
-    return BeamShifts(variation, by_percent, _spread(scene, changes, data.size, length / 3))
+    changes = posterior.open_beams(variation, samples[: max(_OPEN_BEAM_SAMPLES, enough)], rng)
+    errors = _spread(scene, changes, data.size, length / 3)
+    return BeamShifts(variation, by_percent, errors, tuple(changes))
+
+
+def sampled_potentials(
+    scene: Scene,
+    samples: Sequence[Sample],
+    by_beam: BeamShifts | None,
+    size: tuple[int, int],
+    seed: int,
+) -> FloatArray:
+    """Return random changes of each field's potential, px², that its total error allows.
+
+    Those by a beam that is not fitted are random combinations of the changes of `by_beam`.
+
+    Parameters
+    ----------
+    scene : Scene
+        In recorded pixels.
+    samples : sequence of Sample
+        The posterior's.
+    by_beam : BeamShifts or None
+        Changes by the beam.
+    size : tuple of int
+        Height H and width W of the images.
+    seed : int
+        Of the combinations.
+
+    Returns
+    -------
+    ndarray of float32, shape (M, len(samples), H, W)
+        Their mean over the border is 0.
+    """
+    changes = [_potentials_of(scene, sample.change, size) for sample in samples]
+    shifts = () if by_beam is None else by_beam.changes
+    if shifts:
+        moves = np.stack([_potentials_of(scene, shift, size) for shift in shifts])
+        draws = np.random.default_rng([seed, _BEAM_SEED]).normal(size=(len(samples), len(shifts)))
+        draws /= np.sqrt(len(shifts))
+        changes = [
+            change + np.tensordot(drawn, moves, 1)
+            for change, drawn in zip(changes, draws, strict=True)
+        ]
+    return np.stack(changes, axis=1).astype(np.float32)
+
+
+def _potentials_of(scene: Scene, change: Unknowns, size: tuple[int, int]) -> FloatArray:
+    """Potential of each field at the pixels of an image, (M, H, W)."""
+    height, width = size
+    if change.potentials.shape[1:] != scene.rays.shape:
+        change = finer(change)
+    planes = [scene.rays.values(each)[:height, :width] for each in change.potentials]
+    return np.stack([plane - border_mean(plane) for plane in planes])
 
 
 def largest_share(errors: FloatArray, displacements: FloatArray) -> float:

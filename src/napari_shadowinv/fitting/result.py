@@ -32,6 +32,7 @@ from napari_shadowinv.fitting.posterior import BeamError
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.inversion.variables import (
     BEAM_UNCERTAINTY,
+    POTENTIAL_SAMPLES,
     UNCERTAINTY,
     belongs,
     dataset_from_field,
@@ -110,6 +111,9 @@ class FittedField:
         if it was asked for.
     smoothness : tuple of float
         The weights λ and κ of its squared fourth and sixth derivatives (px).
+    samples : ndarray of float32, shape (n, H, W), or None
+        Random changes of the potential, px², that its total error allows, if error bars were
+        asked for; None in files of earlier versions.
     """
 
     name: str
@@ -118,6 +122,7 @@ class FittedField:
     uncertainty: FloatArray | None
     smoothness: tuple[float, float]
     beam_uncertainty: FloatArray | None = None
+    samples: AnyArray | None = None
 
     @property
     def total_uncertainty(self) -> FloatArray | None:
@@ -573,6 +578,9 @@ class Fit:
                     field.beam_uncertainty,
                     label(*words),
                 )
+            if field.samples is not None:
+                planes, *words = POTENTIAL_SAMPLES
+                part["potential_samples"] = planes, field.samples, label(*words)
             attrs = part.attrs
             if len(self.fields) > 1:
                 part = part.rename({name: f"{name}_{field.name}" for name in part.data_vars})
@@ -703,13 +711,14 @@ def noise_in(dataset: xarray.Dataset, name: str) -> FloatArray | None:
 
 
 def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArray) -> FittedField:
-    potential, displacement, uncertainty, by_beam = (
+    potential, displacement, uncertainty, by_beam, samples = (
         numbers_of(dataset, variable + ending) if variable + ending in dataset else None
         for variable in (
             "potential",
             "displacement",
             "displacement_uncertainty",
             "displacement_beam_uncertainty",
+            "potential_samples",
         )
     )
     if potential is None or displacement is None:
@@ -721,5 +730,7 @@ def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArr
         raise ValueError(
             f"displacement has shape {displacement.shape}, potential {potential.shape}"
         )
+    if samples is not None and samples.shape[1:] != potential.shape:
+        raise ValueError(f"samples have shape {samples.shape}, potential {potential.shape}")
     weights = float(smoothness[0]), float(smoothness[1])
-    return FittedField(name, potential, displacement, uncertainty, weights, by_beam)
+    return FittedField(name, potential, displacement, uncertainty, weights, by_beam, samples)

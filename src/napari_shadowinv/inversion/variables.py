@@ -68,6 +68,13 @@ UNCERTAINTY = (_VECTORS, PIXEL, "Standard deviation of the displacement")
 BEAM_UNCERTAINTY = (_VECTORS, "px", "Standard deviation of the displacement by the beam")
 """Another variable of a fit."""
 
+POTENTIAL_SAMPLES = (
+    ("sample", "y", "x"),
+    PIXEL_AREA,
+    "Random changes of the potential as large as its error",
+)
+"""Another variable of a fit."""
+
 
 def dataset_from_field(
     displacement: FloatArray,
