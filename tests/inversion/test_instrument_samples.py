@@ -267,6 +267,16 @@ def test_the_band_of_a_quantity_mirrors_its_samples():
     assert quantity.std == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.parametrize("count", [4, 12])
+def test_bands_of_few_samples_hold_their_share_of_truths(count):
+    """The error of the value and those of the samples are drawn from one normal distribution."""
+    draws = np.random.default_rng(1).normal(size=(count + 1, 20_000))
+    quantity = Quantity(draws[0], draws[0] + draws[1:])
+    for share in (0.68, 0.95):
+        low, high = quantity.band(share)
+        assert ((low < 0) & (high > 0)).mean() == pytest.approx(share, abs=0.01)
+
+
 def test_quantities_are_numbers_and_lines_of_each_sample(image, source):
     result = sample(
         image,

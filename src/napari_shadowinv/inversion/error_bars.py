@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import stdtrit
 
 from napari_shadowinv._system.arrays import unpack_array, unpack_shot
 from napari_shadowinv._system.machine import available_threads, physical_memory
@@ -73,6 +74,7 @@ _LINEAR_ENOUGH = 0.3  # of their change
 _SPREAD_ENOUGH = 0.15  # of the size of the changes
 _MEAN_ENOUGH = 0.3  # of the standard deviation
 _MAX_BEAM_RMS = 0.9
+_ENOUGH_FOR_QUANTILES = 40
 _POLL_SECONDS = 0.1
 _BYTES_PER_SITE, _BYTES_PER_PIXEL = 700, 150  # measured peaks of one sample, rounded up
 
@@ -110,7 +112,8 @@ class Quantity:
 
         Samples stray from the inversion as the inversion does from the truth, so the interval is
         that of the samples, mirrored at the value (the basic bootstrap). It corrects a bias, such
-        as that of a maximum, which noise raises.
+        as that of a maximum, which noise raises. Of fewer than 40 samples, such as those of a fit,
+        it is Student's interval for the next sample, which takes their spread as normal.
 
         Raises
         ------
@@ -118,6 +121,11 @@ class Quantity:
             If the share is not between 0 and 1.
         """
         tails = (1 + _checked_share(share)) / 2, (1 - share) / 2
+        count = len(self.samples)
+        if 1 < count < _ENOUGH_FOR_QUANTILES:
+            middle = self.value - self.bias
+            width = stdtrit(count - 1, tails[0]) * np.sqrt(1 + 1 / count) * self.std
+            return np.asarray(middle - width), np.asarray(middle + width)
         high, low = np.quantile(self.samples, tails, axis=0)
         return np.asarray(2 * self.value - high), np.asarray(2 * self.value - low)
 
