@@ -444,8 +444,10 @@ def test_images_that_do_not_fit_are_refused(
 
 
 def test_a_fit_is_cancelled_at_once(
-    window: Any, tool: Any, qtbot: Any, messages: list[str]
+    window: Any, tool: Any, qtbot: Any, messages: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # Also after a first drawing that comes before the second step, which alone shows nothing.
+    monkeypatch.setattr(_fitting, "_REDRAW_MS", REDRAW_MS)
     tool.view._redraw_timer.setInterval(REDRAW_MS)
     tool.options.set_values({"samples": 1000})
     tool.panel.button.click()
