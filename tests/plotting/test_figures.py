@@ -45,7 +45,6 @@ def panels(figure: Figure) -> list[Any]:
 
 
 def assert_nothing_overlaps(figure: Figure) -> None:
-    figure.draw_without_rendering()
     boxes = [axes.get_tightbbox() for axes in panels(figure)]
     texts = [text.get_window_extent() for text in figure.texts]
     page = figure.bbox
