@@ -23,6 +23,7 @@ __all__ = [
 ]
 
 _PARTS = 4  # of a pixel, each way, in which light is spread
+_STRIP = 16  # lines of rays that are traced at once: few enough for the processor's cache
 
 Displacement = Callable[[FloatArray, FloatArray], FloatArray]
 """Of the rays that start at y and x: an array (2, …), all in px."""
@@ -70,22 +71,27 @@ def counted(
     sees what lands at (y, x), px from the image's middle.
     """
     rng = np.random.default_rng(0)
-    lines = (np.arange(-margin * rays, (side + margin) * rays) for side in shape)
-    y, x = (
-        (line + rng.random(line.shape)) / rays - 0.5 for line in np.meshgrid(*lines, indexing="ij")
-    )
-    flux = np.ones(y.shape) if beam is None else beam(y, x)
-    y, x = np.stack([y, x]) + displacement(y, x)
-    y, x = y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2
-    y, x = frame[0] + frame[1] * y + frame[2] * x, frame[3] + frame[4] * y + frame[5] * x
+    lines = [np.arange(-margin * rays, (side + margin) * rays) for side in shape]
+    offsets = [rng.random((lines[0].size, lines[1].size)) for _ in shape]
     # Parts of pixels, also around the image: from there light is spread into it.
     beyond, parts = (int(5 * blur) + 1, _PARTS) if blur else (0, 1)
     height, width = ((side + 2 * beyond) * parts for side in shape)
-    rows = np.floor(parts * y + height / 2).astype(int)
-    columns = np.floor(parts * x + width / 2).astype(int)
-    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-    places = rows[inside] * width + columns[inside]
-    total = np.bincount(places, flux[inside], minlength=height * width).reshape(height, width)
+    total = np.zeros(height * width)
+    for first in range(0, lines[0].size, _STRIP):
+        strip = slice(first, first + _STRIP)
+        y = (lines[0][strip, None] + offsets[0][strip]) / rays - 0.5
+        x = (lines[1] + offsets[1][strip]) / rays - 0.5
+        flux = None if beam is None else beam(y, x)
+        y, x = np.stack([y, x]) + displacement(y, x)
+        y, x = y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2
+        y, x = frame[0] + frame[1] * y + frame[2] * x, frame[3] + frame[4] * y + frame[5] * x
+        rows = np.floor(parts * y + height / 2).astype(int)
+        columns = np.floor(parts * x + width / 2).astype(int)
+        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        places = rows[inside] * width + columns[inside]
+        weights = None if flux is None else flux[inside]
+        total += np.bincount(places, weights, minlength=height * width)
+    total = total.reshape(height, width)
     spread = gaussian_filter(total / rays**2, parts * blur)
     pixels = spread.reshape(height // parts, parts, width // parts, parts).sum(axis=(1, 3))
     return np.asarray(pixels[beyond : beyond + shape[0], beyond : beyond + shape[1]])
