@@ -29,8 +29,8 @@ NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation, normal
 PIXELS, SQUARE_PIXELS = "px", "px²"
 
 _UNNAMED = re.compile(r"dim_\d+")  # xarray's names for dimensions that got none
-_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9}
-_METRES |= {"metre": 1.0, "meter": 1.0, "micrometer": 1e-6, "micron": 1e-6, "millimeter": 1e-3}
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9}
+METRES |= {"metre": 1.0, "meter": 1.0, "micrometer": 1e-6, "micron": 1e-6, "millimeter": 1e-3}
 _PIXEL_NAMES = {"px", "pixel", "pixels"}
 _SQUARES = {f"{name}{power}" for name in _PIXEL_NAMES for power in ("²", "^2", "**2", "2")}
 _UNITS = {PIXELS: _PIXEL_NAMES, SQUARE_PIXELS: _SQUARES}
@@ -246,7 +246,7 @@ def _spacing(array: Any, dim: str, name: str) -> float | None:
             f"{name} has coordinates along {dim} that are not evenly spaced: expected pixels of "
             "one size; resample it, or drop the coordinates"
         )
-    metres = _METRES.get(str(coordinate.attrs.get("units", "")).strip())
+    metres = METRES.get(str(coordinate.attrs.get("units", "")).strip())
     return None if metres is None else abs(mean) * metres
 
 
