@@ -13,6 +13,8 @@
   further filters of images and estimates of beams: `napari_shadowinv.preprocessing`
 - repeat a result from its provenance: `rerun`; the answer is a `Rerun`
 - predict an image, or invert it linearly: `synthetic_image`, `poisson_invert`
+- trace particles through a 3-D field: `trace`, with `TraceOptions`, of a `FieldGrid`; the answer
+  is a `TracedImage`
 - predict the image of the same object in another experiment: `project`, `project_potential`
 - read and write files: `read`, `write`
 - show a result in a napari viewer: `add_inversion`

@@ -7,10 +7,12 @@ from .inversion import Inversion, Report, invert, plan_sites
 from .inversion.error_bars import Uncertainty, uncertainty
 from .io import Radiograph, read, write
 from .options import BeamPrior, Instrument, InversionOptions
+from .physics.field_grid import FieldGrid
 from .physics.forward import synthetic_image
 from .physics.poisson import poisson_invert
 from .physics.projection import project, project_potential
 from .physics.setup import OpticalSetup, ProtonSetup
+from .physics.tracing import TracedImage, TraceOptions, trace
 from .pipeline import run
 from .pipeline.rerun import Rerun, rerun
 from .pipeline.run_options import RunOptions, WatchOptions
@@ -22,6 +24,7 @@ __version__: str
 __all__ = [
     "BeamPrior",
     "Caution",
+    "FieldGrid",
     "FileFormatError",
     "Fit",
     "FitOptions",
@@ -39,6 +42,8 @@ __all__ = [
     "Report",
     "Rerun",
     "RunOptions",
+    "TraceOptions",
+    "TracedImage",
     "Uncertainty",
     "WatchOptions",
     "__version__",
@@ -56,6 +61,7 @@ __all__ = [
     "run_stack",
     "stack_statistics",
     "synthetic_image",
+    "trace",
     "uncertainty",
     "watch_stack",
     "write",

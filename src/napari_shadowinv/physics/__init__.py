@@ -2,6 +2,7 @@
 
 - the experiment and unit conversions: `setup`; units that are handy to read: `units`
 - the image that a displacement makes: `forward`
+- particles traced through a field on a 3-D grid: `tracing`, `field_grid`
 - the same object in another experiment: `projection`
 - the linear inversion, for comparison: `poisson`
 - test objects with exact fields: `phantoms`

@@ -1,16 +1,23 @@
+from .field_grid import FieldGrid, field_grid
 from .forward import jacobian_determinant, synthetic_image
 from .phantoms import Phantom, ellipse_pair, gaussian_blob, paper_setup, toroid
 from .poisson import border_mean, poisson_invert
 from .projection import project, project_potential, transferred_displacement
 from .setup import OpticalSetup, ProtonSetup, Setup, setup_from_dict
+from .tracing import TracedImage, TracedParticles, TraceOptions, trace, trace_particles
 
 __all__ = [
+    "FieldGrid",
     "OpticalSetup",
     "Phantom",
     "ProtonSetup",
     "Setup",
+    "TraceOptions",
+    "TracedImage",
+    "TracedParticles",
     "border_mean",
     "ellipse_pair",
+    "field_grid",
     "gaussian_blob",
     "jacobian_determinant",
     "paper_setup",
@@ -20,5 +27,7 @@ __all__ = [
     "setup_from_dict",
     "synthetic_image",
     "toroid",
+    "trace",
+    "trace_particles",
     "transferred_displacement",
 ]

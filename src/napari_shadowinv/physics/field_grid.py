@@ -71,8 +71,8 @@ class FieldGrid:
     (-0.0005, 0.0005)
     """
 
-    magnetic: ArrayLike | None = None
-    electric: ArrayLike | None = None
+    magnetic: AnyArray | None = None
+    electric: AnyArray | None = None
     spacing: Sequence[float] = dataclasses.field(kw_only=True)
     centre: Sequence[float] = dataclasses.field(default=(0.0, 0.0, 0.0), kw_only=True)
 
@@ -83,12 +83,13 @@ class FieldGrid:
         for name, array in arrays.items():
             if array is not None:
                 object.__setattr__(self, name, _checked_field(array, f"{name} field"))
-        shapes = {np.shape(array) for array in arrays.values() if array is not None}
-        if len(shapes) > 1:
-            raise InputError(
-                f"the magnetic field has shape {np.shape(self.magnetic)}, the electric field "
-                f"{np.shape(self.electric)}: they must match"
-            )
+        if self.magnetic is not None and self.electric is not None:
+            shapes = self.magnetic.shape, self.electric.shape
+            if shapes[0] != shapes[1]:
+                raise InputError(
+                    f"the magnetic field has shape {shapes[0]}, the electric field {shapes[1]}: "
+                    "they must match"
+                )
         for name in ("spacing", "centre"):
             values = tuple(map(float, np.ravel(getattr(self, name))))
             if len(values) != 3 or not np.isfinite(values).all():
@@ -100,7 +101,8 @@ class FieldGrid:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Number of nodes along (z, y, x)."""
-        depth, height, width = np.shape(self.magnetic if self.magnetic is not None else self.electric)[1:]
+        field: Any = self.electric if self.magnetic is None else self.magnetic
+        depth, height, width = field.shape[1:]
         return depth, height, width
 
     @property
@@ -258,9 +260,7 @@ def unit_factor(symbol: str, text: str, name: str) -> float:
         expected = "V/m, or V or m with a prefix"
     if factor is None:
         received = f"the unit {text!r}" if text else "no unit"
-        raise InputError(
-            f"{name} has {received}: expected {expected}, in its attribute 'units'"
-        )
+        raise InputError(f"{name} has {received}: expected {expected}, in its attribute 'units'")
     return factor
 
 

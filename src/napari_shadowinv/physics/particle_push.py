@@ -19,8 +19,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.geometry.compiler import njit
 
@@ -298,9 +296,10 @@ def _across(
     w00: float, w01: float, w10: float, w11: float,
 ) -> float:  # fmt: skip
     """Interpolate a component in a plane of nodes."""
-    return (
+    value: float = (
         w00 * field[j, i, k, c]
         + w01 * field[j, i + 1, k, c]
         + w10 * field[j + 1, i, k, c]
         + w11 * field[j + 1, i + 1, k, c]
     )
+    return value

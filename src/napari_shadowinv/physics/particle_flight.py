@@ -1,0 +1,457 @@
+"""Flight of charged particles from the source through a field on a grid to the detector.
+
+- particles that are aimed at points of the object plane: `trace_particles`; they are
+  `TracedParticles`; accuracy and other choices: `TraceOptions`
+- the exact line integrals of a grid along straight rays: `line_integrals`
+- for an image: `Flight`, `pixel_centres`
+
+Outside the grid particles fly straight; inside they are pushed by the kernels of `particle_push`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field
+
+from napari_shadowinv._system.arrays import as_numbers, check_finite
+from napari_shadowinv._system.machine import available_threads, in_ranges
+from napari_shadowinv._system.progress import Reporter
+from napari_shadowinv._system.validation import CheckedModel, as_model, check_instance
+from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.field_grid import FieldGrid, field_grid
+from napari_shadowinv.physics.forward import MIN_SIDE_PX
+from napari_shadowinv.physics.particle_push import (
+    TRAPPED,
+    UNTOUCHED,
+    integrate_rays,
+    push_particles,
+)
+from napari_shadowinv.physics.setup import ProtonSetup
+
+Shape = tuple[int, int]
+
+_JOULES_PER_MEV = 1.602176634e-13
+_LIGHT_SPEED = 299792458.0
+PARTICLES_PER_BLOCK = 1 << 17
+"""Particles that are traced, and drawn, together: the random numbers depend on it."""
+_SMALLEST_RANGE = 256  # particles for a thread
+_MAX_PATH = 20.0  # diagonals of the grid, beyond which a particle is trapped
+_MAX_STEPS = 10_000_000  # of a particle across the grid
+
+
+class TraceOptions(CheckedModel):
+    """Choices of `trace`."""
+
+    output: Literal["fluence", "counts"] = Field(
+        default="fluence",
+        title="Output",
+        description=(
+            "fluence: the exact image of regular rays, without noise; counts: particles drawn at "
+            "random, with their counting statistics."
+        ),
+    )
+    rays_per_pixel: int = Field(
+        default=4,
+        ge=1,
+        le=256,
+        title="Rays per pixel",
+        description=(
+            "Rays traced per pixel for a fluence; the next square number is used. Between the rays "
+            "the displacement is interpolated by cubic splines."
+        ),
+    )
+    counts: float = Field(
+        default=100.0,
+        gt=0,
+        le=1e6,
+        allow_inf_nan=False,
+        title="Counts per pixel",
+        description="Mean number of particles per pixel of the image without the object.",
+    )
+    source_size: float = Field(
+        default=0.0,
+        ge=0,
+        le=1.0,
+        allow_inf_nan=False,
+        title="Source size (m)",
+        description="Standard deviation of the Gaussian source in m (FWHM / 2.355); for counts.",
+    )
+    energy_spread: float = Field(
+        default=0.0,
+        ge=0,
+        allow_inf_nan=False,
+        title="Energy spread (MeV)",
+        description="Standard deviation of the kinetic energy in MeV; for counts.",
+    )
+    step: float = Field(
+        default=0.5,
+        gt=0,
+        le=1,
+        title="Step (cells)",
+        description="Longest step of a particle, in units of the smallest spacing of the grid.",
+    )
+    max_turn: float = Field(
+        default=0.05,
+        gt=0,
+        le=0.5,
+        title="Turn per step (rad)",
+        description="Largest change of direction in a step, in the strongest field of the grid.",
+    )
+    keep_particles: bool = Field(
+        default=False,
+        title="Keep particles",
+        description="Also return start, landing point and deflection of each particle; for counts.",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class TracedParticles:
+    """Particles that were traced one by one, in the order of their starting points.
+
+    Attributes
+    ----------
+    aim : ndarray, shape (2, N)
+        Where each would cross the object plane without the object, in px, axis order (y, x).
+    displacement : ndarray, shape (2, N)
+        Landing point minus that without the object, in px of the object plane; NaN if lost.
+    deflection : ndarray, shape (2, N)
+        Change of the angle of flight in rad, axis order (y, x); NaN if lost.
+    energy : ndarray, shape (N,)
+        Kinetic energy at the source in MeV.
+    energy_change : ndarray, shape (N,)
+        Change of the kinetic energy by the object in MeV.
+    lost : ndarray of bool, shape (N,)
+        Whether it did not reach the detector: it turned round, or stayed in the field.
+    landing : ndarray, shape (2, N)
+        Landing point on the detector, divided by the magnification, in px, axis order (y, x).
+    steps : ndarray of int32, shape (N,)
+        Number of steps inside the grid.
+    """
+
+    aim: FloatArray
+    displacement: FloatArray
+    deflection: FloatArray
+    energy: FloatArray
+    energy_change: FloatArray
+    lost: AnyArray
+    landing: FloatArray
+    steps: AnyArray
+
+
+def trace_particles(
+    field: Any,
+    setup: ProtonSetup,
+    aim: ArrayLike,
+    *,
+    shape: Shape = (1, 1),
+    energy: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+    options: TraceOptions | None = None,
+    threads: int | None = None,
+) -> TracedParticles:
+    """Trace particles that are aimed at points of the object plane.
+
+    Parameters
+    ----------
+    field, setup, options, threads
+        As for `trace`; of the options `step` and `max_turn`.
+    aim : array_like, shape (2, N)
+        Points of the object plane in px, axis order (y, x).
+    shape : tuple of int, default (1, 1)
+        Height and width of the image whose middle lies on the axis; pixels are counted in it.
+    energy : array_like, shape (N,), optional
+        Kinetic energies in MeV. Default: that of the setup.
+    start : array_like, shape (2, N), optional
+        Points of the source in m from its middle, axis order (y, x). Default: its middle.
+
+    Returns
+    -------
+    TracedParticles
+
+    Raises
+    ------
+    InputError
+        As `trace`; or if the arrays do not match.
+    """
+    grid = field_grid(field)
+    check_instance(setup, ProtonSetup, "setup")
+    options = as_model(TraceOptions, options, "options")
+    points = as_numbers("aim", aim)
+    if points.ndim != 2 or points.shape[0] != 2:
+        raise InputError(f"aim has shape {points.shape}: expected (2, N), the y component first")
+    check_finite("aim", points)
+    count = points.shape[1]
+    energies = np.full(count, setup.energy) if energy is None else as_numbers("energy", energy)
+    starts = np.zeros((2, count)) if start is None else as_numbers("start", start)
+    if energies.shape != (count,) or starts.shape != (2, count):
+        raise InputError(
+            f"energy has shape {energies.shape} and start {starts.shape}: expected ({count},) and "
+            f"(2, {count}), as many as aims"
+        )
+    check_finite("start", starts)
+    if not (np.isfinite(energies).all() and (energies > 0).all()):
+        raise InputError("energy has values that are not positive numbers: expected MeV above 0")
+    threads = available_threads(checked_threads(threads))
+    flight = Flight(grid, setup, shape, options, threads, Reporter())
+    return flight.push(points, "particles", energies, starts)
+
+
+def line_integrals(
+    field: Any, setup: ProtonSetup, shape: Shape, *, threads: int | None = None
+) -> FloatArray:
+    """Integrate a field over z along the straight rays from the source through the pixels' centres.
+
+    Parameters
+    ----------
+    field, setup, shape, threads
+        As for `trace`.
+
+    Returns
+    -------
+    ndarray, shape (4, H, W)
+        ∫B_y dz and ∫B_x dz in T m, ∫E_y dz and ∫E_x dz in V; exact for a field that is trilinear
+        between the nodes.
+
+    Raises
+    ------
+    InputError
+        As `trace`.
+    """
+    grid = field_grid(field)
+    check_instance(setup, ProtonSetup, "setup")
+    _check_place(grid, setup)
+    shape = checked_shape(shape)
+    rays = straight_rays(setup, shape, pixel_centres(*image_range(shape), 1))
+    integrals = np.zeros((len(rays), 4 if grid.electric is not None else 2))
+    in_ranges(
+        integrate_rays,
+        len(rays),
+        available_threads(checked_threads(threads)),
+        _interleave(grid),
+        *_nodes(grid),
+        rays,
+        integrals,
+        smallest=_SMALLEST_RANGE,
+    )
+    planes = np.zeros((4, *shape))
+    planes[: integrals.shape[1]] = integrals.T.reshape(-1, *shape)
+    return planes
+
+
+class Flight:
+    """A field ready for the kernels, with the experiment around it."""
+
+    def __init__(
+        self,
+        grid: FieldGrid,
+        setup: ProtonSetup,
+        shape: Shape,
+        options: TraceOptions,
+        threads: int,
+        report: Reporter,
+    ) -> None:
+        _check_place(grid, setup)
+        self.grid, self.setup, self.shape, self.options = grid, setup, shape, options
+        self.threads, self.report = threads, report
+        self.field = _interleave(grid)
+        self.origin, self.spacing = _nodes(grid)
+        particle = setup.particle
+        self.rest_energy = particle.mass * _LIGHT_SPEED**2 / _JOULES_PER_MEV
+        self.charge = particle.charge / (particle.mass * _LIGHT_SPEED)
+        self.peaks = np.array([grid.peak("magnetic"), grid.peak("electric") / _LIGHT_SPEED])
+        self.longest = options.step * float(self.spacing.min())
+        diagonal = math.hypot(*((n - 1) * d for n, d in zip(grid.shape, grid.spacing, strict=True)))
+        self.max_path = _MAX_PATH * diagonal
+        self._check_strength(setup.energy)
+
+    def _check_strength(self, energy: float) -> None:
+        """Refuse a field in which a particle would take too many steps, or get no finite speed."""
+        u = float(self.momenta(np.array([energy]))[0])
+        gamma = math.hypot(1.0, u)
+        strength = abs(self.charge) * (self.peaks[0] + self.peaks[1] * gamma / u)
+        if not math.isfinite(strength * self.max_path) or (
+            strength * self.grid.length / self.options.max_turn > _MAX_STEPS
+        ):
+            name, unit = ("electric", "V/m") if self.peaks[1] > self.peaks[0] else ("magnetic", "T")
+            raise InputError(
+                f"the {name} field reaches {self.grid.peak(name):.3g} {unit}, which bends "
+                f"{self.setup.probe} to a radius of {1 / strength:.3g} m, far below the grid's "
+                f"{self.grid.length:.3g} m: check the unit of the field"
+            )
+
+    def momenta(self, energy: FloatArray) -> FloatArray:
+        """Momentum over m c of kinetic energies in MeV."""
+        ratio = energy / self.rest_energy
+        momenta: FloatArray = np.sqrt(ratio * (ratio + 2))
+        return momenta
+
+    def push(
+        self,
+        aim: FloatArray,
+        stage: str,
+        energy: FloatArray | None = None,
+        start: FloatArray | None = None,
+    ) -> TracedParticles:
+        """Trace particles; aims in px, energies in MeV, points of the source in m."""
+        count = aim.shape[1]
+        energies = np.full(count, self.setup.energy) if energy is None else energy
+        particles = straight_rays(self.setup, self.shape, aim, start)
+        particles[:, 3:] *= self.momenta(energies)[:, None]
+        straight = particles.copy()
+        status, steps = np.zeros(count, np.int8), np.zeros(count, np.int32)
+        for first in range(0, count, PARTICLES_PER_BLOCK):
+            self.report(stage, first, count)
+            block = slice(first, min(first + PARTICLES_PER_BLOCK, count))
+            in_ranges(
+                push_particles,
+                block.stop - first,
+                self.threads,
+                self.field,
+                self.origin,
+                self.spacing,
+                particles[block],
+                status[block],
+                steps[block],
+                self.charge,
+                self.longest,
+                self.options.max_turn,
+                self.peaks,
+                self.max_path,
+                smallest=_SMALLEST_RANGE,
+            )
+        # Without the object the landing point is the aim, moved by the source's own size.
+        shift: FloatArray | float = 0.0
+        if start is not None and not self.setup.is_collimated:
+            ratio = self.setup.object_image_distance / self.setup.source_object_distance
+            shift = start * ratio / self.setup.pixel_sizes[1]
+        return self._arrivals(aim, aim - shift, energies, straight, particles, status, steps)
+
+    def _arrivals(
+        self,
+        aim: FloatArray,
+        free_landing: FloatArray,
+        energies: FloatArray,
+        straight: FloatArray,
+        particles: FloatArray,
+        status: AnyArray,
+        steps: AnyArray,
+    ) -> TracedParticles:
+        """Fly particles from the grid to the detector, and compare with a flight without field."""
+        if not np.isfinite(particles).all():
+            bad = int((~np.isfinite(particles)).any(axis=1).sum())
+            raise InputError(
+                f"{bad} particles left the range of floating-point numbers: check the unit of the "
+                "field and the energy"
+            )
+        distance = self.setup.object_image_distance
+        lost = (status == TRAPPED) | (particles[:, 5] <= 0)
+        lost |= particles[:, 2] > distance
+        with np.errstate(divide="ignore", invalid="ignore"):
+            free, landing = (
+                (state[:, 1::-1] + state[:, 4:2:-1] / state[:, 5:] * (distance - state[:, 2:3])).T
+                for state in (straight, particles)
+            )
+            displacement = (landing - free) / self.setup.pixel_sizes[1]
+            angles = (
+                np.arctan2(state[:, 4:2:-1], state[:, 5:]).T for state in (particles, straight)
+            )
+            deflection = next(angles) - next(angles)
+        displacement[:, status == UNTOUCHED] = 0.0
+        deflection[:, status == UNTOUCHED] = 0.0
+        displacement[:, lost] = deflection[:, lost] = np.nan
+        start, end = ((state[:, 3:] ** 2).sum(axis=1) for state in (straight, particles))
+        gammas = np.sqrt(1 + start), np.sqrt(1 + end)
+        change = (end - start) / (gammas[0] + gammas[1]) * self.rest_energy
+        return TracedParticles(
+            aim=aim,
+            displacement=displacement,
+            deflection=deflection,
+            energy=energies,
+            energy_change=np.where(status == UNTOUCHED, 0.0, change),
+            lost=lost,
+            landing=free_landing + displacement,
+            steps=steps,
+        )
+
+
+def straight_rays(
+    setup: ProtonSetup, shape: Shape, aim: FloatArray, start: FloatArray | None = None
+) -> FloatArray:
+    """Return points of the object plane (m) and unit directions as x, y, z, shape (N, 6)."""
+    middle = (np.array(shape) - 1) / 2
+    places = (aim - middle[:, None]) * setup.object_pixel_size
+    rays = np.zeros((aim.shape[1], 6))
+    rays[:, 1], rays[:, 0] = places
+    rays[:, 5] = 1.0
+    if not setup.is_collimated:
+        slopes = (places if start is None else places - start) / setup.source_object_distance
+        rays[:, 4], rays[:, 3] = slopes
+        rays[:, 3:] /= np.sqrt((rays[:, 3:] ** 2).sum(axis=1))[:, None]
+    return rays
+
+
+def _interleave(grid: FieldGrid) -> AnyArray:
+    """Return the field as the kernels take it, shape (Y, X, Z, 3) or (Y, X, Z, 6)."""
+    depth, height, width = grid.shape
+    parts = [grid.magnetic] if grid.electric is None else [grid.magnetic, grid.electric]
+    field = np.zeros((height, width, depth, 3 * len(parts)), np.float32)
+    for part, array in enumerate(parts):
+        if array is None:
+            continue
+        for component in range(3):  # from (z, y, x) to (x, y, z)
+            field[..., 3 * part + component] = np.asarray(array)[2 - component].transpose(1, 2, 0)
+    return field
+
+
+def _nodes(grid: FieldGrid) -> tuple[FloatArray, FloatArray]:
+    """Return the place of the first node and the spacing along x, y, z in m."""
+    origin = np.array([low for low, _ in grid.extent[::-1]])
+    return origin, np.array(grid.spacing[::-1])
+
+
+def _check_place(grid: FieldGrid, setup: ProtonSetup) -> None:
+    low, high = grid.extent[0]
+    source, detector = -setup.source_object_distance, setup.object_image_distance
+    if not (source < low and high < detector):
+        raise InputError(
+            f"the grid reaches from {low:.4g} to {high:.4g} m along the beam, but the source is at "
+            f"{source:.4g} m and the detector at {detector:.4g} m from the object: centre the grid "
+            "on the object, or check its unit of length"
+        )
+
+
+def image_range(shape: Shape) -> tuple[IntArray, IntArray]:
+    """Return the first pixel and the one behind the last along y and x."""
+    return np.zeros(2, np.int64), np.array(shape, np.int64)
+
+
+def pixel_centres(first: IntArray, last: IntArray, fine: int) -> FloatArray:
+    """Return centres of pixels, or of the parts of pixels, in px, shape (2, N)."""
+    axes = [
+        low - 0.5 + (np.arange((high - low) * fine) + 0.5) / fine
+        for low, high in zip(first, last, strict=True)
+    ]
+    return np.stack(np.meshgrid(*axes, indexing="ij")).reshape(2, -1)
+
+
+def checked_shape(shape: Shape) -> Shape:
+    """Return height and width of an image, or raise an `InputError`."""
+    if len(tuple(shape)) != 2 or min(shape) < MIN_SIDE_PX:
+        raise InputError(
+            f"the image has shape {tuple(shape)}: expected (height, width), at least {MIN_SIDE_PX} "
+            "pixels each way"
+        )
+    return int(shape[0]), int(shape[1])
+
+
+def checked_threads(threads: int | None) -> int | None:
+    """Return a number of threads, or raise an `InputError`."""
+    if threads is not None and threads < 1:
+        raise InputError(f"threads is {threads}: expected 1 or more, or None for all cores")
+    return threads
