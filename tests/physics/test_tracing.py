@@ -525,6 +525,6 @@ def test_request_to_stop_ends_the_tracing():
 
 @pytest.mark.skipif(not importlib.util.find_spec("plasmapy"), reason="PlasmaPy is not installed")
 def test_deflections_agree_with_plasmapy():
-    from benchmarks.tracing import compare_with_plasmapy
+    from tracing import compare_with_plasmapy
 
     assert compare_with_plasmapy(toroid_grid(peak=20.0), count=200) < 3e-3

@@ -27,6 +27,8 @@ from napari_shadowinv._system.validation import Model, suggestion, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import IMAGE_TITLES
 from napari_shadowinv.options import FitChoices, FitOptions, Instrument, InversionOptions
+from napari_shadowinv.physics.particle_flight import TraceOptions
+from napari_shadowinv.pipeline.traced_file import GridView
 from napari_shadowinv.preprocessing import ESTIMATES, FIT_STEPS, STEPS, Recipe, Step
 
 HELP_NAMES = ("-h", "--help", "--help-all")
@@ -230,6 +232,8 @@ _OPTIONS = "Options of the inversion"
 _FIT_STEPS = "Steps before the fit, in this order"
 _FIT_CHOICES = "Unknowns and data of the fit"
 _FIT_OPTIONS = "Options of the fit"
+_TRACE = "A 3-D field (docs/tracing.md)"
+_PARTICLES = ("keep_particles",)  # an image holds none
 
 ImageFile = Annotated[
     Path, Argument(help=f"{IMAGE_TITLES}; with --variable, any HDF5 file.", show_default=False)
@@ -480,6 +484,22 @@ def takes_run(
 def takes_fit(command: Callable[..., None]) -> Callable[..., None]:
     """Add a flag for each step and option of a fit to a command with the argument `flags`."""
     return _with_flags(command, dict(_fit_flags()))
+
+
+def takes_trace(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the flags of a traced 3-D field to a command with the argument `flags`."""
+    flags = _option_flags(GridView, _TRACE)
+    return _with_flags(command, dict(flags + _option_flags(TraceOptions, _TRACE, _PARTICLES)))
+
+
+def trace_choices(flags: Mapping[str, Any]) -> tuple[GridView, TraceOptions]:
+    """Return the choices for a traced 3-D field by the flags."""
+    views = {name: value for name, value in flags.items() if name in GridView.model_fields}
+    options = {name: value for name, value in flags.items() if name not in views}
+    return (
+        validate(GridView, views, "", flag_names(GridView)),
+        validate(TraceOptions, options, "", flag_names(TraceOptions)),
+    )
 
 
 def _with_flags(

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from napari_shadowinv._typing import AnyArray, FloatArray
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import ProtonSetup, Setup
+    from napari_shadowinv.physics.tracing import TracedImage
     from napari_shadowinv.pipeline.rerun import Rerun, RerunInputs
 
     Fields = Mapping[str, FloatArray]
@@ -50,7 +51,10 @@ HELP = {
     "image": "The image, if it has moved or changed; for a fit, all images in their order. "
     "Default: the files named in the result, in its folder or the current one.",
     "field": ".shadowinv or pradformat result, or NPY, MATLAB or HDF5 (with --variable) "
-    "containing a displacement (2, H, W) in px or a potential (H, W) in px².",
+    "containing a displacement (2, H, W) in px or a potential (H, W) in px²; or a 3-D field of a "
+    "simulation (openPMD, NetCDF).",
+    "truth": "NetCDF file for line integrals, displacement and deflection of a traced 3-D field.",
+    "seed": "Seed of the particles of a traced 3-D field, for --output counts.",
     "setup": "TOML file with the setup of the prediction, for example with another energy. "
     "Default: the field's own setup.",
     "recorded_with": "TOML file with the setup of the measurement, if the field's file does not "
@@ -218,6 +222,7 @@ shadowinv forward shot.shadowinv
 shadowinv forward shot.shadowinv --setup lower_energy.toml
 shadowinv forward shot.shadowinv --setup lower_energy.toml --deflector electric-field
 shadowinv forward d.npy --recorded-with first.toml --setup second.toml
+shadowinv forward fields.h5 --setup setup.toml --beam x --right y --truth truth.nc
 
 [bold]Another experiment[/bold]
 A deflection depends on the beam; the object's line integral does not. To convert between
@@ -226,10 +231,16 @@ momentum; the default for particles), an electric field (∫E dl, charge / (mome
 a plasma (∫n dz, wavelength squared) or a refractive index (∫ln η dz, unchanged apart from
 dispersion). Both images have the same centre; the predicted one has the pixel size of --setup
 and covers the area where the field is known.
+
+[bold]A 3-D field[/bold]
+An openPMD file (HDF5), or a NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez on x, y and z with units,
+is traced with the particles of --setup. The image has the middle of the object plane, at the
+grid's x = y = z = 0, in its middle.
 """
 
 
 @notify_errors
+@_flags.takes_trace
 def forward(
     field: Annotated[Path, typer.Argument(help=HELP["field"], show_default=False)],
     source: _flags.SourceFile = None,
@@ -243,26 +254,48 @@ def forward(
         str | None, typer.Option(metavar="NAME", help="Name of the array in the source file.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help=HELP["predicted_image"])] = None,
+    truth: Annotated[Path | None, typer.Option(help=HELP["truth"])] = None,
+    seed: Annotated[int, typer.Option(help=HELP["seed"])] = 0,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
+    *,
+    flags: dict[str, Any],
 ) -> None:
-    """Predict the image of a displacement field, for the same setup or another.
+    """Predict the image of a displacement field or of a 3-D field, for any setup.
 
     Without --source, the result's own source is used if the setup is the same; otherwise
     the source is uniform.
     """
     from napari_shadowinv.cli._summary import size_text
-    from napari_shadowinv.io import read_radiograph, write
+    from napari_shadowinv.io import is_field_grid, read_radiograph, write
     from napari_shadowinv.io.formats import IMAGE_WRITERS, TIFF
     from napari_shadowinv.pipeline.files import setup_from
 
     path = Path(f"{field.stem}_image{TIFF.suffix}") if out is None else out
-    _inputs.check_outputs({path: tuple(IMAGE_WRITERS)}, overwrite)
-    _inputs.protect([path], [field, source, setup, recorded_with])
+    outputs = {path: tuple(IMAGE_WRITERS)} | ({} if truth is None else {truth: (".nc",)})
+    _inputs.check_outputs(outputs, overwrite)
+    _inputs.protect(list(outputs), [field, source, setup, recorded_with])
     if source_variable is not None and source is None:
         raise InputError("received --source-variable: it needs --source, the file that contains it")
     target = None if setup is None else setup_from(setup)
     original = None if recorded_with is None else setup_from(recorded_with)
+    if is_field_grid(field):
+        beam = None
+        if source is not None:
+            beam = read_radiograph(source, channel=channel, variable=source_variable).image
+        if original is not None or deflector is not None or dispersion != 1:
+            raise InputError(
+                f"received --recorded-with, --deflector or --dispersion, but {field} is a 3-D "
+                "field, which needs only --setup: leave them out"
+            )
+        traced = trace_field(field, target, beam, variable, flags, seed, quiet)
+        write_traced(traced, path, truth, overwrite)
+        if not quiet:
+            say(traced_table(traced, list(outputs)))
+        return
+    if flags or truth is not None or seed:
+        names = ", ".join(f"--{name.replace('_', '-')}" for name in flags) or "--truth or --seed"
+        raise InputError(f"received {names}, but {field} is no 3-D field: leave them out")
     content = field_from(field, variable)
     original, target = choose_setups(content, target, original, deflector, dispersion)
     # The beam of another experiment is not known.
@@ -407,6 +440,55 @@ def _errors_text(fields: Fields, name: str) -> str:
         return f"peak {peak:.3g} px where the truth is zero"
     distance = float(np.linalg.norm(estimate - truth) / np.linalg.norm(truth))
     return f"peak {peak / true_peak - 1:+.1%}, L2 {distance:.1%}"
+
+
+def trace_field(
+    path: Path,
+    setup: Setup | None,
+    source: AnyArray | None,
+    iteration: str | None,
+    flags: Mapping[str, Any],
+    seed: int,
+    quiet: bool,
+) -> TracedImage:
+    """Trace particles through the 3-D field in a file."""
+    from napari_shadowinv.pipeline.traced_file import trace_file
+
+    view, options = _flags.trace_choices(flags)
+    if source is not None and {"height", "width"} & flags.keys():
+        raise InputError("received --height or --width, but --source sets the size: leave it out")
+    with nullcontext() if quiet else progress_bars() as show:
+        return trace_file(
+            path,
+            setup,
+            view=view,
+            options=options,
+            source=source,
+            iteration=iteration,
+            seed=seed,
+            on_progress=show,
+            should_stop=is_interrupted,
+        )
+
+
+def write_traced(traced: TracedImage, path: Path, truth: Path | None, overwrite: bool) -> None:
+    """Write a traced image, and the truth about it as NetCDF."""
+    from napari_shadowinv.io import replacing, write
+
+    write(path, traced.image, setup=traced.setup, overwrite=overwrite)
+    if truth is not None:
+        with replacing(truth, overwrite) as temporary:
+            traced.to_dataset().to_netcdf(temporary, engine="h5netcdf")
+
+
+def traced_table(traced: TracedImage, written: list[Path]) -> Table:
+    """Build the table of a traced image."""
+    rows = [
+        ("setup", setup_text(traced.setup, shape=traced.image.shape)),
+        *fact_rows(traced.facts),
+        *written_rows(written),
+    ]
+    return two_columns("Traced field", rows)
 
 
 @dataclass(frozen=True)

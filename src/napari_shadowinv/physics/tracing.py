@@ -30,6 +30,7 @@ from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.physics.field_grid import FieldGrid, field_grid
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.particle_flight import (
@@ -66,6 +67,8 @@ Profile = ArrayLike | Callable[[FloatArray, FloatArray], ArrayLike]
 _REACH_SAMPLES = 64  # rays each way through the whole grid, which show how far it moves them
 _SPARE_PX = 2
 _BYTES_PER_RAY = 160
+_MAX_THIN_ERROR = 0.05  # beyond it, the line integral is no good description
+_MAX_EDGE_SHARE = 0.1
 _VECTORS = ("component", *PLANE)
 
 
@@ -146,6 +149,47 @@ class TracedImage:
         norm = float(np.linalg.norm(thin[:, usable]))
         difference = float(np.linalg.norm((self.displacement - thin)[:, usable]))
         return difference / norm if norm > 0 else 0.0
+
+    @property
+    def facts(self) -> tuple[Fact, ...]:
+        """The result in words."""
+        noun = "particles" if self.options.output == "counts" else "rays"
+        counts = (
+            f"{self.launched} {noun}: {self.landed} in the image, {self.outside} outside, "
+            f"{self.lost} lost"
+        )
+        fields = (self.path_integrated_b, self.path_integrated_e)
+        field_b, field_e = (float(np.hypot(*field).max()) for field in fields)
+        peaks = [f"∫B dz {field_b:.3g} T m"] if field_b else []
+        peaks += [f"∫E dz {field_e:.3g} V"] if field_e else []
+        thin = self.thin_screen_error
+        facts = [
+            Fact(
+                "landed",
+                noun.capitalize(),
+                counts,
+                Level.DOUBTFUL if self.lost else Level.SOUND,
+            ),
+            Fact("peak", "Peak", ", ".join(peaks) or "no field across the beam"),
+            Fact(
+                "thin_screen_error",
+                "Thin-screen error",
+                f"{thin:.2%} r.m.s. of the displacement; the grid is {self.length * 1e3:.3g} mm "
+                "long",
+                Level.DOUBTFUL if thin > _MAX_THIN_ERROR else Level.SOUND,
+            ),
+        ]
+        if self.edge_share > _MAX_EDGE_SHARE:
+            facts.append(
+                Fact(
+                    "edge_share",
+                    "Edge of the grid",
+                    f"the field on the faces reaches {self.edge_share:.0%} of its peak: beyond "
+                    "them it is taken as zero, so the image has edges that the object has not",
+                    Level.DOUBTFUL,
+                )
+            )
+        return tuple(facts)
 
     def to_dataset(self) -> xarray.Dataset:
         """Return all arrays with units and coordinates in m; options and setup as attributes."""

@@ -1,0 +1,228 @@
+"""Electric and magnetic fields on 3-D grids from files.
+
+- whether a file holds them: `is_field_grid`; read them: `read_field_grid`
+
+Two layouts of HDF5 files are read: openPMD (https://github.com/openPMD/openPMD-standard, version 1
+and 2), which most particle-in-cell codes write, and NetCDF 4 as xarray writes a dataset with the
+variables Bx, By, Bz or Ex, Ey, Ez.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from napari_shadowinv._system.safety import as_file_errors, check_memory, check_regular
+from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.hdf5 import check_arrays, load_dataset, member, members
+from napari_shadowinv.physics.field_grid import AXES, FieldGrid, field_grid
+
+_HDF5_MARK = b"\x89HDF\r\n\x1a\n"
+_COMPONENT = re.compile(r"[BE]_?[xyz]", re.IGNORECASE)
+_EXPECTED = "an openPMD file or a NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez"
+_SAME_PLACE = 1e-6  # of a cell
+_MAX_LISTED = 10
+_BYTES_PER_NODE = 100  # six components, twice in double precision
+
+
+@as_file_errors
+def is_field_grid(path: Path) -> bool:
+    """Return whether a file holds fields on a 3-D grid; false for a file that cannot be read."""
+    import h5py
+
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        if file.read(len(_HDF5_MARK)) != _HDF5_MARK:
+            return False
+    with h5py.File(path, "r") as content:
+        return "openPMD" in content.attrs or any(
+            _COMPONENT.fullmatch(name) and getattr(item, "ndim", 0) >= len(AXES)
+            for name, item in members(path, content)
+        )
+
+
+@as_file_errors
+def read_field_grid(path: Path, *, iteration: str | int | None = None) -> FieldGrid:
+    """Read E and B from a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        An openPMD file (HDF5) with Cartesian 3-D meshes E, B or both, or a NetCDF 4 file; see
+        `napari_shadowinv.physics.field_grid.field_grid` for its variables.
+    iteration : str or int, optional
+        Iteration of an openPMD file that holds several.
+
+    Returns
+    -------
+    FieldGrid
+        In the axes of the file, with x, y and z as they are named there; `FieldGrid.turned` brings
+        them into the beam's frame. Components of a staggered mesh are averaged to the middle of
+        the cells.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing, damaged or of another kind.
+    InputError
+        If it holds no Cartesian 3-D field, several iterations, or no units.
+    """
+    import h5py
+
+    check_regular(path, _EXPECTED)
+    with path.open("rb") as file:
+        if file.read(len(_HDF5_MARK)) != _HDF5_MARK:
+            raise FileFormatError(f"{path} is no HDF5 file: expected {_EXPECTED}")
+    with h5py.File(path, "r") as content:
+        if "openPMD" in content.attrs:
+            return _read_openpmd(path, content, iteration)
+    if iteration is not None:
+        raise InputError(f"received iteration {iteration}, but {path} is no openPMD file")
+    import xarray as xr
+
+    check_arrays(path)
+    try:
+        return field_grid(xr.load_dataset(path, engine="h5netcdf", decode_times=False))
+    except InputError as error:
+        raise error.about(path) from error
+
+
+def _read_openpmd(path: Path, content: Any, iteration: str | int | None) -> FieldGrid:
+    group = _choose_iteration(path, content, iteration)
+    meshes = member(path, group, _text(content.attrs.get("meshesPath", "fields/")))
+    records = {
+        symbol: record
+        for symbol in ("B", "E")
+        if meshes is not None and (record := member(path, meshes, symbol)) is not None
+    }
+    if not records:
+        raise InputError(f"{path} has no mesh E or B: expected fields on a grid")
+    arrays: dict[str, Any] = {"B": None, "E": None}
+    geometries = []
+    for symbol, record in records.items():
+        arrays[symbol], *geometry = _read_mesh(path, record, symbol)
+        geometries.append(geometry)
+    shapes = [np.shape(arrays[symbol]) for symbol in records]
+    if any(shape != shapes[0] for shape in shapes) or not all(
+        np.allclose(geometry, geometries[0], rtol=_SAME_PLACE) for geometry in geometries
+    ):
+        raise InputError(f"{path} has E and B on different grids: expected one grid for both")
+    spacing, centre = geometries[0]
+    return FieldGrid(arrays["B"], arrays["E"], spacing=spacing, centre=centre)
+
+
+def _choose_iteration(path: Path, content: Any, iteration: str | int | None) -> Any:
+    """Return the group of the only iteration, or of the chosen one."""
+    base = _text(content.attrs.get("basePath", "/data/%T/"))
+    parent = member(path, content, base.partition("%T")[0].strip("/"))
+    names = [] if parent is None else [name for name in parent if name.isdigit()]
+    if not names:
+        raise InputError(f"{path} has no iteration in {base!r}: expected an openPMD file with data")
+    if iteration is None and len(names) > 1:
+        listed = sorted(names, key=int)[:_MAX_LISTED]
+        more = ", …" if len(names) > _MAX_LISTED else ""
+        raise InputError(f"{path} has the iterations {', '.join(listed)}{more}: choose one of them")
+    wanted = names[0] if iteration is None else str(iteration)
+    if wanted not in names:
+        raise InputError(
+            f"{path} has no iteration {wanted}: expected one of "
+            f"{', '.join(sorted(names, key=int)[:_MAX_LISTED])}"
+        )
+    return member(path, parent, wanted)
+
+
+def _read_mesh(path: Path, record: Any, symbol: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a vector field, components and axes in the order (z, y, x), its spacing and middle."""
+    geometry = _text(record.attrs.get("geometry", "cartesian"))
+    labels = [_text(name).lower() for name in np.ravel(record.attrs.get("axisLabels", []))]
+    if geometry != "cartesian" or sorted(labels) != sorted(AXES):
+        raise InputError(
+            f"{path} has {symbol} on a {geometry} mesh with the axes "
+            f"{', '.join(labels) or 'none'}: expected a cartesian one with x, y and z; resample it"
+        )
+    for name in ("gridSpacing", "gridGlobalOffset", "gridUnitSI"):
+        if name not in record.attrs:
+            raise InputError(
+                f"{path} has no {name} for {symbol}: expected a grid with its unit, as openPMD "
+                "requires"
+            )
+    unit = _metres(record.attrs["gridUnitSI"], 3)
+    spacing = np.ravel(record.attrs["gridSpacing"]).astype(float) * unit
+    offset = np.ravel(record.attrs["gridGlobalOffset"]).astype(float) * unit
+    step = -1 if _text(record.attrs.get("dataOrder", "C")) == "F" else 1
+    # An array is read with its slowest axis first; the labels of Fortran order begin with the
+    # fastest.
+    labels, spacing, offset = labels[::step], spacing[::step], offset[::step]
+    order = [labels.index(axis) for axis in AXES]
+    parts, places = [], []
+    for axis in AXES:
+        item = member(path, record, axis)
+        if item is None:
+            raise InputError(f"{path} has no component {symbol}/{axis}: expected x, y and z")
+        if "unitSI" not in item.attrs:
+            raise InputError(
+                f"{path} has no unitSI for {symbol}/{axis}: expected the unit of the field, as "
+                "openPMD requires"
+            )
+        values = _component(path, item) * float(np.ravel(item.attrs["unitSI"])[0])
+        if values.ndim != len(AXES):
+            raise InputError(
+                f"{path} has {symbol}/{axis} with shape {values.shape}: expected three dimensions"
+            )
+        check_memory(values.shape, _BYTES_PER_NODE, "a field")
+        place = np.ravel(item.attrs.get("position", [0.0] * 3)).astype(float)[::step]
+        parts.append(values.transpose(order))
+        places.append(place[order])
+    parts, place = _collocate(parts, np.array(places))
+    spacing, offset = spacing[order], offset[order]
+    counts = np.array(parts[0].shape)
+    middle = offset + spacing * (place + (counts - 1) / 2)
+    return np.stack(parts), spacing, middle
+
+
+def _component(path: Path, item: Any) -> AnyArray:
+    """Return the values of a component, which may be constant."""
+    if hasattr(item, "dtype"):
+        return load_dataset(path, item).astype(np.float64)
+    shape = tuple(int(count) for count in np.ravel(item.attrs["shape"]))
+    # A view of one number takes no memory, whatever shape the file claims.
+    return np.broadcast_to(np.float64(np.ravel(item.attrs["value"])[0]), shape)
+
+
+def _collocate(parts: Sequence[AnyArray], places: FloatArray) -> tuple[list[AnyArray], FloatArray]:
+    """Bring components to common nodes, by linear interpolation along each axis that differs."""
+    parts = list(parts)
+    place = places[0].copy()
+    for axis in range(len(AXES)):
+        if np.ptp(places[:, axis]) < _SAME_PLACE:
+            continue
+        place[axis] = 0.5
+        for k, part in enumerate(parts):
+            share = 0.5 - places[k, axis]
+            low, high = (
+                part.take(range(first, part.shape[axis] - 1 + first), axis=axis) for first in (0, 1)
+            )
+            if share >= 0:
+                parts[k] = (1 - share) * low + share * high
+            else:
+                raise InputError(
+                    f"a component lies at {places[k, axis]:g} of a cell: expected a position from "
+                    "0 to 0.5, as in a staggered mesh"
+                )
+    return parts, place
+
+
+def _metres(unit: Any, count: int) -> FloatArray:
+    """Return the unit of each axis, which is one number before version 2."""
+    values = np.ravel(unit).astype(float)
+    return np.full(count, values[0]) if values.size == 1 else values
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)

@@ -1,0 +1,126 @@
+"""The image of a 3-D field in a file: `trace_file`.
+
+- how the grid lies in the beam, and which image is traced: `GridView`
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from numpy.typing import ArrayLike
+from pydantic import Field
+
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
+from napari_shadowinv._system.validation import CheckedModel
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.field_grids import read_field_grid
+from napari_shadowinv.physics.setup import ProtonSetup
+from napari_shadowinv.physics.tracing import TraceOptions, trace
+
+if TYPE_CHECKING:
+    from napari_shadowinv.physics.field_grid import FieldGrid
+    from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.physics.tracing import TracedImage
+
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+class GridView(CheckedModel):
+    """Direction from which a grid is seen, and the size of its image."""
+
+    beam: Axis = Field(
+        default="z",
+        title="Beam along",
+        description="Axis of the grid along which the beam travels.",
+    )
+    right: Axis = Field(
+        default="x",
+        title="Right along",
+        description="Axis of the grid that points to the right in the image.",
+    )
+    centre: bool = Field(
+        default=False,
+        title="Centre the grid",
+        description="Put the middle of the grid on the middle of the object plane.",
+    )
+    height: int = Field(
+        default=200,
+        ge=4,
+        le=20_000,
+        title="Height (px)",
+        description="Height of the traced image in px.",
+    )
+    width: int = Field(
+        default=200,
+        ge=4,
+        le=20_000,
+        title="Width (px)",
+        description="Width of the traced image in px.",
+    )
+
+    def apply(self, grid: FieldGrid) -> FieldGrid:
+        """Return a grid in the frame of the beam."""
+        turned = grid.turned(self.beam, self.right)
+        return turned.centred() if self.centre else turned
+
+
+def trace_file(
+    path: Path,
+    setup: Setup | None,
+    *,
+    view: GridView | None = None,
+    options: TraceOptions | None = None,
+    source: ArrayLike | None = None,
+    iteration: str | None = None,
+    seed: int = 0,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> TracedImage:
+    """Trace particles through the field in a file.
+
+    Parameters
+    ----------
+    path : Path
+        An openPMD or NetCDF 4 file; see `napari_shadowinv.io.field_grids.read_field_grid`.
+    setup : Setup or None
+        The experiment, of particles.
+    view : GridView, optional
+        Direction of the beam and size of the image, which a source replaces.
+    options, seed, on_progress, should_stop
+        As for `napari_shadowinv.trace`.
+    source : array_like, shape (H, W), optional
+        Undisturbed beam. Default: 1.
+    iteration : str, optional
+        Iteration of an openPMD file that holds several.
+
+    Returns
+    -------
+    TracedImage
+
+    Raises
+    ------
+    InputError, FileFormatError
+        As `read_field_grid` and `napari_shadowinv.trace`; or if the setup is none of particles.
+    """
+    if not isinstance(setup, ProtonSetup):
+        received = "there is no setup" if setup is None else f"the setup is of {setup.beam}"
+        raise InputError(
+            f"{received}: expected one of charged particles, with energy, distances and pixel "
+            "size, to trace them through a 3-D field"
+        )
+    view = view or GridView()
+    shape = (view.height, view.width)
+    if source is not None:
+        shape = getattr(source, "shape", shape)
+    grid = view.apply(read_field_grid(path, iteration=iteration))
+    return trace(
+        grid,
+        setup,
+        shape,
+        options=options,
+        profile=source,
+        seed=seed,
+        on_progress=on_progress,
+        should_stop=should_stop,
+    )
