@@ -36,6 +36,7 @@ ROOMS = (
     ("transport",),
     ("inversion",),
     ("fitting",),
+    ("analysis",),
     ("io",),
     ("pipeline",),
     ("stack", "plotting"),

@@ -41,7 +41,7 @@ from napari_shadowinv.transport.minimise import Solution, with_full_cells
 from napari_shadowinv.transport.sites import RATIO, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
 
-__all__ = ["FLUX_ERRORS", "Budget", "ErrorEstimate", "Errors"]
+__all__ = ["FLUX_ERRORS", "Budget", "ErrorEstimate", "Errors", "discretisation_share"]
 
 _AROUND = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])  # px
 _PLACES = 48  # along the longer side, where levels are compared
@@ -372,6 +372,24 @@ class Errors:
         return cls(**{**values, **tables})
 
 
+def discretisation_share(times: float, rate: float = _USUAL_RATE) -> float:
+    """Return the discretisation error of a solution, as a share of its last change.
+
+    Parameters
+    ----------
+    times : float
+        Number of sites over that of the coarser solution, from which it changed; above 1.
+    rate : float
+        Ratio of the changes by two successive fourfold increases of the number of sites.
+    """
+    return float((times ** (2 * _power_of(rate)) - 1) ** -0.5)
+
+
+def _power_of(rate: float) -> float:
+    """Return the power of the number of sites with which changes fall."""
+    return -math.log(rate) / math.log(RATIO)
+
+
 class Budget:
     """Computation of errors from the levels solved so far."""
 
@@ -538,9 +556,8 @@ class Budget:
         rate = _USUAL_RATE
         if len(changes) > 1 and changes[0] > 0:
             rate = float(np.clip(np.sqrt(changes[1] / changes[0]), *_RATES))
-        power = -math.log(rate) / math.log(RATIO)
         last = ((self._move(solved[-1]) - self._move(solved[-2])) ** 2).sum(axis=0)
-        return last / (times ** (2 * power) - 1), power
+        return last * discretisation_share(times, rate) ** 2, _power_of(rate)
 
     def _response(self, solved: Sequence[LevelSolution]) -> LinearResponse:
         few = [candidate for candidate in solved if len(candidate.weights) <= _MAX_RESPONSE_SITES]

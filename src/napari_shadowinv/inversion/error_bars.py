@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from functools import partial, reduce
+from itertools import chain
 from operator import add
 from statistics import NormalDist
 from threading import Event
@@ -80,6 +81,7 @@ _BYTES_PER_SITE, _BYTES_PER_PIXEL = 700, 150  # measured peaks of one sample, ro
 
 
 QuantityOf = Callable[[FloatArray, FloatArray], ArrayLike]
+Quantities = Mapping[str, QuantityOf] | Callable[[FloatArray], Mapping[str, QuantityOf]]
 
 
 @dataclass(frozen=True)
@@ -277,7 +279,7 @@ def uncertainty(
     method: Literal["linear", "resolve"] = "linear",
     options: InversionOptions | None = None,
     instrument: Instrument | None = None,
-    quantities: Mapping[str, QuantityOf] | None = None,
+    quantities: Quantities | None = None,
     plan: SitePlan | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
@@ -317,10 +319,12 @@ def uncertainty(
     instrument : Instrument, optional
         How well beam, detector and alignment are known. If it states no beam, a source that was not
         recorded is taken to be off as in the error budget. Default: samples draw noise alone.
-    quantities : dict of str to callable, optional
+    quantities : dict of str to callable, or callable, optional
         Numbers whose error bars are needed: functions of potential, (H, W), and displacement,
         (2, H, W), that return a number or an array: a line profile, the mean of a region, an
-        integral, a peak. Several threads may call them at once.
+        integral, a peak. Several threads may call them at once. A function that returns the
+        dictionary is called with the changes of the potential in a few samples, (k, H, W), from
+        which it may choose a smoothing.
 
     Returns
     -------
@@ -404,7 +408,8 @@ def uncertainty(
     resampling = replace(resampling, instrument=draws)
     report = Reporter(on_progress, should_stop)
     image_fields = np.stack([inversion.potential, *inversion.displacement])
-    measure = partial(_measure, quantities, image_fields)
+    functions: dict[str, QuantityOf] = {}
+    measure = partial(_measure, functions, image_fields)
     asked = measure if quantities else None
     outcomes: list[tuple[int, float, bool]] = []
 
@@ -416,9 +421,10 @@ def uncertainty(
 
     check = _LinearCheck(0.0, 1.0, 0.0)
     if method == "resolve":
-        scatter = reduce(
-            add, (Scatter.of(change, asked) for change in solve_samples(seeds, report))
-        )
+        head = list(solve_samples(seeds[:_CHECKED], report))
+        functions.update(_functions(quantities, np.array([change[0] for change in head])))
+        changes = chain(head, solve_samples(seeds[_CHECKED:], report))
+        scatter = reduce(add, (Scatter.of(change, asked) for change in changes))
     else:
         quietly = Reporter(None, should_stop)
         few = seeds[: _CHECKED if draws is None else WIDTH]
@@ -429,6 +435,7 @@ def uncertainty(
         )
         linear = _in_thread(lambda: response.changes(few), quietly)
         check = _LinearCheck.of(linear[:, 1:], checked[:, 1:])
+        functions.update(_functions(quantities, linear[:, 0]))
         del checked, linear
         blocks = [seeds[start : start + WIDTH] for start in range(0, len(seeds), WIDTH)]
         scatter = reduce(add, _in_order(response.scatter, blocks, workers, report))
@@ -470,15 +477,22 @@ def uncertainty(
     )
 
 
-def _checked_quantities(quantities: Mapping[str, QuantityOf] | None) -> Mapping[str, QuantityOf]:
+def _checked_quantities(quantities: Quantities | None) -> Quantities:
     if quantities is None:
         return {}
+    if callable(quantities):
+        return quantities
     if not isinstance(quantities, Mapping) or not all(map(callable, quantities.values())):
         raise InputError(
             f"quantities is {quantities!r}, expected a dictionary of functions of potential and "
             "displacement"
         )
     return quantities
+
+
+def _functions(quantities: Quantities, changes: FloatArray) -> Mapping[str, QuantityOf]:
+    """Return the functions of all quantities, by changes of the potential if they depend on it."""
+    return quantities(changes) if callable(quantities) else quantities
 
 
 def _measure(

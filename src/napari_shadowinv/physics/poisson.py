@@ -1,6 +1,7 @@
 """The linear inversion that holds for weak modulations, for comparison.
 
 - invert an image by solving Poisson's equation: `poisson_invert`
+- the potential of a displacement: `potential_from_displacement`
 - the constant that a potential is free in: `border_mean`
 """
 
@@ -62,6 +63,47 @@ def poisson_invert(image: ArrayLike, *, source: ArrayLike | None = None) -> Floa
         beam = _checked_source(source, target.shape)
         ratio = target * (beam.sum() / flux) / beam
     potential = _solve_neumann(ratio - 1)
+    return potential - border_mean(potential)
+
+
+def potential_from_displacement(displacement: FloatArray) -> FloatArray:
+    """Potential whose negative gradient is closest to a displacement, by least squares.
+
+    Parameters
+    ----------
+    displacement : ndarray, shape (2, H, W)
+        In px, axis order (y, x).
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        In px²; its mean over the image's border is 0. Between neighbouring pixels it falls by the
+        mean of their displacements.
+
+    Examples
+    --------
+    >>> potential = np.outer(np.arange(5.0) ** 2, np.ones(4))
+    >>> displacement = np.stack([np.outer(-2 * np.arange(5.0), np.ones(4)), np.zeros((5, 4))])
+    >>> change = potential_from_displacement(displacement) - potential
+    >>> float(np.ptp(change)) < 1e-12
+    True
+    """
+    down, right = np.asarray(displacement, dtype=np.float64)
+    height, width = down.shape
+    slopes = np.zeros((height, width))
+    by_row, by_column = (down[1:] + down[:-1]) / 2, (right[:, 1:] + right[:, :-1]) / 2
+    slopes[:-1] += by_row
+    slopes[1:] -= by_row
+    slopes[:, :-1] += by_column
+    slopes[:, 1:] -= by_column
+    # The cosines diagonalise the sum of squared differences of neighbours.
+    rows = 2 - 2 * np.cos(np.pi * np.arange(height) / height)
+    columns = 2 - 2 * np.cos(np.pi * np.arange(width) / width)
+    square = rows[:, None] + columns
+    square[0, 0] = 1.0
+    spectrum = dctn(slopes) / square
+    spectrum[0, 0] = 0.0
+    potential: FloatArray = idctn(spectrum)
     return potential - border_mean(potential)
 
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from napari.utils.notifications import show_info
-from numpy.typing import ArrayLike
 from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, Qt
 
@@ -21,6 +17,14 @@ from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._layers import LayerPicker, kind_of, new_shapes, shown_plane
 from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.analysis.paths import (
+    Profile,
+    interpolate,
+    measure_peak,
+    sample_path,
+    sample_strip,
+    table_text,
+)
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
@@ -31,140 +35,7 @@ _LAYER_ROLE = Qt.ItemDataRole.UserRole
 _LINE_SHAPES = ("line", "path")
 _PIXELS = "px"
 _MAX_WIDTH = 1e6
-_MAX_SAMPLES = 5000
 _MAX_NAME_LENGTH = 34
-
-
-@dataclass(frozen=True, eq=False)
-class Profile:
-    name: str
-    unit: str
-    values: FloatArray  # NaN where the line is outside the image
-    averaging: str = ""  # in words; empty for values on the line
-
-
-def sample_path(vertices: ArrayLike, step: float) -> tuple[FloatArray, FloatArray]:
-    """Return points (n, 2) along a path, at most a step apart, and their distances along it."""
-    corners, cumulative_length = _corners(vertices)
-    count = min(int(np.ceil(cumulative_length[-1] / step - 1e-9)) + 1, _MAX_SAMPLES)
-    distance = np.linspace(0, cumulative_length[-1], max(count, 2))
-    return _points_at(corners, cumulative_length, distance), distance
-
-
-def _corners(vertices: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return the distinct corners of a path, and its length up to each corner."""
-    corners = np.asarray(vertices, dtype=np.float64)
-    lengths = np.hypot(*np.diff(corners, axis=0).T)
-    moves = np.concatenate([[True], lengths > 0])
-    if moves.sum() > 1:
-        corners, lengths = corners[moves], lengths[moves[1:]]
-    return corners, np.concatenate([[0.0], np.cumsum(lengths)])
-
-
-def _points_at(
-    corners: FloatArray, cumulative_length: FloatArray, distance: FloatArray
-) -> FloatArray:
-    return np.stack(
-        [np.interp(distance, cumulative_length, corners[:, axis]) for axis in (0, 1)], axis=1
-    )
-
-
-def sample_strip(
-    vertices: ArrayLike, distance: FloatArray, width: float, step: float
-) -> FloatArray:
-    """Return points (m, n, 2) of a strip: at n distances, m points across the path."""
-    corners, cumulative_length = _corners(vertices)
-    points = _points_at(corners, cumulative_length, distance)
-    edges = np.diff(corners, axis=0)
-    edge = np.clip(
-        np.searchsorted(cumulative_length, distance, side="right") - 1, 0, len(edges) - 1
-    )
-    lengths = np.maximum(np.hypot(*edges.T), np.finfo(float).tiny)
-    along_y, along_x = (edges / lengths[:, None])[edge].T
-    across = np.stack([along_x, -along_y], axis=1)
-    count = min(max(int(np.ceil(width / step - 1e-9)), 1), _MAX_SAMPLES)
-    offsets = width * ((np.arange(count) + 0.5) / count - 0.5)
-    rows: FloatArray = points + offsets[:, None, None] * across
-    return rows
-
-
-def interpolate(
-    image: ArrayLike, points: FloatArray, to_pixels: Callable[[FloatArray], FloatArray]
-) -> FloatArray:
-    """Return values at world points (n, 2), or means over m of (m, n, 2); NaN outside."""
-    from scipy.ndimage import map_coordinates
-
-    plane = np.asarray(image, dtype=np.float64)
-    pixels = to_pixels(points.reshape(-1, 2))
-    values = np.asarray(map_coordinates(plane, pixels.T, order=1, mode="nearest"))
-    size = np.array(plane.shape)
-    inside = ((pixels >= -0.5) & (pixels <= size - 0.5)).all(axis=1)
-    rows = np.where(inside, values, 0.0).reshape(-1, points.shape[-2])
-    count = inside.reshape(rows.shape).sum(axis=0)
-    return np.where(count > 0, rows.sum(axis=0) / np.maximum(count, 1), np.nan)
-
-
-@dataclass(frozen=True)
-class PeakMeasures:
-    """Peak of a profile, its full width at half maximum, and the area under the profile."""
-
-    peak: float  # the value of largest magnitude, with its sign
-    position: float  # distance along the line
-    width: float  # NaN if the profile stays above half of the peak up to an end of the line
-    area: float
-
-    def text(self, unit: str, distance_unit: str) -> str:
-        """Return the measures in words, with their units."""
-        width = "beyond the line" if np.isnan(self.width) else f"{self.width:.4g} {distance_unit}"
-        return (
-            f"peak {f'{self.peak:.4g} {unit}'.strip()} at {self.position:.4g} {distance_unit}, "
-            f"width (FWHM) {width}, "
-            f"area {self.area:.4g} {'·'.join(filter(None, (unit, distance_unit)))}"
-        )
-
-
-def measure_peak(distance: FloatArray, values: FloatArray) -> PeakMeasures | None:
-    """Measure the peak of largest magnitude; None if the line misses the image.
-
-    Nothing is subtracted: half of the maximum counts from zero.
-    """
-    inside = np.isfinite(values)
-    if not inside.any():
-        return None
-    distance, values = distance[inside], values[inside]
-    top = int(np.abs(values).argmax())
-    peak = float(values[top])
-    relative = values / peak if peak else np.zeros_like(values)
-    edges = [_half_maximum(distance[top::step], relative[top::step]) for step in (-1, 1)]
-    area = float(np.trapezoid(values, distance))
-    return PeakMeasures(peak, float(distance[top]), edges[1] - edges[0], area)
-
-
-def _half_maximum(distance: FloatArray, relative: FloatArray) -> float:
-    """Return the distance at which a flank, starting at 1, falls to a half; NaN if it does not."""
-    below = np.flatnonzero(relative < 0.5)
-    if not below.size or below[0] == 0:
-        return float("nan")
-    pair = slice(below[0] - 1, below[0] + 1)
-    return float(np.interp(-0.5, -relative[pair], distance[pair]))
-
-
-def table_text(distance: FloatArray, unit: str, profiles: Sequence[Profile]) -> str:
-    """Return profiles as comma-separated columns, with units in the first row."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([f"distance ({unit})", *(_heading(profile) for profile in profiles)])
-    for row in zip(distance, *(profile.values for profile in profiles), strict=True):
-        writer.writerow([f"{value:.9g}" for value in row])
-    return text.getvalue()
-
-
-def _heading(profile: Profile) -> str:
-    """Return the heading of a column: name, unit unless in the name, and averaging."""
-    name = profile.name
-    if profile.unit and f"({profile.unit})" not in name:
-        name = f"{name} ({profile.unit})"
-    return f"{name}, {profile.averaging}" if profile.averaging else name
 
 
 class ProfilePlot(Plot):

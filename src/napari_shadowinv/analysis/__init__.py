@@ -1,0 +1,13 @@
+"""Products: quantities computed from a retrieved field, each with its band.
+
+- measure products of a result: `analyse`; each becomes a `ProductResult`
+- values along a line or path: `LineProfile`; in a drawn region: `Region`
+- line integrals: `Flux`, `EnclosedCurrent`, `EnclosedCharge`
+- maps: `CurrentDensity`, `ChargeDensity`
+- how strongly the field structures the image: `Contrast`
+- add a product: a subclass of `Product`, and its entry in `PRODUCTS`
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

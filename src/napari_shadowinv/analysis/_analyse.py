@@ -1,0 +1,284 @@
+"""Products of a result with their bands, in one pass over samples of its field: `analyse`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.analysis._field_samples import (
+    Callbacks,
+    Evaluation,
+    SampledField,
+    sampled_fields,
+)
+from napari_shadowinv.analysis.frame import FieldFrame, field_unit
+from napari_shadowinv.analysis.product import FieldNoise, Product, Variable, product_from_dict
+from napari_shadowinv.analysis.result import ProductResult
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Fact, Level, caution_facts
+from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.physics.setup import Setup
+
+__all__ = ["analyse"]
+
+_MIN_SAMPLES = 20
+
+
+def analyse(
+    result: Any,
+    products: Product | Mapping[str, Any] | Sequence[Product | Mapping[str, Any]],
+    *,
+    samples: int = 100,
+    unit: str | None = None,
+    deflector: str | None = None,
+    setup: Setup | None = None,
+    seed: int = 0,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> list[ProductResult]:
+    """Measure products of a result, each with its band.
+
+    All products share one pass over samples of the field. Those of an inversion, also of one that
+    was read from a file, are drawn from the noise of its image and from its instrument, as by
+    `uncertainty`; its discretisation error is added. A fit has stored its samples. The field of
+    another program has none, so its products have no bands.
+
+    Parameters
+    ----------
+    result : Inversion, Fit or RetrievedField
+        Of one shot.
+    products : Product, mapping, or sequence of these
+        Products, or tables of their fields, such as ``{"product": "flux", "path": …}``.
+    samples : int
+        Number of samples, at least 20. A band of 95 % needs about 100. For a fit at most the
+        number that it has stored.
+    unit : str, optional
+        Unit of the field, such as "MG µm"; all are in `FIELD_UNITS`. It chooses the field, too:
+        "V" an electric one. Default: the SI unit of what deflects.
+    deflector : str, optional
+        Key of what deflects, such as "E". Of a fit with several fields only this one is analysed.
+    setup : Setup, optional
+        The experiment, for SI units. Default: that of the result.
+    seed : int
+        For the signs of errors that are the same in all samples, such as the discretisation's.
+    on_progress, should_stop
+        As of `invert`.
+
+    Returns
+    -------
+    list of ProductResult
+        For each product, and each field that it is defined for.
+
+    Raises
+    ------
+    InputError
+        If a product cannot be measured in this result, the unit is unknown or does not belong to
+        the result, or the result is not of one shot.
+    InversionCancelled
+        If `should_stop` returned true.
+
+    Examples
+    --------
+    >>> from napari_shadowinv import invert
+    >>> y, x = np.mgrid[:40, :40] - 19.5
+    >>> image = 400 * (1 + 0.2 * np.exp(-(x**2 + y**2) / 50))
+    >>> line = {"product": "profile", "path": [(20, 5), (20, 35)]}
+    >>> (profile,) = analyse(invert(np.random.default_rng(0).poisson(image)), line, samples=20)
+    >>> profile["magnitude"].value.shape, profile.variables["magnitude"].unit
+    ((31,), 'pixel')
+    """
+    listed = _checked_products(products)
+    if not isinstance(samples, int | np.integer) or isinstance(samples, bool):
+        raise InputError(f"samples is {samples!r}, expected a whole number")
+    if samples < _MIN_SAMPLES:
+        raise InputError(f"samples is {samples}, expected at least {_MIN_SAMPLES}")
+    chosen_unit = None if unit is None else field_unit(unit)
+    fields = sampled_fields(result, setup, chosen_unit, deflector)
+    callbacks = Callbacks(on_progress, should_stop)
+    tasks = [_Task(each, _products_for(listed, each.frame, len(fields))) for each in fields]
+    missing = [each for each in listed if not any(each in task.products for task in tasks)]
+    if missing:
+        missing[0].check(fields[0].frame)
+    names = _names([product for task in tasks for product in task.products])
+    headline = Fact("result", "Field", result.headline.text, result.headline.level)
+    results: list[ProductResult] = []
+    for task in tasks:
+        if not task.products:
+            continue
+        evaluation = task.field.evaluate(task.choose, int(samples), callbacks)
+        rng = np.random.default_rng(seed)
+        results += task.results(evaluation, rng, names[len(results) :], headline)
+    return results
+
+
+def _checked_products(products: Any) -> list[Product]:
+    single = isinstance(products, Product | Mapping)
+    listed = [products] if single else list(products)
+    if not listed:
+        raise InputError("got no product, expected at least one")
+    return [
+        each if isinstance(each, Product) else product_from_dict(each, f"product {number}")
+        for number, each in enumerate(listed, 1)
+    ]
+
+
+def _products_for(products: list[Product], frame: FieldFrame, n_fields: int) -> list[Product]:
+    """Return the products of one of several fields, after a check that they can be measured."""
+    suitable = [each for each in products if n_fields == 1 or each.is_defined_for(frame.unit.field)]
+    for product in suitable:
+        product.check(frame)
+    return suitable
+
+
+def _names(products: Sequence[Product]) -> list[str]:
+    """Return names for files: the label or the kind, with a number if there are several."""
+    bases = [(each.label or each.name()).replace(" ", "_").replace("-", "_") for each in products]
+    names = []
+    for number, base in enumerate(bases):
+        earlier = bases[:number].count(base)
+        names.append(base if bases.count(base) == 1 else f"{base}_{earlier + 1}")
+    return names
+
+
+@dataclass
+class _Task:
+    """The products of one field; `choose` replaces them by those that are measured."""
+
+    field: SampledField
+    products: list[Product]
+    _layout: list[tuple[int, str, tuple[int, ...]]] = dataclasses.field(default_factory=list)
+
+    def choose(self, noise: FieldNoise | None) -> Any:
+        """Choose what follows from the noise, and return the function that measures everything."""
+        frame, potential = self.field.frame, self.field.potential
+        self.products = [each.adapt(potential, noise, frame) for each in self.products]
+        values = self._values(potential, self.field.displacement)
+        self._layout = [(place, name, value.shape) for place, name, value in values]
+        return self.measure
+
+    def _values(
+        self, potential: FloatArray, displacement: FloatArray
+    ) -> list[tuple[int, str, FloatArray]]:
+        return [
+            (place, name, np.asarray(value, dtype=np.float64))
+            for place, product in enumerate(self.products)
+            for name, value in product.measure(potential, displacement, self.field.frame).items()
+        ]
+
+    def measure(self, potential: FloatArray, displacement: FloatArray) -> FloatArray:
+        """Return all numbers of all products as one vector."""
+        values = self._values(potential, displacement)
+        return np.concatenate([value.ravel() for _, _, value in values])
+
+    def results(
+        self,
+        evaluation: Evaluation,
+        rng: np.random.Generator,
+        names: Sequence[str],
+        headline: Fact,
+    ) -> list[ProductResult]:
+        """Return the results, with systematic errors of random sign added to the samples."""
+        systematic = {**evaluation.systematic, **self._by_energy()}
+        if len(evaluation.samples):
+            systematic |= self._by_product()
+        samples = evaluation.samples.copy()
+        causes = list(evaluation.causes)
+        for cause, error in systematic.items():
+            strengths = _standard_numbers(rng, len(samples))
+            samples += strengths[:, None] * error
+            if len(samples) and error.any():
+                causes.append(cause)
+        quantities: list[dict[str, Quantity]] = [{} for _ in self.products]
+        start = 0
+        for place, name, shape in self._layout:
+            part = slice(start, start + int(np.prod(shape)))
+            start = part.stop
+            quantities[place][name] = Quantity(
+                evaluation.value[part].reshape(shape),
+                samples[:, part].reshape(len(samples), *shape),
+            )
+        frame = self.field.frame
+        doubts = caution_facts(evaluation.cautions)
+        return [
+            _result(product, name, quantity, frame, causes, [headline, *doubts])
+            for product, name, quantity in zip(self.products, names, quantities, strict=False)
+        ]
+
+    def _by_energy(self) -> dict[str, FloatArray]:
+        """Return the errors by the energy of the beam, which scales fields in SI units."""
+        frame, share = self.field.frame, self.field.instrument.energy
+        if not share or frame.setup is None or frame.unit.field == "displacement":
+            return {}
+        share *= abs(frame.setup.sensitivity_to_beam(frame.unit.field))
+        values, scaled = (self._in_energy(factor) for factor in (1.0, 1.0 + share))
+        noun = frame.setup.beam_quantity().noun
+        return {f"{noun}, {100 * self.field.instrument.energy:.2g} %": scaled - values}
+
+    def _in_energy(self, factor: float) -> FloatArray:
+        return self.measure(factor * self.field.potential, factor * self.field.displacement)
+
+    def _by_product(self) -> dict[str, FloatArray]:
+        """Return the errors by the products' own methods."""
+        errors = [
+            product.systematic(self.field.potential, self.field.displacement, self.field.frame)
+            for product in self.products
+        ]
+        if not any(errors):
+            return {}
+        parts = [
+            np.broadcast_to(errors[place].get(name, 0.0), shape).ravel()
+            for place, name, shape in self._layout
+        ]
+        return {"smoothing": np.concatenate(parts)}
+
+
+def _standard_numbers(rng: np.random.Generator, count: int) -> FloatArray:
+    """Return normal numbers of mean 0 and standard deviation 1."""
+    numbers = rng.normal(size=count)
+    if count < 2:
+        return numbers
+    return np.asarray((numbers - numbers.mean()) / numbers.std(ddof=1))
+
+
+def _result(
+    product: Product,
+    name: str,
+    quantities: dict[str, Quantity],
+    frame: FieldFrame,
+    causes: Sequence[str],
+    doubts: Sequence[Fact],
+) -> ProductResult:
+    variables: dict[str, Variable] = product.variables(frame)
+    for constant, values in product.constants(frame).items():
+        array = np.asarray(values, dtype=np.float64)
+        quantities[constant] = Quantity(array, np.zeros((0, *array.shape)))
+    if causes:
+        bands = Fact("bands", "Bands", f"68 and 95 %, by {', '.join(causes)}")
+    else:
+        bands = Fact(
+            "bands", "Bands", "none: the errors of this field are not known", Level.DOUBTFUL
+        )
+    facts = (
+        *product.facts(quantities, frame),
+        *caution_facts(product.cautions(quantities, frame)),
+        *doubts,
+        bands,
+    )
+    return ProductResult(
+        name=name,
+        product=product,
+        field=frame.unit.field,
+        unit=frame.unit,
+        quantities={each: quantities[each] for each in variables},
+        variables=variables,
+        coordinates=product.coordinates(frame),
+        facts=facts,
+        limits=(*product.remarks(frame), *frame.limits),
+        causes=tuple(causes),
+    )

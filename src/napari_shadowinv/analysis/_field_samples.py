@@ -1,0 +1,418 @@
+"""A field with random samples of its errors, for each kind of result: `sampled_fields`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from napari_shadowinv._system.progress import Reporter
+from napari_shadowinv._system.safety import check_memory
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.analysis.frame import FIELD_UNITS, FieldFrame, FieldUnit
+from napari_shadowinv.analysis.product import FieldNoise
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion._invert import invert, plan_sites
+from napari_shadowinv.inversion.budget import discretisation_share
+from napari_shadowinv.inversion.error_bars import uncertainty
+from napari_shadowinv.inversion.noise import ImageNoise
+from napari_shadowinv.inversion.normalise import prepare
+from napari_shadowinv.options import Instrument
+from napari_shadowinv.physics.beam import displacement_from_potential
+from napari_shadowinv.physics.poisson import potential_from_displacement
+from napari_shadowinv.physics.setup import Setup
+
+if TYPE_CHECKING:
+    from napari_shadowinv.fitting.result import Fit, FittedField
+    from napari_shadowinv.inversion.result import Inversion, RetrievedField
+
+Measure = Callable[[FloatArray, FloatArray], FloatArray]
+"""Returns all numbers of all products of a potential and a displacement, shape (m,)."""
+
+Choose = Callable[[FieldNoise | None], Measure]
+"""Returns the measure, with the choices that follow from the noise."""
+
+_COARSER = 4  # times fewer sites
+_MIN_COARSE_SITES = 16
+_PILOT_SAMPLES = 8
+_MAX_REPEAT_ERROR = 0.02  # of the displacement, r.m.s., between a result and its repetition
+_LEAST_NOISE = 1e-9  # of the brightest pixel
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """All numbers of all products, shape (m,), with samples (n, m) and systematic errors.
+
+    `systematic` has errors (m,) by their causes, each of one sign or the other.
+    """
+
+    value: FloatArray
+    samples: FloatArray
+    systematic: dict[str, FloatArray]
+    causes: tuple[str, ...]
+    cautions: tuple[Caution, ...] = ()
+
+
+class SampledField(Protocol):
+    """A field and the scatter of products of it."""
+
+    @property
+    def frame(self) -> FieldFrame: ...
+
+    @property
+    def potential(self) -> FloatArray: ...
+
+    @property
+    def displacement(self) -> FloatArray: ...
+
+    @property
+    def instrument(self) -> Instrument: ...
+
+    def evaluate(self, choose: Choose, samples: int, report: Callbacks) -> Evaluation:
+        """Measure the field and samples of its errors."""
+
+
+@dataclass(frozen=True)
+class Callbacks:
+    """Arguments `on_progress` and `should_stop`."""
+
+    on_progress: Any = None
+    should_stop: Any = None
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        return {"on_progress": self.on_progress, "should_stop": self.should_stop}
+
+
+@dataclass(frozen=True, eq=False)
+class BareField:
+    """A field whose errors are not known."""
+
+    frame: FieldFrame
+    potential: FloatArray
+    displacement: FloatArray
+    instrument: Instrument = field(default_factory=Instrument)
+
+    def evaluate(self, choose: Choose, samples: int, report: Callbacks) -> Evaluation:
+        value = choose(None)(self.potential, self.displacement)
+        return Evaluation(value, np.zeros((0, value.size)), {}, ())
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSamples:
+    """A fitted field with stored changes of its potential, (n, H, W)."""
+
+    frame: FieldFrame
+    potential: FloatArray
+    displacement: FloatArray
+    instrument: Instrument
+    changes: FloatArray
+    causes: tuple[str, ...]
+
+    def evaluate(self, choose: Choose, samples: int, report: Callbacks) -> Evaluation:
+        reporter = Reporter(**report.keywords)
+        pilot = np.asarray(self.changes[:_PILOT_SAMPLES], dtype=np.float64)
+        measure = choose(FieldNoise(pilot))
+        value = measure(self.potential, self.displacement)
+        count = min(samples, len(self.changes))
+        check_samples(count, value.size)
+        scatter = np.empty((count, value.size))
+        for index, change in enumerate(self.changes[:count]):
+            reporter("samples", index, count)
+            moved = self.displacement + displacement_from_potential(change)
+            scatter[index] = measure(self.potential + change, moved)
+        return Evaluation(value, scatter, {}, self.causes)
+
+
+@dataclass(frozen=True, eq=False)
+class ResampledInversion:
+    """An inversion, of which samples are drawn by its noise and instrument."""
+
+    frame: FieldFrame
+    inversion: Inversion
+
+    @property
+    def potential(self) -> FloatArray:
+        return self.inversion.potential
+
+    @property
+    def displacement(self) -> FloatArray:
+        return self.inversion.displacement
+
+    @property
+    def instrument(self) -> Instrument:
+        return self.inversion.instrument
+
+    def evaluate(self, choose: Choose, samples: int, report: Callbacks) -> Evaluation:
+        inversion = self.inversion
+        options, recorded = recorded_shot(inversion)
+        mask = None if inversion.mask.all() else inversion.mask
+        plan = plan_sites(
+            inversion.source, options, mask=mask, measured=has_measured_source(inversion),
+            **report.keywords,
+        )  # fmt: skip
+        coarse = self._coarse_field(report)
+        measures: list[Measure] = []
+
+        def quantities(changes: FloatArray) -> dict[str, Measure]:
+            finer = None if coarse is None else coarse.share * (self.potential - coarse.potential)
+            measures.append(choose(FieldNoise(changes, finer)))
+            check_samples(samples, measures[0](self.potential, self.displacement).size)
+            return {"all": measures[0]}
+
+        scatter = uncertainty(
+            inversion.image,
+            samples,
+            noise=recorded.noise,
+            units_per_quantum=recorded.units_per_quantum,
+            options=options,
+            instrument=inversion.instrument,
+            quantities=quantities,
+            plan=plan,
+            **report.keywords,
+        )
+        (measure,) = measures
+        value = measure(self.potential, self.displacement)
+        repeated = scatter.quantities["all"]
+        systematic, causes = {}, ["noise", *scatter.imperfections]
+        if coarse is not None:
+            change = value - measure(coarse.potential, coarse.displacement)
+            systematic["discretisation"] = coarse.share * change
+        cautions = [each for each in scatter.warnings if each.code == "samples"]
+        cautions += self._repeat_cautions(scatter.inversion)
+        shifted = repeated.samples + (value - repeated.value)
+        return Evaluation(value, shifted, systematic, tuple(causes), tuple(cautions))
+
+    def _coarse_field(self, report: Callbacks) -> CoarseField | None:
+        """Invert the image with a quarter of the sites; None if these are too few."""
+        inversion = self.inversion
+        options, _ = recorded_shot(inversion)
+        count = (options.n_sites or 0) // _COARSER
+        if count < _MIN_COARSE_SITES:
+            return None
+        coarse = invert(
+            inversion.image,
+            source=inversion.source,
+            mask=None if inversion.mask.all() else inversion.mask,
+            options=options.model_copy(update={"n_sites": count}),
+            instrument=inversion.instrument,
+            **report.keywords,
+        )
+        times = len(inversion.sites) / len(coarse.sites)
+        if not times > 1:
+            return None
+        return CoarseField(coarse.potential, coarse.displacement, discretisation_share(times))
+
+    def _repeat_cautions(self, repeated: Inversion) -> Iterator[Caution]:
+        change = float(np.linalg.norm(repeated.displacement - self.displacement))
+        share = change / max(float(np.linalg.norm(self.displacement)), 1e-300)
+        if share > _MAX_REPEAT_ERROR:
+            yield Caution(
+                "samples",
+                f"the samples belong to an inversion that differs from the result by {share:.0%} "
+                "(r.m.s.): the bands may be too narrow; invert the image again",
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseField:
+    """Solution with fewer sites, and the discretisation error as a share of the change."""
+
+    potential: FloatArray
+    displacement: FloatArray
+    share: float
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedNoise:
+    """Arguments of `uncertainty` for the noise of an image."""
+
+    noise: Any
+    units_per_quantum: float | None = None
+
+
+def recorded_shot(inversion: Inversion) -> tuple[Any, RecordedNoise]:
+    """Return options that repeat an inversion of its own image, and the noise of that image.
+
+    The image of a result is scaled to the flux of its source, and so are the noise level and the
+    units per quantum here.
+    """
+    scale, options = inversion.report.flux_scale, inversion.options
+    changes: dict[str, Any] = {"n_sites": number_of_inner_sites(inversion)}
+    for name in ("noise_level", "units_per_quantum"):
+        if (stated := getattr(options, name)) is not None:
+            changes[name] = stated / scale
+    if options.flux == "fit":
+        changes["flux"] = "known"
+    options = options.model_copy(update=changes)
+    if options.units_per_quantum is not None:
+        return options, RecordedNoise("poisson", options.units_per_quantum)
+    mask = None if inversion.mask.all() else inversion.mask
+    prepared = prepare(inversion.image, inversion.source, options, mask)
+    noise = ImageNoise(prepared.in_units(), options, inversion.instrument.noise_correlation)
+    mean = inversion.source[inversion.mask].mean()
+    deviation = mean * np.sqrt(noise.variance(inversion.image / mean))
+    least = _LEAST_NOISE * float(inversion.image.max())
+    return options, RecordedNoise(np.maximum(deviation, least))
+
+
+def number_of_inner_sites(inversion: Inversion) -> int:
+    """Return the number of sites to ask for: without those in a margin."""
+    size = np.array(inversion.image.shape)
+    is_inside = ((inversion.sites >= -0.5) & (inversion.sites <= size - 0.5)).all(axis=1)
+    return max(int(is_inside.sum()), 4)
+
+
+def has_measured_source(inversion: Inversion) -> bool:
+    """Return whether the source of an inversion was recorded, as its error budget takes it."""
+    provenance = inversion.provenance
+    if provenance is not None and not provenance.image.measured:
+        return False
+    errors = inversion.errors
+    return errors is None or errors.beam is None or errors.beam_basis not in ("assumed", "outside")
+
+
+def check_samples(count: int, size: int) -> None:
+    """Refuse more numbers than fit in memory."""
+    check_memory((count, size), 8 * 3, "the samples of these products")
+
+
+def sampled_fields(
+    result: Any, setup: Setup | None, unit: FieldUnit | None, deflector: str | None
+) -> list[SampledField]:
+    """Return the fields of a result with samples of their errors.
+
+    Raises
+    ------
+    InputError
+        If the result has no field of that unit or deflector, or is not of one shot.
+    """
+    makers: dict[str, Callable[..., Iterator[SampledField]]] = {
+        "shadowinv result": _of_inversion,
+        "shadowinv fit": _of_fit,
+        "shadowinv field": _of_field,
+    }
+    kind = getattr(result, "kind", None)
+    if kind not in makers:
+        dims = getattr(result, "dims", ())
+        if "shot" in dims:
+            raise InputError(
+                "got a stack of shots, expected the result of one shot: choose one by its index"
+            )
+        raise InputError(
+            f"got {type(result).__name__}, expected the result of an inversion or a fit"
+        )
+    fields = list(makers[str(kind)](result, setup, unit, deflector))
+    if not fields:
+        wanted = deflector if unit is None else unit.symbol
+        raise InputError(f"the result has no field for {wanted!r}: choose another unit")
+    return fields
+
+
+def _of_inversion(
+    inversion: Inversion, setup: Setup | None, unit: FieldUnit | None, deflector: str | None
+) -> Iterator[SampledField]:
+    frame = make_frame(
+        setup or inversion.setup, inversion.mask, unit, deflector,
+        image=np.where(inversion.mask, inversion.image * inversion.report.flux_scale, np.nan),
+    )  # fmt: skip
+    yield ResampledInversion(frame, inversion)
+
+
+def _of_fit(
+    fit: Fit, setup: Setup | None, unit: FieldUnit | None, deflector: str | None
+) -> Iterator[SampledField]:
+    setup = setup or fit.setup
+    for field in fit.fields:
+        if deflector not in (None, field.name):
+            continue
+        if unit is not None and setup is not None and not is_field_of(setup, unit, field.name):
+            continue
+        image = np.where(fit.mask[0], fit.images[0], np.nan)
+        frame = make_frame(setup, fit.used, unit, field.name, image=image)
+        yield _fitted(fit, field, frame)
+
+
+def _fitted(fit: Fit, field: FittedField, frame: FieldFrame) -> SampledField:
+    samples = getattr(field, "samples", None)
+    if samples is None or not len(samples):
+        return BareField(frame, field.potential, field.displacement, fit.instrument)
+    errors = fit.pixel_errors(field)
+    causes = ("noise",) if errors is None else errors.causes
+    return StoredSamples(
+        frame, field.potential, field.displacement, fit.instrument, samples, causes
+    )
+
+
+def _of_field(
+    retrieved: RetrievedField, setup: Setup | None, unit: FieldUnit | None, deflector: str | None
+) -> Iterator[SampledField]:
+    displacement = retrieved.displacement
+    if displacement.ndim != 3:
+        raise InputError(
+            f"got displacements of shape {displacement.shape}, expected the result of one shot: "
+            "choose one by its index"
+        )
+    dataset = retrieved.dataset
+    potential = (
+        np.asarray(dataset["potential"].values, dtype=np.float64)
+        if "potential" in dataset
+        else potential_from_displacement(displacement)
+    )
+    mask = np.asarray(np.isfinite(displacement).all(axis=0))
+    frame = make_frame(setup or retrieved.setup, mask, unit, deflector)
+    yield BareField(frame, potential, displacement)
+
+
+def make_frame(
+    setup: Setup | None,
+    mask: BoolArray,
+    unit: FieldUnit | None,
+    deflector: str | None,
+    image: FloatArray | None = None,
+) -> FieldFrame:
+    """Return the frame of a field; an `InputError` if the unit does not belong to the setup."""
+    height, width = mask.shape
+    if setup is None:
+        if unit is not None and unit.field != "displacement":
+            raise InputError(
+                f"unit is {unit.symbol!r}, and the result has no setup to convert pixels with: "
+                "expected 'px', or give the setup to the inversion"
+            )
+        return FieldFrame((height, width), mask, None, "", FIELD_UNITS["px"], image)
+    titles = {each.key: each.title for each in setup.deflectors}
+    if deflector is not None and deflector not in titles:
+        raise InputError(
+            f"deflector is {deflector!r}, expected one of {', '.join(titles)} for this beam"
+        )
+    if unit is None:
+        unit = default_unit(setup, titles.get(deflector or "", ""))
+    elif not is_field_of(setup, unit, deflector):
+        names = {"displacement", *(each.name for each in setup.si_fields)}
+        symbols = [each.symbol for each in FIELD_UNITS.values() if each.field in names]
+        raise InputError(
+            f"unit is {unit.symbol!r}, expected one of {', '.join(symbols)} for a beam of "
+            f"{setup.beam}"
+        )
+    of_unit = [each.deflector for each in setup.si_fields if each.name == unit.field]
+    key = deflector or next(filter(None, of_unit), "")
+    return FieldFrame((height, width), mask, setup, key, unit, image)
+
+
+def default_unit(setup: Setup, deflector: str) -> FieldUnit:
+    """Return the first unit of the field that is shown of a setup."""
+    main = setup.other_fields.get(deflector, setup.main_field)
+    return next(unit for unit in FIELD_UNITS.values() if unit.field == main.name)
+
+
+def is_field_of(setup: Setup, unit: FieldUnit, deflector: str | None) -> bool:
+    """Return whether a setup has the field of a unit, for a deflector if one is chosen."""
+    if unit.field == "displacement":
+        return True
+    return any(
+        each.name == unit.field and (deflector is None or each.deflector in ("", deflector))
+        for each in setup.si_fields
+    )

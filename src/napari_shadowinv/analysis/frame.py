@@ -1,0 +1,217 @@
+"""The plane in which products are measured, and the units of its field: `FieldFrame`.
+
+- units to choose from: `FIELD_UNITS`, `field_unit`
+- what a radiograph cannot show, in sentences: `FieldFrame.limits`
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.physics.units import PIXEL
+
+__all__ = ["FIELD_UNITS", "FieldFrame", "FieldUnit", "field_unit"]
+
+_THIN_SCREEN_ERRORS = (0.017, 0.1), (0.055, 0.2)  # error, object's length over source distance
+
+
+@dataclass(frozen=True)
+class FieldUnit:
+    """Unit in which a field is shown.
+
+    Attributes
+    ----------
+    symbol : str
+        As people write it, such as "MG µm".
+    size : float
+        In the SI unit of the field.
+    field : str
+        Variable of the field, such as "path_integrated_b"; one of the setup's `si_fields`.
+    """
+
+    symbol: str
+    size: float
+    field: str
+
+
+_B, _E = "path_integrated_b", "path_integrated_e"
+FIELD_UNITS: dict[str, FieldUnit] = {
+    unit.symbol: unit
+    for unit in (
+        FieldUnit("T m", 1.0, _B),
+        FieldUnit("T mm", 1e-3, _B),
+        FieldUnit("MG µm", 1e-4, _B),
+        FieldUnit("kG cm", 1e-3, _B),
+        FieldUnit("G cm", 1e-6, _B),
+        FieldUnit("V", 1.0, _E),
+        FieldUnit("m⁻²", 1.0, "line_integrated_density"),
+        FieldUnit("m", 1.0, "line_integrated_log_index"),
+        FieldUnit("rad", 1.0, "deflection_angle"),
+        FieldUnit("px", 1.0, "displacement"),
+    )
+}
+"""Units of fields by their symbols. Each belongs to one field, which it chooses."""
+
+_SPELLINGS = {"MG um": "MG µm", "m-2": "m⁻²", "m^-2": "m⁻²"}
+
+
+def field_unit(symbol: str) -> FieldUnit:
+    """Return a unit by its symbol; an `InputError` if there is no such unit.
+
+    Examples
+    --------
+    >>> field_unit("MG um").size
+    0.0001
+    """
+    spaced = symbol.replace("·", " ").replace("μ", "µ")
+    unit = FIELD_UNITS.get(_SPELLINGS.get(spaced, spaced))
+    if unit is None:
+        raise InputError(f"unit is {symbol!r}, expected one of {', '.join(FIELD_UNITS)}")
+    return unit
+
+
+@dataclass(frozen=True, eq=False)
+class FieldFrame:
+    """The plane of a field: its pixels, its setup, and the unit of the field.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Height and width in px.
+    mask : ndarray of bool, shape (H, W)
+        Pixels that were used; elsewhere the field is a smooth continuation.
+    setup : Setup or None
+        The experiment. None: everything is measured in pixels.
+    deflector : str
+        Key of the cause of the deflection, such as "B" or "E"; empty if there is no setup.
+    unit : FieldUnit
+        Unit of the field, which also decides which field is measured.
+    image : ndarray, shape (H, W), or None
+        The recorded image, for its intensity.
+    """
+
+    shape: tuple[int, int]
+    mask: BoolArray
+    setup: Setup | None
+    deflector: str
+    unit: FieldUnit
+    image: AnyArray | None = None
+
+    @property
+    def pixel(self) -> float:
+        """Side of a pixel in the object plane in m; 1 without a setup."""
+        return 1.0 if self.setup is None else self.setup.object_pixel_size
+
+    @property
+    def length_unit(self) -> str:
+        """Unit of lengths in datasets: "m", or pixels without a setup."""
+        return PIXEL if self.setup is None else "m"
+
+    @property
+    def si_unit(self) -> str:
+        """Unit of the field's values in datasets, such as "T m"."""
+        if self.unit.field == "displacement":
+            return PIXEL
+        return next(unit.symbol for unit in FIELD_UNITS.values() if unit.field == self.unit.field)
+
+    @cached_property
+    def long_name(self) -> str:
+        """The field in words, such as "Path-integrated magnetic field"."""
+        if self.unit.field == "displacement" or self.setup is None:
+            return "Displacement"
+        (field,) = (each for each in self.setup.si_fields if each.name == self.unit.field)
+        return field.long_name.partition(",")[0]
+
+    @cached_property
+    def is_vector(self) -> bool:
+        """Whether the field has components, as line-integrated densities have not."""
+        if self.unit.field == "displacement" or self.setup is None:
+            return True
+        return any(
+            field.is_vector for field in self.setup.si_fields if field.name == self.unit.field
+        )
+
+    def field(self, potential: FloatArray, displacement: FloatArray) -> FloatArray:
+        """Return the field in SI units.
+
+        Parameters
+        ----------
+        potential : ndarray, shape (H, W)
+            In px².
+        displacement : ndarray, shape (2, H, W)
+            In px.
+
+        Returns
+        -------
+        ndarray, shape (2, H, W), or (H, W) if it is no vector
+            Of a vector the components along y and x.
+        """
+        if self.unit.field == "displacement" or self.setup is None:
+            return displacement
+        return self.setup.field_in_si(
+            self.unit.field, displacement if self.is_vector else potential
+        )
+
+    def require_field(self, product: str, *fields: str) -> None:
+        """Refuse a product of other fields than this one, with an `InputError`."""
+        if self.unit.field in fields:
+            return
+        units = ", ".join(unit.symbol for unit in FIELD_UNITS.values() if unit.field in fields)
+        if self.setup is None:
+            raise InputError(
+                f"{product} needs the setup of the experiment, and the result has none: give it to "
+                "the inversion"
+            )
+        raise InputError(
+            f"{product} is not defined for a field in {self.unit.symbol}, expected one of {units}"
+        )
+
+    @cached_property
+    def limits(self) -> tuple[str, ...]:
+        """What the image cannot show of this field, in sentences."""
+        axial = {
+            _B: "A magnetic field along the beam deflects nothing, and neither does any field "
+            "whose line integral across the beam vanishes, such as the azimuthal field of a "
+            "current across the beam seen from the side.",
+            _E: "An electric field along the beam changes the energy of the particles, not their "
+            "direction, and is not measured.",
+        }.get(self.unit.field, "Only gradients across the beam deflect.")
+        sentences = [
+            axial,
+            "A rotation of the displacement is not seen: the deflection is taken as the gradient "
+            "of a potential, as it is for thin objects.",
+            "A uniform deflection shifts the whole image, and a purely magnifying one scales it: "
+            "neither differs from a shifted beam or another distance, unless the position of the "
+            "beam on the detector is known.",
+        ]
+        if self.setup is not None and not self.setup.is_collimated:
+            source = self.setup.source_object_distance
+            errors = " and ".join(
+                f"{100 * error:.2g} % for an object of {1e3 * share * source:.3g} mm along the beam"
+                for error, share in _THIN_SCREEN_ERRORS
+            )
+            sentences.append(f"The object is taken as thin: this errs by {errors}.")
+        return tuple(sentences)
+
+    def check_points(self, points: FloatArray, name: str) -> None:
+        """Refuse points (n, 2) of which any is outside the image, with an `InputError`."""
+        size = np.array(self.shape)
+        outside = ~((points >= -0.5) & (points <= size - 0.5)).all(axis=1)
+        if not np.isfinite(points).all():
+            raise InputError(f"{name} has a point that is not finite, expected (y, x) in px")
+        if outside.any():
+            y, x = points[outside][0]
+            raise InputError(
+                f"{name} has the point y = {y:g}, x = {x:g} px, expected points inside the image "
+                f"of {self.shape[0]} × {self.shape[1]} px"
+            )
+
+    def length(self, pixels: float) -> float:
+        """Return a length in px in the unit of lengths."""
+        return pixels * self.pixel

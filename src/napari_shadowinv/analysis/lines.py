@@ -1,0 +1,146 @@
+"""Values of a field along a line or path: `LineProfile`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.analysis.frame import FieldFrame
+from napari_shadowinv.analysis.paths import (
+    interpolate_cubic,
+    path_directions,
+    sample_path,
+    sample_strip,
+)
+from napari_shadowinv.analysis.product import Coordinate, Product, Variable
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.inversion.error_bars import Quantity
+
+__all__ = ["LineProfile", "Path"]
+
+_MAX_POINTS = 10_000
+_NOTABLE_MASK = 0.02
+_STEP_PX = 1.0
+
+
+def _checked_path(path: Any) -> Any:
+    points = np.asarray(path, dtype=np.float64)
+    if not np.isfinite(points).all():
+        raise ValueError("expected finite numbers: (y, x) in px")
+    if not np.hypot(*np.diff(points, axis=0).T).sum() > 0:
+        raise ValueError("expected a line with a length: two different points (y, x) in px")
+    return path
+
+
+Path = Annotated[
+    tuple[tuple[float, float], ...],
+    Field(min_length=2, max_length=_MAX_POINTS),
+    AfterValidator(_checked_path),
+]
+"""Corners (y, x) of a line or path in px."""
+
+
+def path_field(description: str) -> Any:
+    """Return the field of a line or path."""
+    return Field(
+        title="Path (px)",
+        description=description,
+        json_schema_extra={"metavar": "Y,X Y,X …"},
+    )
+
+
+class LineProfile(Product):
+    """Field and image along a line or path, averaged over a width.
+
+    The normal points to the right of the line's direction as the image is shown, with y downwards.
+    """
+
+    title = "profile along a line"
+    place = 10
+    product: Literal["profile"] = "profile"
+    path: Path = path_field("Corners of the line or path, (y, x) in px.")
+    width: float = Field(
+        default=0.0,
+        ge=0,
+        allow_inf_nan=False,
+        title="Width (px)",
+        description=(
+            "Width of the strip across the line over which values are averaged, in px. 0: values "
+            "on the line."
+        ),
+    )
+
+    def check(self, frame: FieldFrame) -> None:
+        super().check(frame)
+        frame.check_points(np.array(self.path), "the path")
+
+    @property
+    def _distance(self) -> FloatArray:
+        return sample_path(self.path, _STEP_PX)[1]
+
+    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+        name, dims, unit = frame.long_name, ("distance",), frame.si_unit
+        if not frame.is_vector:
+            variables = {"value": Variable(dims, unit, name)}
+        else:
+            variables = {
+                "magnitude": Variable(dims, unit, f"{name}, magnitude"),
+                "along": Variable(dims, unit, f"{name}, component along the line"),
+                "normal": Variable(dims, unit, f"{name}, component to the right of the line"),
+            }
+        if frame.image is not None:
+            variables["intensity"] = Variable(dims, "1", "Intensity of the image")
+        return variables
+
+    def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
+        values = frame.length(1.0) * self._distance
+        return {"distance": Coordinate(values, frame.length_unit, "Distance along the line")}
+
+    def measure(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
+        field = frame.field(potential, displacement)
+        if not frame.is_vector:
+            return {"value": self._mean_across(field, frame)}
+        along = path_directions(self.path, self._distance)
+        components = np.stack([self._mean_across(plane, frame) for plane in field], axis=1)
+        right = np.stack([along[:, 1], -along[:, 0]], axis=1)
+        return {
+            "magnitude": np.hypot(*components.T),
+            "along": (components * along).sum(axis=1),
+            "normal": (components * right).sum(axis=1),
+        }
+
+    def constants(self, frame: FieldFrame) -> dict[str, FloatArray]:
+        if frame.image is None:
+            return {}
+        return {"intensity": self._mean_across(np.asarray(frame.image, dtype=np.float64), frame)}
+
+    def _mean_across(self, plane: FloatArray, frame: FieldFrame) -> FloatArray:
+        """Return means over the points of the strip that are inside the image."""
+        points = sample_strip(self.path, self._distance, self.width, _STEP_PX)
+        size = np.array(frame.shape)
+        inside = ((points >= -0.5) & (points <= size - 0.5)).all(axis=-1)
+        values = interpolate_cubic(plane, np.clip(points, -0.5, size - 0.5))
+        return np.asarray(np.where(inside, values, 0.0).sum(axis=0) / inside.sum(axis=0))
+
+    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
+        return mask_cautions(sample_path(self.path, _STEP_PX)[0], frame, "the line")
+
+
+def mask_cautions(points: FloatArray, frame: FieldFrame, name: str) -> list[Caution]:
+    """Warn if points (n, 2) lie at masked pixels."""
+    rows, columns = (
+        np.clip(np.rint(points[:, axis]).astype(int), 0, frame.shape[axis] - 1) for axis in (0, 1)
+    )
+    share = 1 - float(frame.mask[rows, columns].mean())
+    if share <= _NOTABLE_MASK:
+        return []
+    text = (
+        f"{share:.0%} of {name} is at masked pixels, where the field is only a smooth continuation"
+    )
+    return [Caution("mask", text)]

@@ -1,0 +1,229 @@
+"""Points along lines and paths, and the values of planes there.
+
+- points along a path, and across it within a strip: `sample_path`, `sample_strip`
+- directions along a path: `path_directions`; a circle as a path: `circle_path`
+- values at points: `interpolate`, `interpolate_cubic`
+- the peak of a profile, its width and area: `measure_peak`, `PeakMeasures`
+- profiles as comma-separated text: `Profile`, `table_text`
+
+Points are (y, x) in any unit; `interpolate` maps them to pixels.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from napari_shadowinv._typing import FloatArray
+
+__all__ = [
+    "PeakMeasures",
+    "Profile",
+    "circle_path",
+    "interpolate",
+    "interpolate_cubic",
+    "measure_peak",
+    "path_directions",
+    "sample_path",
+    "sample_strip",
+    "table_text",
+]
+
+_MAX_SAMPLES = 5000
+_CIRCLE_CORNERS = 720
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Values along a line, with their name and unit.
+
+    Attributes
+    ----------
+    name, unit : str
+    values : ndarray, shape (n,)
+        NaN where the line is outside the image.
+    averaging : str
+        The averaging across the line in words; empty for values on the line.
+    """
+
+    name: str
+    unit: str
+    values: FloatArray
+    averaging: str = ""
+
+
+def sample_path(vertices: ArrayLike, step: float) -> tuple[FloatArray, FloatArray]:
+    """Return points (n, 2) along a path, at most a step apart, and their distances along it."""
+    corners, cumulative_length = _corners(vertices)
+    count = min(int(np.ceil(cumulative_length[-1] / step - 1e-9)) + 1, _MAX_SAMPLES)
+    distance = np.linspace(0, cumulative_length[-1], max(count, 2))
+    return _points_at(corners, cumulative_length, distance), distance
+
+
+def _corners(vertices: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return the distinct corners of a path, and its length up to each corner."""
+    corners = np.asarray(vertices, dtype=np.float64)
+    lengths = np.hypot(*np.diff(corners, axis=0).T)
+    moves = np.concatenate([[True], lengths > 0])
+    if moves.sum() > 1:
+        corners, lengths = corners[moves], lengths[moves[1:]]
+    return corners, np.concatenate([[0.0], np.cumsum(lengths)])
+
+
+def _points_at(
+    corners: FloatArray, cumulative_length: FloatArray, distance: FloatArray
+) -> FloatArray:
+    return np.stack(
+        [np.interp(distance, cumulative_length, corners[:, axis]) for axis in (0, 1)], axis=1
+    )
+
+
+def sample_strip(
+    vertices: ArrayLike, distance: FloatArray, width: float, step: float
+) -> FloatArray:
+    """Return points (m, n, 2) of a strip: at n distances, m points across the path."""
+    corners, cumulative_length = _corners(vertices)
+    points = _points_at(corners, cumulative_length, distance)
+    edges = np.diff(corners, axis=0)
+    edge = np.clip(
+        np.searchsorted(cumulative_length, distance, side="right") - 1, 0, len(edges) - 1
+    )
+    lengths = np.maximum(np.hypot(*edges.T), np.finfo(float).tiny)
+    along_y, along_x = (edges / lengths[:, None])[edge].T
+    across = np.stack([along_x, -along_y], axis=1)
+    count = min(max(int(np.ceil(width / step - 1e-9)), 1), _MAX_SAMPLES)
+    offsets = width * ((np.arange(count) + 0.5) / count - 0.5)
+    rows: FloatArray = points + offsets[:, None, None] * across
+    return rows
+
+
+def interpolate(
+    image: ArrayLike, points: FloatArray, to_pixels: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
+    """Return values at world points (n, 2), or means over m of (m, n, 2); NaN outside."""
+    from scipy.ndimage import map_coordinates
+
+    plane = np.asarray(image, dtype=np.float64)
+    pixels = to_pixels(points.reshape(-1, 2))
+    values = np.asarray(map_coordinates(plane, pixels.T, order=1, mode="nearest"))
+    size = np.array(plane.shape)
+    inside = ((pixels >= -0.5) & (pixels <= size - 0.5)).all(axis=1)
+    rows = np.where(inside, values, 0.0).reshape(-1, points.shape[-2])
+    count = inside.reshape(rows.shape).sum(axis=0)
+    return np.where(count > 0, rows.sum(axis=0) / np.maximum(count, 1), np.nan)
+
+
+@dataclass(frozen=True)
+class PeakMeasures:
+    """Peak of a profile, its full width at half maximum, and the area under the profile."""
+
+    peak: float  # the value of largest magnitude, with its sign
+    position: float  # distance along the line
+    width: float  # NaN if the profile stays above half of the peak up to an end of the line
+    area: float
+
+    def text(self, unit: str, distance_unit: str) -> str:
+        """Return the measures in words, with their units."""
+        width = "beyond the line" if np.isnan(self.width) else f"{self.width:.4g} {distance_unit}"
+        return (
+            f"peak {f'{self.peak:.4g} {unit}'.strip()} at {self.position:.4g} {distance_unit}, "
+            f"width (FWHM) {width}, "
+            f"area {self.area:.4g} {'·'.join(filter(None, (unit, distance_unit)))}"
+        )
+
+
+def measure_peak(distance: FloatArray, values: FloatArray) -> PeakMeasures | None:
+    """Measure the peak of largest magnitude; None if the line misses the image.
+
+    Nothing is subtracted: half of the maximum counts from zero.
+    """
+    inside = np.isfinite(values)
+    if not inside.any():
+        return None
+    distance, values = distance[inside], values[inside]
+    top = int(np.abs(values).argmax())
+    peak = float(values[top])
+    relative = values / peak if peak else np.zeros_like(values)
+    edges = [_half_maximum(distance[top::step], relative[top::step]) for step in (-1, 1)]
+    area = float(np.trapezoid(values, distance))
+    return PeakMeasures(peak, float(distance[top]), edges[1] - edges[0], area)
+
+
+def _half_maximum(distance: FloatArray, relative: FloatArray) -> float:
+    """Return the distance at which a flank, starting at 1, falls to a half; NaN if it does not."""
+    below = np.flatnonzero(relative < 0.5)
+    if not below.size or below[0] == 0:
+        return float("nan")
+    pair = slice(below[0] - 1, below[0] + 1)
+    return float(np.interp(-0.5, -relative[pair], distance[pair]))
+
+
+def table_text(distance: FloatArray, unit: str, profiles: Sequence[Profile]) -> str:
+    """Return profiles as comma-separated columns, with units in the first row."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([f"distance ({unit})", *(_heading(profile) for profile in profiles)])
+    for row in zip(distance, *(profile.values for profile in profiles), strict=True):
+        writer.writerow([f"{value:.9g}" for value in row])
+    return text.getvalue()
+
+
+def _heading(profile: Profile) -> str:
+    """Return the heading of a column: name, unit unless in the name, and averaging."""
+    name = profile.name
+    if profile.unit and f"({profile.unit})" not in name:
+        name = f"{name} ({profile.unit})"
+    return f"{name}, {profile.averaging}" if profile.averaging else name
+
+
+def path_directions(vertices: ArrayLike, distance: FloatArray) -> FloatArray:
+    """Return the unit vectors (n, 2) along a path, in axis order (y, x), at distances along it."""
+    corners, cumulative_length = _corners(vertices)
+    edges = np.diff(corners, axis=0)
+    edge = np.clip(
+        np.searchsorted(cumulative_length, distance, side="right") - 1, 0, len(edges) - 1
+    )
+    lengths = np.maximum(np.hypot(*edges.T), np.finfo(float).tiny)
+    directions: FloatArray = (edges / lengths[:, None])[edge]
+    return directions
+
+
+def circle_path(center: tuple[float, float], radius: float) -> FloatArray:
+    """Return corners (n, 2) of a closed polygon with the area of a circle, from x towards y."""
+    angles = np.linspace(0, 2 * np.pi, _CIRCLE_CORNERS + 1)
+    step = 2 * np.pi / _CIRCLE_CORNERS
+    corner_radius = radius * np.sqrt(step / np.sin(step))
+    return np.asarray(center) + corner_radius * np.stack([np.sin(angles), np.cos(angles)], axis=1)
+
+
+def interpolate_cubic(plane: FloatArray, points: FloatArray) -> FloatArray:
+    """Return values of a plane at points (..., 2) in px, by cubic polynomials through 4 × 4 pixels.
+
+    Points in the outermost half pixel are extrapolated.
+    """
+    value: FloatArray = np.zeros(points.shape[:-1])
+    axes = [_cubic_weights(points[..., axis], plane.shape[axis]) for axis in (0, 1)]
+    (rows, row_weights), (columns, column_weights) = axes
+    for i in range(rows.shape[-1]):
+        for k in range(columns.shape[-1]):
+            weight = row_weights[..., i] * column_weights[..., k]
+            value += weight * plane[rows[..., i], columns[..., k]]
+    return value
+
+
+def _cubic_weights(places: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return the pixels (..., n) around places, and the weights of Lagrange's polynomial."""
+    n = min(4, count)
+    first = np.clip(np.floor(places).astype(np.int64) - 1, 0, count - n)
+    nodes = np.arange(n)
+    offset = places[..., None] - first[..., None]
+    weights = np.ones((*places.shape, n))
+    for node in nodes:
+        for other_node in nodes[nodes != node]:
+            weights[..., node] *= (offset[..., 0] - other_node) / (node - other_node)
+    return first[..., None] + nodes, weights

@@ -1,0 +1,272 @@
+"""The base class of all products, and what describes their numbers: `Product`, `Variable`.
+
+- all products by name: `products`; one of a mapping, such as a table of TOML: `product_from_dict`
+- a number with its bands in words: `quantity_text`, `value_text`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from napari_shadowinv._system.validation import suggestion, validate
+from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.analysis.frame import FieldFrame
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Fact
+from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.physics.units import PIXEL, display_unit, prefix_for
+from napari_shadowinv.preprocessing.steps import Choice, choices_of
+
+__all__ = [
+    "BANDS",
+    "Coordinate",
+    "FieldNoise",
+    "Product",
+    "Variable",
+    "product_from_dict",
+    "products",
+    "quantity_text",
+    "value_text",
+]
+
+BANDS = 0.68, 0.95
+"""Shares of probability of the bands that files, tables and figures have."""
+
+_NO_PREFIX = ("", "1", PIXEL, "m⁻²", "m⁻³")
+_MIN_SAMPLES = 2
+
+
+@dataclass(frozen=True)
+class Variable:
+    """Number, or array of numbers, of a product.
+
+    Attributes
+    ----------
+    dims : tuple of str
+        Names of the axes of its values; empty for a number. Those of a map are "y" and "x".
+    unit : str
+        Unit of its values. Values in the frame's `si_unit` are shown in its `unit`.
+    long_name : str
+        In words.
+    """
+
+    dims: tuple[str, ...]
+    unit: str
+    long_name: str
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinate:
+    """Places along an axis of a product: values, unit and name in words."""
+
+    values: AnyArray
+    unit: str
+    long_name: str
+
+
+@dataclass(frozen=True, eq=False)
+class FieldNoise:
+    """A few random errors of a field, from which a product chooses its smoothing.
+
+    Attributes
+    ----------
+    potentials : ndarray, shape (k, H, W)
+        Changes of the potential in px² by noise and instrument.
+    discretisation : ndarray, shape (H, W), or None
+        Likely change by more sites, px²; None if it was not estimated.
+    """
+
+    potentials: FloatArray
+    discretisation: FloatArray | None = None
+
+
+class Product(Choice):
+    """A quantity that is computed from a retrieved field.
+
+    A subclass names itself in a field ``product: Literal["…"]``, has its choices as fields, and
+    defines `variables`, `measure` and, for arrays, `coordinates`.
+    """
+
+    key = "product"
+    # Keys of the fields that it can be computed from, such as "path_integrated_b"; empty for any.
+    fields: ClassVar[tuple[str, ...]] = ()
+    reference: ClassVar[str] = ""  # literature and equation
+
+    product: str = Field(title="Product", description="Kind of product.")
+    label: str = Field(
+        default="",
+        max_length=60,
+        pattern=r"^[\w .()+-]*$",
+        title="Label",
+        description="Name in files and figures. Default: that of the product.",
+    )
+
+    def check(self, frame: FieldFrame) -> None:
+        """Raise an `InputError` if the product cannot be measured in a frame."""
+        if self.fields:
+            frame.require_field(self.title, *self.fields)
+
+    def is_defined_for(self, field: str) -> bool:
+        """Return whether it can be computed from a field, such as "path_integrated_b"."""
+        return not self.fields or field in self.fields
+
+    def adapt(self, potential: FloatArray, noise: FieldNoise | None, frame: FieldFrame) -> Self:
+        """Return the product with the choices that follow from the noise of the field.
+
+        Parameters
+        ----------
+        potential : ndarray, shape (H, W)
+            In px².
+        noise : FieldNoise or None
+            None if it is not known.
+        frame : FieldFrame
+        """
+        return self
+
+    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+        """Describe the numbers that `measure` and `constants` return."""
+        raise NotImplementedError
+
+    def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
+        """Return the places along the axes of the variables, by the names of the axes."""
+        return {}
+
+    def measure(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
+        """Compute the product of a field in SI units.
+
+        It must not change its arguments: several threads call it at once, for many samples.
+
+        Parameters
+        ----------
+        potential : ndarray, shape (H, W)
+            In px².
+        displacement : ndarray, shape (2, H, W)
+            In px.
+        frame : FieldFrame
+        """
+        raise NotImplementedError
+
+    def constants(self, frame: FieldFrame) -> dict[str, FloatArray]:
+        """Return variables that do not depend on the field, such as the recorded intensity."""
+        return {}
+
+    def systematic(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
+        """Return likely errors by the product's own method, such as its smoothing.
+
+        They widen the bands of the variables that they name.
+        """
+        return {}
+
+    def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
+        """Return the product in words. Default: each number, and the peak of each array."""
+        facts = []
+        for name, variable in self.variables(frame).items():
+            if name not in quantities:
+                continue
+            quantity = quantities[name]
+            title = variable.long_name
+            if variable.dims and quantity.value.size:
+                title = f"Largest {title[0].lower()}{title[1:]}"
+                quantity = at_peak(quantity)
+            if quantity.value.ndim == 0:
+                text = quantity_text(quantity, variable.unit, frame)
+                facts.append(Fact(name, title, text, short=text))
+        return facts
+
+    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
+        """Return reasons to doubt the product."""
+        return []
+
+    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
+        """Return how the product has to be read, in sentences."""
+        return ()
+
+
+def at_peak(quantity: Quantity) -> Quantity:
+    """Return an array's quantity at the place where its magnitude is largest."""
+    place = int(np.nanargmax(np.abs(quantity.value)))
+    samples = quantity.samples.reshape(len(quantity.samples), -1)
+    return Quantity(np.asarray(quantity.value.ravel()[place]), samples[:, place])
+
+
+def products() -> dict[str, type[Product]]:
+    """Return all kinds of products that are imported, by their names."""
+    return choices_of(Product)
+
+
+def product_from_dict(mapping: Mapping[str, Any], where: str = "product") -> Product:
+    """Return the product of a mapping that names its kind; an `InputError` if it cannot be used.
+
+    Examples
+    --------
+    >>> import napari_shadowinv.analysis.lines
+    >>> product_from_dict({"product": "profile", "path": [(0, 0), (0, 9)]}).title
+    'profile along a line'
+    """
+    kinds = products()
+    name = mapping.get("product")
+    if name not in kinds:
+        raise InputError(f"{where}: product is {name!r}; {suggestion(str(name), kinds)}")
+    return validate(kinds[str(name)], mapping, where)
+
+
+def has_bands(quantity: Quantity) -> bool:
+    """Return whether a quantity has samples for a band."""
+    return len(quantity.samples) >= _MIN_SAMPLES
+
+
+def shown_unit(unit: str, frame: FieldFrame, largest: float) -> tuple[float, str]:
+    """Return the factor from a unit of a dataset to a handy one, and the unit's name."""
+    if unit == frame.si_unit:
+        return 1 / frame.unit.size, frame.unit.symbol
+    if unit in _NO_PREFIX or not unit.isascii() or PIXEL in unit:
+        return 1.0, display_unit(unit).replace("1", "") if unit == "1" else display_unit(unit)
+    factor, prefix = prefix_for(largest)
+    return factor, f"{prefix}{unit}"
+
+
+def quantity_text(quantity: Quantity, unit: str, frame: FieldFrame) -> str:
+    """Return a number with its bands in words, in a handy unit.
+
+    Parameters
+    ----------
+    quantity : Quantity
+        Of a single number.
+    unit : str
+        Of its values.
+    frame : FieldFrame
+        Has the unit that a field is shown in.
+    """
+    value = float(quantity.value)
+    factor, name = shown_unit(unit, frame, abs(value))
+    ends: Sequence[tuple[float, ...]] = ()
+    if has_bands(quantity):
+        ends = [tuple(factor * float(end) for end in quantity.band(share)) for share in BANDS]
+    return value_text(factor * value, ends, name)
+
+
+def value_text(value: float, ends: Sequence[tuple[float, ...]], unit: str) -> str:
+    """Return a number with the ends of its bands, to two figures of the narrowest.
+
+    >>> value_text(97.13, [(95.2, 99.1), (93.4, 101.0)], "T m")
+    '97.1 T m (95.2 to 99.1; 95 %: 93.4 to 101.0)'
+    """
+    unit = f" {unit}" if unit else ""
+    width = (ends[0][1] - ends[0][0]) / 2 if ends else 0.0
+    if not (width > 0 and np.isfinite(width)):
+        return f"{value:.4g}{unit}"
+    decimals = max(0, 1 - int(np.floor(np.log10(width))))
+    bands = [f"{low:.{decimals}f} to {high:.{decimals}f}" for low, high in ends]
+    shares = ("", *(f"{share:.0%} ".replace("%", " %:") for share in BANDS[1:]))
+    listed = "; ".join(f"{share}{band}" for share, band in zip(shares, bands, strict=True))
+    return f"{value:.{decimals}f}{unit} ({listed})"
