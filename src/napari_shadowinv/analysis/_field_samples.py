@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -17,7 +18,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion._invert import invert, plan_sites
 from napari_shadowinv.inversion.budget import discretisation_share
-from napari_shadowinv.inversion.error_bars import uncertainty
+from napari_shadowinv.inversion.error_bars import Uncertainty, uncertainty
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.options import Instrument
@@ -39,6 +40,7 @@ _COARSER = 4  # times fewer sites
 _MIN_COARSE_SITES = 16
 _PILOT_SAMPLES = 8
 _MAX_REPEAT_ERROR = 0.02  # of the displacement, r.m.s., between a result and its repetition
+_LEAST_SHARE_OF_NOISE = 0.2  # of the discretisation error, for its cautions to matter
 _LEAST_NOISE = 1e-9  # of the brightest pixel
 
 
@@ -94,7 +96,7 @@ class BareField:
     frame: FieldFrame
     potential: FloatArray
     displacement: FloatArray
-    instrument: Instrument = field(default_factory=Instrument)
+    instrument: Instrument = dataclasses.field(default_factory=Instrument)
 
     def evaluate(self, choose: Choose, samples: int, report: Callbacks) -> Evaluation:
         value = choose(None)(self.potential, self.displacement)
@@ -158,8 +160,8 @@ class ResampledInversion:
         measures: list[Measure] = []
 
         def quantities(changes: FloatArray) -> dict[str, Measure]:
-            finer = None if coarse is None else coarse.share * (self.potential - coarse.potential)
-            measures.append(choose(FieldNoise(changes, finer)))
+            spacing = (inversion.image.size / number_of_inner_sites(inversion)) ** 0.5
+            measures.append(choose(FieldNoise(changes, spacing)))
             check_samples(samples, measures[0](self.potential, self.displacement).size)
             return {"all": measures[0]}
 
@@ -181,10 +183,18 @@ class ResampledInversion:
         if coarse is not None:
             change = value - measure(coarse.potential, coarse.displacement)
             systematic["discretisation"] = coarse.share * change
-        cautions = [each for each in scatter.warnings if each.code == "samples"]
+        cautions = list(self._sample_cautions(scatter))
         cautions += self._repeat_cautions(scatter.inversion)
         shifted = repeated.samples + (value - repeated.value)
         return Evaluation(value, shifted, systematic, tuple(causes), tuple(cautions))
+
+    def _sample_cautions(self, scatter: Uncertainty) -> Iterator[Caution]:
+        errors = self.inversion.errors
+        by_noise = float(np.sqrt((scatter.displacement_std**2).sum(axis=0).mean()))
+        # Without noise, samples differ by the tolerance of the solver.
+        if errors is not None and by_noise < _LEAST_SHARE_OF_NOISE * errors.discretisation.rms:
+            return
+        yield from (each for each in scatter.warnings if each.code == "samples")
 
     def _coarse_field(self, report: Callbacks) -> CoarseField | None:
         """Invert the image with a quarter of the sites; None if these are too few."""
@@ -318,6 +328,7 @@ def _of_inversion(
     frame = make_frame(
         setup or inversion.setup, inversion.mask, unit, deflector,
         image=np.where(inversion.mask, inversion.image * inversion.report.flux_scale, np.nan),
+        source=np.where(inversion.mask, inversion.source * inversion.report.flux_scale, np.nan),
     )  # fmt: skip
     yield ResampledInversion(frame, inversion)
 
@@ -332,7 +343,8 @@ def _of_fit(
         if unit is not None and setup is not None and not is_field_of(setup, unit, field.name):
             continue
         image = np.where(fit.mask[0], fit.images[0], np.nan)
-        frame = make_frame(setup, fit.used, unit, field.name, image=image)
+        source = np.where(fit.mask[0], fit.source[0], np.nan)
+        frame = make_frame(setup, fit.used, unit, field.name, image=image, source=source)
         yield _fitted(fit, field, frame)
 
 
@@ -372,7 +384,9 @@ def make_frame(
     mask: BoolArray,
     unit: FieldUnit | None,
     deflector: str | None,
+    *,
     image: FloatArray | None = None,
+    source: FloatArray | None = None,
 ) -> FieldFrame:
     """Return the frame of a field; an `InputError` if the unit does not belong to the setup."""
     height, width = mask.shape
@@ -382,7 +396,7 @@ def make_frame(
                 f"unit is {unit.symbol!r}, and the result has no setup to convert pixels with: "
                 "expected 'px', or give the setup to the inversion"
             )
-        return FieldFrame((height, width), mask, None, "", FIELD_UNITS["px"], image)
+        return FieldFrame((height, width), mask, None, "", FIELD_UNITS["px"], image, source)
     titles = {each.key: each.title for each in setup.deflectors}
     if deflector is not None and deflector not in titles:
         raise InputError(
@@ -399,7 +413,7 @@ def make_frame(
         )
     of_unit = [each.deflector for each in setup.si_fields if each.name == unit.field]
     key = deflector or next(filter(None, of_unit), "")
-    return FieldFrame((height, width), mask, setup, key, unit, image)
+    return FieldFrame((height, width), mask, setup, key, unit, image, source)
 
 
 def default_unit(setup: Setup, deflector: str) -> FieldUnit:

@@ -76,6 +76,13 @@ def field_unit(symbol: str) -> FieldUnit:
     return unit
 
 
+def si_unit_of(field: str) -> str:
+    """Return the unit of a field in datasets, such as "T m" of "path_integrated_b"."""
+    if field == "displacement":
+        return PIXEL
+    return next(unit.symbol for unit in FIELD_UNITS.values() if unit.field == field)
+
+
 @dataclass(frozen=True, eq=False)
 class FieldFrame:
     """The plane of a field: its pixels, its setup, and the unit of the field.
@@ -92,8 +99,8 @@ class FieldFrame:
         Key of the cause of the deflection, such as "B" or "E"; empty if there is no setup.
     unit : FieldUnit
         Unit of the field, which also decides which field is measured.
-    image : ndarray, shape (H, W), or None
-        The recorded image, for its intensity.
+    image, source : ndarray, shape (H, W), or None
+        The recorded image and the undisturbed beam in its unit; NaN where masked.
     """
 
     shape: tuple[int, int]
@@ -102,6 +109,16 @@ class FieldFrame:
     deflector: str
     unit: FieldUnit
     image: AnyArray | None = None
+    source: AnyArray | None = None
+
+    @cached_property
+    def contrast(self) -> FloatArray | None:
+        """Image over source, less 1, shape (H, W); 0 where there is no source."""
+        if self.image is None or self.source is None:
+            return None
+        is_lit = self.source > 0
+        ratio = np.divide(self.image, self.source, out=np.ones(self.shape), where=is_lit)
+        return np.asarray(np.where(is_lit, ratio - 1, 0.0), dtype=np.float64)
 
     @property
     def pixel(self) -> float:
@@ -116,9 +133,7 @@ class FieldFrame:
     @property
     def si_unit(self) -> str:
         """Unit of the field's values in datasets, such as "T m"."""
-        if self.unit.field == "displacement":
-            return PIXEL
-        return next(unit.symbol for unit in FIELD_UNITS.values() if unit.field == self.unit.field)
+        return si_unit_of(self.unit.field)
 
     @cached_property
     def long_name(self) -> str:

@@ -16,14 +16,13 @@ from napari_shadowinv.analysis.paths import (
     sample_path,
     sample_strip,
 )
-from napari_shadowinv.analysis.product import Coordinate, Product, Variable
+from napari_shadowinv.analysis.product import Coordinate, Product, Variable, mask_cautions
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion.error_bars import Quantity
 
 __all__ = ["LineProfile", "Path"]
 
 _MAX_POINTS = 10_000
-_NOTABLE_MASK = 0.02
 _STEP_PX = 1.0
 
 
@@ -130,17 +129,3 @@ class LineProfile(Product):
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
         return mask_cautions(sample_path(self.path, _STEP_PX)[0], frame, "the line")
-
-
-def mask_cautions(points: FloatArray, frame: FieldFrame, name: str) -> list[Caution]:
-    """Warn if points (n, 2) lie at masked pixels."""
-    rows, columns = (
-        np.clip(np.rint(points[:, axis]).astype(int), 0, frame.shape[axis] - 1) for axis in (0, 1)
-    )
-    share = 1 - float(frame.mask[rows, columns].mean())
-    if share <= _NOTABLE_MASK:
-        return []
-    text = (
-        f"{share:.0%} of {name} is at masked pixels, where the field is only a smooth continuation"
-    )
-    return [Caution("mask", text)]

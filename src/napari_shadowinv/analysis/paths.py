@@ -1,7 +1,8 @@
 """Points along lines and paths, and the values of planes there.
 
 - points along a path, and across it within a strip: `sample_path`, `sample_strip`
-- directions along a path: `path_directions`; a circle as a path: `circle_path`
+- directions along a path, and its pieces: `path_directions`, `edge_midpoints`
+- a circle as a path: `circle_path`
 - values at points: `interpolate`, `interpolate_cubic`
 - the peak of a profile, its width and area: `measure_peak`, `PeakMeasures`
 - profiles as comma-separated text: `Profile`, `table_text`
@@ -19,12 +20,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import FloatArray, IntArray
 
 __all__ = [
     "PeakMeasures",
     "Profile",
     "circle_path",
+    "edge_midpoints",
     "interpolate",
     "interpolate_cubic",
     "measure_peak",
@@ -193,12 +195,23 @@ def path_directions(vertices: ArrayLike, distance: FloatArray) -> FloatArray:
     return directions
 
 
+def edge_midpoints(outline: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
+    """Cut the edges of a path into pieces; return their middles and vectors, (n, 2) each."""
+    edges = np.diff(outline, axis=0)
+    counts = np.maximum(np.ceil(np.hypot(*edges.T) / step - 1e-9), 1).astype(np.int64)
+    edge = np.repeat(np.arange(len(edges)), counts)
+    place = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts)
+    pieces: FloatArray = (edges / counts[:, None])[edge]
+    return outline[:-1][edge] + (place[:, None] + 0.5) * pieces, pieces
+
+
 def circle_path(center: tuple[float, float], radius: float) -> FloatArray:
     """Return corners (n, 2) of a closed polygon with the area of a circle, from x towards y."""
     angles = np.linspace(0, 2 * np.pi, _CIRCLE_CORNERS + 1)
     step = 2 * np.pi / _CIRCLE_CORNERS
     corner_radius = radius * np.sqrt(step / np.sin(step))
-    return np.asarray(center) + corner_radius * np.stack([np.sin(angles), np.cos(angles)], axis=1)
+    directions = np.stack([np.sin(angles), np.cos(angles)], axis=1)
+    return np.asarray(np.asarray(center) + corner_radius * directions, dtype=np.float64)
 
 
 def interpolate_cubic(plane: FloatArray, points: FloatArray) -> FloatArray:
@@ -216,7 +229,7 @@ def interpolate_cubic(plane: FloatArray, points: FloatArray) -> FloatArray:
     return value
 
 
-def _cubic_weights(places: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+def _cubic_weights(places: FloatArray, count: int) -> tuple[IntArray, FloatArray]:
     """Return the pixels (..., n) around places, and the weights of Lagrange's polynomial."""
     n = min(4, count)
     first = np.clip(np.floor(places).astype(np.int64) - 1, 0, count - n)

@@ -40,6 +40,8 @@ BANDS = 0.68, 0.95
 
 _NO_PREFIX = ("", "1", PIXEL, "m⁻²", "m⁻³")
 _MIN_SAMPLES = 2
+_NOTABLE_MASK = 0.02
+_NOTABLE_BIAS = 0.3  # of the standard deviation
 
 
 @dataclass(frozen=True)
@@ -78,12 +80,12 @@ class FieldNoise:
     ----------
     potentials : ndarray, shape (k, H, W)
         Changes of the potential in px² by noise and instrument.
-    discretisation : ndarray, shape (H, W), or None
-        Likely change by more sites, px²; None if it was not estimated.
+    spacing : float
+        Spacing of the sites in px; 0 for a field without sites.
     """
 
     potentials: FloatArray
-    discretisation: FloatArray | None = None
+    spacing: float = 0.0
 
 
 class Product(Choice):
@@ -171,16 +173,11 @@ class Product(Choice):
         """Return the product in words. Default: each number, and the peak of each array."""
         facts = []
         for name, variable in self.variables(frame).items():
-            if name not in quantities:
-                continue
-            quantity = quantities[name]
-            title = variable.long_name
-            if variable.dims and quantity.value.size:
-                title = f"Largest {title[0].lower()}{title[1:]}"
-                quantity = at_peak(quantity)
-            if quantity.value.ndim == 0:
-                text = quantity_text(quantity, variable.unit, frame)
-                facts.append(Fact(name, title, text, short=text))
+            quantity, title = quantities[name], variable.long_name
+            if variable.dims:
+                quantity, title = at_peak(quantity), largest_title(title)
+            text = quantity_text(quantity, variable.unit, frame)
+            facts.append(Fact(name, title, text, short=text))
         return facts
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
@@ -192,10 +189,15 @@ class Product(Choice):
         return ()
 
 
+def largest_title(title: str) -> str:
+    """Return the title of the largest value of an array with a title."""
+    return f"Largest {title[0].lower()}{title[1:]}"
+
+
 def at_peak(quantity: Quantity) -> Quantity:
     """Return an array's quantity at the place where its magnitude is largest."""
     place = int(np.nanargmax(np.abs(quantity.value)))
-    samples = quantity.samples.reshape(len(quantity.samples), -1)
+    samples = quantity.samples.reshape(len(quantity.samples), quantity.value.size)
     return Quantity(np.asarray(quantity.value.ravel()[place]), samples[:, place])
 
 
@@ -220,6 +222,20 @@ def product_from_dict(mapping: Mapping[str, Any], where: str = "product") -> Pro
     return validate(kinds[str(name)], mapping, where)
 
 
+def mask_cautions(points: AnyArray, frame: FieldFrame, name: str) -> list[Caution]:
+    """Warn if points (n, 2) lie at masked pixels."""
+    rows, columns = (
+        np.clip(np.rint(points[:, axis]).astype(int), 0, frame.shape[axis] - 1) for axis in (0, 1)
+    )
+    share = 1 - float(frame.mask[rows, columns].mean())
+    if share <= _NOTABLE_MASK:
+        return []
+    text = (
+        f"{share:.0%} of {name} is at masked pixels, where the field is only a smooth continuation"
+    )
+    return [Caution("mask", text)]
+
+
 def has_bands(quantity: Quantity) -> bool:
     """Return whether a quantity has samples for a band."""
     return len(quantity.samples) >= _MIN_SAMPLES
@@ -235,8 +251,16 @@ def shown_unit(unit: str, frame: FieldFrame, largest: float) -> tuple[float, str
     return factor, f"{prefix}{unit}"
 
 
+def corrected(quantity: Quantity) -> FloatArray:
+    """Return values without the bias by noise, where it is a notable part of their errors."""
+    if not has_bands(quantity):
+        return quantity.value
+    is_biased = np.abs(quantity.bias) > _NOTABLE_BIAS * quantity.std
+    return np.asarray(quantity.value - np.where(is_biased, quantity.bias, 0.0))
+
+
 def quantity_text(quantity: Quantity, unit: str, frame: FieldFrame) -> str:
-    """Return a number with its bands in words, in a handy unit.
+    """Return a number, corrected for a bias by noise, with its bands in words.
 
     Parameters
     ----------
@@ -247,7 +271,7 @@ def quantity_text(quantity: Quantity, unit: str, frame: FieldFrame) -> str:
     frame : FieldFrame
         Has the unit that a field is shown in.
     """
-    value = float(quantity.value)
+    value = float(corrected(quantity))
     factor, name = shown_unit(unit, frame, abs(value))
     ends: Sequence[tuple[float, ...]] = ()
     if has_bands(quantity):

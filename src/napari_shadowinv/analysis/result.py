@@ -1,21 +1,46 @@
-"""Products with their bands: `ProductResult`, and all of one result, `Analysis`."""
+"""Products with their bands: `ProductResult`; in files and tables.
+
+- products among the variables of a dataset: `add_products`, `products_in`
+- all numbers as one table of comma-separated values: `products_table`
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import csv
+import io
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from napari_shadowinv._system.arrays import PLANE
+from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.analysis.frame import FieldUnit
+from napari_shadowinv.analysis.frame import FieldUnit, field_unit, si_unit_of
 from napari_shadowinv.analysis.product import (
+    BANDS,
     Coordinate,
     Product,
     Variable,
     has_bands,
+    product_from_dict,
 )
-from napari_shadowinv.facts import Fact
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.physics.units import display_unit, label, numbers_of
 
-__all__ = ["ProductResult"]
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["ProductResult", "add_products", "products_in", "products_table"]
+
+_ATTRIBUTE = "products"
+_COLUMNS = ("product", "quantity", "place", "place_unit", "value", "unit", "bias", "std")
+
+Band = tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,17 +59,20 @@ class ProductResult:
         Unit in which the field is shown.
     quantities : dict of str to Quantity
         Values in SI units, by the names of `variables`; with samples if the errors of the field
-        are known.
+        are known and the product was not read from a file.
     variables : dict of str to Variable
         Axes, unit and long name of each.
     coordinates : dict of str to Coordinate
         Places along the axes.
     facts : tuple of Fact
-        The product in words, its cautions first.
+        The product in words, its cautions among them.
     limits : tuple of str
         What the image cannot show, and how the product has to be read.
     causes : tuple of str
         What the bands hold, such as "noise" and "discretisation"; empty without bands.
+    stored : dict of str to dict of str to ndarray
+        Of a product that was read from a file: "bias", "std" and the ends of the bands, such as
+        "low_68", by the names of `variables`.
     """
 
     name: str
@@ -57,21 +85,228 @@ class ProductResult:
     facts: tuple[Fact, ...]
     limits: tuple[str, ...]
     causes: tuple[str, ...]
+    stored: dict[str, dict[str, FloatArray]] = field(default_factory=dict)
 
     @property
     def title(self) -> str:
-        """Title of the product, or its label."""
+        """Label of the product, or else its title."""
         return self.product.label or self.product.title
 
     @property
     def has_bands(self) -> bool:
         """Whether the errors of the field are known."""
-        return any(map(has_bands, self.quantities.values()))
+        return bool(self.causes)
 
     def __getitem__(self, name: str) -> Quantity:
         return self.quantities[name]
 
-    def band(self, name: str, share: float = 0.68) -> tuple[FloatArray, FloatArray] | None:
-        """Return lower and upper end of a variable's interval; None without samples."""
+    def band(self, name: str, share: float = 0.68) -> Band | None:
+        """Return lower and upper end of a variable's interval; None if it has none.
+
+        Raises
+        ------
+        InputError
+            If the share of probability is not between 0 and 1, or is neither 0.68 nor 0.95 for a
+            product that was read from a file.
+        """
+        if has_bands(self.quantities[name]):
+            return self.quantities[name].band(share)
+        if name not in self.stored:
+            return None
+        if share not in BANDS:
+            raise InputError(
+                f"share is {share!r}, and files have bands of {' and '.join(map(str, BANDS))}: "
+                "expected one of them, or analyse the result again"
+            )
+        low, high = (self.stored[name][each] for each in _band_names(share))
+        return low, high
+
+    def statistics(self, name: str) -> dict[str, FloatArray]:
+        """Return bias, standard deviation and ends of the bands of a variable, in SI units.
+
+        Keys are "bias", "std", "low_68", "high_68", "low_95" and "high_95"; empty without bands.
+        """
         quantity = self.quantities[name]
-        return quantity.band(share) if has_bands(quantity) else None
+        if not has_bands(quantity):
+            return self.stored.get(name, {})
+        numbers = {"bias": quantity.bias, "std": quantity.std}
+        for share in BANDS:
+            numbers |= dict(zip(_band_names(share), quantity.band(share), strict=True))
+        return numbers
+
+    def scale_of(self, name: str) -> tuple[float, str]:
+        """Return the factor from SI to the unit in which a variable is shown, and that unit."""
+        unit = self.variables[name].unit
+        if unit == si_unit_of(self.field):
+            return 1 / self.unit.size, self.unit.symbol
+        return 1.0, display_unit(unit)
+
+
+def _band_names(share: float) -> tuple[str, str]:
+    return f"low_{100 * share:.0f}", f"high_{100 * share:.0f}"
+
+
+def add_products(dataset: xarray.Dataset, results: Sequence[ProductResult]) -> xarray.Dataset:
+    """Return a result's dataset with the variables of products, in SI units.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        As of `Inversion.to_dataset`. Products that it has already are replaced.
+    results : sequence of ProductResult
+
+    Returns
+    -------
+    xarray.Dataset
+        With ``<name>_<variable>``, and for those with bands also ``…_bias``, ``…_std``,
+        ``…_low_68``, ``…_high_68``, ``…_low_95`` and ``…_high_95``. The attribute ``products`` is a
+        JSON text with the choices and the facts.
+    """
+    if _ATTRIBUTE in dataset.attrs:
+        dataset = _without_products(dataset)
+    names = [each.name for each in results]
+    if len(set(names)) < len(names):
+        raise InputError("two products have the same name: give them labels")
+    variables: dict[str, Any] = {}
+    for each in results:
+        for name, variable in each.variables.items():
+            dims = _dims(each.name, variable)
+            values = {"": each.quantities[name].value} | each.statistics(name)
+            for statistic, numbers in values.items():
+                words = f"{variable.long_name}, {statistic}" if statistic else variable.long_name
+                ending = f"_{statistic}" if statistic else ""
+                variables[f"{each.name}_{name}{ending}"] = (
+                    dims, numbers, label(variable.unit, words),
+                )  # fmt: skip
+        for axis, places in each.coordinates.items():
+            if axis not in PLANE:
+                words = label(places.unit, places.long_name)
+                variables[f"{each.name}_{axis}"] = (f"{each.name}_{axis}", places.values, words)
+    taken = variables.keys() & dataset.variables.keys()
+    if taken:
+        raise InputError(f"the result has a variable {min(taken)!r} already: give another label")
+    entries = [
+        {
+            "name": each.name,
+            "choices": each.product.model_dump(mode="json", exclude_none=True),
+            "field": each.field,
+            "unit": each.unit.symbol,
+            "variables": list(each.variables),
+            "axes": list(each.coordinates),
+            "facts": [asdict(fact) for fact in each.facts],
+            "limits": each.limits,
+            "causes": each.causes,
+        }
+        for each in results
+    ]
+    return dataset.assign(variables).assign_attrs({_ATTRIBUTE: json.dumps(entries)})
+
+
+def _dims(name: str, variable: Variable) -> tuple[str, ...]:
+    """Return the axes of a variable in a file; those of maps are those of the image."""
+    return tuple(axis if axis in PLANE else f"{name}_{axis}" for axis in variable.dims)
+
+
+def _without_products(dataset: xarray.Dataset) -> xarray.Dataset:
+    names = [entry["name"] for entry in json.loads(dataset.attrs[_ATTRIBUTE])]
+    of_products = [
+        each
+        for each in dataset.variables
+        if any(str(each).startswith(f"{name}_") for name in names)
+    ]
+    attributes = {key: value for key, value in dataset.attrs.items() if key != _ATTRIBUTE}
+    cleared = dataset.drop_vars(of_products)
+    cleared.attrs = attributes
+    return cleared
+
+
+def products_in(dataset: xarray.Dataset) -> list[ProductResult]:
+    """Return the products in the dataset of a file; an empty list if it has none.
+
+    Raises
+    ------
+    InputError
+        If a variable or an attribute is damaged.
+    """
+    if _ATTRIBUTE not in dataset.attrs:
+        return []
+    with as_input_errors("the products"):
+        return [_from_entry(dataset, entry) for entry in json.loads(dataset.attrs[_ATTRIBUTE])]
+
+
+def _from_entry(dataset: xarray.Dataset, entry: dict[str, Any]) -> ProductResult:
+    name = entry["name"]
+    quantities, variables, stored = {}, {}, {}
+    for variable in entry["variables"]:
+        array = dataset[f"{name}_{variable}"]
+        values = np.asarray(numbers_of(dataset, f"{name}_{variable}"), dtype=np.float64)
+        values = values.reshape(array.shape)
+        dims = tuple(str(axis).removeprefix(f"{name}_") for axis in array.dims)
+        words = array.attrs["units"], array.attrs["long_name"]
+        variables[variable] = Variable(dims, *words)
+        quantities[variable] = Quantity(values, np.zeros((0, *values.shape)))
+        if f"{name}_{variable}_std" in dataset:
+            stored[variable] = {
+                statistic: np.asarray(dataset[f"{name}_{variable}_{statistic}"].values)
+                for statistic in ("bias", "std", *(n for s in BANDS for n in _band_names(s)))
+            }
+    coordinates = {}
+    for axis in entry["axes"]:
+        places = dataset[axis if axis in PLANE else f"{name}_{axis}"]
+        words = str(places.attrs["units"]), str(places.attrs["long_name"])
+        coordinates[axis] = Coordinate(np.asarray(places.values), *words)
+    return ProductResult(
+        name=name,
+        product=product_from_dict(entry["choices"]),
+        field=entry["field"],
+        unit=field_unit(entry["unit"]),
+        quantities=quantities,
+        variables=variables,
+        coordinates=coordinates,
+        facts=tuple(Fact(**{**each, "level": Level(each["level"])}) for each in entry["facts"]),
+        limits=tuple(entry["limits"]),
+        causes=tuple(entry["causes"]),
+        stored=stored,
+    )
+
+
+def products_table(results: Sequence[ProductResult]) -> str:
+    """Return all numbers but those of maps as comma-separated values, one in each row.
+
+    Columns: product, quantity, place along its axis with its unit, value, unit, bias by noise,
+    standard deviation and the ends of the bands, all in the unit of the row. Fields are in the
+    unit that they are shown in.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    bands = [each for share in BANDS for each in _band_names(share)]
+    writer.writerow([*_COLUMNS, *bands])
+    for result in results:
+        for name, variable in result.variables.items():
+            if len(variable.dims) <= 1:
+                writer.writerows(_rows(result, name, ("bias", "std", *bands)))
+    return text.getvalue()
+
+
+def _rows(result: ProductResult, name: str, statistics: Sequence[str]) -> Iterator[list[str]]:
+    factor, unit = result.scale_of(name)
+    values = np.atleast_1d(result.quantities[name].value)
+    numbers = result.statistics(name)
+    columns = [
+        np.atleast_1d(numbers[each]) if each in numbers else np.full(values.shape, np.nan)
+        for each in statistics
+    ]
+    dims = result.variables[name].dims
+    coordinate = result.coordinates[dims[0]] if dims else None
+    for row, value in enumerate(values):
+        place = "" if coordinate is None else f"{coordinate.values[row]:.9g}"
+        place_unit = "" if coordinate is None else display_unit(coordinate.unit)
+        yield [
+            result.name,
+            name,
+            place,
+            place_unit,
+            f"{factor * value:.9g}",
+            unit,
+            *("" if np.isnan(column[row]) else f"{factor * column[row]:.9g}" for column in columns),
+        ]

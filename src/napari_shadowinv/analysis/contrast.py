@@ -1,0 +1,121 @@
+"""How strongly a field structures the image, and the regime that follows: `Contrast`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.analysis.frame import FieldFrame
+from napari_shadowinv.analysis.maps import MIN_SPACINGS, Smoothed, smooth
+from napari_shadowinv.analysis.product import Variable
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.facts import Fact, Level
+from napari_shadowinv.inversion.error_bars import Quantity
+
+__all__ = ["Contrast"]
+
+_MAX_LINEAR = 0.1  # compression up to which the image's contrast is the Laplacian, to some 10 %
+_NEARLY_CROSSED = 0.8
+_CROSSED = 1.0
+_BORDER_PX = 2
+
+_REGIMES = {
+    "linear": "linear: the contrast of the image is the current density, and any inversion will do",
+    "injective": "nonlinear injective: rays do not cross, and the field follows from one image",
+    "caustic": "caustic: rays cross, and one image belongs to several fields",
+    "diffusive": (
+        "diffusive: rays cross inside the object, and the image shows only how far they scatter"
+    ),
+}
+
+
+class Contrast(Smoothed):
+    """Contrast parameter µ = d/ℓ of an image, with its regime after Bott et al.
+
+    d is the r.m.s. displacement and ℓ the scale over which it varies: the ratio of d to the r.m.s.
+    of its divergence. So µ is the r.m.s. contrast that the image would have in the linear limit.
+    """
+
+    title = "contrast"
+    place = 80
+    reference = "A. F. A. Bott et al., J. Plasma Phys. 83, 905830614 (2017)"
+    product: Literal["contrast"] = "contrast"
+    object_length: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Object length (m)",
+        description=(
+            "Length of the object along the beam, in m, for the diffusive regime. Default: unknown."
+        ),
+    )
+
+    def _width(self, plane: FloatArray, noise: FloatArray, spacing: float) -> float:
+        # A mean over the image bears more noise than a map, and bands are corrected for it.
+        return max(super()._width(plane, noise, spacing) / 2, MIN_SPACINGS * spacing)
+
+    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+        return {
+            "mu": Variable((), "1", "Contrast parameter µ"),
+            "displacement": Variable((), frame.length_unit, "Displacement, r.m.s."),
+            "scale": Variable((), frame.length_unit, "Scale over which the displacement varies"),
+            "compression": Variable((), "1", "Largest compression of the beam, 1 where rays cross"),
+        }
+
+    def measure(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
+        inner = np.s_[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX]
+        used = frame.mask[inner]
+        plane = smooth(potential, self.smoothing or 0.0)
+        down, right = np.gradient(plane)
+        (yy, yx), xx = np.gradient(down), np.gradient(right, axis=1)
+        slopes = np.stack([down, right])[(slice(None), *inner)][:, used]
+        yy, yx, xx = (part[inner][used] for part in (yy, yx, xx))
+        variation = slopes - slopes.mean(axis=1, keepdims=True)
+        move = float(np.sqrt((variation**2).sum(axis=0).mean()))
+        mu = float(np.sqrt(((yy + xx) ** 2).mean()))
+        compression = (yy + xx) / 2 + np.hypot((yy - xx) / 2, yx)
+        return {
+            "mu": np.asarray(mu),
+            "displacement": np.asarray(frame.length(move)),
+            "scale": np.asarray(frame.length(move / mu if mu else np.inf)),
+            "compression": np.asarray(compression.max()),
+        }
+
+    def regime(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> str:
+        """Return the regime: "linear", "injective", "caustic" or "diffusive"."""
+        compression = float(quantities["compression"].value)
+        if self.object_length is not None and frame.setup is not None:
+            # Inside the object a ray moves by its angle times the length.
+            angle = float(
+                frame.setup.deflection_angle(float(quantities["displacement"].value) / frame.pixel)
+            )
+            if angle * self.object_length > float(quantities["scale"].value):
+                return "diffusive"
+        if compression >= _CROSSED:
+            return "caustic"
+        return "linear" if compression < _MAX_LINEAR else "injective"
+
+    def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
+        regime = self.regime(quantities, frame)
+        level = Level.SOUND if regime in ("linear", "injective") else Level.DOUBTFUL
+        return [
+            *super().facts(quantities, frame),
+            Fact("regime", "Regime", _REGIMES[regime], level),
+            Fact("smoothing", "Smoothing", self.smoothing_text(frame)),
+        ]
+
+    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
+        compression = float(quantities["compression"].value)
+        if not _NEARLY_CROSSED < compression < _CROSSED:
+            return []
+        text = (
+            f"the beam is compressed by up to {compression:.2g}, near 1, where rays cross: an "
+            "inversion never shows crossed rays, so µ may be larger; fit several images"
+        )
+        return [Caution("folds", text)]

@@ -1,0 +1,155 @@
+"""Line integrals of a field: `Flux`, `EnclosedCurrent`, `EnclosedCharge`.
+
+A magnetic field b = ∫B dz deflects by a = ∇Φ turned by a right angle. So the flux of b across a
+line is a difference of the potential at its ends, whatever the path between them; and its
+circulation around an outline is the outward flux of the deflection.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+from scipy import constants
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.analysis.frame import FieldFrame
+from napari_shadowinv.analysis.lines import Path, path_field
+from napari_shadowinv.analysis.outlines import Outlined
+from napari_shadowinv.analysis.paths import edge_midpoints, interpolate_cubic
+from napari_shadowinv.analysis.product import Product, Variable, mask_cautions
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.error_bars import Quantity
+
+__all__ = ["EnclosedCharge", "EnclosedCurrent", "Flux"]
+
+_B, _E = "path_integrated_b", "path_integrated_e"
+_STEP_PX = 0.5
+
+
+class Flux(Product):
+    """Magnetic flux across a line: ∫(∫B dz)·n dl.
+
+    The normal n points to the right of the line's direction as the image is shown, with y
+    downwards. The flux depends on the ends of the line alone, because B has no sources.
+    """
+
+    title = "flux across a line"
+    place = 30
+    fields = (_B,)
+    product: Literal["flux"] = "flux"
+    path: Path = path_field("Corners of the line or path, (y, x) in px; only its ends count.")
+
+    def check(self, frame: FieldFrame) -> None:
+        super().check(frame)
+        frame.check_points(np.array(self.path), "the path")
+        if self.path[0] == self.path[-1]:
+            raise InputError(
+                "the line is closed, and the flux across a closed line is zero, as a magnetic "
+                "field has no sources: expected an open line; the current inside is the product "
+                "'current'"
+            )
+
+    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+        return {"flux": Variable((), "Wb", "Magnetic flux across the line")}
+
+    def measure(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
+        start, end = interpolate_cubic(potential, np.array([self.path[0], self.path[-1]]))
+        # A displacement along the line belongs to a field across it.
+        return {"flux": np.asarray((start - end) * unit_field(frame)[0] * frame.pixel)}
+
+    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
+        return (
+            "The flux is that of the field integrated along the beam, across the line; a flux of "
+            "it through an area of the image has no meaning.",
+        )
+
+
+class _Enclosed(Outlined):
+    """Outward flux of the deflection through an outline, which follows from what is inside."""
+
+    def _outward_flux(self, displacement: FloatArray) -> float:
+        """Return the outward flux of a displacement through the outline, px²."""
+        points, sides = edge_midpoints(self.outline, _STEP_PX)
+        down, right = (interpolate_cubic(plane, points) for plane in displacement)
+        # From x to y around the outline, outwards is to the left of the direction.
+        return float((right * sides[:, 0] - down * sides[:, 1]).sum())
+
+    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
+        return mask_cautions(edge_midpoints(self.outline, _STEP_PX)[0], frame, "the outline")
+
+
+class EnclosedCurrent(_Enclosed):
+    """Current along the beam inside an outline: ∫I dz = ∮(∫B dz)·dl / µ₀.
+
+    Positive along the beam, into the image as it is shown.
+    """
+
+    title = "enclosed current"
+    place = 40
+    fields = (_B,)
+    product: Literal["current"] = "current"
+
+    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+        return {"current": Variable((), "A m", "Current inside the outline, integrated along z")}
+
+    def measure(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
+        outward = self._outward_flux(displacement)
+        return {"current": np.asarray(current_factor(frame) * outward * frame.pixel)}
+
+    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
+        return (
+            "The current is integrated over the thickness of the object: divide by its length "
+            "along the beam for a mean current in A.",
+        )
+
+
+class EnclosedCharge(_Enclosed):
+    """Charge inside an outline, ε₀ ∮(∫E dz)·n dl, over the thickness of the object."""
+
+    title = "enclosed charge"
+    place = 50
+    fields = (_E,)
+    product: Literal["charge"] = "charge"
+
+    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+        return {"charge": Variable((), "C", "Charge inside the outline")}
+
+    def measure(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
+        outward = self._outward_flux(displacement)
+        return {"charge": np.asarray(charge_factor(frame) * outward * frame.pixel)}
+
+    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
+        return (
+            "This is Gauss's law in the column behind the outline: it holds if the electric field "
+            "along the beam vanishes before and behind the object.",
+        )
+
+
+def unit_field(frame: FieldFrame) -> FloatArray:
+    """Return the field (y, x) in SI units by a displacement of 1 px along x."""
+    unit = np.zeros((2, 1, 1))
+    unit[1] = 1.0
+    return np.asarray(frame.field(np.zeros((1, 1)), unit)).ravel()
+
+
+def current_factor(frame: FieldFrame) -> float:
+    """Return (1/µ₀) ∮(∫B dz)·dl, in A, by an outward flux of the displacement of 1 px².
+
+    Times the pixel size in m.
+    """
+    # In the direction from x to y around an outline, +y follows outwards +x.
+    return float(unit_field(frame)[0] / constants.mu_0)
+
+
+def charge_factor(frame: FieldFrame) -> float:
+    """Return ε₀ ∮(∫E dz)·n dl, in C/m, by an outward flux of the displacement of 1 px²."""
+    return float(unit_field(frame)[1] * constants.epsilon_0)
