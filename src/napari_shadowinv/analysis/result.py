@@ -7,10 +7,11 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -85,7 +86,7 @@ class ProductResult:
     facts: tuple[Fact, ...]
     limits: tuple[str, ...]
     causes: tuple[str, ...]
-    stored: dict[str, dict[str, FloatArray]] = field(default_factory=dict)
+    stored: dict[str, dict[str, FloatArray]] = dataclasses.field(default_factory=dict)
 
     @property
     def title(self) -> str:
@@ -242,8 +243,7 @@ def _from_entry(dataset: xarray.Dataset, entry: dict[str, Any]) -> ProductResult
         values = np.asarray(numbers_of(dataset, f"{name}_{variable}"), dtype=np.float64)
         values = values.reshape(array.shape)
         dims = tuple(str(axis).removeprefix(f"{name}_") for axis in array.dims)
-        words = array.attrs["units"], array.attrs["long_name"]
-        variables[variable] = Variable(dims, *words)
+        variables[variable] = Variable(dims, array.attrs["units"], array.attrs["long_name"])
         quantities[variable] = Quantity(values, np.zeros((0, *values.shape)))
         if f"{name}_{variable}_std" in dataset:
             stored[variable] = {
