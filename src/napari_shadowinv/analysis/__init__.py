@@ -5,7 +5,10 @@
 - line integrals: `Flux`, `EnclosedCurrent`, `EnclosedCharge`
 - maps: `CurrentDensity`, `ChargeDensity`
 - how strongly the field structures the image: `Contrast`
-- add a product: a subclass of `Product`, and its entry in `PRODUCTS`
+- all kinds: `PRODUCTS`; products of a table or a line of text: `product_from_dict`,
+  `product_from_text`
+- products in files and tables: `add_products`, `products_in`, `products_table`
+- add a product: a subclass of `Product`, in a module that `kinds` imports
 """
 
 import lazy_loader

@@ -2,14 +2,16 @@ from ._analyse import analyse
 from .contrast import Contrast
 from .currents import EnclosedCharge, EnclosedCurrent, Flux
 from .frame import FIELD_UNITS, FieldFrame
+from .kinds import PRODUCTS, product_from_dict, product_from_text
 from .lines import LineProfile
 from .maps import ChargeDensity, CurrentDensity
 from .product import Product
 from .regions import Region
-from .result import ProductResult
+from .result import ProductResult, add_products, products_in, products_table
 
 __all__ = [
     "FIELD_UNITS",
+    "PRODUCTS",
     "ChargeDensity",
     "Contrast",
     "CurrentDensity",
@@ -21,5 +23,10 @@ __all__ = [
     "Product",
     "ProductResult",
     "Region",
+    "add_products",
     "analyse",
+    "product_from_dict",
+    "product_from_text",
+    "products_in",
+    "products_table",
 ]

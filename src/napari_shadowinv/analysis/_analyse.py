@@ -18,7 +18,8 @@ from napari_shadowinv.analysis._field_samples import (
     sampled_fields,
 )
 from napari_shadowinv.analysis.frame import FieldFrame, field_unit
-from napari_shadowinv.analysis.product import FieldNoise, Product, Variable, product_from_dict
+from napari_shadowinv.analysis.kinds import product_from_dict
+from napari_shadowinv.analysis.product import FieldNoise, Product, Variable
 from napari_shadowinv.analysis.result import ProductResult
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level, caution_facts
@@ -188,17 +189,17 @@ class _Task:
         if len(evaluation.samples):
             systematic |= self._by_product()
         samples = evaluation.samples.copy()
-        causes = list(evaluation.causes)
-        for cause, error in systematic.items():
-            strengths = _standard_numbers(rng, len(samples))
-            samples += strengths[:, None] * error
-            if len(samples) and error.any():
-                causes.append(cause)
+        for error in systematic.values():
+            samples += _standard_numbers(rng, len(samples))[:, None] * error
         quantities: list[dict[str, Quantity]] = [{} for _ in self.products]
+        causes = [list(evaluation.causes) for _ in self.products]
         start = 0
         for place, name, shape in self._layout:
             part = slice(start, start + int(np.prod(shape)))
             start = part.stop
+            for cause, error in systematic.items():
+                if len(samples) and error[part].any() and cause not in causes[place]:
+                    causes[place].append(cause)
             quantities[place][name] = Quantity(
                 evaluation.value[part].reshape(shape),
                 samples[:, part].reshape(len(samples), *shape),
@@ -206,8 +207,10 @@ class _Task:
         frame = self.field.frame
         doubts = caution_facts(evaluation.cautions)
         return [
-            _result(product, name, quantity, frame, causes, [headline, *doubts])
-            for product, name, quantity in zip(self.products, names, quantities, strict=False)
+            _result(product, name, quantity, frame, list_of_causes, [headline, *doubts])
+            for product, name, quantity, list_of_causes in zip(
+                self.products, names, quantities, causes, strict=False
+            )
         ]
 
     def _by_energy(self) -> dict[str, FloatArray]:

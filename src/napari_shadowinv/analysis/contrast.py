@@ -60,7 +60,7 @@ class Contrast(Smoothed):
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
         return {
-            "mu": Variable((), "1", "Contrast parameter µ"),
+            "mu": Variable((), "1", "Contrast parameter µ", "contrast µ"),
             "displacement": Variable((), frame.length_unit, "Displacement, r.m.s."),
             "scale": Variable((), frame.length_unit, "Scale over which the displacement varies"),
             "compression": Variable((), "1", "Largest compression of the beam, 1 where rays cross"),

@@ -37,6 +37,7 @@ class Flux(Product):
     """
 
     title = "flux across a line"
+    primary = "path"
     place = 30
     fields = (_B,)
     product: Literal["flux"] = "flux"

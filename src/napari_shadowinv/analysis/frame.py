@@ -184,7 +184,8 @@ class FieldFrame:
                 "the inversion"
             )
         raise InputError(
-            f"{product} is not defined for a field in {self.unit.symbol}, expected one of {units}"
+            f"{product} is not defined for a field in {self.unit.symbol}: choose one of {units} as "
+            "the unit"
         )
 
     @cached_property

@@ -27,6 +27,8 @@ _STEP_PX = 1.0
 
 
 def _checked_path(path: Any) -> Any:
+    if len(path) < 2:
+        raise ValueError("expected at least two points (y, x) in px")
     points = np.asarray(path, dtype=np.float64)
     if not np.isfinite(points).all():
         raise ValueError("expected finite numbers: (y, x) in px")
@@ -37,7 +39,7 @@ def _checked_path(path: Any) -> Any:
 
 Path = Annotated[
     tuple[tuple[float, float], ...],
-    Field(min_length=2, max_length=_MAX_POINTS),
+    Field(max_length=_MAX_POINTS),
     AfterValidator(_checked_path),
 ]
 """Corners (y, x) of a line or path in px."""
@@ -59,6 +61,7 @@ class LineProfile(Product):
     """
 
     title = "profile along a line"
+    primary = "path"
     place = 10
     product: Literal["profile"] = "profile"
     path: Path = path_field("Corners of the line or path, (y, x) in px.")
@@ -88,8 +91,12 @@ class LineProfile(Product):
         else:
             variables = {
                 "magnitude": Variable(dims, unit, f"{name}, magnitude"),
-                "along": Variable(dims, unit, f"{name}, component along the line"),
-                "normal": Variable(dims, unit, f"{name}, component to the right of the line"),
+                "along": Variable(
+                    dims, unit, f"{name}, component along the line", "component along"
+                ),
+                "normal": Variable(
+                    dims, unit, f"{name}, component to the right of the line", "component across"
+                ),
             }
         if frame.image is not None:
             variables["intensity"] = Variable(dims, "1", "Intensity of the image")

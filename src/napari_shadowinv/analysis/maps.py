@@ -31,7 +31,6 @@ from napari_shadowinv.analysis.product import (
     Product,
     Variable,
     at_peak,
-    largest_title,
     quantity_text,
 )
 from napari_shadowinv.facts import Fact
@@ -43,6 +42,7 @@ _ORDER = 3
 MIN_SPACINGS = 1.5  # of the sites, in widths: finer structures are those of the cells
 _WIDTHS_PX = (0.0, *(0.7 * 2 ** (step / 4) for step in range(23)))
 _MAX_SHARE_OF_SIDE = 0.1
+_MAX_LINEAR = 0.3  # of the Laplacian, for a comparison with the image
 _WIDTH_WITHOUT_NOISE_PX = 3.0
 # Wave number times width at which the gain is a half: 1 - (1 - exp(-x²/2))³ = ½.
 _HALF_GAIN = math.sqrt(-2 * math.log(1 - 0.5 ** (1 / _ORDER)))
@@ -182,16 +182,16 @@ class _SourceMap(Smoothed):
     def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
         text = quantity_text(at_peak(inside(quantities["density"], frame)), self.unit, frame)
         return [
-            Fact("density", largest_title(self.long_name), text, short=text),
+            Fact("density", "Largest density", text, short=text),
             Fact("smoothing", "Smoothing", self.smoothing_text(frame)),
             *self._linear_facts(quantities["density"], frame),
         ]
 
     def _linear_facts(self, density: Quantity, frame: FieldFrame) -> list[Fact]:
         """Compare with the contrast of the image, which is the same for weak deflections."""
-        if frame.contrast is None:
-            return []
         curvature = density.value / self._per_curvature(frame)
+        if frame.contrast is None or np.abs(curvature[frame.mask]).max() > _MAX_LINEAR:
+            return []
         image = smooth(np.where(frame.mask, frame.contrast, 0.0), self.smoothing or 0.0)
         used = frame.mask
         size = float(np.sqrt((curvature[used] ** 2).mean()))
@@ -200,7 +200,7 @@ class _SourceMap(Smoothed):
         gap = float(np.sqrt(((curvature - image)[used] ** 2).mean())) / size
         text = (
             f"the contrast of the image, equally smoothed, differs from this map by {gap:.0%} "
-            "(r.m.s.); for weak deflections they are the same"
+            "(r.m.s.); for deflections as weak as these they are nearly the same"
         )
         return [Fact("linear", "Linear limit", text)]
 

@@ -70,16 +70,16 @@ class Outlined(Product):
             raise CombinationError(
                 "expected one outline: {center} and {radius} of a circle, {rectangle}, or {path}"
             )
+        if self.path is not None and crosses_itself(self.outline):
+            raise CombinationError(
+                "the {path} crosses itself, so the area inside is not defined: expected a polygon "
+                "whose sides do not meet"
+            )
         if self.center is None:
             y, x = self.outline.T
             area = abs(float((y[:-1] * x[1:] - y[1:] * x[:-1]).sum())) / 2
             if not area > 0:
                 raise CombinationError("the outline has no area, expected corners that enclose one")
-        if self.path is not None and crosses_itself(self.outline):
-            raise CombinationError(
-                "the {path} crosses itself, so what it encloses is not defined: expected a polygon "
-                "whose sides do not meet"
-            )
         return self
 
     @property

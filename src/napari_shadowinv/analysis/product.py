@@ -1,6 +1,5 @@
 """The base class of all products, and what describes their numbers: `Product`, `Variable`.
 
-- all products by name: `products`; one of a mapping, such as a table of TOML: `product_from_dict`
 - a number with its bands in words: `quantity_text`, `value_text`
 """
 
@@ -8,20 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 from pydantic import Field
 
-from napari_shadowinv._system.validation import suggestion, validate
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.units import PIXEL, display_unit, prefix_for
-from napari_shadowinv.preprocessing.steps import Choice, choices_of
+from napari_shadowinv.preprocessing.steps import Choice
 
 __all__ = [
     "BANDS",
@@ -29,8 +26,6 @@ __all__ = [
     "FieldNoise",
     "Product",
     "Variable",
-    "product_from_dict",
-    "products",
     "quantity_text",
     "value_text",
 ]
@@ -56,11 +51,14 @@ class Variable:
         Unit of its values. Values in the frame's `si_unit` are shown in its `unit`.
     long_name : str
         In words.
+    title : str
+        In a few words, for tables. Default: its name.
     """
 
     dims: tuple[str, ...]
     unit: str
     long_name: str
+    title: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +98,6 @@ class Product(Choice):
     fields: ClassVar[tuple[str, ...]] = ()
     reference: ClassVar[str] = ""  # literature and equation
 
-    product: str = Field(title="Product", description="Kind of product.")
     label: str = Field(
         default="",
         max_length=60,
@@ -173,11 +170,12 @@ class Product(Choice):
         """Return the product in words. Default: each number, and the peak of each array."""
         facts = []
         for name, variable in self.variables(frame).items():
-            quantity, title = quantities[name], variable.long_name
+            quantity = quantities[name]
+            title = variable.title or name.replace("_", " ")
             if variable.dims:
-                quantity, title = at_peak(quantity), largest_title(title)
+                quantity, title = at_peak(quantity), f"largest {title}"
             text = quantity_text(quantity, variable.unit, frame)
-            facts.append(Fact(name, title, text, short=text))
+            facts.append(Fact(name, f"{title[:1].upper()}{title[1:]}", text, short=text))
         return facts
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
@@ -189,37 +187,11 @@ class Product(Choice):
         return ()
 
 
-def largest_title(title: str) -> str:
-    """Return the title of the largest value of an array with a title."""
-    return f"Largest {title[0].lower()}{title[1:]}"
-
-
 def at_peak(quantity: Quantity) -> Quantity:
     """Return an array's quantity at the place where its magnitude is largest."""
     place = int(np.nanargmax(np.abs(quantity.value)))
     samples = quantity.samples.reshape(len(quantity.samples), quantity.value.size)
     return Quantity(np.asarray(quantity.value.ravel()[place]), samples[:, place])
-
-
-def products() -> dict[str, type[Product]]:
-    """Return all kinds of products that are imported, by their names."""
-    return choices_of(Product)
-
-
-def product_from_dict(mapping: Mapping[str, Any], where: str = "product") -> Product:
-    """Return the product of a mapping that names its kind; an `InputError` if it cannot be used.
-
-    Examples
-    --------
-    >>> import napari_shadowinv.analysis.lines
-    >>> product_from_dict({"product": "profile", "path": [(0, 0), (0, 9)]}).title
-    'profile along a line'
-    """
-    kinds = products()
-    name = mapping.get("product")
-    if name not in kinds:
-        raise InputError(f"{where}: product is {name!r}; {suggestion(str(name), kinds)}")
-    return validate(kinds[str(name)], mapping, where)
 
 
 def mask_cautions(points: AnyArray, frame: FieldFrame, name: str) -> list[Caution]:

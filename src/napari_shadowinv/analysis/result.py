@@ -20,13 +20,13 @@ from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.frame import FieldUnit, field_unit, si_unit_of
+from napari_shadowinv.analysis.kinds import product_from_dict
 from napari_shadowinv.analysis.product import (
     BANDS,
     Coordinate,
     Product,
     Variable,
     has_bands,
-    product_from_dict,
 )
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level
@@ -181,8 +181,12 @@ def add_products(dataset: xarray.Dataset, results: Sequence[ProductResult]) -> x
                 )  # fmt: skip
         for axis, places in each.coordinates.items():
             if axis not in PLANE:
-                words = label(places.unit, places.long_name)
-                variables[f"{each.name}_{axis}"] = (f"{each.name}_{axis}", places.values, words)
+                attributes = label(places.unit, places.long_name)
+                variables[f"{each.name}_{axis}"] = (
+                    f"{each.name}_{axis}",
+                    places.values,
+                    attributes,
+                )
     taken = variables.keys() & dataset.variables.keys()
     if taken:
         raise InputError(f"the result has a variable {min(taken)!r} already: give another label")

@@ -15,6 +15,7 @@ import typer
 
 from napari_shadowinv import __version__
 from napari_shadowinv.cli import (
+    _analyse_command,
     _film_command,
     _fit_command,
     _shot_commands,
@@ -82,6 +83,7 @@ app.command(cls=HelpfulCommand)(_shot_commands.rerun)
 app.command(cls=HelpfulCommand, epilog=_fit_command.EPILOG)(_fit_command.fit)
 app.command(cls=HelpfulCommand, epilog=_film_command.EPILOG)(_film_command.film)
 app.command(cls=HelpfulCommand, epilog=_shot_commands.FORWARD_EPILOG)(_shot_commands.forward)
+app.command(cls=_analyse_command.AnalyseCommand)(_analyse_command.analyse)
 app.command(cls=HelpfulCommand)(_shot_commands.info)
 app.command(cls=HelpfulCommand)(_shot_commands.demo)
 app.command(cls=HelpfulCommand, epilog=_stack_commands.BATCH_EPILOG)(_stack_commands.batch)

@@ -2,6 +2,7 @@
 
 - the figure of any result: `result_figure`; of each kind: `report_figure`, `fit_figure`,
   `pack_figure`
+- products with their bands: `products_figure`
 - tests of one static field: `left_out_figure`, `windows_figure`
 - fields side by side: `comparison_figure`; a figure's file: `save_figure`
 - a stack as a movie: `write_film`
@@ -13,6 +14,7 @@ disturb the figures of a notebook.
 from napari_shadowinv.plotting._film_figure import pack_figure
 from napari_shadowinv.plotting._fit_figure import fit_figure, left_out_figure, windows_figure
 from napari_shadowinv.plotting._movie import in_few_colours, stack_frames, write_film
+from napari_shadowinv.plotting._product_figure import products_figure
 from napari_shadowinv.plotting.figures import (
     comparison_figure,
     report_figure,
@@ -26,6 +28,7 @@ __all__ = [
     "in_few_colours",
     "left_out_figure",
     "pack_figure",
+    "products_figure",
     "report_figure",
     "result_figure",
     "save_figure",

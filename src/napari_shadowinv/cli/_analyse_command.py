@@ -1,0 +1,170 @@
+"""`shadowinv analyse`: products of a result with their bands."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from napari_shadowinv.cli import _flags, _inputs
+from napari_shadowinv.cli._flags import HelpfulCommand
+from napari_shadowinv.cli._summary import Rows, fact_rows, two_columns, written_rows
+from napari_shadowinv.cli._terminal import is_interrupted, notify_errors, progress_bars, say
+from napari_shadowinv.errors import InputError
+
+if TYPE_CHECKING:
+    from napari_shadowinv.analysis import Product, ProductResult
+    from napari_shadowinv.io.read_write import AnyResult
+
+HELP = {
+    "result": "Result of an inversion or a fit, .shadowinv; or pradformat, .h5.",
+    "products": "Products, each in quotes: its name, points y,x in px, and name=value.",
+    "file": "TOML file with a table [[products]] for each product.",
+    "unit": "Unit of the field: T m, T mm, MG µm, kG cm, G cm, V, m⁻², m, rad or px. It chooses "
+    "the field, too. Default: SI.",
+    "deflector": "Field of a fit with several: B, E, plasma or phase. Default: all.",
+    "samples": "Samples of the field for the bands.",
+    "csv": "Table of all numbers with their bands.",
+    "figure": "Figure of the products: .png, .pdf or .svg.",
+    "out": "Copy of the result with the products, .shadowinv.",
+}
+_EPILOG = r"""
+[bold]Examples[/bold]
+shadowinv analyse a.shadowinv "profile 99,20 99,180 width=5" --unit "MG um"
+shadowinv analyse a.shadowinv "current center=99,99 radius=40" --csv a.csv
+shadowinv analyse a.shadowinv current-density contrast --figure map.png
+
+[bold]Products[/bold]
+{products}
+
+[bold]Exit codes[/bold]
+0 written; 2 invalid input, nothing written; 130 cancelled.
+"""
+
+
+class AnalyseCommand(HelpfulCommand):
+    """Command whose help lists all products, which are imported only then."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        from napari_shadowinv.analysis.kinds import PRODUCTS, product_syntax
+
+        lines = [product_syntax(kind).replace("[", r"\[") for kind in PRODUCTS.values()]
+        self.epilog = _EPILOG.format(products="\n".join(lines))
+        super().format_help(ctx, formatter)
+
+
+@notify_errors
+def analyse(
+    result: Annotated[Path, typer.Argument(help=HELP["result"], show_default=False)],
+    product: Annotated[
+        list[str] | None, typer.Argument(help=HELP["products"], show_default=False)
+    ] = None,
+    products: Annotated[Path | None, typer.Option(help=HELP["file"])] = None,
+    unit: Annotated[str | None, typer.Option(help=HELP["unit"])] = None,
+    deflector: Annotated[str | None, typer.Option(help=HELP["deflector"])] = None,
+    samples: Annotated[int, typer.Option(help=HELP["samples"], metavar="N")] = 100,
+    setup: _flags.SetupFile = None,
+    csv: Annotated[Path | None, typer.Option(help=HELP["csv"])] = None,
+    figure: Annotated[Path | None, typer.Option(help=HELP["figure"])] = None,
+    out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
+    overwrite: _flags.Overwrite = False,
+    quiet: _flags.Quiet = False,
+) -> None:
+    """Measure profiles, regions, fluxes, currents and maps of a result, with error bands.
+
+    Bands hold the noise of the image, the discretisation and what was stated of the instrument.
+    """
+    from napari_shadowinv.analysis import analyse as measure
+    from napari_shadowinv.io import read_dataset
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, SITES
+    from napari_shadowinv.io.read_write import result_from_dataset
+    from napari_shadowinv.pipeline.files import setup_from
+
+    chosen = _products(product or [], products)
+    suffixes = {csv: SITES.suffixes, figure: FIGURE_SUFFIXES, out: RESULT.suffixes}
+    outputs = {path: endings for path, endings in suffixes.items() if path is not None}
+    _inputs.check_outputs(outputs, overwrite)
+    _inputs.protect(list(outputs), [result, setup, products])
+    dataset = read_dataset(result)
+    if "shot" in dataset.dims:
+        raise InputError(
+            f"{result} is a stack of shots, expected the result of one: write one of them by "
+            "shadowinv export --shots N"
+        )
+    content = result_from_dataset(dataset)
+    with nullcontext() if quiet else progress_bars() as show:
+        results = measure(
+            content,
+            chosen,
+            samples=samples,
+            unit=unit,
+            deflector=deflector,
+            setup=None if setup is None else setup_from(setup),
+            on_progress=show,
+            should_stop=is_interrupted,
+        )
+    _write(results, content, dataset, {"csv": csv, "figure": figure, "out": out}, overwrite)
+    if not quiet:
+        for table in _tables(results):
+            say(table)
+        if outputs:
+            say(two_columns("Files", written_rows(outputs)))
+
+
+def _products(texts: list[str], file: Path | None) -> list[Product]:
+    """Return the products of arguments and of a file."""
+    from napari_shadowinv.analysis import PRODUCTS, product_from_dict, product_from_text
+    from napari_shadowinv.io import read_toml
+
+    entries: Any = [] if file is None else read_toml(file).get("products", [])
+    if not isinstance(entries, list):
+        raise InputError(f"{file}: expected tables [[products]]")
+    listed = [product_from_text(text) for text in texts]
+    listed += [
+        product_from_dict(entry, f"{file}, product {n}") for n, entry in enumerate(entries, 1)
+    ]
+    if not listed:
+        names = ", ".join(PRODUCTS)
+        raise InputError(f"received no product, expected at least one: {names}")
+    return listed
+
+
+def _write(
+    results: list[ProductResult],
+    content: AnyResult,
+    dataset: Any,
+    paths: dict[str, Path | None],
+    overwrite: bool,
+) -> None:
+    """Write all files, or none."""
+    from napari_shadowinv.analysis import add_products, products_table
+    from napari_shadowinv.io import replacing, write
+    from napari_shadowinv.plotting import products_figure
+    from napari_shadowinv.plotting.figures import DOTS_PER_INCH
+
+    with ExitStack() as stack:
+        if (path := paths["csv"]) is not None:
+            temporary = stack.enter_context(replacing(path, overwrite))
+            temporary.write_text(products_table(results), encoding="utf-8")
+        if (path := paths["figure"]) is not None:
+            temporary = stack.enter_context(replacing(path, overwrite))
+            products_figure(results).savefig(temporary, dpi=DOTS_PER_INCH)
+        if (path := paths["out"]) is not None:
+            write(path, add_products(dataset, results), overwrite=overwrite)
+
+
+def _tables(results: list[ProductResult]) -> list[Any]:
+    """Return a table for each product, and what the image cannot show below the last."""
+    shared = set.intersection(*({(f.key, f.text) for f in each.facts} for each in results))
+    tables = []
+    for each in results:
+        facts = [fact for fact in each.facts if (fact.key, fact.text) not in shared]
+        tables.append(two_columns(f"{each.title} ({each.name})", fact_rows(facts or each.facts)))
+    common = [fact for fact in results[0].facts if (fact.key, fact.text) in shared]
+    rows: Rows = fact_rows(common) if len(results) > 1 else []
+    limits = dict.fromkeys(sentence for each in results for sentence in each.limits)
+    rows += [("note", sentence) for sentence in limits]
+    tables.append(two_columns("All products", rows))
+    return tables

@@ -1,0 +1,155 @@
+"""Products of a result on a page: `products_figure`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from napari_shadowinv._system.arrays import PLANE
+from napari_shadowinv.analysis.product import BANDS
+from napari_shadowinv.facts import Level
+from napari_shadowinv.physics.units import display_unit, prefix_for
+from napari_shadowinv.plotting import _panels
+from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from napari_shadowinv.analysis import ProductResult
+
+_WIDTH_IN = 8.0
+_HEIGHT_IN = 3.2  # of a panel
+_LINE_IN = 0.19  # of the text
+_LETTERS = 105
+_COLOURS = ("#1f77b4", "#d95f02", "#1b9e77")
+_OPACITIES = (0.35, 0.18)
+
+
+def products_figure(results: Sequence[ProductResult], *, title: str | None = None) -> Figure:
+    """Show products on a page: curves and maps with their bands, and all numbers below.
+
+    Parameters
+    ----------
+    results : sequence of ProductResult
+    title : str, optional
+        A heading, such as the shot's name.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure with an Agg canvas; write it with `save_figure`.
+    """
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    drawn = [each for each in results if any(v.dims for v in each.variables.values())]
+    lines = _footer(results)
+    foot = 0.25 + _LINE_IN * len(lines)
+    head = 0.35 if title else 0.1
+    height = head + _HEIGHT_IN * len(drawn) + foot
+    with mpl.rc_context(_panels.STYLE):
+        figure = Figure(figsize=(_WIDTH_IN, height))
+        FigureCanvasAgg(figure)
+        for number, each in enumerate(drawn):
+            bottom = height - head - _HEIGHT_IN * (number + 1)
+            box = (0.1, (bottom + 0.6) / height, 0.78, (_HEIGHT_IN - 1.0) / height)
+            _draw(figure.add_axes(box), each)
+        if title:
+            figure.text(0.02, 1 - 0.1 / height, title, va="top", weight="bold")
+        for number, (text, colour) in enumerate(lines):
+            place = (foot - 0.15 - _LINE_IN * number) / height
+            figure.text(0.02, place, text, va="top", fontsize=8, color=colour)
+    return figure
+
+
+def _footer(results: Sequence[ProductResult]) -> list[tuple[str, str]]:
+    sentences = []
+    for each in results:
+        facts = [fact for fact in each.facts if not fact.is_detail]
+        sentences += [
+            (f"{each.name}: {fact.title}: {fact.text}", _colour(fact.level)) for fact in facts
+        ]
+    limits = dict.fromkeys(sentence for each in results for sentence in each.limits)
+    sentences = list(dict.fromkeys(sentences)) + [(text, QUIET_COLOUR) for text in limits]
+    return _panels.wrapped(sentences, _LETTERS)
+
+
+def _colour(level: Level) -> str:
+    return QUIET_COLOUR if level is Level.SOUND else ALARM_COLOUR
+
+
+def _draw(axes: Axes, result: ProductResult) -> None:
+    axes.set_title(result.title)
+    maps = [name for name, variable in result.variables.items() if variable.dims == PLANE]
+    if maps:
+        _draw_map(axes, result, maps[0])
+        return
+    curves = [name for name, variable in result.variables.items() if len(variable.dims) == 1]
+    draw_curves(axes, result, [name for name in curves if name != "intensity"])
+    if "intensity" in curves:
+        beside = axes.twinx()
+        coordinate = result.coordinates[result.variables["intensity"].dims[0]]
+        factor, _ = prefix_for(float(np.max(np.abs(coordinate.values), initial=0.0)))
+        values = result.quantities["intensity"].value
+        beside.plot(factor * coordinate.values, values, color="0.6", linewidth=0.8)
+        beside.set_ylabel("image", color="0.5")
+        beside.margins(x=0)
+
+
+def draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> None:
+    """Draw variables along an axis with their bands, in the unit that they are shown in.
+
+    Parameters
+    ----------
+    axes : Axes
+    result : ProductResult
+    names : sequence of str
+        Variables with one common axis.
+    """
+    coordinate = result.coordinates[result.variables[names[0]].dims[0]]
+    factor, prefix = prefix_for(float(np.max(np.abs(coordinate.values), initial=0.0)))
+    in_metres = coordinate.unit == "m"
+    places = coordinate.values * (factor if in_metres else 1.0)
+    for number, name in enumerate(names):
+        scale, unit = result.scale_of(name)
+        colour = _COLOURS[number % len(_COLOURS)]
+        axes.plot(places, scale * result[name].value, color=colour, linewidth=1.3, label=name)
+        for share, opacity in zip(BANDS, _OPACITIES, strict=True):
+            if (band := result.band(name, share)) is not None:
+                style: Any = {"color": colour, "alpha": opacity, "linewidth": 0}
+                axes.fill_between(places, scale * band[0], scale * band[1], **style)
+    unit_of_places = f"{prefix}m" if in_metres else display_unit(coordinate.unit)
+    axes.set_xlabel(f"{coordinate.long_name} ({unit_of_places})")
+    axes.set_ylabel(f"field ({unit})")
+    axes.grid(alpha=0.25, linewidth=0.6)
+    axes.margins(x=0)
+    axes.legend(frameon=False, fontsize=8)
+
+
+def _draw_map(axes: Axes, result: ProductResult, name: str) -> None:
+    values = result[name].value
+    limit = float(np.nanpercentile(np.abs(values), 99.8)) or 1.0
+    factor, prefix = prefix_for(limit)
+    rows, columns = (result.coordinates[axis].values for axis in PLANE)
+    scale, letter = 1.0, display_unit(result.coordinates["x"].unit)
+    if letter == "m":
+        scale, letter = prefix_for(float(columns[-1]))
+        letter = f"{letter}m"
+    half = scale * (columns[1] - columns[0]) / 2
+    image = axes.imshow(
+        factor * values,
+        cmap="RdBu_r",
+        vmin=-factor * limit,
+        vmax=factor * limit,
+        extent=(
+            -half, scale * columns[-1] + half, scale * rows[-1] + half, -half,
+        ),
+    )  # fmt: skip
+    axes.set_xlabel(f"x ({letter})")
+    axes.set_ylabel(f"y ({letter})")
+    unit = f"{prefix}{result.variables[name].unit}"
+    axes.figure.colorbar(image, ax=axes, label=unit)
