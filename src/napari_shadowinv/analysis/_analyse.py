@@ -11,6 +11,7 @@ import numpy as np
 
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.analysis._derivatives import finer_displacement
 from napari_shadowinv.analysis._field_samples import (
     Callbacks,
     Evaluation,
@@ -187,7 +188,7 @@ class _Task:
         """Return the results, with systematic errors of random sign added to the samples."""
         systematic = {**evaluation.systematic, **self._by_energy()}
         if len(evaluation.samples):
-            systematic |= self._by_product()
+            systematic |= self._by_readout() | self._by_product()
         samples = evaluation.samples.copy()
         for error in systematic.values():
             samples += _standard_numbers(rng, len(samples))[:, None] * error
@@ -225,6 +226,12 @@ class _Task:
 
     def _in_energy(self, factor: float) -> FloatArray:
         return self.measure(factor * self.field.potential, factor * self.field.displacement)
+
+    def _by_readout(self) -> dict[str, FloatArray]:
+        """Return the errors by the central differences of which the displacement is made."""
+        potential, displacement = self.field.potential, self.field.displacement
+        finer = self.measure(potential, finer_displacement(potential, displacement))
+        return {"pixels": finer - self.measure(potential, displacement)}
 
     def _by_product(self) -> dict[str, FloatArray]:
         """Return the errors by the products' own methods."""

@@ -9,8 +9,13 @@ import numpy as np
 from pydantic import Field
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.analysis._derivatives import first_derivative, second_derivative
 from napari_shadowinv.analysis.frame import FieldFrame
-from napari_shadowinv.analysis.maps import MIN_SPACINGS, Smoothed, smooth
+from napari_shadowinv.analysis.maps import (
+    MIN_SPACINGS,
+    Smoothed,
+    smooth,
+)
 from napari_shadowinv.analysis.product import Variable
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Fact, Level
@@ -21,7 +26,7 @@ __all__ = ["Contrast"]
 _MAX_LINEAR = 0.1  # compression up to which the image's contrast is the Laplacian, to some 10 %
 _NEARLY_CROSSED = 0.8
 _CROSSED = 1.0
-_BORDER_PX = 2
+_BORDER_PX = 4  # by two derivatives of fourth order
 
 _REGIMES = {
     "linear": "linear: the contrast of the image is the current density, and any inversion will do",
@@ -69,13 +74,14 @@ class Contrast(Smoothed):
     def measure(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
     ) -> dict[str, FloatArray]:
+        plane = smooth(potential, self.smoothing or 0.0)
+        crossed = first_derivative(first_derivative(plane, 0), 1)[2:-2, 2:-2]
         inner = np.s_[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX]
         used = frame.mask[inner]
-        plane = smooth(potential, self.smoothing or 0.0)
-        down, right = np.gradient(plane)
-        (yy, yx), xx = np.gradient(down), np.gradient(right, axis=1)
-        slopes = np.stack([down, right])[(slice(None), *inner)][:, used]
-        yy, yx, xx = (part[inner][used] for part in (yy, yx, xx))
+        inside = [np.s_[2:-2, _BORDER_PX:-_BORDER_PX], np.s_[_BORDER_PX:-_BORDER_PX, 2:-2]]
+        down, right = (first_derivative(plane, axis)[inside[axis]][used] for axis in (0, 1))
+        yy, xx = (second_derivative(plane, axis)[inside[axis]][used] for axis in (0, 1))
+        yx, slopes = crossed[used], np.stack([down, right])
         variation = slopes - slopes.mean(axis=1, keepdims=True)
         move = float(np.sqrt((variation**2).sum(axis=0).mean()))
         mu = float(np.sqrt(((yy + xx) ** 2).mean()))

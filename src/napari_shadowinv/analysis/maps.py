@@ -23,6 +23,7 @@ from pydantic import Field
 from scipy.fft import dctn, idctn
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.analysis._derivatives import laplacian
 from napari_shadowinv.analysis.currents import charge_factor, current_factor
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.product import (
@@ -33,28 +34,21 @@ from napari_shadowinv.analysis.product import (
     at_peak,
     quantity_text,
 )
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact
 from napari_shadowinv.inversion.error_bars import Quantity
 
-__all__ = ["ChargeDensity", "CurrentDensity", "Smoothed", "chosen_width", "laplacian", "smooth"]
+__all__ = ["ChargeDensity", "CurrentDensity", "Smoothed", "chosen_width", "smooth"]
 
 _ORDER = 3
 MIN_SPACINGS = 1.5  # of the sites, in widths: finer structures are those of the cells
 _WIDTHS_PX = (0.0, *(0.7 * 2 ** (step / 4) for step in range(23)))
 _MAX_SHARE_OF_SIDE = 0.1
+_MIN_SIDE_PX = 12
 _MAX_LINEAR = 0.3  # of the Laplacian, for a comparison with the image
 _WIDTH_WITHOUT_NOISE_PX = 3.0
 # Wave number times width at which the gain is a half: 1 - (1 - exp(-x²/2))³ = ½.
 _HALF_GAIN = math.sqrt(-2 * math.log(1 - 0.5 ** (1 / _ORDER)))
-
-
-def laplacian(potential: FloatArray) -> FloatArray:
-    """Laplacian of a potential by five pixels; at the border that of the next pixel inside."""
-    inner = (
-        potential[2:, 1:-1] + potential[:-2, 1:-1] + potential[1:-1, 2:] + potential[1:-1, :-2]
-        - 4 * potential[1:-1, 1:-1]
-    )  # fmt: skip
-    return np.asarray(np.pad(inner, 1, mode="edge"))
 
 
 def _gaussian_gain(shape: tuple[int, ...], width: float) -> FloatArray:
@@ -115,6 +109,14 @@ class Smoothed(Product):
             "expected error, which follows from the noise."
         ),
     )
+
+    def check(self, frame: FieldFrame) -> None:
+        super().check(frame)
+        if min(frame.shape) < _MIN_SIDE_PX:
+            raise InputError(
+                f"the field has {frame.shape[0]} × {frame.shape[1]} px, expected at least "
+                f"{_MIN_SIDE_PX} px each way for its {self.title}"
+            )
 
     def adapt(self, potential: FloatArray, noise: FieldNoise | None, frame: FieldFrame) -> Self:
         if self.smoothing is not None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _WIDTH_IN = 8.0
 _HEIGHT_IN = 3.2  # of a panel
 _LINE_IN = 0.19  # of the text
-_LETTERS = 105
+_LETTERS = 125
 _COLOURS = ("#1f77b4", "#d95f02", "#1b9e77")
 _OPACITIES = (0.35, 0.18)
 
@@ -67,15 +67,17 @@ def products_figure(results: Sequence[ProductResult], *, title: str | None = Non
 
 
 def _footer(results: Sequence[ProductResult]) -> list[tuple[str, str]]:
-    sentences = []
+    """Return the numbers of each product, each caution once, and what the image cannot show."""
+    sentences, doubts = [], []
     for each in results:
-        facts = [fact for fact in each.facts if not fact.is_detail]
-        sentences += [
-            (f"{each.name}: {fact.title}: {fact.text}", _colour(fact.level)) for fact in facts
-        ]
+        numbers = [fact for fact in each.facts if fact.short or fact.key in each.variables]
+        listed = "; ".join(f"{fact.title.lower()} {fact.text}" for fact in numbers)
+        sentences.append((f"{each.title}: {listed}", QUIET_COLOUR))
+        doubts += [fact for fact in each.facts if fact not in numbers]
+    sentences += [(f"{fact.title}: {fact.text}", _colour(fact.level)) for fact in doubts]
     limits = dict.fromkeys(sentence for each in results for sentence in each.limits)
-    sentences = list(dict.fromkeys(sentences)) + [(text, QUIET_COLOUR) for text in limits]
-    return _panels.wrapped(sentences, _LETTERS)
+    sentences += [(text, QUIET_COLOUR) for text in limits]
+    return _panels.wrapped(dict.fromkeys(sentences), _LETTERS)
 
 
 def _colour(level: Level) -> str:

@@ -1,0 +1,48 @@
+"""Derivatives of planes, of fourth order in the size of a pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from napari_shadowinv._typing import FloatArray
+
+
+def laplacian(potential: FloatArray) -> FloatArray:
+    """Laplacian of a potential, of fourth order in the size of a pixel.
+
+    Within two pixels of the border it is that of the nearest pixel inside.
+    """
+    inner = second_derivative(potential, 0)[:, 2:-2] + second_derivative(potential, 1)[2:-2]
+    return np.asarray(np.pad(inner, 2, mode="edge"))
+
+
+def second_derivative(plane: FloatArray, axis: int) -> FloatArray:
+    """Second derivative along an axis of fourth order; two pixels shorter at each end."""
+    far_low, low, middle, high, far_high = _shifted(plane, axis)
+    return np.asarray((16 * (low + high) - far_low - far_high - 30 * middle) / 12)
+
+
+def first_derivative(plane: FloatArray, axis: int) -> FloatArray:
+    """Derivative along an axis of fourth order; two pixels shorter at each end."""
+    far_low, low, _, high, far_high = _shifted(plane, axis)
+    return np.asarray((8 * (high - low) - far_high + far_low) / 12)
+
+
+def _shifted(plane: FloatArray, axis: int) -> list[FloatArray]:
+    """Return the planes shifted by -2 to 2 px along an axis, without its ends."""
+    count = plane.shape[axis] - 4
+    along = np.moveaxis(plane, axis, 0)
+    return [np.moveaxis(along[start : start + count], 0, axis) for start in range(5)]
+
+
+def finer_displacement(potential: FloatArray, displacement: FloatArray) -> FloatArray:
+    """Return the displacement by derivatives of fourth order, unchanged within 2 px of the border.
+
+    Inversions read it out by central differences, of second order, which lack 1 % of a wave of
+    26 px.
+    """
+    finer = displacement.copy()
+    if min(potential.shape) > 4:
+        finer[0, 2:-2] = -first_derivative(potential, 0)
+        finer[1, :, 2:-2] = -first_derivative(potential, 1)
+    return finer

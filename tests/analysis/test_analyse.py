@@ -1,0 +1,267 @@
+"""All products in one pass: bands, units, kinds of results, and wrong requests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from helpers.exact_fields import SETUP, field_of
+from napari_shadowinv.analysis import (
+    FIELD_UNITS,
+    EnclosedCurrent,
+    Flux,
+    LineProfile,
+    Region,
+    add_products,
+    analyse,
+    product_from_text,
+    products_in,
+    products_table,
+)
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Level
+from napari_shadowinv.inversion import Inversion, invert
+from napari_shadowinv.inversion.error_bars import uncertainty
+from napari_shadowinv.inversion.result import RetrievedField
+from napari_shadowinv.physics.phantoms import Phantom
+
+LINE = LineProfile(path=[(31.5, 10), (31.5, 53)], width=3)
+CIRCLES = [
+    EnclosedCurrent(center=center, radius=radius)
+    for center, radius in (((31.5, 31.5), 8), ((27, 36), 10), ((38, 30), 6), ((25, 25), 9))
+]
+
+
+def test_bands_hold_the_truth_as_often_as_they_say(
+    recorded: Callable[[int], Inversion], ring: Phantom
+):
+    products = [LINE, *CIRCLES, Flux(path=[(31.5, 31.5), (31.5, 44)])]
+    truths = analyse(field_of(ring), products)
+    inside = []
+    for seed in range(10, 16):
+        results = analyse(recorded(seed), products, setup=SETUP, samples=30)
+        for result, truth in zip(results, truths, strict=True):
+            for name, quantity in truth.quantities.items():
+                low, high = result.band(name)
+                inside.append(((low <= quantity.value) & (quantity.value <= high)).mean())
+    assert 0.55 < np.mean(inside) < 0.82
+
+
+def test_bands_are_those_of_uncertainty(inversion: Inversion):
+    # The noise is measured in the image, here it is that of counts.
+    counts = inversion.image * inversion.report.flux_scale
+
+    def mean(potential: np.ndarray, displacement: np.ndarray) -> float:
+        return float(displacement[1, 20:44, 20:44].mean())
+
+    reference = uncertainty(
+        np.rint(counts), 200, source=inversion.source, quantities={"mean": mean},
+        options={"n_sites": len(inversion.sites)},
+    )  # fmt: skip
+    region = Region(rectangle=((19.5, 19.5), (43.5, 43.5)))
+    (result,) = analyse(inversion, region, samples=200, unit="px")
+    assert result["mean_x"].value == pytest.approx(mean(inversion.potential, inversion.displacement))
+    assert result["mean_x"].std == pytest.approx(reference.quantities["mean"].std, rel=0.35)
+
+
+def test_a_saved_inversion_has_the_same_bands(inversion: Inversion):
+    again = Inversion.from_dataset(inversion.to_dataset())
+    before, after = (analyse(each, LINE, samples=20)[0] for each in (inversion, again))
+    np.testing.assert_array_equal(before["magnitude"].samples, after["magnitude"].samples)
+
+
+def test_bands_follow_the_stated_noise(inversion: Inversion):
+    def spread(level: float) -> float:
+        options = inversion.options.model_copy(update={"noise_level": level})
+        (result,) = analyse(replace(inversion, options=options), LINE, samples=40)
+        return float(result["normal"].std.mean())
+
+    assert spread(80.0) > 2 * spread(20.0)
+
+
+def test_discretisation_and_instrument_are_among_the_causes(inversion: Inversion):
+    instrument = inversion.instrument.model_copy(update={"background": 0.05, "energy": 0.1})
+    (result,) = analyse(
+        replace(inversion, instrument=instrument), CIRCLES[0], setup=SETUP, samples=20
+    )
+    assert result.causes[0] == "noise"
+    assert {"background, 5 %", "discretisation", "energy, 10 %"} <= set(result.causes)
+    # ∫B dz is proportional to the momentum, which is to the root of the energy.
+    assert result["current"].std / abs(result["current"].value) > 0.045
+
+
+def test_results_do_not_depend_on_threads(inversion: Inversion):
+    options = inversion.options.model_copy(update={"threads": 1})
+    first, second = (
+        analyse(each, LINE, samples=20)[0]
+        for each in (inversion, replace(inversion, options=options))
+    )
+    np.testing.assert_array_equal(first["along"].samples, second["along"].samples)
+
+
+def test_products_together_are_those_alone(inversion: Inversion):
+    together = analyse(inversion, [LINE, CIRCLES[0]], setup=SETUP, samples=20)
+    (alone,) = analyse(inversion, CIRCLES[0], setup=SETUP, samples=20)
+    assert together[1]["current"].value == alone["current"].value
+    assert together[1]["current"].std == pytest.approx(alone["current"].std, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("unit", "size"), [("T m", 1), ("T mm", 1e-3), ("MG µm", 1e-4), ("kG cm", 1e-3), ("G cm", 1e-6)]
+)
+def test_units_of_a_magnetic_field_are_multiples(unit: str, size: float, exact: RetrievedField):
+    (result,) = analyse(exact, LineProfile(path=[(40, 10), (40, 90)]), unit=unit)
+    factor, symbol = result.scale_of("magnitude")
+    assert (symbol, factor) == (unit, pytest.approx(1 / size))
+    field = SETUP.path_integrated_b(exact.displacement)
+    assert result["magnitude"].value.max() <= np.hypot(*field).max() * (1 + 1e-9)
+    assert result.facts[0].text.endswith(unit)
+
+
+def test_a_unit_chooses_its_field(exact: RetrievedField):
+    line = LineProfile(path=[(40, 10), (40, 90)])
+    pixels, volts, angles = (analyse(exact, line, unit=unit)[0] for unit in ("px", "V", "rad"))
+    ratio = SETUP.path_integrated_e([0.0, 1.0])[1]
+    np.testing.assert_allclose(volts["along"].value, ratio * pixels["along"].value)
+    ratio = float(SETUP.deflection_angle(1.0))
+    np.testing.assert_allclose(angles["along"].value, ratio * pixels["along"].value)
+
+
+def test_a_field_without_errors_has_no_bands(exact: RetrievedField):
+    (result,) = analyse(exact, CIRCLES[0])
+    assert result.band("current") is None
+    assert not result.has_bands
+    fact = next(fact for fact in result.facts if fact.key == "bands")
+    assert fact.level is Level.DOUBTFUL
+
+
+def test_every_result_says_what_the_image_cannot_show(exact: RetrievedField):
+    (result,) = analyse(exact, LINE)
+    text = " ".join(result.limits)
+    for subject in ("along the beam", "rotation", "uniform deflection", "taken as thin"):
+        assert subject in text
+
+
+def test_products_come_back_from_a_dataset(inversion: Inversion):
+    results = analyse(inversion, [LINE, CIRCLES[0], CIRCLES[1]], setup=SETUP, samples=20)
+    dataset = add_products(inversion.to_dataset(SETUP), results)
+    assert dataset["current_1_current"].attrs["units"] == "A m"
+    assert Inversion.from_dataset(dataset).displacement is not None
+    again = products_in(dataset)
+    assert [each.name for each in again] == ["profile", "current_1", "current_2"]
+    assert [each.product for each in again] == [each.product for each in results]
+    assert [each.facts for each in again] == [each.facts for each in results]
+    for before, after in zip(results, again, strict=True):
+        for name in before.quantities:
+            np.testing.assert_array_equal(before[name].value, after[name].value)
+            np.testing.assert_array_equal(before.band(name, 0.95), after.band(name, 0.95))
+    assert products_table(again) == products_table(results)
+    assert products_in(add_products(dataset, again[:1]))[0].name == "profile"
+    with pytest.raises(InputError, match=r"files have bands of 0\.68 and 0\.95"):
+        again[0].band("along", 0.5)
+
+
+def test_table_has_the_numbers_in_their_units(inversion: Inversion):
+    results = analyse(inversion, [LINE, CIRCLES[0]], setup=SETUP, samples=20, unit="MG um")
+    rows = [row.split(",") for row in products_table(results).splitlines()]
+    assert rows[0][:6] == ["product", "quantity", "place", "place_unit", "value", "unit"]
+    magnitude = [row for row in rows if row[:2] == ["profile", "magnitude"]]
+    assert {row[5] for row in magnitude} == {"MG µm"}
+    np.testing.assert_allclose(
+        [float(row[4]) for row in magnitude], results[0]["magnitude"].value / 1e-4, rtol=1e-6
+    )
+    assert rows[-1][1] == "current"
+    assert rows[-1][5] == "A m"
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"unit": "furlong"}, r"unit is 'furlong', expected one of T m"),
+        ({"unit": "m-2"}, r"unit is 'm⁻²', expected one of T m.*particles"),
+        ({"samples": 3}, "expected at least 20"),
+        ({"samples": 20.5}, "expected a whole number"),
+        ({"deflector": "plasma"}, "expected one of B, E for this beam"),
+    ],
+)
+def test_a_wrong_choice_is_refused(
+    keywords: dict[str, object], message: str, exact: RetrievedField
+):
+    with pytest.raises(InputError, match=message):
+        analyse(exact, LINE, **keywords)
+
+
+def test_pixels_without_a_setup_have_one_unit(exact: RetrievedField):
+    bare = RetrievedField(exact.dataset.drop_attrs())
+    (result,) = analyse(bare, LINE)
+    assert result.variables["along"].unit == "pixel"
+    with pytest.raises(InputError, match="no setup to convert pixels with"):
+        analyse(bare, LINE, unit="T m")
+    with pytest.raises(InputError, match="needs the setup of the experiment"):
+        analyse(bare, CIRCLES[0])
+
+
+def test_a_potential_is_found_for_a_field_without_one(exact: RetrievedField):
+    line = Flux(path=[(50, 50), (50, 90)])
+    without = RetrievedField(exact.dataset.drop_vars("potential"))
+    expected, actual = (analyse(each, line)[0]["flux"].value for each in (exact, without))
+    assert actual == pytest.approx(expected, rel=5e-3)
+
+
+def test_a_stack_is_refused(exact: RetrievedField):
+    import xarray as xr
+
+    stack = xr.concat([exact.dataset, exact.dataset], "shot")
+    for wrong in (stack, RetrievedField(stack)):
+        with pytest.raises(InputError, match="expected the result of one shot"):
+            analyse(wrong, LINE)
+    with pytest.raises(InputError, match="expected the result of an inversion or a fit"):
+        analyse(np.zeros((5, 5)), LINE)
+    with pytest.raises(InputError, match="got no product"):
+        analyse(exact, [])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("proflie 1,1 2,2", "did you mean 'profile'"),
+        ("profile a,b 2,2", "expected points y,x in px"),
+        ("flux 1,1 2,2 width=3", "flux has no 'width'"),
+        ("contrast 3", "expected name=value"),
+        ("", "the product is ''"),
+    ],
+)
+def test_a_wrong_line_of_text_is_refused(text: str, message: str):
+    with pytest.raises(InputError, match=message):
+        product_from_text(text)
+
+
+def test_text_describes_the_same_products():
+    circle = product_from_text("current center=31.5,31.5 radius=8")
+    assert circle == CIRCLES[0]
+    assert product_from_text("profile 31.5,10 31.5,53 width=3") == LINE
+    corners = product_from_text("region rectangle=1,2 3,4")
+    assert corners == Region(rectangle=((1, 2), (3, 4)))
+
+
+def test_each_unit_belongs_to_one_field():
+    fields = {unit.field for unit in FIELD_UNITS.values()}
+    for field in fields:
+        sizes = [unit.size for unit in FIELD_UNITS.values() if unit.field == field]
+        assert sizes[0] == 1  # the SI unit is first
+        assert len(fields) == 6
+
+
+def test_masked_pixels_under_a_line_are_reported(ring: Phantom):
+    from napari_shadowinv.physics.forward import synthetic_image
+
+    image = 400 * synthetic_image(ring.displacement)
+    mask = np.ones(image.shape, bool)
+    mask[28:36, 5:20] = False
+    inversion = invert(np.random.default_rng(0).poisson(image), mask=mask)
+    (result,) = analyse(inversion, LINE, samples=20)
+    caution = next(fact for fact in result.facts if fact.key == "mask")
+    assert "of the line is at masked pixels" in caution.text

@@ -1,0 +1,148 @@
+"""Line integrals: exact values, Stokes' theorem, additivity and symmetries."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import constants
+
+from helpers.exact_fields import SETUP, field_of
+from napari_shadowinv.analysis import (
+    CurrentDensity,
+    EnclosedCharge,
+    EnclosedCurrent,
+    Flux,
+    analyse,
+)
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.result import RetrievedField
+from napari_shadowinv.physics.phantoms import Phantom, gaussian_blob, toroid
+
+PIXEL = SETUP.object_pixel_size
+
+
+def number(field: RetrievedField, product: Flux | EnclosedCurrent | EnclosedCharge) -> float:
+    unit = "V" if isinstance(product, EnclosedCharge) else None
+    (result,) = analyse(field, product, unit=unit)
+    (quantity,) = result.quantities.values()
+    return float(quantity.value)
+
+
+def test_flux_of_a_toroid_is_that_of_its_formula():
+    sigma, peak = 30e-6, 50e-4  # m, T m
+    field = field_of(toroid((151, 151), SETUP, peak / 1e-4, sigma))
+    # On the right of the middle a counter-clockwise field points up, to the left of a line in +x.
+    r = 40 * PIXEL
+    exact = -peak * sigma * np.exp(0.5) * (1 - np.exp(-(r**2) / (2 * sigma**2)))
+    assert number(field, Flux(path=[(75, 75), (75, 115)])) == pytest.approx(exact, rel=1e-3)
+
+
+def test_current_of_a_toroid_is_that_of_its_formula():
+    sigma, peak, radius = 30e-6, 50e-4, 25 * PIXEL
+    field = field_of(toroid((151, 151), SETUP, peak / 1e-4, sigma))
+    strength = peak * radius / sigma * np.exp(0.5 - radius**2 / (2 * sigma**2))
+    # Counter-clockwise as shown, so the current is towards the viewer, against the beam.
+    exact = -2 * np.pi * radius * strength / constants.mu_0
+    current = number(field, EnclosedCurrent(center=(75, 75), radius=25))
+    assert current == pytest.approx(exact, rel=1e-3)
+
+
+def test_charge_of_a_gaussian_is_that_of_gauss_law():
+    # A potential A exp(-r²/2σ²) px²: outward displacement A r/σ² exp(-r²/2σ²).
+    amplitude, sigma, radius = 60.0, 15.0, 20.0
+    field = field_of(gaussian_blob((121, 121), amplitude, sigma))
+    outward = amplitude * radius / sigma**2 * np.exp(-(radius**2) / (2 * sigma**2))
+    volts = SETUP.path_integrated_e([0.0, outward])[1]
+    exact = constants.epsilon_0 * 2 * np.pi * radius * PIXEL * volts
+    charge = number(field, EnclosedCharge(center=(60, 60), radius=radius))
+    assert charge == pytest.approx(exact, rel=1e-3)
+
+
+def test_enclosed_current_is_the_integral_of_the_current_density(exact: RetrievedField):
+    # A rectangle along the edges of pixels encloses whole pixels.
+    low, high = (19.5, 24.5), (69.5, 60.5)
+    (density,) = analyse(exact, CurrentDensity(smoothing=0))
+    inside = density["density"].value[20:70, 25:61]
+    current = number(exact, EnclosedCurrent(rectangle=(low, high)))
+    assert inside.sum() * PIXEL**2 == pytest.approx(current, rel=5e-3)
+
+
+def test_fluxes_of_joined_lines_add_up(exact: RetrievedField):
+    a, b, c = (30.0, 20.0), (55.5, 61.2), (70.0, 40.0)
+    parts = [number(exact, Flux(path=path)) for path in ([a, b], [b, c])]
+    assert number(exact, Flux(path=[a, b, c])) == pytest.approx(sum(parts))
+    assert number(exact, Flux(path=[c, a])) == pytest.approx(-sum(parts))
+
+
+def test_currents_of_halves_add_up(exact: RetrievedField):
+    whole = number(exact, EnclosedCurrent(rectangle=((20, 25), (70, 65))))
+    left = number(exact, EnclosedCurrent(rectangle=((20, 25), (70, 40))))
+    right = number(exact, EnclosedCurrent(path=[(20, 40), (70, 40), (70, 65), (20, 65)]))
+    assert left + right == pytest.approx(whole, rel=1e-4)
+
+
+def test_current_does_not_depend_on_the_sense_of_its_outline(exact: RetrievedField):
+    corners = [(20.0, 25.0), (22.0, 70.0), (75.0, 60.0), (60.0, 30.0)]
+    first, second = (number(exact, EnclosedCurrent(path=c)) for c in (corners, corners[::-1]))
+    assert first == pytest.approx(second)
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_current_turns_with_its_field(turns: int, ellipses: Phantom):
+    def turned(point: tuple[float, float]) -> tuple[float, float]:
+        """Turn a point as `np.rot90` turns the image."""
+        y, x = point
+        height, width = ellipses.potential.shape
+        for _ in range(turns):
+            y, x, height, width = width - 1 - x, y, width, height
+        return y, x
+
+    down, right = (np.rot90(plane, turns) for plane in ellipses.displacement)
+    for _ in range(turns):
+        down, right = -right, down
+    field = field_of(Phantom(np.rot90(ellipses.potential, turns), np.stack([down, right])))
+    corners = [(20.0, 25.0), (22.0, 70.0), (75.0, 60.0)]
+    before = number(field_of(ellipses), EnclosedCurrent(path=corners))
+    after = number(field, EnclosedCurrent(path=[turned(corner) for corner in corners]))
+    assert after == pytest.approx(before)
+
+
+def test_current_keeps_its_sign_in_a_mirror(ellipses: Phantom):
+    # B is mirrored as an axial vector: ∫j_z dz stays, as the deflection is mirrored like a vector.
+    down, right = ellipses.displacement[:, :, ::-1]
+    field = field_of(Phantom(ellipses.potential[:, ::-1], np.stack([down, -right])))
+    circle = {"center": (40.0, 45.0), "radius": 20.0}
+    before = number(field_of(ellipses), EnclosedCurrent(**circle))
+    mirrored = {"center": (40.0, 109.0 - 45.0), "radius": 20.0}
+    assert number(field, EnclosedCurrent(**mirrored)) == pytest.approx(before)
+
+
+def test_flux_across_a_closed_line_is_refused(exact: RetrievedField):
+    with pytest.raises(InputError, match=r"closed line is zero.*'current'"):
+        analyse(exact, Flux(path=[(10, 10), (20, 30), (10, 10)]))
+
+
+@pytest.mark.parametrize(
+    ("outline", "message"),
+    [
+        ({}, "expected one outline"),
+        ({"center": (5, 5)}, "only one of 'center' and 'radius'"),
+        ({"center": (5, 5), "radius": 0}, "greater than 0"),
+        ({"rectangle": ((5, 5), (5, 9))}, "no area"),
+        ({"path": [(0, 0), (9, 9), (0, 9), (9, 0)]}, "crosses itself"),
+        ({"center": (5, 5), "radius": 3, "rectangle": ((1, 1), (3, 3))}, "expected one outline"),
+    ],
+)
+def test_an_outline_without_an_inside_is_refused(outline: dict[str, object], message: str):
+    with pytest.raises(InputError, match=message):
+        EnclosedCurrent(**outline)
+
+
+def test_a_circle_beyond_the_image_is_refused(exact: RetrievedField):
+    with pytest.raises(InputError, match=r"expected points inside the image of 100 × 110 px"):
+        analyse(exact, EnclosedCurrent(center=(10, 10), radius=20))
+
+
+def test_a_current_needs_a_magnetic_field(exact: RetrievedField):
+    with pytest.raises(InputError, match="not defined for a field in V: choose one of T m"):
+        analyse(exact, EnclosedCurrent(center=(50, 50), radius=9), unit="V")

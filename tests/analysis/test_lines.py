@@ -1,0 +1,130 @@
+"""Profiles along lines and paths."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from helpers.exact_fields import SETUP, field_of
+from napari_shadowinv.analysis import LineProfile, Region, analyse
+from napari_shadowinv.analysis.paths import (
+    circle_path,
+    edge_midpoints,
+    interpolate_cubic,
+    path_directions,
+    sample_path,
+)
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.result import RetrievedField
+from napari_shadowinv.physics.phantoms import Phantom, toroid
+
+
+def test_profile_of_a_toroid_has_its_peak_across_the_line():
+    field = field_of(toroid((101, 101), SETUP, 50.0, 30e-6))
+    (profile,) = analyse(field, LineProfile(path=[(50, 50), (50, 90)]), unit="MG um")
+    assert profile["normal"].value.min() == pytest.approx(-50e-4, rel=1e-3)  # upwards, to the left
+    np.testing.assert_allclose(profile["along"].value, 0, atol=1e-9)
+    distance = profile.coordinates["distance"]
+    assert distance.unit == "m"
+    top = distance.values[profile["magnitude"].value.argmax()]
+    assert top == pytest.approx(30e-6, abs=SETUP.object_pixel_size)
+    assert profile.facts[0].text == "50 MG µm"
+
+
+def test_components_of_a_profile_are_those_of_the_vector(exact: RetrievedField):
+    (profile,) = analyse(exact, LineProfile(path=[(20, 15), (60, 80), (30, 90)], width=4))
+    squares = profile["along"].value ** 2 + profile["normal"].value ** 2
+    np.testing.assert_allclose(squares, profile["magnitude"].value ** 2)
+
+
+def test_reversed_line_has_the_opposite_components(exact: RetrievedField):
+    ends = [(20.0, 15.0), (60.0, 80.0)]
+    (there,), (back,) = (analyse(exact, LineProfile(path=path)) for path in (ends, ends[::-1]))
+    for name in ("along", "normal"):
+        np.testing.assert_allclose(there[name].value, -back[name].value[::-1], atol=1e-12)
+
+
+def test_width_averages_across_the_line(ellipses: Phantom):
+    rows = np.arange(100.0)[:, None] * np.ones(110)
+    field = field_of(Phantom(-(rows**3) / 3, np.stack([rows**2, 0 * rows])))
+    line = {"path": [(50, 10), (50, 90)]}
+    (thin,), (wide,) = (
+        analyse(field, LineProfile(**line, width=width), unit="px") for width in (0, 9)
+    )
+    np.testing.assert_allclose(thin["magnitude"].value, 2500)
+    np.testing.assert_allclose(wide["magnitude"].value, 2500 + (9**2 - 1) / 12, rtol=1e-9)
+
+
+def test_cubic_interpolation_is_exact_for_cubic_polynomials():
+    y, x = np.mgrid[:12, :15].astype(float)
+    places = np.random.default_rng(0).uniform((0, 0), (11, 14), (200, 2))
+    plane = y**3 - 2 * y * x**2 + x**3 + 5
+    exact = places[:, 0] ** 3 - 2 * places[:, 0] * places[:, 1] ** 2 + places[:, 1] ** 3 + 5
+    np.testing.assert_allclose(interpolate_cubic(plane, places), exact)
+
+
+def test_pieces_of_a_path_add_up_to_its_edges():
+    outline = np.array([(0.0, 0.0), (3.0, 4.0), (3.0, -2.0), (0.0, 0.0)])
+    middles, pieces = edge_midpoints(outline, 0.5)
+    assert np.hypot(*pieces.T).max() <= 0.5 + 1e-12
+    np.testing.assert_allclose(pieces.sum(axis=0), 0, atol=1e-12)
+    area = abs((middles[:, 1] * pieces[:, 0]).sum())
+    assert area == pytest.approx(9.0)  # ∮ x dy
+
+
+def test_directions_follow_the_edges_of_a_path():
+    path = [(0, 0), (0, 4), (3, 4)]
+    _, distance = sample_path(path, 1.0)
+    directions = path_directions(path, distance)
+    np.testing.assert_allclose(directions[:4], [[0, 1]] * 4)
+    np.testing.assert_allclose(directions[-3:], [[1, 0]] * 3)
+
+
+def test_circle_path_has_the_area_of_its_circle():
+    y, x = circle_path((4.0, 7.0), 3.0).T
+    area = (x[:-1] * y[1:] - x[1:] * y[:-1]).sum() / 2
+    assert area == pytest.approx(9 * np.pi, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("choices", "message"),
+    [
+        ({"path": [(1, 1)]}, "at least two points"),
+        ({"path": [(1, 1), (1, 1)]}, "a line with a length"),
+        ({"path": [(1, 1), (1, float("nan"))]}, "finite"),
+        ({"path": [(1, 1), (2, 2)], "width": -1}, "at least 0"),
+    ],
+)
+def test_a_line_without_a_length_is_refused(choices: dict[str, object], message: str):
+    with pytest.raises(InputError, match=message):
+        LineProfile(**choices)
+
+
+def test_a_line_outside_the_image_is_refused(exact: RetrievedField):
+    with pytest.raises(InputError, match=r"the point y = 50, x = 200 px.*100 × 110 px"):
+        analyse(exact, LineProfile(path=[(50, 50), (50, 200)]))
+
+
+def test_region_has_the_statistics_of_its_pixels(exact: RetrievedField):
+    (region,) = analyse(exact, Region(rectangle=((29.5, 19.5), (59.5, 69.5))), unit="px")
+    part = exact.displacement[:, 30:60, 20:70]
+    length = np.hypot(*part)
+    assert region["mean"].value == pytest.approx(length.mean())
+    assert region["peak"].value == pytest.approx(length.max())
+    assert region["rms"].value == pytest.approx(np.sqrt((length**2).mean()))
+    assert region["mean_x"].value == pytest.approx(part[1].mean())
+    rows = np.arange(30, 60)[:, None]
+    centroid = SETUP.object_pixel_size * (length * rows).sum() / length.sum()
+    assert region["centroid_y"].value == pytest.approx(centroid)
+
+
+def test_circle_holds_the_pixels_within_its_radius(exact: RetrievedField):
+    (region,) = analyse(exact, Region(center=(50.2, 51.3), radius=17.4), unit="px")
+    y, x = np.indices((100, 110))
+    inside = np.hypot(y - 50.2, x - 51.3) < 17.4
+    assert region["mean"].value == pytest.approx(np.hypot(*exact.displacement)[inside].mean())
+
+
+def test_a_region_between_pixels_is_refused(exact: RetrievedField):
+    with pytest.raises(InputError, match="no pixel's centre"):
+        analyse(exact, Region(center=(50.5, 50.5), radius=0.2))

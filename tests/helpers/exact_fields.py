@@ -1,0 +1,14 @@
+"""Exact fields of phantoms as results, with the setup of the paper."""
+
+from __future__ import annotations
+
+from napari_shadowinv.inversion.result import RetrievedField
+from napari_shadowinv.inversion.variables import dataset_from_field
+from napari_shadowinv.physics.phantoms import Phantom, paper_setup
+
+SETUP = paper_setup()
+
+
+def field_of(phantom: Phantom) -> RetrievedField:
+    """Return the exact field of a phantom."""
+    return RetrievedField(dataset_from_field(phantom.displacement, phantom.potential, SETUP))
