@@ -168,7 +168,7 @@ def first_windows() -> None:
     viewer.layers.selection.active = viewer.layers["residual (% of mean) – toroid"]
     photograph(viewer, "tutorial-first-residual.png", close=False)
     show_only(viewer, "|∫B×dz| (mT·m)")
-    profile = open_widget(viewer, "Line profile")
+    profile = open_widget(viewer, "Analyse")
     profile._draw()
     profile.lines.layer.add([[99.5, 5.0], [99.5, 194.0]], shape_type="line")
     for layer in profile.checked():

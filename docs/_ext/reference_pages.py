@@ -40,6 +40,7 @@ TASKS: dict[str, tuple[str, ...]] = {
     "Repeat a result from its provenance": ("rerun", "Rerun"),
     "Describe the experiment, for SI units": ("ProtonSetup", "OpticalSetup"),
     "Estimate the error of a field": ("Instrument", "BeamPrior", "uncertainty", "Uncertainty"),
+    "Measure currents, profiles and maps of a result": ("analyse",),
     "Fit one or several images, also where rays cross": ("fit", "FitShot", "FitOptions", "Fit"),
     "Invert many shots": (
         "run_stack",
@@ -65,6 +66,7 @@ TASKS: dict[str, tuple[str, ...]] = {
 }
 
 MODULES = {
+    "analysis": "Products of a result",
     "preprocessing": "Recipes, steps, filters and source estimates",
     "film": "Films, CR-39 and image plates",
     "pipeline": "From a recipe and a shot to a result",

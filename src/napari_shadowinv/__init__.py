@@ -4,6 +4,8 @@
 - how well beam, detector and alignment are known, for its errors: `Instrument`, `BeamPrior`
 - share sites between shots with one source: `plan_sites`
 - how far the image's noise moves its field: `uncertainty`
+- currents, fluxes, profiles and maps of a result, with their bands: `analyse`; all products are in
+  `napari_shadowinv.analysis`
 - several images of one object, folds, an unknown beam: `fit`, with `FitOptions`, of `FitShot`;
   the answer is a `Fit` with a verdict
 - deflections in SI units: `ProtonSetup`, `OpticalSetup`

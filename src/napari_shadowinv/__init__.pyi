@@ -1,5 +1,6 @@
 from ._napari.layers import add_inversion
 from ._system.progress import Progress
+from .analysis import analyse
 from .cautions import Caution
 from .errors import FileFormatError, InputError, InversionCancelled
 from .fitting import Fit, FitOptions, FitShot, fit
@@ -48,6 +49,7 @@ __all__ = [
     "WatchOptions",
     "__version__",
     "add_inversion",
+    "analyse",
     "fit",
     "invert",
     "invert_stack",

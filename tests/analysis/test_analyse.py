@@ -63,7 +63,9 @@ def test_bands_are_those_of_uncertainty(inversion: Inversion):
     )  # fmt: skip
     region = Region(rectangle=((19.5, 19.5), (43.5, 43.5)))
     (result,) = analyse(inversion, region, samples=200, unit="px")
-    assert result["mean_x"].value == pytest.approx(mean(inversion.potential, inversion.displacement))
+    assert result["mean_x"].value == pytest.approx(
+        mean(inversion.potential, inversion.displacement)
+    )
     assert result["mean_x"].std == pytest.approx(reference.quantities["mean"].std, rel=0.35)
 
 

@@ -73,3 +73,16 @@ def test_poisson_inversion_refuses_wrong_input() -> None:
         poisson_invert(image, source=0 * image)
     with pytest.raises(InputError, match=r"potential has shape \(4,\)"):
         border_mean(np.ones(4))
+
+
+def test_potential_of_a_displacement_has_it_as_its_gradient():
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[:30, :41] / 10
+    potential = np.sin(y) * np.cos(2 * x) + 3 * x * y
+    slopes = np.stack([np.cos(y) * np.cos(2 * x) + 3 * x, -2 * np.sin(y) * np.sin(2 * x) + 3 * y])
+    result = potential_from_displacement(-slopes / 10)
+    gap = result - potential
+    assert np.ptp(gap) < 2e-3 * np.ptp(potential)
+    assert border_mean(result) == pytest.approx(0, abs=1e-12)
+    noisy = potential_from_displacement(-slopes / 10 + 1e-3 * rng.normal(size=slopes.shape))
+    assert np.abs(noisy - result).max() < 0.02

@@ -13,6 +13,7 @@ from napari_shadowinv.analysis._derivatives import first_derivative, second_deri
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.maps import (
     MIN_SPACINGS,
+    ORDER,
     Smoothed,
     smooth,
 )
@@ -74,7 +75,21 @@ class Contrast(Smoothed):
     def measure(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
     ) -> dict[str, FloatArray]:
-        plane = smooth(potential, self.smoothing or 0.0)
+        return self._measure(potential, frame, ORDER)
+
+    def systematic(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
+        finer = self._measure(potential, frame, ORDER + 1)
+        return {
+            name: finer[name] - value
+            for name, value in self._measure(potential, frame, ORDER).items()
+        }
+
+    def _measure(
+        self, potential: FloatArray, frame: FieldFrame, order: int
+    ) -> dict[str, FloatArray]:
+        plane = smooth(potential, self.smoothing or 0.0, order)
         crossed = first_derivative(first_derivative(plane, 0), 1)[2:-2, 2:-2]
         inner = np.s_[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX]
         used = frame.mask[inner]

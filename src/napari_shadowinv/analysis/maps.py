@@ -40,7 +40,7 @@ from napari_shadowinv.inversion.error_bars import Quantity
 
 __all__ = ["ChargeDensity", "CurrentDensity", "Smoothed", "chosen_width", "smooth"]
 
-_ORDER = 3
+ORDER = 3
 MIN_SPACINGS = 1.5  # of the sites, in widths: finer structures are those of the cells
 _WIDTHS_PX = (0.0, *(0.7 * 2 ** (step / 4) for step in range(23)))
 _MAX_SHARE_OF_SIDE = 0.1
@@ -48,7 +48,7 @@ _MIN_SIDE_PX = 12
 _MAX_LINEAR = 0.3  # of the Laplacian, for a comparison with the image
 _WIDTH_WITHOUT_NOISE_PX = 3.0
 # Wave number times width at which the gain is a half: 1 - (1 - exp(-x²/2))³ = ½.
-_HALF_GAIN = math.sqrt(-2 * math.log(1 - 0.5 ** (1 / _ORDER)))
+_HALF_GAIN = math.sqrt(-2 * math.log(1 - 0.5 ** (1 / ORDER)))
 
 
 def _gaussian_gain(shape: tuple[int, ...], width: float) -> FloatArray:
@@ -57,11 +57,11 @@ def _gaussian_gain(shape: tuple[int, ...], width: float) -> FloatArray:
     return np.asarray(rows[:, None] * columns)
 
 
-def _gain(shape: tuple[int, ...], width: float, order: int = _ORDER) -> FloatArray:
+def _gain(shape: tuple[int, ...], width: float, order: int = ORDER) -> FloatArray:
     return np.asarray(1 - (1 - _gaussian_gain(shape, width)) ** order)
 
 
-def smooth(plane: FloatArray, width: float, order: int = _ORDER) -> FloatArray:
+def smooth(plane: FloatArray, width: float, order: int = ORDER) -> FloatArray:
     """Smooth a plane by the gain 1 - (1 - G)^order, with a Gaussian G of a width in px.
 
     The plane is mirrored at its border.
@@ -130,7 +130,7 @@ class Smoothed(Product):
     def _width(self, plane: FloatArray, noise: FloatArray, spacing: float) -> float:
         return chosen_width(plane, noise, spacing)
 
-    def sources(self, potential: FloatArray, order: int = _ORDER) -> FloatArray:
+    def sources(self, potential: FloatArray, order: int = ORDER) -> FloatArray:
         """Return the smoothed Laplacian of a potential, shape (H, W), without a unit."""
         return smooth(laplacian(potential), self.smoothing or 0.0, order)
 
@@ -178,7 +178,7 @@ class _SourceMap(Smoothed):
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
     ) -> dict[str, FloatArray]:
         # The next order of the kernel shows what this one takes away.
-        lost = self.sources(potential, _ORDER + 1) - self.sources(potential)
+        lost = self.sources(potential, ORDER + 1) - self.sources(potential)
         return {"density": self._per_curvature(frame) * lost}
 
     def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:

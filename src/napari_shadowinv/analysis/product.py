@@ -97,6 +97,8 @@ class Product(Choice):
     # Keys of the fields that it can be computed from, such as "path_integrated_b"; empty for any.
     fields: ClassVar[tuple[str, ...]] = ()
     reference: ClassVar[str] = ""  # literature and equation
+    # Variables that are recorded and not retrieved, such as the image's intensity.
+    recorded: ClassVar[tuple[str, ...]] = ()
 
     label: str = Field(
         default="",

@@ -27,6 +27,7 @@ class Region(Outlined):
 
     title = "region"
     place = 20
+    recorded = ("intensity",)
     product: Literal["region"] = "region"
 
     def check(self, frame: FieldFrame) -> None:

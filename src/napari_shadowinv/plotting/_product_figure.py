@@ -91,7 +91,7 @@ def _draw(axes: Axes, result: ProductResult) -> None:
         _draw_map(axes, result, maps[0])
         return
     curves = [name for name, variable in result.variables.items() if len(variable.dims) == 1]
-    draw_curves(axes, result, [name for name in curves if name != "intensity"])
+    draw_curves(axes, result, [name for name in curves if name not in result.product.recorded])
     if "intensity" in curves:
         beside = axes.twinx()
         coordinate = result.coordinates[result.variables["intensity"].dims[0]]

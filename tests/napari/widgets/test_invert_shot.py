@@ -605,7 +605,7 @@ def test_menu_brings_a_hidden_tab_to_the_front(
     window: Any, tool: Any, open_widget: Any, qtbot: Any
 ) -> None:
     qtbot.waitUntil(lambda: tool._dock is not None, timeout=PATIENCE)
-    front = open_widget("Line profile")
+    front = open_widget("Analyse")
     qtbot.waitUntil(lambda: tool.visibleRegion().isEmpty(), timeout=PATIENCE)
     dock = tool._dock
     dock.setVisible(not dock.isVisible())  # as napari's menu does

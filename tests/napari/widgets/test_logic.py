@@ -22,14 +22,14 @@ from napari_shadowinv._napari.widgets._layers import crop_of, image_of, mask_of
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
 from napari_shadowinv._napari.widgets.forward_model import BlobRecipe, ForwardJob, ToroidRecipe
 from napari_shadowinv._napari.widgets.invert_shot import SourceJob, estimate_cost
-from napari_shadowinv._napari.widgets.line_profile import (
+from napari_shadowinv._system.progress import Progress
+from napari_shadowinv.analysis.paths import (
     Profile,
     interpolate,
     sample_path,
     sample_strip,
     table_text,
 )
-from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.inversion import Inversion, compilation, invert
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup

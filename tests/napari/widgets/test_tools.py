@@ -14,7 +14,7 @@ from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import metadata_for, role_of, source_of, unit_of
 from napari_shadowinv._napari.layers import add_inversion
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, ModelPicker
-from napari_shadowinv._napari.widgets.line_profile import measure_peak
+from napari_shadowinv.analysis.paths import measure_peak
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import (
@@ -38,7 +38,7 @@ NAMES = (
     "Film pack",
     "Estimate source",
     "Forward model",
-    "Line profile",
+    "Analyse",
 )
 
 
@@ -327,7 +327,7 @@ def profile(window: Any, open_widget: Any) -> Any:
     placement = {"scale": (2.0, 2.0), "units": ("um", "um")}
     for name, plane, unit in (("height", 3.0 * y + x, "nm"), ("field", 1.0 * x, "T")):
         window.add_image(plane, name=name, metadata=metadata_for("image", unit), **placement)
-    tool = open_widget("Line profile")
+    tool = open_widget("Analyse")
     for name in ("height", "field"):
         tool.check(window.layers[name])
     tool._draw()
@@ -443,7 +443,7 @@ def test_a_profile_is_exported_whole(
 
 
 def test_a_line_needs_an_image(window: Any, open_widget: Any, messages: list[str]) -> None:
-    tool = open_widget("Line profile")
+    tool = open_widget("Analyse")
     tool._draw()
     assert len(messages) == 1
     assert "no image" in messages[0]

@@ -211,8 +211,8 @@ def test_first_shadowgram_is_clicked_to_its_end(
     assert residual.replace(" ", "") in report_of(tool).replace(" ", "")
     assert "Warning" not in report_of(tool)
 
-    choose(f"Plugins > {PLUGIN} > Line profile")
-    profile = tool_of(window, "Line profile")
+    choose(f"Plugins > {PLUGIN} > Analyse")
+    profile = tool_of(window, "Analyse")
     press(profile, "✎")
     middle = field.extent.world.mean(axis=0)
     ends = np.array([field.extent.world[0], field.extent.world[1]])

@@ -1,8 +1,8 @@
-"""The widget that plots values along a line across layers: `LineProfile`."""
+"""The widget that measures layers along a line, and products of a result: `Analyse`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._layers import LayerPicker, kind_of, new_shapes, shown_plane
+from napari_shadowinv._napari.widgets._products import ProductForm, pixel_mapper
 from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.paths import (
@@ -65,8 +66,8 @@ class ProfilePlot(Plot):
         self.draw()
 
 
-class LineProfile(qt.Docked):
-    """Draw a line to plot the values of the checked layers along it, in their units."""
+class Analyse(qt.Docked):
+    """Plot the checked layers along a line in their units, and measure products of a result."""
 
     spare_width = 50
 
@@ -110,7 +111,12 @@ class LineProfile(qt.Docked):
             forms.labelled("Width", width),
             self.hint,
         )
-        layout = qt.column(self, *rows, margin=6)
+        page, self.products = QtWidgets.QWidget(), ProductForm(viewer)
+        self.tabs = QtWidgets.QTabWidget()
+        self.tabs.addTab(page, "Layers along a line")
+        self.tabs.addTab(self.products, "Products of a result")
+        qt.column(self, self.tabs)
+        layout = qt.column(page, *rows, margin=6)
         layout.addWidget(self.plot, 1)
         for widget in (self.measures, self.export, self.problem):
             layout.addWidget(widget)
@@ -162,7 +168,7 @@ class LineProfile(qt.Docked):
                 Profile(
                     layer.name,
                     unit_of(layer),
-                    interpolate(shown_plane(layer, position), points, _mapper(layer)),
+                    interpolate(shown_plane(layer, position), points, pixel_mapper(layer)),
                     averaging,
                 )
                 for layer in layers
@@ -280,14 +286,3 @@ class LineProfile(qt.Docked):
         )
         if name:
             show_info(f"Wrote {forms.save_text(text, name, SITES.suffix)}")
-
-
-def _mapper(layer: Any) -> Callable[[Any], Any]:
-    """Return the function from world points to a layer's pixels, which may be rotated."""
-    leading = np.zeros(layer.ndim - 2)
-    origin, next_row, next_column = (
-        np.asarray(layer.data_to_world((*leading, *pixel))[-2:])
-        for pixel in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
-    )
-    to_pixels = np.linalg.inv(np.stack([next_row - origin, next_column - origin], axis=1))
-    return lambda points: (points - origin) @ to_pixels.T

@@ -1,0 +1,142 @@
+"""`shadowinv analyse`: its table, its files and its messages."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.command_line import content, flat, shadowinv
+from helpers.exact_fields import SETUP, field_of
+from napari_shadowinv import write
+from napari_shadowinv.analysis import PRODUCTS, analyse, product_from_text, products_in
+from napari_shadowinv.inversion import Inversion, invert
+from napari_shadowinv.io import read_dataset
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import toroid
+
+CIRCLE = "current center=23.5,23.5 radius=8"
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    phantom = toroid((48, 48), SETUP, 30.0, 9e-6)
+    image = np.random.default_rng(0).poisson(400 * synthetic_image(phantom.displacement))
+    inversion = invert(image, source=np.full(image.shape, 400.0))
+    path = tmp_path_factory.mktemp("result") / "ring.shadowinv"
+    return write(path, inversion.to_dataset(SETUP))
+
+
+@pytest.fixture
+def setup_file(tmp_path: Path) -> Path:
+    path = tmp_path / "setup.toml"
+    lines = [f"{name} = {value!r}" for name, value in SETUP.model_dump().items()]
+    path.write_text("\n".join(lines).replace("'", '"'))
+    return path
+
+
+def test_table_has_the_numbers_of_python(result: Path, setup_file: Path) -> None:
+    outcome = shadowinv(
+        "analyse", result, CIRCLE, "--samples", 20, "--setup", setup_file, "--unit", "MG um"
+    )
+    assert outcome.exit_code == 0, outcome.output
+    inversion = Inversion.from_dataset(read_dataset(result))
+    (expected,) = analyse(
+        inversion, product_from_text(CIRCLE), samples=20, setup=SETUP, unit="MG um"
+    )
+    text = flat(outcome.output)
+    assert expected.facts[0].text in text
+    assert "A rotation of the displacement is not seen" in text
+
+
+def test_all_files_are_written(result: Path, setup_file: Path, tmp_path: Path) -> None:
+    names = {"--csv": "a.csv", "--figure": "a.png", "--out": "a.shadowinv"}
+    flags = [part for flag, name in names.items() for part in (flag, tmp_path / name)]
+    products = ["profile 23.5,5 23.5,42 width=3", "current-density"]
+    outcome = shadowinv(
+        "analyse", result, *products, "--samples", 20, "--setup", setup_file, "-q", *flags
+    )
+    assert outcome.exit_code == 0, outcome.output
+    assert outcome.output == ""
+    rows = list(csv.DictReader((tmp_path / "a.csv").open(encoding="utf-8")))
+    assert {row["quantity"] for row in rows} == {"magnitude", "along", "normal", "intensity"}
+    (profile, density) = products_in(read_dataset(tmp_path / "a.shadowinv"))
+    written = [float(row["value"]) for row in rows if row["quantity"] == "along"]
+    np.testing.assert_allclose(written, profile["along"].value, rtol=1e-6)
+    assert density["density"].value.shape == (48, 48)
+    assert (tmp_path / "a.png").read_bytes()[:4] == b"\x89PNG"
+    # A file with products is a result like any other.
+    again = shadowinv("analyse", tmp_path / "a.shadowinv", CIRCLE, "--unit", "px")
+    assert again.exit_code == 2
+    assert "not defined for a field in px" in flat(again.output)
+
+
+def test_products_come_from_a_file(result: Path, tmp_path: Path) -> None:
+    file = tmp_path / "products.toml"
+    file.write_text(
+        '[[products]]\nproduct = "region"\ncenter = [23.5, 23.5]\nradius = 9\nlabel = "core"\n'
+    )
+    outcome = shadowinv("analyse", result, "--products", file, "--samples", 20)
+    assert outcome.exit_code == 0, outcome.output
+    assert "core (core)" in outcome.output
+    file.write_text('[[products]]\nproduct = "region"\nradius = 9\n')
+    outcome = shadowinv("analyse", result, "--products", file)
+    assert outcome.exit_code == 2
+    assert "products.toml, product 1: received only one of" in flat(outcome.output)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "received no product, expected at least one: profile, region, flux"),
+        (["fluxx 1,1 2,2"], "did you mean 'flux'?"),
+        ([CIRCLE, "--unit", "furlong"], "unit is 'furlong', expected one of T m"),
+        ([CIRCLE, "--samples", "2"], "expected at least 20"),
+        (["profile 5,5 5,500"], "expected points inside the image of 48 × 48 px"),
+        (["profile 5,5 5,9 width=-2"], "'width' is '-2'"),
+        (["flux 5,5 9,9 5,5"], "the flux across a closed line is zero"),
+        ([CIRCLE, "--csv", "a.txt"], "a.txt"),
+    ],
+)
+def test_a_mistake_is_one_sentence(
+    arguments: list[str], message: str, result: Path, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    outcome = shadowinv("analyse", result, *arguments)
+    assert outcome.exit_code == 2
+    assert message in flat(outcome.output)
+    assert "Traceback" not in outcome.output
+    assert content(tmp_path) == {}
+
+
+def test_an_image_and_a_stack_are_refused(tmp_path: Path) -> None:
+    image = write(tmp_path / "image.npy", np.ones((8, 9)))
+    outcome = shadowinv("analyse", image, "contrast")
+    assert outcome.exit_code == 2
+    assert "expected the result" in flat(outcome.output)
+
+
+def test_a_result_is_never_overwritten(result: Path) -> None:
+    before = result.read_bytes()
+    outcome = shadowinv("analyse", result, CIRCLE, "--out", result, "--overwrite")
+    assert outcome.exit_code == 2
+    assert "both read and written" in flat(outcome.output)
+    assert result.read_bytes() == before
+
+
+def test_help_lists_every_product_with_its_choices() -> None:
+    short, whole = (shadowinv("analyse", flag).output for flag in ("-h", "--help-all"))
+    assert len(short.splitlines()) <= 40
+    for name in PRODUCTS:
+        assert f"\n  {name} " in whole
+    assert "[smoothing=" in whole
+
+
+def test_field_of_another_program_has_no_bands(tmp_path: Path) -> None:
+    field = field_of(toroid((40, 40), SETUP, 30.0, 9e-6))
+    path = write(tmp_path / "field.shadowinv", field.dataset)
+    outcome = shadowinv("analyse", path, "current center=19.5,19.5 radius=8")
+    assert outcome.exit_code == 0, outcome.output
+    assert "none: the errors of this field are not known" in flat(outcome.output)
