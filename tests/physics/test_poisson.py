@@ -8,7 +8,11 @@ import pytest
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair, paper_setup, toroid
-from napari_shadowinv.physics.poisson import border_mean, poisson_invert
+from napari_shadowinv.physics.poisson import (
+    border_mean,
+    poisson_invert,
+    potential_from_displacement,
+)
 
 
 def test_weak_asymmetric_object_is_recovered_in_place() -> None:

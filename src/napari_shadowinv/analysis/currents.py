@@ -44,14 +44,14 @@ class Flux(Product):
     path: Path = path_field("Corners of the line or path, (y, x) in px; only its ends count.")
 
     def check(self, frame: FieldFrame) -> None:
-        super().check(frame)
-        frame.check_points(np.array(self.path), "the path")
         if self.path[0] == self.path[-1]:
             raise InputError(
                 "the line is closed, and the flux across a closed line is zero, as a magnetic "
                 "field has no sources: expected an open line; the current inside is the product "
                 "'current'"
             )
+        super().check(frame)
+        frame.check_points(np.array(self.path), "the path")
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
         return {"flux": Variable((), "Wb", "Magnetic flux across the line")}

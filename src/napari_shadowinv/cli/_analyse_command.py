@@ -77,6 +77,7 @@ def analyse(
     Bands hold the noise of the image, the discretisation and what was stated of the instrument.
     """
     from napari_shadowinv.analysis import analyse as measure
+    from napari_shadowinv.inversion.variables import setup_from_dataset
     from napari_shadowinv.io import read_dataset
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, SITES
     from napari_shadowinv.io.read_write import result_from_dataset
@@ -101,7 +102,7 @@ def analyse(
             samples=samples,
             unit=unit,
             deflector=deflector,
-            setup=None if setup is None else setup_from(setup),
+            setup=setup_from_dataset(dataset) if setup is None else setup_from(setup),
             on_progress=show,
             should_stop=is_interrupted,
         )
