@@ -190,7 +190,7 @@ class FieldFrame:
 
     @cached_property
     def limits(self) -> tuple[str, ...]:
-        """What the image cannot show of this field, in sentences."""
+        """Sentences on the parts of this field that the image cannot show."""
         axial = {
             _B: "A magnetic field along the beam deflects nothing, and neither does any field "
             "whose line integral across the beam vanishes, such as the azimuthal field of a "

@@ -217,7 +217,7 @@ def has_bands(quantity: Quantity) -> bool:
 
 def shown_unit(unit: str, frame: FieldFrame, largest: float) -> tuple[float, str]:
     """Return the factor from a unit of a dataset to a handy one, and the unit's name."""
-    if unit == frame.si_unit:
+    if unit == frame.si_unit and frame.unit.size != 1:
         return 1 / frame.unit.size, frame.unit.symbol
     if unit in _NO_PREFIX or not unit.isascii() or PIXEL in unit:
         return 1.0, display_unit(unit).replace("1", "") if unit == "1" else display_unit(unit)

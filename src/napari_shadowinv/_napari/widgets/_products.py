@@ -120,8 +120,9 @@ class ProductForm(QtWidgets.QWidget):
         self.results: list[ProductResult] = []
         self._measured: _Request | None = None
         tip = "<qt>Layer of the result of an inversion or a fit.</qt>"
-        kinds = ("image", "labels", "vectors")
-        self.result = LayerPicker(viewer, kinds, tip, suits=lambda layer: bool(result_of(layer)))
+        self.result = LayerPicker(
+            viewer, ("image",), tip, suits=lambda layer: bool(result_of(layer))
+        )
         self.product = SteadyComboBox()
         for name, kind in PRODUCTS.items():
             self.product.addItem(f"{kind.title[:1].upper()}{kind.title[1:]}", name)
