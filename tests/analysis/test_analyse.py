@@ -23,9 +23,11 @@ from napari_shadowinv.analysis import (
 )
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
+from napari_shadowinv.fitting import Fit, FitOptions, fit
 from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.inversion.error_bars import uncertainty
 from napari_shadowinv.inversion.result import RetrievedField
+from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import Phantom
 
 LINE = LineProfile(path=[(31.5, 10), (31.5, 53)], width=3)
@@ -109,6 +111,40 @@ def test_products_together_are_those_alone(inversion: Inversion):
     (alone,) = analyse(inversion, CIRCLES[0], setup=SETUP, samples=20)
     assert together[1]["current"].value == alone["current"].value
     assert together[1]["current"].std == pytest.approx(alone["current"].std, rel=0.02)
+
+
+@pytest.fixture(scope="module")
+def fitted(ring: Phantom) -> Fit:
+    """A fit of the middle of the ring, with two samples that are known."""
+    image = 400 * synthetic_image(ring.displacement)[12:52, 12:52]
+    noisy = np.random.default_rng(5).poisson(image).astype(float)
+    result = fit(
+        noisy, source=np.full(image.shape, 400.0), setups=[SETUP],
+        options=FitOptions(samples=0, max_iterations=5, spacing=0.25, threads=1),
+    )  # fmt: skip
+    y, x = np.mgrid[:40, :40].astype(float)
+    changes = np.stack([0.3 * x, -0.1 * y, np.zeros((40, 40))]).astype(np.float32)
+    (field,) = result.fields
+    return replace(result, fields=(replace(field, samples=changes),))
+
+
+def test_a_fit_has_the_bands_of_its_samples(fitted: Fit):
+    (flux,) = analyse(fitted, Flux(path=[(10, 10), (10, 30)]))
+    # A potential that rises along the line by 0.3 px² a px; not at all, if it rises across.
+    rise = -SETUP.path_integrated_b([0.0, 1.0])[0] * 0.3 * 20 * SETUP.object_pixel_size
+    np.testing.assert_allclose(
+        flux["flux"].samples - flux["flux"].value, [rise, 0, 0], rtol=1e-5, atol=1e-6 * abs(rise)
+    )
+    assert "3 samples" in str(flux.facts)
+    with pytest.raises(InputError, match="'E'"):
+        analyse(fitted, LINE, deflector="E")
+
+
+def test_a_fit_without_samples_has_no_bands(fitted: Fit):
+    (field,) = fitted.fields
+    bare = replace(fitted, fields=(replace(field, samples=None),))
+    (flux,) = analyse(bare, Flux(path=[(10, 10), (10, 30)]))
+    assert not flux.has_bands
 
 
 @pytest.mark.parametrize(
@@ -258,8 +294,6 @@ def test_each_unit_belongs_to_one_field():
 
 
 def test_masked_pixels_under_a_line_are_reported(ring: Phantom):
-    from napari_shadowinv.physics.forward import synthetic_image
-
     image = 400 * synthetic_image(ring.displacement)
     mask = np.ones(image.shape, bool)
     mask[28:36, 5:20] = False

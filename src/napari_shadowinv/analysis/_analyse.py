@@ -269,7 +269,9 @@ def _result(
         array = np.asarray(values, dtype=np.float64)
         quantities[constant] = Quantity(array, np.zeros((0, *array.shape)))
     if causes:
-        bands = Fact("bands", "Bands", f"68 and 95 %, by {', '.join(causes)}")
+        count = max(len(quantity.samples) for quantity in quantities.values())
+        text = f"68 and 95 %, by {', '.join(causes)}; {count} samples"
+        bands = Fact("bands", "Bands", text)
     else:
         bands = Fact(
             "bands", "Bands", "none: the errors of this field are not known", Level.DOUBTFUL
