@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from helpers.command_line import flat
 from napari_shadowinv import Fit, FitOptions, Inversion, cli, fit, invert, synthetic_image, write
+from napari_shadowinv.analysis import PRODUCTS, analyse
 from napari_shadowinv.cli._terminal import EXIT_MISTAKE
 from napari_shadowinv.fitting import unknowns
 from napari_shadowinv.inversion.budget import FLUX_ERRORS
@@ -64,6 +65,18 @@ def test_the_filter_is_a_step(names):
     image = np.ones((20, 20))
     image[9, 9] = 50.0
     np.testing.assert_array_equal(step.apply(Radiograph(image)).image, 1.0)
+
+
+def test_the_product_has_a_band(names):
+    assert "steepness" not in PRODUCTS
+    displacement = gaussian_blob((24, 24), 4.0, 4.0).displacement
+    counts = np.random.default_rng(0).poisson(400 * synthetic_image(displacement))
+    inversion = invert(counts)
+    (result,) = analyse(inversion, names["Steepness"](), samples=20)
+    low, high = result.band("steepness")
+    assert low < high
+    slope = np.abs(np.diff(inversion.displacement[0], axis=0)).max()
+    assert result["steepness"].value == slope
 
 
 def test_the_option_is_one_field(names):

@@ -67,6 +67,9 @@ def test_all_files_are_written(result: Path, setup_file: Path, tmp_path: Path) -
     np.testing.assert_allclose(written, profile["along"].value, rtol=1e-6)
     assert density["density"].value.shape == (48, 48)
     assert (tmp_path / "a.png").read_bytes()[:4] == b"\x89PNG"
+    info = flat(shadowinv("info", tmp_path / "a.shadowinv").output)
+    assert "current_density" in info
+    assert density.facts[0].text in info
     # A file with products is a result like any other.
     again = shadowinv("analyse", tmp_path / "a.shadowinv", CIRCLE, "--unit", "px")
     assert again.exit_code == 2

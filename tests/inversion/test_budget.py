@@ -22,7 +22,7 @@ from napari_shadowinv import (
     synthetic_image,
 )
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.inversion.budget import Budget, ErrorEstimate
+from napari_shadowinv.inversion.budget import Budget, ErrorEstimate, discretisation_share
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.options import ASSUMED_BEAM
@@ -645,3 +645,11 @@ def test_the_error_by_noise_follows_a_stated_correlation(width):
     assert not any(c.code == "correlated-noise" for c in results[0].report.warnings)
     white = invert(shot(), plan=plan, options=options, instrument={"noise_correlation": 0})
     assert white.errors.noise_correlation == 0
+
+
+@pytest.mark.parametrize("rate", [0.25, 0.35, 0.7])
+def test_discretisation_share_is_the_rest_of_a_geometric_series(rate: float) -> None:
+    # Changes by ever four times the sites fall by the rate, and their squares add.
+    remaining = np.sqrt(sum(rate ** (2 * k) for k in range(1, 200)))
+    assert discretisation_share(4.0, rate) == pytest.approx(remaining)
+    assert discretisation_share(16.0, rate) < discretisation_share(4.0, rate)

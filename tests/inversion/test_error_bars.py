@@ -371,3 +371,22 @@ def test_the_page_about_error_bars_works_as_it_stands_there(tmp_path: Path, monk
     assert 0.3 * middle.mean() < names["error_bar"] < 1.5 * middle.mean()  # type: ignore[operator]
     for target in re.findall(r"\]\((?!https:)([^)#]+)\)", text):
         assert (page.parent / target).exists(), target
+
+
+def test_quantities_may_depend_on_the_first_samples() -> None:
+    counts = np.random.default_rng(1).poisson(400, (24, 24))
+    spreads: list[float] = []
+
+    def choose(changes: np.ndarray) -> dict[str, object]:
+        assert changes.shape[1:] == (24, 24)
+        spreads.append(float(changes.std()))
+        return {"middle": lambda potential, displacement: potential[12, 12] / spreads[0]}
+
+    for method in ("linear", "resolve"):
+        chosen = uncertainty(counts, n=20, method=method, quantities=choose)
+        middle = {"middle": lambda potential, displacement: potential[12, 12]}
+        fixed = uncertainty(counts, n=20, method=method, quantities=middle)
+        np.testing.assert_allclose(
+            chosen.quantities["middle"].samples * spreads.pop(), fixed.quantities["middle"].samples
+        )
+        assert spreads == []

@@ -143,7 +143,19 @@ def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
         ResultKind.FILM_DOSES: _film_rows,
         ResultKind.FIELD: _field_rows,
     }
-    return rows_by_kind[ResultKind.of(dataset.attrs)](dataset)
+    return [*rows_by_kind[ResultKind.of(dataset.attrs)](dataset), *_product_rows(dataset)]
+
+
+def _product_rows(dataset: xarray.Dataset) -> _summary.Rows:
+    """Return the numbers of the products in the file of a result."""
+    from napari_shadowinv.analysis import products_in
+
+    return [
+        (each.name, f"{fact.title.lower()} {fact.text}")
+        for each in products_in(dataset)
+        for fact in each.facts
+        if fact.key in each.variables
+    ]
 
 
 def _inversion_rows(dataset: xarray.Dataset) -> _summary.Rows:
