@@ -16,7 +16,7 @@ from napari_shadowinv.analysis.frame import FIELD_UNITS, FieldFrame, FieldUnit
 from napari_shadowinv.analysis.product import FieldNoise
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion._invert import invert, plan_sites
+from napari_shadowinv.inversion import invert, plan_sites
 from napari_shadowinv.inversion.budget import discretisation_share
 from napari_shadowinv.inversion.error_bars import Uncertainty, uncertainty
 from napari_shadowinv.inversion.noise import ImageNoise
