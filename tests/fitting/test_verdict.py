@@ -50,13 +50,7 @@ ALONE = {
 
 @pytest.mark.parametrize(
     ("part", "side", "safety"),
-    [
-        ("background", 80, 1),
-        ("beam", 80, 1),
-        ("blur", 80, 1),
-        ("absorption", 80, 2),
-        ("beam", 79, 2),
-    ],
+    [("background", 80, 1), ("beam", 80, 1), ("gamma", 80, 2), ("blur", 80, 2), ("beam", 79, 2)],
 )
 def test_errors_that_are_underestimated_need_a_margin(part: str, side: int, safety: float) -> None:
     for factor, expected in ((0.9, Verdict.DETERMINED), (1.1, Verdict.UNCERTAIN)):
