@@ -56,6 +56,12 @@ TASKS: dict[str, tuple[str, ...]] = {
         "project_potential",
         "poisson_invert",
     ),
+    "Trace particles through a 3-D field": (
+        "trace",
+        "TraceOptions",
+        "TracedImage",
+        "FieldGrid",
+    ),
     "Show a result in napari": ("add_inversion",),
     "Follow progress, cancel, handle errors": (
         "Progress",

@@ -140,6 +140,14 @@ def test_particle_drifts_across_electric_and_magnetic_fields():
     np.testing.assert_allclose(landing, screen, rtol=2e-3)
 
 
+def test_ray_along_an_edge_of_the_grid_takes_no_more_steps_than_others():
+    grid = uniform_grid(nodes=11, by=5.0)
+    ends = np.array(grid.extent[1]) / SETUP.object_pixel_size
+    places = np.concatenate([ends * share for share in (0.95238095, 1.0, 1.05263158)])
+    aim = np.stack(np.meshgrid(places, places)).reshape(2, -1)
+    assert trace_particles(grid, SETUP, aim).steps.max() < 40
+
+
 def test_fields_in_balance_do_not_deflect():
     magnetic = 5.0
     grid = uniform_grid(by=magnetic, ex=PARALLEL.velocity * magnetic)

@@ -28,7 +28,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import IMAGE_TITLES
 from napari_shadowinv.options import FitChoices, FitOptions, Instrument, InversionOptions
 from napari_shadowinv.physics.particle_flight import TraceOptions
-from napari_shadowinv.pipeline.traced_file import GridView
+from napari_shadowinv.pipeline.traced_file import SizedView
 from napari_shadowinv.preprocessing import ESTIMATES, FIT_STEPS, STEPS, Recipe, Step
 
 HELP_NAMES = ("-h", "--help", "--help-all")
@@ -488,16 +488,16 @@ def takes_fit(command: Callable[..., None]) -> Callable[..., None]:
 
 def takes_trace(command: Callable[..., None]) -> Callable[..., None]:
     """Add the flags of a traced 3-D field to a command with the argument `flags`."""
-    flags = _option_flags(GridView, _TRACE)
+    flags = _option_flags(SizedView, _TRACE)
     return _with_flags(command, dict(flags + _option_flags(TraceOptions, _TRACE, _PARTICLES)))
 
 
-def trace_choices(flags: Mapping[str, Any]) -> tuple[GridView, TraceOptions]:
+def trace_choices(flags: Mapping[str, Any]) -> tuple[SizedView, TraceOptions]:
     """Return the choices for a traced 3-D field by the flags."""
-    views = {name: value for name, value in flags.items() if name in GridView.model_fields}
+    views = {name: value for name, value in flags.items() if name in SizedView.model_fields}
     options = {name: value for name, value in flags.items() if name not in views}
     return (
-        validate(GridView, views, "", flag_names(GridView)),
+        validate(SizedView, views, "", flag_names(SizedView)),
         validate(TraceOptions, options, "", flag_names(TraceOptions)),
     )
 

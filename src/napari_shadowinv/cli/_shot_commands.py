@@ -461,6 +461,7 @@ def trace_field(
         return trace_file(
             path,
             setup,
+            shape=(view.height, view.width),
             view=view,
             options=options,
             source=source,

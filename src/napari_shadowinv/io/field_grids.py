@@ -114,7 +114,7 @@ def _read_openpmd(path: Path, content: Any, iteration: str | int | None) -> Fiel
     ):
         raise InputError(f"{path} has E and B on different grids: expected one grid for both")
     spacing, centre = geometries[0]
-    return FieldGrid(arrays["B"], arrays["E"], spacing=spacing, centre=centre)
+    return FieldGrid(arrays["B"], arrays["E"], spacing=spacing.tolist(), centre=centre.tolist())
 
 
 def _choose_iteration(path: Path, content: Any, iteration: str | int | None) -> Any:

@@ -95,8 +95,9 @@ def push_particles(
         y += start * uy / u * inv_y
         z += start * uz / u * inv_z
         length = min(longest, max_turn * u / (max_b + max_e * gamma / u))
-        # Steps of equal length end at the rim.
-        length = (end - start) / math.ceil((end - start) / length)
+        if end - start > length:
+            # Steps of equal length end at the rim.
+            length = (end - start) / math.ceil((end - start) / length)
         squared_u = u * u
         step_u = squared_u  # for which the step was chosen
         flight = length / u  # c dt / γ

@@ -1,6 +1,6 @@
 """The image of a 3-D field in a file: `trace_file`.
 
-- how the grid lies in the beam, and which image is traced: `GridView`
+- how the grid lies in the beam: `GridView`; with the size of the image: `SizedView`
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
 class GridView(CheckedModel):
-    """Direction from which a grid is seen, and the size of its image."""
+    """Direction from which a grid is seen."""
 
     beam: Axis = Field(
         default="z",
@@ -44,6 +44,16 @@ class GridView(CheckedModel):
         title="Centre the grid",
         description="Put the middle of the grid on the middle of the object plane.",
     )
+
+    def apply(self, grid: FieldGrid) -> FieldGrid:
+        """Return a grid in the frame of the beam."""
+        turned = grid.turned(self.beam, self.right)
+        return turned.centred() if self.centre else turned
+
+
+class SizedView(GridView):
+    """Direction from which a grid is seen, and the size of its image."""
+
     height: int = Field(
         default=200,
         ge=4,
@@ -59,16 +69,12 @@ class GridView(CheckedModel):
         description="Width of the traced image in px.",
     )
 
-    def apply(self, grid: FieldGrid) -> FieldGrid:
-        """Return a grid in the frame of the beam."""
-        turned = grid.turned(self.beam, self.right)
-        return turned.centred() if self.centre else turned
-
 
 def trace_file(
     path: Path,
     setup: Setup | None,
     *,
+    shape: tuple[int, int] = (200, 200),
     view: GridView | None = None,
     options: TraceOptions | None = None,
     source: ArrayLike | None = None,
@@ -85,8 +91,10 @@ def trace_file(
         An openPMD or NetCDF 4 file; see `napari_shadowinv.io.field_grids.read_field_grid`.
     setup : Setup or None
         The experiment, of particles.
+    shape : tuple of int, default (200, 200)
+        Height and width of the image in px, if there is no source.
     view : GridView, optional
-        Direction of the beam and size of the image, which a source replaces.
+        Direction of the beam. Default: along z, with x to the right.
     options, seed, on_progress, should_stop
         As for `napari_shadowinv.trace`.
     source : array_like, shape (H, W), optional
@@ -110,7 +118,6 @@ def trace_file(
             "size, to trace them through a 3-D field"
         )
     view = view or GridView()
-    shape = (view.height, view.width)
     if source is not None:
         shape = getattr(source, "shape", shape)
     grid = view.apply(read_field_grid(path, iteration=iteration))

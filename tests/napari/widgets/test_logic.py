@@ -20,7 +20,12 @@ from napari_shadowinv import (
 from napari_shadowinv._napari.widgets._editors import format_number, parse_number
 from napari_shadowinv._napari.widgets._layers import crop_of, image_of, mask_of
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
-from napari_shadowinv._napari.widgets.forward_model import BlobRecipe, ForwardJob, ToroidRecipe
+from napari_shadowinv._napari.widgets.forward_model import (
+    BlobRecipe,
+    ForwardJob,
+    GridFile,
+    ToroidRecipe,
+)
 from napari_shadowinv._napari.widgets.invert_shot import SourceJob, estimate_cost
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.analysis.paths import (
@@ -387,6 +392,28 @@ def test_a_potential_and_its_object_make_the_same_image() -> None:
 def test_a_magnetic_object_asks_for_particles() -> None:
     with pytest.raises(InputError, match="select the setup"):
         ForwardJob(ToroidRecipe()).run()
+
+
+def test_forward_model_traces_a_3d_field_from_a_file(tmp_path):
+    """The field is uniform: the displacement is that of its line integral."""
+    places = np.linspace(-2e-4, 2e-4, 9)
+    zeros = np.zeros((9, 9, 9))
+    components = {"Bx": zeros, "By": zeros + 0.5, "Bz": zeros}
+    dataset = xr.Dataset(
+        {name: (("z", "y", "x"), values, {"units": "T"}) for name, values in components.items()},
+        {axis: (axis, places, {"units": "m"}) for axis in "zyx"},
+    )
+    path = tmp_path / "field.nc"
+    dataset.to_netcdf(path, engine="h5netcdf")
+    setup = paper_setup()
+    with pytest.raises(InputError, match="there is no setup"):
+        ForwardJob(GridFile(str(path), GridView()), shape=(20, 30)).run()
+    job = ForwardJob(GridFile(str(path), GridView(right="-x")), shape=(20, 30), setup=setup)
+    prediction = job.run()
+    # Seen with x to the left, y points up.
+    expected = setup.displacement_from_path_integrated_b([-0.5 * 4e-4, 0.0])[1]
+    np.testing.assert_allclose(prediction.displacement[1], expected, rtol=1e-2)
+    assert "faces reaches 100%" in prediction.warning
 
 
 def test_a_plane_is_sampled_exactly_at_its_place_in_the_world() -> None:

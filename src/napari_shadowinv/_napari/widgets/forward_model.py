@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -28,10 +29,12 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Level
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import SETUPS, deflector_titles
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.inversion_run import plane_of
+from napari_shadowinv.pipeline.traced_file import GridView
 
 if TYPE_CHECKING:
     import napari
@@ -187,6 +190,14 @@ PHANTOMS: dict[str, type[PhantomRecipe]] = {
 }
 
 
+@dataclass(frozen=True)
+class GridFile:
+    """A 3-D field in a file, and the direction from which it is seen."""
+
+    path: str
+    view: GridView
+
+
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """The image that an object casts, with its displacement and source."""
@@ -216,7 +227,7 @@ class Prediction:
 class ForwardJob(Job):
     """A prediction of the image of a potential, a displacement in px, or a simulated object."""
 
-    field: ArrayLike | PhantomRecipe
+    field: ArrayLike | PhantomRecipe | GridFile
     shape: tuple[int, int] = (200, 200)  # of a simulated object's image
     to_px2: float = 1.0  # conversion factor of the potential to px²
     setup: Setup | None = None
@@ -237,6 +248,8 @@ class ForwardJob(Job):
 
         report = Reporter(on_progress, should_stop)
         report("field", 0, None)
+        if isinstance(self.field, GridFile):
+            return self._trace(self.field, on_progress, should_stop)
         displacement, assumption = self._transfer(self._displacement())
         source, shadow = self._source(displacement.shape[1:])
         image = synthetic_image(
@@ -249,6 +262,36 @@ class ForwardJob(Job):
         flux_inside = float(image.sum() / flux) if flux else 1.0
         return Prediction(
             image, displacement, source, float(caustic.mean()), flux_inside, assumption
+        )
+
+    def _trace(
+        self, grid: GridFile, on_progress: OnProgress | None, should_stop: ShouldStop | None
+    ) -> Prediction:
+        """Trace particles through a 3-D field."""
+        from napari_shadowinv.physics.forward import jacobian_determinant
+        from napari_shadowinv.pipeline.traced_file import trace_file
+
+        source = None if self.source is None else plane_of(self.source, "the source")
+        traced = trace_file(
+            Path(grid.path),
+            self.setup,
+            shape=self.shape,
+            view=grid.view,
+            source=source,
+            on_progress=on_progress,
+            should_stop=should_stop,
+        )
+        displacement = np.nan_to_num(traced.displacement)
+        caustic = jacobian_determinant(displacement) < self.caustic_jacobian
+        doubts = [fact.text for fact in traced.facts if fact.level is not Level.SOUND]
+        flux = traced.source.sum()
+        return Prediction(
+            traced.image,
+            displacement,
+            source,
+            float(caustic.mean()),
+            float(traced.image.sum() / flux) if flux else 1.0,
+            "".join(f"{text[0].upper()}{text[1:]}. " for text in doubts).strip(),
         )
 
     def layers(self, content: Prediction) -> list[FullLayerData]:
@@ -301,13 +344,15 @@ class ForwardJob(Job):
 
         if isinstance(self.field, PhantomRecipe):
             return self.field.phantom(self.shape, self.setup).displacement
-        if np.ndim(self.field) == 3:
-            return np.asarray(self.field, dtype=np.float64)
-        return displacement_from_potential(self.to_px2 * plane_of(self.field, "the potential"))
+        values: Any = self.field
+        if np.ndim(values) == 3:
+            return np.asarray(values, dtype=np.float64)
+        return displacement_from_potential(self.to_px2 * plane_of(values, "the potential"))
 
 
 _FIELDS = ("field", "field y", "field x")
 _LAYER = "layer"
+_GRID = "grid"
 _MAX_SIDE_PX = 20_000
 
 
@@ -379,9 +424,21 @@ class ForwardModel(ToolPanel):
         )
         super().__init__(viewer, "forward-model", panel)
         self.object = forms.ModelPicker(
-            "Object", {**forms.kinds_of(PHANTOMS), _LAYER: ("a result or potential", None)}
+            "Object",
+            {
+                **forms.kinds_of(PHANTOMS),
+                _GRID: ("a 3-D field from a file", GridView),
+                _LAYER: ("a result or potential", None),
+            },
         )
         self.object.choice.setToolTip("Object that deflects the beam.")
+        self.file = forms.PathEdit(
+            "Choose a 3-D field", "openPMD or NetCDF file", "3-D fields (*.h5 *.hdf5 *.nc)"
+        )
+        self.file.setToolTip(
+            "<qt>openPMD file (HDF5), or NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez; particles "
+            "are traced through it.</qt>"
+        )
         self.potential = LayerPicker(
             viewer,
             ("image",),
@@ -414,14 +471,16 @@ class ForwardModel(ToolPanel):
             self.interpretation,
             forms.labelled("Deflected by", self.deflector),
         )
+        self._file_row = forms.labelled("File", self.file)
         self._last = LastResults(viewer, self)
         size = side_by_side((self.width_px, 1), (QLabel("×"), 0), (self.height_px, 1))
         self._size_row = forms.labelled("Size (px)", size)
-        self.add(self.object, *self._potential_rows, self._size_row, self.setup)
+        self.add(self.object, self._file_row, *self._potential_rows, self._size_row, self.setup)
         self.add(forms.labelled("Source", self.source), self._last.keep_earlier)
         self.add(self.panel, self.warning, self.save_result)
         self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
         self.object.changed.connect(self._on_change)
+        self.file.changed.connect(self.keep)
         self.potential.picked.connect(self._follow_potential)
         self.setup.changed.connect(self._on_change)
         for side in (self.height_px, self.width_px):
@@ -433,6 +492,7 @@ class ForwardModel(ToolPanel):
     def state(self) -> dict[str, Any]:
         return {
             "object": self.object.state(),
+            "file": self.file.path,
             "setup": {**self.setup.state(), "kind": self.setup.picker.kind},
             "size": [self.height_px.value(), self.width_px.value()],
         }
@@ -440,6 +500,7 @@ class ForwardModel(ToolPanel):
     def restore(self, state: Any) -> None:
         self.setup.restore(state.get("setup", {}))
         self.object.restore(state.get("object", {}))
+        self.file.edit.setText(str(state.get("file", "")))
         if self.object.kind != _LAYER:
             self._choose_setup(str(state.get("setup", {}).get("kind", "proton")))
         size = state.get("size", [200, 200])
@@ -466,7 +527,12 @@ class ForwardModel(ToolPanel):
                 **common,
             )
         recipe: Any = self.object.model()
-        title = type(recipe).title
+        title = "" if self.object.kind == _GRID else type(recipe).title
+        if self.object.kind == _GRID:
+            if not self.file.path:
+                raise InputError("there is no file with a 3-D field: choose one")
+            recipe = GridFile(self.file.path, recipe)
+            title = Path(self.file.path).stem
         shape = (self.height_px.value(), self.width_px.value())
         if source is not None:
             shape = source.shape
@@ -495,6 +561,8 @@ class ForwardModel(ToolPanel):
         if self.object.kind == _LAYER and self._ready:
             self._select_field()
         self._follow_potential()
+        if self.object.kind == _GRID and self._ready:
+            self._choose_setup("proton")
         recipe = PHANTOMS.get(self.object.kind)
         if recipe is None or not recipe.probe or not self._ready:
             return
@@ -528,6 +596,7 @@ class ForwardModel(ToolPanel):
         for row in self._potential_rows:
             row.setVisible(is_layer)
         self._size_row.setVisible(not is_layer)
+        self._file_row.setVisible(self.object.kind == _GRID)
         if is_layer:
             self._show_interpretation()
         self.keep()
