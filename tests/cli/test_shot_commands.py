@@ -514,6 +514,48 @@ def test_forward_refuses_files_without_a_field(folder: Path, refused: Callable[.
     refused("forward", "d.npy", "--source", "beam.npy", names=("(9, 9)", "(24, 32)"))
 
 
+@pytest.fixture
+def grid(folder: Path) -> Path:
+    """A uniform field of 0.5 T along y in a box of 0.4 mm, as a simulation might leave it."""
+    places = np.linspace(-0.2, 0.2, 9)
+    zeros = np.zeros((9, 9, 9))
+    components = {"Bx": zeros, "By": zeros + 0.5, "Bz": zeros}
+    fields = xr.Dataset(
+        {name: (("z", "y", "x"), values, {"units": "T"}) for name, values in components.items()},
+        {axis: (axis, places, {"units": "mm"}) for axis in "zyx"},
+    )
+    fields.to_netcdf("grid.nc", engine="h5netcdf")
+    (folder / "setup.toml").write_text(PROTON_TOML)
+    return Path("grid.nc")
+
+
+def test_forward_traces_a_3d_field(grid: Path) -> None:
+    traced = shadowinv(
+        "forward", grid, "--setup", "setup.toml", "--beam", "z", "--right=-x", "--height", "20",
+        "--width", "30", "--truth", "truth.nc", "--out", "image.tif",
+    )  # fmt: skip
+    assert traced.exit_code == 0
+    assert "faces reaches 100%" in flat(traced.output)
+    assert tifffile.imread("image.tif").shape == (20, 30)
+    with xr.open_dataset("truth.nc", engine="h5netcdf") as truth:
+        field = truth["path_integrated_b"].sel(component="y").values
+    np.testing.assert_allclose(field[10, 15], -0.5 * 4e-4, rtol=1e-6)
+
+
+def test_forward_refuses_choices_that_do_not_fit_a_3d_field(
+    grid: Path, refused: Callable[..., None]
+) -> None:
+    refused("forward", grid, names="there is no setup")
+    trace = ("forward", grid, "--setup", "setup.toml")
+    refused(*trace, "--beam", "x", "--right", "x", names="two different axes")
+    refused(*trace, "--source-size", "1e-5", names="use output 'counts'")
+    refused(*trace, "--step", "3", names="--step is 3")
+    refused(*trace, "--deflector", "plasma", names="leave them out")
+    refused(*trace, "--variable", "4", names="no openPMD file")
+    np.save("d.npy", BLOB.displacement)
+    refused("forward", "d.npy", "--counts", "3", names="d.npy is no 3-D field")
+
+
 LOW_ENERGY_TOML = PROTON_TOML.replace("14.7", "3.0")
 
 

@@ -27,8 +27,7 @@ from napari_shadowinv._system.validation import Model, suggestion, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import IMAGE_TITLES
 from napari_shadowinv.options import FitChoices, FitOptions, Instrument, InversionOptions
-from napari_shadowinv.physics.particle_flight import TraceOptions
-from napari_shadowinv.pipeline.traced_file import SizedView
+from napari_shadowinv.physics.trace_options import SizedView, TraceOptions
 from napari_shadowinv.preprocessing import ESTIMATES, FIT_STEPS, STEPS, Recipe, Step
 
 HELP_NAMES = ("-h", "--help", "--help-all")

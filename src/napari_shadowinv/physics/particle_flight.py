@@ -1,7 +1,7 @@
 """Flight of charged particles from the source through a field on a grid to the detector.
 
 - particles that are aimed at points of the object plane: `trace_particles`; they are
-  `TracedParticles`; accuracy and other choices: `TraceOptions`
+  `TracedParticles`
 - the exact line integrals of a grid along straight rays: `line_integrals`
 - for an image: `Flight`, `pixel_centres`
 
@@ -12,16 +12,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field
 
 from napari_shadowinv._system.arrays import as_numbers, check_finite
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._system.progress import Reporter
-from napari_shadowinv._system.validation import CheckedModel, as_model, check_instance
+from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.field_grid import FieldGrid, field_grid
@@ -33,6 +32,7 @@ from napari_shadowinv.physics.particle_push import (
     push_particles,
 )
 from napari_shadowinv.physics.setup import ProtonSetup
+from napari_shadowinv.physics.trace_options import TraceOptions
 
 Shape = tuple[int, int]
 
@@ -43,71 +43,6 @@ PARTICLES_PER_BLOCK = 1 << 17
 _SMALLEST_RANGE = 256  # particles for a thread
 _MAX_PATH = 20.0  # diagonals of the grid, beyond which a particle is trapped
 _MAX_STEPS = 10_000_000  # of a particle across the grid
-
-
-class TraceOptions(CheckedModel):
-    """Choices of `trace`."""
-
-    output: Literal["fluence", "counts"] = Field(
-        default="fluence",
-        title="Output",
-        description=(
-            "fluence: the exact image of regular rays, without noise; counts: particles drawn at "
-            "random, with their counting statistics."
-        ),
-    )
-    rays_per_pixel: int = Field(
-        default=4,
-        ge=1,
-        le=256,
-        title="Rays per pixel",
-        description=(
-            "Rays traced per pixel for a fluence; the next square number is used. Between the rays "
-            "the displacement is interpolated by cubic splines."
-        ),
-    )
-    counts: float = Field(
-        default=100.0,
-        gt=0,
-        le=1e6,
-        allow_inf_nan=False,
-        title="Counts per pixel",
-        description="Mean number of particles per pixel of the image without the object.",
-    )
-    source_size: float = Field(
-        default=0.0,
-        ge=0,
-        le=1.0,
-        allow_inf_nan=False,
-        title="Source size (m)",
-        description="Standard deviation of the Gaussian source in m (FWHM / 2.355); for counts.",
-    )
-    energy_spread: float = Field(
-        default=0.0,
-        ge=0,
-        allow_inf_nan=False,
-        title="Energy spread (MeV)",
-        description="Standard deviation of the kinetic energy in MeV; for counts.",
-    )
-    step: float = Field(
-        default=0.5,
-        gt=0,
-        le=1,
-        title="Step (cells)",
-        description="Longest step of a particle, in units of the smallest spacing of the grid.",
-    )
-    max_turn: float = Field(
-        default=0.05,
-        gt=0,
-        le=0.5,
-        title="Turn per step (rad)",
-        description="Largest change of direction in a step, in the strongest field of the grid.",
-    )
-    keep_particles: bool = Field(
-        default=False,
-        title="Keep particles",
-        description="Also return start, landing point and deflection of each particle; for counts.",
-    )
 
 
 @dataclass(frozen=True, eq=False)

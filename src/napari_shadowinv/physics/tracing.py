@@ -38,7 +38,6 @@ from napari_shadowinv.physics.particle_flight import (
     Flight,
     Shape,
     TracedParticles,
-    TraceOptions,
     checked_shape,
     checked_threads,
     image_range,
@@ -47,6 +46,7 @@ from napari_shadowinv.physics.particle_flight import (
     trace_particles,
 )
 from napari_shadowinv.physics.setup import ProtonSetup
+from napari_shadowinv.physics.trace_options import TraceOptions
 from napari_shadowinv.physics.units import label, place_coordinates
 
 if TYPE_CHECKING:

@@ -1,73 +1,22 @@
-"""The image of a 3-D field in a file: `trace_file`.
-
-- how the grid lies in the beam: `GridView`; with the size of the image: `SizedView`
-"""
+"""The image of a 3-D field in a file: `trace_file`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
-from pydantic import Field
 
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
-from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.field_grids import read_field_grid
 from napari_shadowinv.physics.setup import ProtonSetup
-from napari_shadowinv.physics.tracing import TraceOptions, trace
+from napari_shadowinv.physics.trace_options import GridView, TraceOptions
+from napari_shadowinv.physics.tracing import trace
 
 if TYPE_CHECKING:
-    from napari_shadowinv.physics.field_grid import FieldGrid
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.physics.tracing import TracedImage
-
-Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
-
-
-class GridView(CheckedModel):
-    """Direction from which a grid is seen."""
-
-    beam: Axis = Field(
-        default="z",
-        title="Beam along",
-        description="Axis of the grid along which the beam travels.",
-    )
-    right: Axis = Field(
-        default="x",
-        title="Right along",
-        description="Axis of the grid that points to the right in the image.",
-    )
-    centre: bool = Field(
-        default=False,
-        title="Centre the grid",
-        description="Put the middle of the grid on the middle of the object plane.",
-    )
-
-    def apply(self, grid: FieldGrid) -> FieldGrid:
-        """Return a grid in the frame of the beam."""
-        turned = grid.turned(self.beam, self.right)
-        return turned.centred() if self.centre else turned
-
-
-class SizedView(GridView):
-    """Direction from which a grid is seen, and the size of its image."""
-
-    height: int = Field(
-        default=200,
-        ge=4,
-        le=20_000,
-        title="Height (px)",
-        description="Height of the traced image in px.",
-    )
-    width: int = Field(
-        default=200,
-        ge=4,
-        le=20_000,
-        title="Width (px)",
-        description="Width of the traced image in px.",
-    )
 
 
 def trace_file(

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 from napari.layers import Image, Labels, Shapes
 
 from napari_shadowinv import (
@@ -38,6 +39,7 @@ from napari_shadowinv.analysis.paths import (
 from napari_shadowinv.inversion import Inversion, compilation, invert
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+from napari_shadowinv.physics.trace_options import GridView
 from napari_shadowinv.pipeline import Cache, run
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES, quick_source
 from napari_shadowinv.pipeline.run_options import RunOptions

@@ -32,9 +32,9 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import SETUPS, deflector_titles
+from napari_shadowinv.physics.trace_options import GridView
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.inversion_run import plane_of
-from napari_shadowinv.pipeline.traced_file import GridView
 
 if TYPE_CHECKING:
     import napari
