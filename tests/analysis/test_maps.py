@@ -8,13 +8,21 @@ from scipy import constants
 from scipy.ndimage import gaussian_filter
 
 from helpers.exact_fields import SETUP, field_of
-from napari_shadowinv.analysis import ChargeDensity, Contrast, CurrentDensity, analyse
+from napari_shadowinv.analysis import ChargeDensity, Contrast, CurrentDensity, Region, analyse
 from napari_shadowinv.analysis._derivatives import laplacian
 from napari_shadowinv.analysis.maps import chosen_width, smooth
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.inversion.result import RetrievedField
-from napari_shadowinv.physics.phantoms import Phantom, gaussian_blob, toroid
+from napari_shadowinv.inversion.variables import dataset_from_field
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import (
+    Phantom,
+    gaussian_blob,
+    toroid,
+    wakefield,
+    wakefield_setup,
+)
 
 PIXEL = SETUP.object_pixel_size
 
@@ -98,9 +106,6 @@ def test_smoothing_of_an_inversion_follows_its_noise(inversion: Inversion):
 
 
 def test_weak_map_is_the_contrast_of_the_image():
-    from napari_shadowinv.inversion import invert
-    from napari_shadowinv.physics.forward import synthetic_image
-
     weak = toroid((64, 64), SETUP, 3.0, 12e-6)
     image = 1e6 * synthetic_image(weak.displacement)
     inversion = invert(image, source=np.full(image.shape, 1e6))
@@ -158,3 +163,27 @@ def test_a_map_of_a_few_pixels_is_refused():
     field = field_of(gaussian_blob((9, 9), 1.0, 2.0))
     with pytest.raises(InputError, match="expected at least 12 px each way"):
         analyse(field, CurrentDensity())
+
+
+def test_crossed_rays_of_an_inversion_are_the_caustic_regime():
+    blob = gaussian_blob((64, 64), -1.6 * 64, 8.0)
+    image = np.random.default_rng(0).poisson(300 * synthetic_image(blob.displacement))
+    inversion = invert(image, source=np.full(image.shape, 300.0))
+    assert "folds" in {caution.code for caution in inversion.cautions}
+    (contrast,) = analyse(inversion, Contrast(), samples=20)
+    assert contrast["compression"].value < 1
+    assert "caustic: rays cross" in str(contrast.facts)
+
+
+def test_large_numbers_have_a_power_of_ten():
+    setup = wakefield_setup()
+    wave = wakefield((80, 120), setup)
+    field = RetrievedField(dataset_from_field(wave.displacement, wave.potential, setup))
+    (region,) = analyse(field, Region(center=(39.5, 59.5), radius=20), unit="m-2")
+    peak = float(region["peak"].value)
+    text = next(fact.text for fact in region.facts if fact.key == "peak")
+    number, _, unit = text.partition(" × 10²")
+    assert float(number) * 10.0 ** (20 + int("⁰¹²³⁴".index(unit[0]))) == pytest.approx(
+        peak, rel=1e-3
+    )
+    assert text.endswith("m⁻²")

@@ -11,7 +11,7 @@ import numpy as np
 
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.analysis._derivatives import finer_displacement
+from napari_shadowinv.analysis._derivatives import finer_displacement, finer_potential
 from napari_shadowinv.analysis._field_samples import (
     Callbacks,
     Evaluation,
@@ -228,9 +228,10 @@ class _Task:
         return self.measure(factor * self.field.potential, factor * self.field.displacement)
 
     def _by_readout(self) -> dict[str, FloatArray]:
-        """Return the errors by the central differences of which the displacement is made."""
+        """Return the errors by the size of a pixel, and by the central differences of the read-out."""
         potential, displacement = self.field.potential, self.field.displacement
-        finer = self.measure(potential, finer_displacement(potential, displacement))
+        finer_plane = finer_potential(potential)
+        finer = self.measure(finer_plane, finer_displacement(finer_plane, displacement))
         return {"pixels": finer - self.measure(potential, displacement)}
 
     def _by_product(self) -> dict[str, FloatArray]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -330,7 +330,8 @@ def _of_inversion(
         image=np.where(inversion.mask, inversion.image * inversion.report.flux_scale, np.nan),
         source=np.where(inversion.mask, inversion.source * inversion.report.flux_scale, np.nan),
     )  # fmt: skip
-    yield ResampledInversion(frame, inversion)
+    is_folded = any(caution.code == "folds" for caution in inversion.cautions)
+    yield ResampledInversion(replace(frame, has_crossed_rays=is_folded), inversion)
 
 
 def _of_fit(

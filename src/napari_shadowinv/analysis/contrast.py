@@ -118,7 +118,7 @@ class Contrast(Smoothed):
             )
             if angle * self.object_length > float(quantities["scale"].value):
                 return "diffusive"
-        if compression >= _CROSSED:
+        if compression >= _CROSSED or frame.has_crossed_rays:
             return "caustic"
         return "linear" if compression < _MAX_LINEAR else "injective"
 
@@ -133,7 +133,8 @@ class Contrast(Smoothed):
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
         compression = float(quantities["compression"].value)
-        if not _NEARLY_CROSSED < compression < _CROSSED:
+        is_near = _NEARLY_CROSSED < compression < _CROSSED
+        if not is_near or frame.has_crossed_rays:
             return []
         text = (
             f"the beam is compressed by up to {compression:.2g}, near 1, where rays cross: an "

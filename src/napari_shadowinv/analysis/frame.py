@@ -101,6 +101,8 @@ class FieldFrame:
         Unit of the field, which also decides which field is measured.
     image, source : ndarray, shape (H, W), or None
         The recorded image and the undisturbed beam in its unit; NaN where masked.
+    has_crossed_rays : bool
+        Whether the result says that rays cross.
     """
 
     shape: tuple[int, int]
@@ -110,6 +112,7 @@ class FieldFrame:
     unit: FieldUnit
     image: AnyArray | None = None
     source: AnyArray | None = None
+    has_crossed_rays: bool = False
 
     @cached_property
     def contrast(self) -> FloatArray | None:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Self
@@ -36,6 +37,8 @@ BANDS = 0.68, 0.95
 _NO_PREFIX = ("", "1", PIXEL, "m⁻²", "m⁻³")
 _MIN_SAMPLES = 2
 _NOTABLE_MASK = 0.02
+_MAX_PLAIN = 1e5  # larger numbers have a power of ten
+_RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 _NOTABLE_BIAS = 0.3  # of the standard deviation
 
 
@@ -219,6 +222,9 @@ def shown_unit(unit: str, frame: FieldFrame, largest: float) -> tuple[float, str
     """Return the factor from a unit of a dataset to a handy one, and the unit's name."""
     if unit == frame.si_unit and frame.unit.size != 1:
         return 1 / frame.unit.size, frame.unit.symbol
+    if unit not in ("", "1", PIXEL) and not unit.isascii() and largest >= _MAX_PLAIN:
+        power = math.floor(math.log10(largest))
+        return 10.0**-power, f"× 10{str(power).translate(_RAISED)} {unit}"
     if unit in _NO_PREFIX or not unit.isascii() or PIXEL in unit:
         return 1.0, display_unit(unit).replace("1", "") if unit == "1" else display_unit(unit)
     factor, prefix = prefix_for(largest)
