@@ -183,7 +183,6 @@ def test_large_numbers_have_a_power_of_ten():
     peak = float(region["peak"].value)
     text = next(fact.text for fact in region.facts if fact.key == "peak")
     number, _, unit = text.partition(" × 10²")
-    assert float(number) * 10.0 ** (20 + int("⁰¹²³⁴".index(unit[0]))) == pytest.approx(
-        peak, rel=1e-3
-    )
+    power = 20 + "⁰¹²³⁴".index(unit[0])
+    assert float(number) * 10.0**power == pytest.approx(peak, rel=1e-3)
     assert text.endswith("m⁻²")

@@ -228,7 +228,7 @@ class _Task:
         return self.measure(factor * self.field.potential, factor * self.field.displacement)
 
     def _by_readout(self) -> dict[str, FloatArray]:
-        """Return the errors by the size of a pixel, and by the central differences of the read-out."""
+        """Return the errors by means over pixels, and by central differences of the read-out."""
         potential, displacement = self.field.potential, self.field.displacement
         finer_plane = finer_potential(potential)
         finer = self.measure(finer_plane, finer_displacement(finer_plane, displacement))
