@@ -8,6 +8,7 @@ from .maps import ChargeDensity, CurrentDensity
 from .product import Product
 from .regions import Region
 from .result import ProductResult, add_products, products_in, products_table
+from .series import TimeSeries, time_series
 
 __all__ = [
     "FIELD_UNITS",
@@ -23,10 +24,12 @@ __all__ = [
     "Product",
     "ProductResult",
     "Region",
+    "TimeSeries",
     "add_products",
     "analyse",
     "product_from_dict",
     "product_from_text",
     "products_in",
     "products_table",
+    "time_series",
 ]
