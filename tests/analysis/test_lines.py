@@ -15,6 +15,7 @@ from napari_shadowinv.analysis.paths import (
     sample_path,
 )
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.physics.phantoms import Phantom, toroid
 
@@ -42,6 +43,25 @@ def test_reversed_line_has_the_opposite_components(exact: RetrievedField):
     (there,), (back,) = (analyse(exact, LineProfile(path=path)) for path in (ends, ends[::-1]))
     for name in ("along", "normal"):
         np.testing.assert_allclose(there[name].value, -back[name].value[::-1], atol=1e-12)
+
+
+def test_band_of_a_magnitude_is_that_along_the_field_and_never_negative():
+    random = np.random.default_rng(0).normal(size=(2, 200, 3))
+    parts = np.array([[30.0, 0.3, 0.0], [40.0, 0.4, 0.0]])
+    along, normal = (
+        Quantity(value, value + noise) for value, noise in zip(parts, random, strict=True)
+    )
+    size = np.hypot(*parts)
+    # Samples of a length have its bias: noise makes the short vectors longer.
+    biased = Quantity(size, np.hypot(along.samples, normal.samples))
+    profile = LineProfile(path=[(0, 0), (0, 2)])
+    refined = profile.refine({"magnitude": biased, "along": along, "normal": normal})["magnitude"]
+    low, high = refined.band(0.68)
+    assert (high - low)[0] == pytest.approx(2, rel=0.15)
+    assert (low >= 0).all()
+    assert (refined.value <= high).all()
+    assert low[1] == 0
+    assert (biased.band(0.68)[1] < size)[1:].all()
 
 
 def test_width_averages_across_the_line(ellipses: Phantom):

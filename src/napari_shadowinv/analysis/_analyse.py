@@ -266,6 +266,7 @@ def _result(
     doubts: Sequence[Fact],
 ) -> ProductResult:
     variables: dict[str, Variable] = product.variables(frame)
+    quantities = product.refine(quantities)
     for constant, values in product.constants(frame).items():
         array = np.asarray(values, dtype=np.float64)
         quantities[constant] = Quantity(array, np.zeros((0, *array.shape)))

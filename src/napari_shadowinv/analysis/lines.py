@@ -122,6 +122,18 @@ class LineProfile(Product):
             "normal": (components * right).sum(axis=1),
         }
 
+    def refine(self, quantities: dict[str, Quantity]) -> dict[str, Quantity]:
+        """Give the magnitude the error of the component along the field: it is never negative."""
+        if "magnitude" not in quantities:
+            return quantities
+        magnitude, along, normal = (quantities[key] for key in ("magnitude", "along", "normal"))
+        size = np.maximum(magnitude.value, np.finfo(float).tiny)
+        changes = [part.value * (part.samples - part.value) for part in (along, normal)]
+        samples = magnitude.value + (changes[0] + changes[1]) / size
+        # A band reaches as far below the value as samples are above it.
+        samples = np.minimum(samples, 2 * magnitude.value)
+        return quantities | {"magnitude": Quantity(magnitude.value, samples)}
+
     def constants(self, frame: FieldFrame) -> dict[str, FloatArray]:
         if frame.image is None:
             return {}

@@ -171,6 +171,16 @@ class Product(Choice):
         """
         return {}
 
+    def refine(self, quantities: dict[str, Quantity]) -> dict[str, Quantity]:
+        """Return the quantities with errors that follow from those of others. Default: as they are.
+
+        Parameters
+        ----------
+        quantities : dict of str to Quantity
+            All that `measure` returns, with samples if the errors of the field are known.
+        """
+        return quantities
+
     def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
         """Return the product in words. Default: each number, and the peak of each array."""
         facts = []
