@@ -247,7 +247,8 @@ def measure_inversion() -> None:
             inversion = invert(traced.image)
             field = SETUP.path_integrated_b(inversion.displacement)
             print(
-                f"inversion  {name:11} ({strength:g}): image contrast {traced.image.std():.2f} r.m.s., "
+                f"inversion  {name:11} ({strength:g}): "
+                f"image contrast {traced.image.std():.2f} r.m.s., "
                 f"∫B dz {relative(field, traced.path_integrated_b):.1%} L2 from the truth, "
                 f"displacement {relative(inversion.displacement, traced.displacement):.1%}; "
                 f"thin-screen error {traced.thin_screen_error:.1%}"

@@ -337,6 +337,8 @@ NAMED_IN = {
     "physics/__init__.pyi": "the public names",
     "physics/beam.py": "an example in a docstring",
     "physics/setup.py": "where they are defined",
+    "physics/tracing.py": "only charged particles are traced",
+    "physics/particle_flight.py": "only charged particles are traced",
     "physics/phantoms.py": "a magnetic field deflects particles, a plasma wave is probed by light",
     "cli/_shot_commands.py": "the demonstration is a magnetic field",
     "film/pack.py": "stopping in film is that of protons",

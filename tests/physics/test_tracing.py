@@ -9,7 +9,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.physics.field_grid import FieldGrid, field_grid
-from napari_shadowinv.physics.setup import ProtonSetup
+from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.physics.tracing import (
     TraceOptions,
     line_integrals,
@@ -524,6 +524,11 @@ def test_source_size_of_a_collimated_beam_is_refused():
     options = {"output": "counts", "source_size": 1e-5}
     with pytest.raises(InputError, match="collimated"):
         trace(toroid_grid(nodes=11), PARALLEL, (20, 20), options=options)
+
+
+def test_setup_of_light_is_refused():
+    with pytest.raises(InputError, match="charged particles"):
+        trace(toroid_grid(nodes=11), OpticalSetup.example(), (20, 20))
 
 
 def test_request_to_stop_ends_the_tracing():

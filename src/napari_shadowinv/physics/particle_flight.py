@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._system.arrays import as_numbers, check_finite
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._system.progress import Reporter
-from napari_shadowinv._system.validation import as_model, check_instance
+from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.field_grid import FieldGrid, field_grid
@@ -115,7 +115,7 @@ def trace_particles(
         As `trace`; or if the arrays do not match.
     """
     grid = field_grid(field)
-    check_instance(setup, ProtonSetup, "setup")
+    check_particles(setup)
     options = as_model(TraceOptions, options, "options")
     points = as_numbers("aim", aim)
     if points.ndim != 2 or points.shape[0] != 2:
@@ -159,7 +159,7 @@ def line_integrals(
         As `trace`.
     """
     grid = field_grid(field)
-    check_instance(setup, ProtonSetup, "setup")
+    check_particles(setup)
     _check_place(grid, setup)
     shape = checked_shape(shape)
     rays = straight_rays(setup, shape, pixel_centres(*image_range(shape), 1))
@@ -373,6 +373,17 @@ def pixel_centres(first: IntArray, last: IntArray, fine: int) -> FloatArray:
         for low, high in zip(first, last, strict=True)
     ]
     return np.stack(np.meshgrid(*axes, indexing="ij")).reshape(2, -1)
+
+
+def check_particles(setup: Any) -> ProtonSetup:
+    """Return the setup, or raise an `InputError` if it is none of charged particles."""
+    if not isinstance(setup, ProtonSetup):
+        kind = f"setup is of {setup.beam}" if hasattr(setup, "beam") else f"setup is {setup!r:.60}"
+        raise InputError(
+            f"{'there is no setup' if setup is None else kind}: expected one of charged particles, "
+            "with energy, distances and pixel size, to trace them through a 3-D field"
+        )
+    return setup
 
 
 def checked_shape(shape: Shape) -> Shape:

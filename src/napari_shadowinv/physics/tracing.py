@@ -27,7 +27,7 @@ from napari_shadowinv._system.arrays import PLANE, as_numbers, check_finite, pla
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
-from napari_shadowinv._system.validation import as_model, check_instance
+from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level
@@ -38,6 +38,7 @@ from napari_shadowinv.physics.particle_flight import (
     Flight,
     Shape,
     TracedParticles,
+    check_particles,
     checked_shape,
     checked_threads,
     image_range,
@@ -298,7 +299,7 @@ def trace(
     0.008
     """
     grid = field_grid(field)
-    check_instance(setup, ProtonSetup, "setup")
+    check_particles(setup)
     options = as_model(TraceOptions, options, "options")
     shape = checked_shape(shape)
     _check_choices(options, setup, spectrum)

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
-from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.field_grids import read_field_grid
-from napari_shadowinv.physics.setup import ProtonSetup
+from napari_shadowinv.physics.particle_flight import check_particles
 from napari_shadowinv.physics.trace_options import GridView, TraceOptions
 from napari_shadowinv.physics.tracing import trace
 
@@ -60,19 +59,14 @@ def trace_file(
     InputError, FileFormatError
         As `read_field_grid` and `napari_shadowinv.trace`; or if the setup is none of particles.
     """
-    if not isinstance(setup, ProtonSetup):
-        received = "there is no setup" if setup is None else f"the setup is of {setup.beam}"
-        raise InputError(
-            f"{received}: expected one of charged particles, with energy, distances and pixel "
-            "size, to trace them through a 3-D field"
-        )
+    checked = check_particles(setup)
     view = view or GridView()
     if source is not None:
         shape = getattr(source, "shape", shape)
     grid = view.apply(read_field_grid(path, iteration=iteration))
     return trace(
         grid,
-        setup,
+        checked,
         shape,
         options=options,
         profile=source,
