@@ -1,5 +1,6 @@
 import importlib.util
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -427,6 +428,16 @@ def test_turned_grid_is_the_field_seen_along_another_axis(beam, right):
     np.testing.assert_allclose(turned.magnetic, values, atol=1e-9)
 
 
+class UnitObject:
+    """A unit as an object."""
+
+    def __init__(self, text):
+        self.text = text
+
+    def __str__(self):
+        return self.text
+
+
 def dataset(units="T", length="m", scale=1.0, size=1.0, dims=("x", "z", "y"), reverse=False):
     grid = toroid_grid(nodes=11)
     variables = {
@@ -450,6 +461,24 @@ def test_dataset_is_converted_to_si(choices):
     np.testing.assert_allclose(grid.magnetic, expected.magnetic, rtol=1e-12)
     np.testing.assert_allclose(grid.spacing, expected.spacing)
     np.testing.assert_allclose(grid.extent, expected.extent)
+
+
+def test_grid_with_a_dataset_in_the_layout_of_plasmapy_is_read():
+    """PlasmaPy: axes ax0, ax1, ax2 are x, y, z; units are objects whose text is the unit."""
+    grid = toroid_grid(nodes=11)
+    axes = dict(zip(("ax2", "ax1", "ax0"), "zyx", strict=True))
+    variables = {
+        f"B_{axis}": (tuple(axes), np.asarray(grid.magnetic)[k] * 1e4, {"unit": UnitObject("G")})
+        for k, axis in enumerate("zyx")
+    }
+    coords = {
+        name: np.linspace(low, high, 11) * 1e3
+        for name, (low, high) in zip(axes, grid.extent, strict=True)
+    }
+    labelled = xr.Dataset(variables, coords, {"axis_units": [UnitObject("mm")] * 3})
+    read = field_grid(SimpleNamespace(ds=labelled))
+    np.testing.assert_allclose(read.magnetic, grid.magnetic, rtol=1e-12)
+    np.testing.assert_allclose(read.extent, grid.extent)
 
 
 def test_traced_image_is_labelled_with_units():

@@ -201,8 +201,7 @@ def field_grid(field: Any) -> FieldGrid:
     """
     if isinstance(field, FieldGrid):
         return field
-    if hasattr(field, "is_uniform_grid") and hasattr(field, "ds"):
-        field = field.ds  # of PlasmaPy
+    field = getattr(field, "ds", field)  # of a grid of PlasmaPy
     if not all(hasattr(field, name) for name in ("data_vars", "coords", "dims")):
         raise InputError(
             f"the field is of type {type(field).__name__}: expected a FieldGrid, a dataset of "
