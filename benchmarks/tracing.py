@@ -54,6 +54,19 @@ def rod(peak: float, length: float = SIDE, nodes: int = 97) -> FieldGrid:
     return FieldGrid(np.stack([0 * x, -x * profile, y * profile]), spacing=spacing_of(nodes, box))
 
 
+def toroid(peak: float, nodes: int = 97) -> FieldGrid:
+    """An azimuthal field about the beam, Gaussian across and along it, in 1 mm.
+
+    `peak` is its largest line integral in T m.
+    """
+    box = (1.3 * SIDE, SIDE, SIDE)
+    z, y, x = nodes_of(nodes, box)
+    width, depth = SIDE / 9, SIDE / (2 * math.sqrt(2 * math.log(100)))
+    profile = np.exp(-(x**2 + y**2) / (2 * width**2) - z**2 / (2 * depth**2))
+    profile *= peak * math.exp(0.5) / (width * depth * math.sqrt(2 * math.pi))
+    return FieldGrid(np.stack([0 * x, -x * profile, y * profile]), spacing=spacing_of(nodes, box))
+
+
 def turbulence(rms: float, nodes: int = 97, slope: float = -11 / 3, seed: int = 0) -> FieldGrid:
     """A random field without divergence in a cube, `rms` in T, that fades towards the faces."""
     z, y, x = nodes_of(nodes, (SIDE,) * 3)
@@ -126,7 +139,7 @@ def measure_speed() -> None:
 def measure_steps() -> None:
     """Print the error of the deflection by the length of a step."""
     aim = np.random.default_rng(0).uniform(-60, 60, (2, 2000))
-    grids = {"rod": rod(0.02), "turbulence": turbulence(50.0), "bubble": bubble(100.0)}
+    grids = {"toroid": toroid(0.02), "turbulence": turbulence(50.0), "bubble": bubble(100.0)}
     for name, grid in grids.items():
         exact = trace_particles(grid, SETUP, aim, options=TraceOptions(step=0.02)).deflection
         for step in (1.0, 0.5, 0.25):
@@ -192,12 +205,12 @@ def measure_plasmapy() -> None:
     if importlib.util.find_spec("plasmapy") is None:
         print("plasmapy  not installed: pip install plasmapy")
         return
-    rod_grid = rod(0.02)
-    electric = np.asarray(rod_grid.magnetic)[[0, 2, 1]] * 1e7
+    magnetic = toroid(0.02)
+    electric = np.asarray(magnetic.magnetic)[[0, 2, 1]] * 1e7
     grids = {
-        "rod, B": rod_grid,
-        "rod, E": FieldGrid(electric=electric, spacing=rod_grid.spacing),
-        "rod, E and B": FieldGrid(rod_grid.magnetic, electric, spacing=rod_grid.spacing),
+        "toroid, B": magnetic,
+        "toroid, E": FieldGrid(electric=electric, spacing=magnetic.spacing),
+        "toroid, both": FieldGrid(magnetic.magnetic, electric, spacing=magnetic.spacing),
         "turbulence": turbulence(50.0),
         "bubble": bubble(100.0),
     }
