@@ -189,9 +189,10 @@ class _Task:
         systematic = {**evaluation.systematic, **self._by_energy()}
         if len(evaluation.samples):
             systematic |= self._by_readout() | self._by_product()
-        samples = evaluation.samples.copy()
+        samples = evaluation.samples
         for error in systematic.values():
-            samples += _standard_numbers(rng, len(samples))[:, None] * error
+            for sample, strength in zip(samples, _standard_numbers(rng, len(samples)), strict=True):
+                sample += strength * error
         quantities: list[dict[str, Quantity]] = [{} for _ in self.products]
         causes = [list(evaluation.causes) for _ in self.products]
         start = 0

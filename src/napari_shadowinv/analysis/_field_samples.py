@@ -41,6 +41,7 @@ _MIN_COARSE_SITES = 16
 _PILOT_SAMPLES = 8
 _MAX_REPEAT_ERROR = 0.02  # of the displacement, r.m.s., between a result and its repetition
 _LEAST_SHARE_OF_NOISE = 0.2  # of the discretisation error, for its cautions to matter
+_MANY_NUMBERS = 20_000  # of all products together
 _LEAST_NOISE = 1e-9  # of the brightest pixel
 
 
@@ -121,7 +122,7 @@ class StoredSamples:
         value = measure(self.potential, self.displacement)
         count = min(samples, len(self.changes))
         check_samples(count, value.size)
-        scatter = np.empty((count, value.size))
+        scatter = np.empty((count, value.size), sample_type(value.size))
         for index, change in enumerate(self.changes[:count]):
             reporter("samples", index, count)
             moved = self.displacement + displacement_from_potential(change)
@@ -162,8 +163,10 @@ class ResampledInversion:
         def quantities(changes: FloatArray) -> dict[str, Measure]:
             spacing = (inversion.image.size / number_of_inner_sites(inversion)) ** 0.5
             measures.append(choose(FieldNoise(changes, spacing)))
-            check_samples(samples, measures[0](self.potential, self.displacement).size)
-            return {"all": measures[0]}
+            size = measures[0](self.potential, self.displacement).size
+            check_samples(samples, size)
+            kind = sample_type(size)
+            return {"all": lambda *field: measures[0](*field).astype(kind, copy=False)}
 
         scatter = uncertainty(
             inversion.image,
@@ -185,7 +188,8 @@ class ResampledInversion:
             systematic["discretisation"] = coarse.share * change
         cautions = list(self._sample_cautions(scatter))
         cautions += self._repeat_cautions(scatter.inversion)
-        shifted = repeated.samples + (value - repeated.value)
+        shifted = repeated.samples
+        shifted += (value - repeated.value).astype(shifted.dtype)
         return Evaluation(value, shifted, systematic, tuple(causes), tuple(cautions))
 
     def _sample_cautions(self, scatter: Uncertainty) -> Iterator[Caution]:
@@ -287,7 +291,13 @@ def has_measured_source(inversion: Inversion) -> bool:
 
 def check_samples(count: int, size: int) -> None:
     """Refuse more numbers than fit in memory."""
-    check_memory((count, size), 8 * 3, "the samples of these products")
+    each = 4 * np.dtype(sample_type(size)).itemsize  # with copies of them
+    check_memory((count, size), each, "the samples of these products")
+
+
+def sample_type(size: int) -> type[Any]:
+    """Return the type of samples of some numbers: those of maps in single precision."""
+    return np.float32 if size > _MANY_NUMBERS else np.float64
 
 
 def sampled_fields(
