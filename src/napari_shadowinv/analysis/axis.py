@@ -1,0 +1,188 @@
+"""The axis of an object in the plane of a field: coordinates along and across it, and its place.
+
+- sample a field on both sides of an axis: `Axis`, `sample_sides`
+- find the axis from the symmetry of the field: `find_axis`; where a field has none: `asymmetry`
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.analysis.paths import interpolate_cubic
+
+__all__ = ["Axis", "asymmetry", "find_axis", "sample_sides"]
+
+_MAX_TILT = math.radians(20)
+_START_RADIUS = 0.3  # of the side across, while the axis is only sought
+_FITTED_RADIUS = 0.9  # of the largest, so that a shifted axis stays inside
+_TOLERANCE_PX = 1e-3
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A straight axis in the image plane.
+
+    Attributes
+    ----------
+    start, end : tuple of float
+        Its ends (y, x) in px.
+    """
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+
+    @property
+    def length(self) -> float:
+        """Distance of the ends in px."""
+        return math.dist(self.start, self.end)
+
+    @property
+    def direction(self) -> FloatArray:
+        """Unit vector (y, x) from start to end."""
+        return np.asarray((np.array(self.end) - np.array(self.start)) / self.length)
+
+    @property
+    def across(self) -> FloatArray:
+        """Unit vector (y, x) across the axis, to the right of an axis that points downwards."""
+        along_y, along_x = self.direction
+        return np.array([-along_x, along_y])
+
+    def places(self) -> FloatArray:
+        """Return distances from the start along the axis, one px apart."""
+        return np.arange(math.floor(self.length + 1e-9) + 1.0)
+
+    def points(self, places: FloatArray, offsets: FloatArray) -> FloatArray:
+        """Return points (places, offsets, 2) of the image."""
+        along = np.array(self.start) + places[:, None] * self.direction
+        return np.asarray(along[:, None] + offsets[:, None] * self.across)
+
+    def max_radius(self, shape: tuple[int, int]) -> float:
+        """Return the largest distance from the axis at which both sides are inside the image."""
+        limits = [math.inf]
+        for end in (self.start, self.end):
+            for place, step, count in zip(end, self.across, shape, strict=True):
+                if abs(step) > 1e-9:
+                    room = min(place + 0.5, count - 0.5 - place)
+                    limits.append(room / abs(step))
+        return max(min(limits), 0.0)
+
+
+def sample_sides(
+    component: FloatArray, axis: Axis, radius: int, *, is_odd: bool = True
+) -> tuple[FloatArray, FloatArray]:
+    """Return a component of the field on both sides of an axis.
+
+    Parameters
+    ----------
+    component : ndarray, shape (H, W)
+    axis : Axis
+    radius : int
+        Largest distance from the axis in px.
+    is_odd : bool
+        Whether the component changes its sign across the axis of a symmetric object; the second
+        side is then turned round.
+
+    Returns
+    -------
+    right, left : ndarray, shape (places, radius)
+        At the distances 0, 1, … px from the axis. They are equal if the field is symmetric.
+    """
+    offsets, places = np.arange(float(radius)), axis.places()
+    right = interpolate_cubic(component, axis.points(places, offsets))
+    left = interpolate_cubic(component, axis.points(places, -offsets))
+    return right, -left if is_odd else left
+
+
+def asymmetry(right: FloatArray, left: FloatArray) -> float:
+    """Return the difference of two sides relative to their mean (r.m.s.)."""
+    mean = float(np.linalg.norm(right + left)) / 2
+    return float(np.linalg.norm(right - left)) / mean if mean > 0 else math.inf
+
+
+def component_across(displacement: FloatArray, axis: Axis) -> FloatArray:
+    """Return the component of vectors (2, H, W) across an axis."""
+    return np.asarray(np.tensordot(axis.across, displacement, axes=1))
+
+
+def find_axis(
+    displacement: FloatArray,
+    direction: str = "vertical",
+    *,
+    start: Axis | None = None,
+    find_tilt: bool = True,
+) -> Axis:
+    """Return the axis about which the deflection across it is most nearly odd.
+
+    Parameters
+    ----------
+    displacement : ndarray, shape (2, H, W)
+        In px.
+    direction : {"vertical", "horizontal"}
+        Rough direction of the axis, unless a start is stated.
+    start : Axis, optional
+        To refine. Default: the best of all positions along that direction.
+    find_tilt : bool
+        Whether the axis may be inclined.
+
+    Returns
+    -------
+    Axis
+        From edge to edge of the image; of a start, between its ends.
+    """
+    shape = displacement.shape[1:]
+    if start is None:
+        start = _best_parallel(displacement, direction)
+    radius = max(int(_FITTED_RADIUS * start.max_radius(shape)), 4)
+    middle = (np.array(start.start) + np.array(start.end)) / 2
+    half = start.length / 2
+
+    def axis_at(shift: float, tilt: float) -> Axis:
+        along = math.cos(tilt) * start.direction + math.sin(tilt) * start.across
+        centre = middle + shift * start.across
+        first, last = centre - half * along, centre + half * along
+        return Axis((float(first[0]), float(first[1])), (float(last[0]), float(last[1])))
+
+    def mismatch(choice: FloatArray) -> float:
+        shift, tilt = float(choice[0]), float(choice[1]) / half if find_tilt else 0.0
+        if abs(tilt) > _MAX_TILT:
+            return math.inf
+        axis = axis_at(shift, tilt)
+        return asymmetry(*sample_sides(component_across(displacement, axis), axis, radius))
+
+    # Both numbers are px: the shift of the middle, and that of the ends against it.
+    size = 2 if find_tilt else 1
+    simplex = np.vstack([np.zeros(size), 1.0 * np.eye(size)])
+    best = minimize(
+        lambda choice: mismatch(np.append(choice, 0.0)),
+        np.zeros(size),
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "xatol": _TOLERANCE_PX, "fatol": 1e-9},
+    )
+    shift, tilt = (float(best.x[0]), float(best.x[1]) / half if find_tilt else 0.0)
+    return axis_at(shift, tilt)
+
+
+def _best_parallel(displacement: FloatArray, direction: str) -> Axis:
+    """Return the best of all axes along y or x, by whole pixels."""
+    height, width = displacement.shape[1:]
+    is_vertical = direction == "vertical"
+    component = displacement[1] if is_vertical else displacement[0].T
+    radius = max(int(_START_RADIUS * component.shape[1]), 4)
+    best, best_position = math.inf, component.shape[1] / 2
+    power = component**2
+    for position in range(radius, component.shape[1] - radius):
+        sides = component[:, position : position + radius]
+        mirrored = component[:, position : position - radius : -1]
+        odd = np.sum((sides - mirrored) ** 2) / 4
+        score = 1.0 - odd / max(float(power.sum()) / 2, 1e-300)
+        if score < best:
+            best, best_position = float(score), float(position)
+    if is_vertical:
+        return Axis((0.0, best_position), (height - 1.0, best_position))
+    # An axis along x points to the left, so that across points downwards.
+    return Axis((best_position, width - 1.0), (best_position, 0.0))

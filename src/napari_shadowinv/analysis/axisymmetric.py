@@ -1,0 +1,539 @@
+"""Profiles about an axis: `AxisymmetricProfile` from the side, `AzimuthalProfile` face-on.
+
+From the side, the profile follows from the deflection across the axis by an Abel inversion, see
+`napari_shadowinv.analysis.abel`: refractive index, gas density and temperature, or electron density
+of light; electric potential and radial field, or the axial field of a coil-like magnetic field, of
+particles. An azimuthal magnetic field is seen along its axis only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+from scipy.constants import mu_0
+
+from napari_shadowinv._system.validation import CombinationError
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.analysis.abel import choose_smoothing, operators
+from napari_shadowinv.analysis.axis import (
+    Axis,
+    asymmetry,
+    component_across,
+    find_axis,
+    sample_sides,
+)
+from napari_shadowinv.analysis.frame import FieldFrame
+from napari_shadowinv.analysis.lines import mask_cautions
+from napari_shadowinv.analysis.paths import interpolate_cubic
+from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Product, Variable
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.physics.beam import displacement_from_potential, length_text
+from napari_shadowinv.physics.setup import OpticalSetup
+from napari_shadowinv.physics.units import PIXEL
+
+__all__ = ["AxisymmetricProfile", "AzimuthalProfile"]
+
+_B, _E, _N = "path_integrated_b", "path_integrated_e", "line_integrated_density"
+_LENGTHS = ("displacement", "deflection_angle", "line_integrated_log_index")
+_MIN_RADIUS_PX = 8
+_DEFAULT_SMOOTHING = 1.0
+_EDGE_SHARE = 0.06  # of the radius, in which the field should have ended
+_NOTABLE_EDGE = 0.05  # of the largest deflection
+_NOTABLE_ASYMMETRY = 0.1
+_NOTABLE_LENGTH = 0.02  # of the distance to the source
+_PROFILE_END = 0.05  # of the largest value of a profile
+_AZIMUTHAL = (
+    "an azimuthal magnetic field is not visible from the side: its components across the beam "
+    "cancel in each line of sight (∫B dz = 0), so it deflects nothing there; view it along its "
+    "axis (product 'azimuthal'), or choose the component 'axial' for the field of a coil"
+)
+
+AxisPoints = tuple[tuple[float, float], tuple[float, float]]
+
+
+class AxisymmetricProfile(Product):
+    """Radial profiles of an object with an axis across the beam, by Abel inversion.
+
+    The two halves are averaged, and inverted apart as a check. Beyond the radius the object is
+    taken to be undisturbed, so that values are changes against the surroundings.
+    """
+
+    title = "axisymmetric profile"
+    place = 60
+    fields: ClassVar = (*_LENGTHS, _N, _E, _B)
+    reference: ClassVar = "Daun et al., Appl. Opt. 45, 4638 (2006)"
+    product: Literal["axisymmetric"] = "axisymmetric"
+    axis: AxisPoints | None = Field(
+        default=None,
+        title="Axis (px)",
+        description=(
+            "Two points (y, x) of the axis, which may be inclined; profiles are computed between "
+            "them. Default: found from the symmetry of the field, from edge to edge."
+        ),
+        json_schema_extra={"metavar": "Y,X Y,X"},
+    )
+    direction: Literal["vertical", "horizontal"] = Field(
+        default="vertical",
+        title="Direction",
+        description="Rough direction of an axis that is to be found.",
+    )
+    find_tilt: bool = Field(
+        default=True,
+        title="Inclined",
+        description="Whether an axis that is to be found may be inclined.",
+    )
+    radius: float | None = Field(
+        default=None,
+        ge=_MIN_RADIUS_PX,
+        allow_inf_nan=False,
+        title="Radius (px)",
+        description=(
+            "Distance from the axis in px beyond which the object is undisturbed. Default: the "
+            "nearest edge of the image."
+        ),
+    )
+    slice_width: float = Field(
+        default=1.0,
+        ge=0,
+        allow_inf_nan=False,
+        title="Slice (px)",
+        description=(
+            "Length along the axis in px over which a profile is averaged. 0: the whole axis."
+        ),
+    )
+    smoothing: float | None = Field(
+        default=None,
+        ge=0,
+        allow_inf_nan=False,
+        title="Smoothing",
+        description=(
+            "Weight of the profile's second differences against the deflections. Default: as far as "
+            "its error stays a quarter of that by noise, as the halves show it."
+        ),
+    )
+    component: Literal["azimuthal", "axial"] = Field(
+        default="azimuthal",
+        title="Component of B",
+        description=(
+            "Component of a magnetic field: 'axial' of a field without azimuthal component, such "
+            "as that of a coil. An azimuthal field is not visible from the side."
+        ),
+    )
+    gladstone_dale: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Gladstone-Dale constant (m³/kg)",
+        description=(
+            "(η - 1)/ρ of the gas in m³/kg, 2.26e-4 for air in visible light: gives the density."
+        ),
+    )
+    ambient_density: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Ambient density (kg/m³)",
+        description="Density of the undisturbed gas in kg/m³, 1.20 for air at 20 °C.",
+    )
+    ambient_temperature: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Ambient temperature (K)",
+        description=(
+            "Temperature of the undisturbed gas in K: gives that of the object, an ideal gas of "
+            "the same composition at the same pressure."
+        ),
+    )
+    axis_error: float | None = Field(
+        default=None,
+        ge=0,
+        title="Error of the axis (px)",
+        description="Standard error of the axis' position in px. Default: from the noise.",
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if self.ambient_density is not None and self.gladstone_dale is None:
+            raise CombinationError(
+                "{ambient_density} is set without {gladstone_dale}, expected both: the density "
+                "follows from the refractive index by that constant"
+            )
+        if self.ambient_temperature is not None and self.ambient_density is None:
+            raise CombinationError(
+                "{ambient_temperature} is set without {ambient_density}, expected both: the "
+                "temperature follows from the ratio of the densities"
+            )
+        if self.axis is not None and self.axis[0] == self.axis[1]:
+            raise CombinationError("{axis} has two equal points, expected a line with a length")
+        return self
+
+    def check(self, frame: FieldFrame) -> None:
+        super().check(frame)
+        if frame.unit.field == _B and self.component == "azimuthal":
+            raise InputError(_AZIMUTHAL)
+        if self.gladstone_dale is not None and not _is_index(frame):
+            raise InputError(
+                "a Gladstone-Dale constant is set, but the field is not a refractive index: "
+                "expected the result of a beam of light, with the unit rad or m"
+            )
+        if self.axis is not None:
+            frame.check_points(np.array(self.axis), "the axis")
+            self._radius_px(frame)
+
+    def _axis(self, frame: FieldFrame) -> Axis:
+        if self.axis is not None:
+            return Axis(*self.axis)
+        height, width = frame.shape
+        if self.direction == "vertical":
+            return Axis((0.0, (width - 1) / 2), (height - 1.0, (width - 1) / 2))
+        return Axis(((height - 1) / 2, width - 1.0), ((height - 1) / 2, 0.0))
+
+    def _radius_px(self, frame: FieldFrame) -> int:
+        most = self._axis(frame).max_radius(frame.shape)
+        if most < _MIN_RADIUS_PX:
+            raise InputError(
+                f"the axis comes within {most:.3g} px of the edge of the image, expected "
+                f"{_MIN_RADIUS_PX} px or more on both sides: shorten or move it"
+            )
+        if self.radius is not None and self.radius > most + 0.5:
+            raise InputError(
+                f"radius is {self.radius:g} px, expected at most {most:.1f} px: the distance of "
+                "the axis from the edge of the image"
+            )
+        return int(most if self.radius is None else min(self.radius, most))
+
+    def _component(self, displacement: FloatArray, axis: Axis, frame: FieldFrame) -> FloatArray:
+        """Return the deflection across the axis in px, or the axial magnetic field in T m."""
+        if frame.unit.field != _B:
+            return component_across(displacement, axis)
+        field = frame.field(displacement[0], displacement)
+        return np.asarray(np.tensordot(axis.direction, field, axes=1))
+
+    def _sides(
+        self, displacement: FloatArray, frame: FieldFrame, shift: float = 0.0
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return both sides of the object, (slices, radius), averaged over each slice."""
+        axis = self._axis(frame)
+        if shift:
+            start, end = (np.array(end) + shift * axis.across for end in (axis.start, axis.end))
+            axis = Axis((float(start[0]), float(start[1])), (float(end[0]), float(end[1])))
+        component = self._component(displacement, axis, frame)
+        is_odd = frame.unit.field != _B
+        sides = sample_sides(component, axis, self._radius_px(frame), is_odd=is_odd)
+        edges = self._slices(frame)
+        widths = np.diff([*edges, len(axis.places())])
+        right, left = (np.add.reduceat(side, edges, axis=0) / widths[:, None] for side in sides)
+        return right, left
+
+    def _slices(self, frame: FieldFrame) -> list[int]:
+        """Return the first place of each slice along the axis."""
+        count = len(self._axis(frame).places())
+        number = max(round(count / self.slice_width), 1) if self.slice_width else 1
+        return [int(place) for place in np.unique(np.linspace(0, count, number + 1)[:-1].round())]
+
+    def _operators(self, frame: FieldFrame) -> tuple[FloatArray, FloatArray]:
+        smoothing = _DEFAULT_SMOOTHING if self.smoothing is None else self.smoothing
+        of_deflection = frame.unit.field != _B
+        return operators(self._radius_px(frame), smoothing, of_deflection=of_deflection)
+
+    def adapt(self, potential: FloatArray, noise: FieldNoise | None, frame: FieldFrame) -> Self:
+        displacement = displacement_from_potential(potential)
+        changes: dict[str, object] = {}
+        if self.axis is None:
+            if frame.unit.field == _B:
+                raise InputError(
+                    "the axis of a magnetic field cannot be found from its symmetry, expected two "
+                    "points of the axis"
+                )
+            axis = find_axis(displacement, self.direction, find_tilt=self.find_tilt)
+            changes["axis"] = (axis.start, axis.end)
+            if noise is not None and self.axis_error is None:
+                changes["axis_error"] = _axis_error(displacement, noise, axis, self.find_tilt)
+        product = self.model_copy(update=changes)
+        if self.smoothing is None:
+            matrix, _ = product._operators(frame)
+            smoothing = choose_smoothing(matrix, *product._sides(displacement, frame))
+            product = product.model_copy(update={"smoothing": smoothing})
+        return product
+
+    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+        dims = ("along", "radius")
+        variables = {
+            name: Variable(dims, unit, long_name)
+            for name, (unit, long_name) in self._names(frame).items()
+        }
+        first = next(iter(variables.values()))
+        variables["half_difference"] = Variable(
+            dims, first.unit, f"{first.long_name}, right half minus left half"
+        )
+        variables["asymmetry"] = Variable(
+            (), "1", "Difference of the halves of the deflection, relative (r.m.s.)"
+        )
+        variables["edge"] = Variable((), "1", "Deflection at the edge, relative to the largest")
+        return variables
+
+    def _names(self, frame: FieldFrame) -> dict[str, tuple[str, str]]:
+        field = frame.unit.field
+        if field == _B:
+            return {"axial_field": ("T", "Axial magnetic field")}
+        if field == _E:
+            return {
+                "electric_potential": ("V", "Electric potential"),
+                "radial_field": ("V/m", "Radial electric field"),
+            }
+        if field == _N:
+            return {"electron_density": ("m⁻³", "Electron density")}
+        if not _is_index(frame):
+            return {"profile": (PIXEL, "Deflection potential for each pixel along the beam")}
+        names = {"refractive_index": ("1", "Change of the refractive index")}
+        if self.gladstone_dale is not None:
+            names["density_change"] = ("kg/m³", "Change of the density")
+        if self.ambient_density is not None:
+            names["density"] = ("kg/m³", "Density")
+        if self.ambient_temperature is not None:
+            names["temperature"] = ("K", "Temperature at constant pressure")
+        return names
+
+    def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
+        count = len(self._axis(frame).places())
+        edges = np.array([*self._slices(frame), count])
+        middles = (edges[:-1] + edges[1:] - 1) / 2
+        unit = frame.length_unit
+        radii = np.arange(float(self._radius_px(frame)))
+        return {
+            "along": Coordinate(frame.length(1.0) * middles, unit, "Distance along the axis"),
+            "radius": Coordinate(frame.length(1.0) * radii, unit, "Distance from the axis"),
+        }
+
+    def measure(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
+        right, left = self._sides(displacement, frame)
+        _, inverse = self._operators(frame)
+        values = self._profiles((right + left) / 2 @ inverse.T, frame)
+        scale = self._scale(frame)
+        values["half_difference"] = scale * (right - left) @ inverse.T
+        values["asymmetry"] = np.asarray(asymmetry(right, left))
+        mean = np.abs((right + left) / 2)
+        width = max(round(_EDGE_SHARE * mean.shape[1]), 2)
+        edge = np.abs((right + left)[:, -width:].mean(axis=1) / 2).max()
+        values["edge"] = np.asarray(edge / max(mean.max(), 1e-300))
+        return values
+
+    def _scale(self, frame: FieldFrame) -> float:
+        """Return the first of the profiles for a profile of 1 px."""
+        field, setup, pixel = frame.unit.field, frame.setup, frame.pixel
+        unit_plane = np.ones(1)
+        if field == _B:
+            return 1.0 / pixel
+        if setup is None or not (field in (_E, _N) or _is_index(frame)):
+            return 1.0
+        if field == _E:
+            return float(setup.field_in_si(_E, np.ones((2, 1)))[0, 0])
+        if field == _N:
+            return float(setup.field_in_si(_N, unit_plane)[0]) / pixel
+        return -float(setup.potential(unit_plane)[0]) / pixel
+
+    def _profiles(self, profile: FloatArray, frame: FieldFrame) -> dict[str, FloatArray]:
+        first, *others = self._names(frame)
+        change = self._scale(frame) * profile
+        values = {first: change}
+        if "radial_field" in others:
+            # The profile is even at the axis and ends at 0.
+            padded = np.concatenate([change[:, 1:2], change, 0 * change[:, :1]], axis=1)
+            values["radial_field"] = -(padded[:, 2:] - padded[:, :-2]) / (2 * frame.pixel)
+        if self.gladstone_dale is not None:
+            values["density_change"] = change / self.gladstone_dale
+        if self.ambient_density is not None:
+            values["density"] = self.ambient_density + values["density_change"]
+        if self.ambient_temperature is not None and self.ambient_density is not None:
+            ratio = values["density"] / self.ambient_density
+            hot = self.ambient_temperature / np.where(ratio > 0, ratio, np.nan)
+            values["temperature"] = hot
+        return values
+
+    def systematic(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
+        """Return the change of the profile by one more smoothing, and by the error of the axis."""
+        matrix, inverse = self._operators(frame)
+        right, left = self._sides(displacement, frame)
+        profile = (right + left) / 2 @ inverse.T
+        values = self._profiles(profile, frame)
+        again = self._profiles(profile @ matrix.T @ inverse.T, frame)
+        errors = {name: np.abs(again[name] - values[name]) for name in values}
+        if self.axis_error:
+            sides = (self._sides(displacement, frame, sign * self.axis_error) for sign in (1, -1))
+            moved = [self._profiles((a + b) / 2 @ inverse.T, frame) for a, b in sides]
+            for name, error in errors.items():
+                change = np.abs(moved[0][name] + moved[1][name] - 2 * values[name]) / 2
+                errors[name] = np.hypot(error, change)
+        return errors
+
+    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
+        axis, radius = self._axis(frame), self._radius_px(frame)
+        points = axis.points(axis.places(), np.arange(-radius + 1.0, radius)).reshape(-1, 2)
+        cautions = mask_cautions(points, frame, "the object")
+        edge, halves = (float(quantities[name].value) for name in ("edge", "asymmetry"))
+        if edge > _NOTABLE_EDGE:
+            text = (
+                f"the deflection at the edge is {edge:.0%} of the largest: the object does not end "
+                "inside the radius, which shifts and bends the profile; use a wider image"
+            )
+            cautions.append(Caution("cut-object", text))
+        if halves > _NOTABLE_ASYMMETRY:
+            text = (
+                f"the halves of the object differ by {halves:.0%} (r.m.s.): it is not symmetric "
+                "about this axis, and the profile is that of the mean of the halves"
+            )
+            cautions.append(Caution("misfit", text))
+        profile = quantities[next(iter(self._names(frame)))].value
+        return [*cautions, *_length_cautions(np.abs(profile), frame)]
+
+    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
+        remarks = [
+            "The profile assumes rotational symmetry about the axis, and no change beyond the "
+            "radius; an inclination of the axis towards the beam is not seen."
+        ]
+        if self.axis is not None:
+            axis = self._axis(frame)
+            (y0, x0), (y1, x1) = axis.start, axis.end
+            error = "" if self.axis_error is None else f", position ± {self.axis_error:.2g} px"
+            remarks.append(
+                f"The axis runs from y = {y0:.1f}, x = {x0:.1f} to y = {y1:.1f}, x = {x1:.1f} px"
+                f"{error}."
+            )
+        if self.ambient_temperature is not None:
+            remarks.append(
+                "Density and temperature assume one Gladstone-Dale constant and one molar mass "
+                "everywhere; those of burnt gas differ from those of air by several per cent."
+            )
+        return tuple(remarks)
+
+
+class AzimuthalProfile(Product):
+    """Azimuthal magnetic field around an axis along the beam, and the current that it encloses.
+
+    Seen along its axis an azimuthal field deflects radially, so its line integral is read off: the
+    mean of ∫B_φ dz over circles. The enclosed current is 2πr ∫B_φ dz / µ₀, in A m, since the field
+    is integrated along the beam. Positive fields run counter-clockwise in the image as shown.
+    """
+
+    title = "azimuthal field along the beam"
+    place = 65
+    fields: ClassVar = (_B,)
+    product: Literal["azimuthal"] = "azimuthal"
+    center: tuple[float, float] = Field(
+        title="Centre (px)",
+        description="Centre (y, x) of the circles in px.",
+        json_schema_extra={"metavar": "Y,X"},
+    )
+    radius: float | None = Field(
+        default=None,
+        ge=_MIN_RADIUS_PX,
+        allow_inf_nan=False,
+        title="Radius (px)",
+        description="Radius of the largest circle in px. Default: up to the edge of the image.",
+    )
+
+    def check(self, frame: FieldFrame) -> None:
+        super().check(frame)
+        frame.check_points(np.array([self.center]), "the centre")
+        self._radii(frame)
+
+    def _radii(self, frame: FieldFrame) -> FloatArray:
+        pairs = zip(self.center, frame.shape, strict=True)
+        most = min(min(place, count - 1 - place) for place, count in pairs)
+        if most < _MIN_RADIUS_PX:
+            raise InputError(
+                f"the centre is {most:.3g} px from the edge of the image, expected at least "
+                f"{_MIN_RADIUS_PX} px"
+            )
+        if self.radius is not None and self.radius > most + 0.5:
+            raise InputError(
+                f"radius is {self.radius:g} px, expected at most {most:.1f} px: the distance of "
+                "the centre from the edge of the image"
+            )
+        return np.arange(float(int(most if self.radius is None else min(self.radius, most))) + 1.0)
+
+    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+        dims = ("radius",)
+        return {
+            "azimuthal_field": Variable(dims, "T m", "Path-integrated azimuthal magnetic field"),
+            "current": Variable(dims, "A m", "Path-integrated enclosed current"),
+            "variation": Variable(dims, "T m", "Variation of the field along the circle (r.m.s.)"),
+        }
+
+    def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
+        radii = frame.length(1.0) * self._radii(frame)
+        return {"radius": Coordinate(radii, frame.length_unit, "Distance from the axis")}
+
+    def measure(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
+        radii = self._radii(frame)
+        angles = 2 * np.pi * np.arange(max(int(6 * radii[-1]), 16)) / max(int(6 * radii[-1]), 16)
+        sine, cosine = np.sin(angles), np.cos(angles)
+        points = np.array(self.center) + radii[:, None, None] * np.stack([sine, cosine], axis=-1)
+        field = frame.field(potential, displacement)
+        # Counter-clockwise with y downwards: along (y, x) = (-cos, sin) of the angle from x to y.
+        azimuthal = -cosine * interpolate_cubic(field[0], points)
+        azimuthal += sine * interpolate_cubic(field[1], points)
+        mean = azimuthal.mean(axis=1)
+        # With x to the right, y down and z into the screen, a current along the beam has a
+        # field from x to y, which is clockwise as shown.
+        return {
+            "azimuthal_field": mean,
+            "current": -2 * np.pi * frame.length(1.0) * radii * mean / mu_0,
+            "variation": azimuthal.std(axis=1),
+        }
+
+    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
+        return (
+            "A positive current flows along the beam, and its field runs clockwise in the image.",
+        )
+
+
+def _is_index(frame: FieldFrame) -> bool:
+    """Return whether the field is that of the refractive index, in SI units."""
+    is_light = isinstance(frame.setup, OpticalSetup)
+    return is_light and frame.unit.field in ("deflection_angle", "line_integrated_log_index")
+
+
+def _axis_error(
+    displacement: FloatArray, noise: FieldNoise, axis: Axis, find_tilt: bool
+) -> float | None:
+    """Return the standard error of the axis in px, r.m.s. over its length."""
+    positions = []
+    for change in noise.potentials:
+        moved = displacement + displacement_from_potential(change)
+        shifted = find_axis(moved, start=axis, find_tilt=find_tilt)
+        ends = np.array([shifted.start, shifted.end]) - np.array([axis.start, axis.end])
+        positions.append(ends @ axis.across)
+    if len(positions) < 2:
+        return None
+    return float(np.sqrt(np.var(positions, axis=0, ddof=1).mean()))
+
+
+def _length_cautions(profile: FloatArray, frame: FieldFrame) -> list[Caution]:
+    """Warn of an object that is not thin against its distance from a point source."""
+    setup = frame.setup
+    if setup is None or setup.is_collimated:
+        return []
+    strong = np.flatnonzero((profile > _PROFILE_END * profile.max()).any(axis=0))
+    length = 2 * frame.length(float(strong.max()) if len(strong) else 0.0)
+    share = length / setup.source_object_distance
+    if share <= _NOTABLE_LENGTH:
+        return []
+    text = (
+        f"the object is {length_text(length)} long along the beam, {share:.0%} of its distance "
+        "from the source: rays are not parallel inside it and magnify its front more than its "
+        "back, which the Abel inversion does not allow for"
+    )
+    return [Caution("setup", text)]
