@@ -140,8 +140,8 @@ def choose_smoothing(matrix: FloatArray, side: FloatArray, opposite_side: FloatA
     """Return the largest smoothing whose error is small against that by noise.
 
     The sides of an axisymmetric object differ by their noise, and half of their difference is the
-    error of their mean. The profile is smoothed as far as one more smoothing changes it by a quarter
-    of that (r.m.s.), so that bands by noise hold.
+    error of their mean. The profile is smoothed as far as one more smoothing changes it by a
+    quarter of that (r.m.s.), so that bands by noise hold.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def choose_smoothing(matrix: FloatArray, side: FloatArray, opposite_side: FloatA
     """
     if not np.isfinite([side, opposite_side]).all():
         raise InputError("the deflections are not finite, expected numbers everywhere")
-    best = _SMOOTHINGS[0]
+    best: float = _SMOOTHINGS[0]
     for smoothing in _SMOOTHINGS:
         inverse = inverse_matrix(matrix, smoothing)
         profile = (side + opposite_side) / 2 @ inverse.T

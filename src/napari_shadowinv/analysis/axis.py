@@ -132,9 +132,10 @@ def find_axis(
     Returns
     -------
     Axis
-        From edge to edge of the image; of a start, between its ends.
+        So long that all of its both sides are inside the image; of a start, as long as that.
     """
     shape = displacement.shape[1:]
+    is_free = start is None
     if start is None:
         start = _best_parallel(displacement, direction)
     radius = max(int(_FITTED_RADIUS * start.max_radius(shape)), 4)
@@ -163,8 +164,20 @@ def find_axis(
         method="Nelder-Mead",
         options={"initial_simplex": simplex, "xatol": _TOLERANCE_PX, "fatol": 1e-9},
     )
-    shift, tilt = (float(best.x[0]), float(best.x[1]) / half if find_tilt else 0.0)
-    return axis_at(shift, tilt)
+    axis = axis_at(float(best.x[0]), float(best.x[1]) / half if find_tilt else 0.0)
+    return _inset(axis, shape) if is_free else axis
+
+
+def _inset(axis: Axis, shape: tuple[int, ...]) -> Axis:
+    """Shorten an inclined axis so that its sides do not leave the image at its ends."""
+    wide = int(np.argmax(np.abs(axis.across)))
+    room = min(min(end[wide], shape[wide] - 1 - end[wide]) for end in (axis.start, axis.end))
+    margin = room * abs(axis.across[1 - wide]) / abs(axis.direction[1 - wide])
+    if not 0 < 2 * margin < axis.length:
+        return axis
+    start = np.array(axis.start) + margin * axis.direction
+    end = np.array(axis.end) - margin * axis.direction
+    return Axis((float(start[0]), float(start[1])), (float(end[0]), float(end[1])))
 
 
 def _best_parallel(displacement: FloatArray, direction: str) -> Axis:

@@ -47,6 +47,8 @@ _NOTABLE_EDGE = 0.05  # of the largest deflection
 _NOTABLE_ASYMMETRY = 0.1
 _NOTABLE_LENGTH = 0.02  # of the distance to the source
 _PROFILE_END = 0.05  # of the largest value of a profile
+_MIN_DRAWS = 3
+_TILT_ERRORS = 2.0  # below which an inclination is not significant
 _AZIMUTHAL = (
     "an azimuthal magnetic field is not visible from the side: its components across the beam "
     "cancel in each line of sight (∫B dz = 0), so it deflects nothing there; view it along its "
@@ -112,8 +114,8 @@ class AxisymmetricProfile(Product):
         allow_inf_nan=False,
         title="Smoothing",
         description=(
-            "Weight of the profile's second differences against the deflections. Default: as far as "
-            "its error stays a quarter of that by noise, as the halves show it."
+            "Weight of the profile's second differences against the deflections. Default: as "
+            "far as its error stays a quarter of that by noise, which the halves show."
         ),
     )
     component: Literal["azimuthal", "axial"] = Field(
@@ -251,10 +253,10 @@ class AxisymmetricProfile(Product):
                     "the axis of a magnetic field cannot be found from its symmetry, expected two "
                     "points of the axis"
                 )
-            axis = find_axis(displacement, self.direction, find_tilt=self.find_tilt)
+            axis, error = _found_axis(displacement, noise, self.direction, self.find_tilt)
             changes["axis"] = (axis.start, axis.end)
-            if noise is not None and self.axis_error is None:
-                changes["axis_error"] = _axis_error(displacement, noise, axis, self.find_tilt)
+            if self.axis_error is None:
+                changes["axis_error"] = error
         product = self.model_copy(update=changes)
         if self.smoothing is None:
             matrix, _ = product._operators(frame)
@@ -506,19 +508,23 @@ def _is_index(frame: FieldFrame) -> bool:
     return is_light and frame.unit.field in ("deflection_angle", "line_integrated_log_index")
 
 
-def _axis_error(
-    displacement: FloatArray, noise: FieldNoise, axis: Axis, find_tilt: bool
-) -> float | None:
-    """Return the standard error of the axis in px, r.m.s. over its length."""
-    positions = []
+def _found_axis(
+    displacement: FloatArray, noise: FieldNoise | None, direction: str, find_tilt: bool
+) -> tuple[Axis, float | None]:
+    """Return the axis with its standard error in px; an inclination within its error is none."""
+    axis = find_axis(displacement, direction, find_tilt=find_tilt)
+    if noise is None or len(noise.potentials) < _MIN_DRAWS:
+        return axis, None
+    ends = []
     for change in noise.potentials:
         moved = displacement + displacement_from_potential(change)
         shifted = find_axis(moved, start=axis, find_tilt=find_tilt)
-        ends = np.array([shifted.start, shifted.end]) - np.array([axis.start, axis.end])
-        positions.append(ends @ axis.across)
-    if len(positions) < 2:
-        return None
-    return float(np.sqrt(np.var(positions, axis=0, ddof=1).mean()))
+        ends.append((np.array([shifted.start, shifted.end]) - [axis.start, axis.end]) @ axis.across)
+    start, end = np.array(ends).T
+    tilt = abs(axis.across[0] if direction == "vertical" else axis.across[1]) * axis.length
+    if find_tilt and tilt < _TILT_ERRORS * float(np.std(end - start, ddof=1)):
+        return _found_axis(displacement, noise, direction, find_tilt=False)
+    return axis, float(np.sqrt((np.var(start, ddof=1) + np.var(end, ddof=1)) / 2))
 
 
 def _length_cautions(profile: FloatArray, frame: FieldFrame) -> list[Caution]:
