@@ -48,7 +48,7 @@ _NOTABLE_ASYMMETRY = 0.1
 _NOTABLE_LENGTH = 0.02  # of the distance to the source
 _PROFILE_END = 0.05  # of the largest value of a profile
 _MIN_DRAWS = 3
-_TILT_ERRORS = 2.0  # below which an inclination is not significant
+_TILT_ERRORS = 4.0  # of three draws, below which an inclination is not significant
 _AZIMUTHAL = (
     "an azimuthal magnetic field is not visible from the side: its components across the beam "
     "cancel in each line of sight (∫B dz = 0), so it deflects nothing there; view it along its "
@@ -278,6 +278,9 @@ class AxisymmetricProfile(Product):
             (), "1", "Difference of the halves of the deflection, relative (r.m.s.)"
         )
         variables["edge"] = Variable((), "1", "Deflection at the edge, relative to the largest")
+        variables["axis_offset"] = Variable(
+            (), frame.length_unit, "Symmetry axis of the field, offset from the axis"
+        )
         return variables
 
     def _names(self, frame: FieldFrame) -> dict[str, tuple[str, str]]:
@@ -326,6 +329,7 @@ class AxisymmetricProfile(Product):
         width = max(round(_EDGE_SHARE * mean.shape[1]), 2)
         edge = np.abs((right + left)[:, -width:].mean(axis=1) / 2).max()
         values["edge"] = np.asarray(edge / max(mean.max(), 1e-300))
+        values["axis_offset"] = np.asarray(frame.length(_axis_offset(right, left)))
         return values
 
     def _scale(self, frame: FieldFrame) -> float:
@@ -525,6 +529,16 @@ def _found_axis(
     if find_tilt and tilt < _TILT_ERRORS * float(np.std(end - start, ddof=1)):
         return _found_axis(displacement, noise, direction, find_tilt=False)
     return axis, float(np.sqrt((np.var(start, ddof=1) + np.var(end, ddof=1)) / 2))
+
+
+def _axis_offset(right: FloatArray, left: FloatArray) -> float:
+    """Return by how many px the axis of the field is to the right of the assumed axis.
+
+    To first order, halves (δ(y), -δ(-y)) differ by -2 Δ δ'(y) of a field that is shifted by Δ.
+    """
+    slope = np.gradient((right + left) / 2, axis=1)
+    size = float(np.sum(slope**2))
+    return -float(np.sum((right - left) * slope)) / (2 * size) if size > 0 else 0.0
 
 
 def _length_cautions(profile: FloatArray, frame: FieldFrame) -> list[Caution]:

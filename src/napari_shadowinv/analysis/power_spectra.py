@@ -1,0 +1,324 @@
+"""Power spectra of a field in a window, and their power laws.
+
+- weights of a window without masked pixels: `window_weights`
+- the spectrum of the displacement: `RingSpectrum`, `ring_spectrum`
+- the exponent of a power law: `fit_exponent`
+- random displacements with a spectrum: `random_displacement`
+- how an inversion changes the spectrum: `measure_response`
+
+Wavenumbers k are angular, in rad/px. Of the displacement d two spectra are in use, which differ by a
+factor 2πk, and their exponents by one: the *ring-summed* P(k), with ∫P dk = ⟨|d|²⟩, and the
+*ring-averaged* density P(k)/2πk, with ∫∫ P/2πk dk_x dk_y = ⟨|d|²⟩. Here P is ring-summed unless it
+is called a density.
+
+The spectrum is that of the Laplacian of the potential, divided by that of the operator. The
+Laplacian is nearly white where the displacement has a steep spectrum, so that less power leaks from
+large structures to small ones at the edge of the window.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+from scipy.optimize import minimize_scalar
+
+from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion._invert import invert
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.forward import synthetic_image
+
+__all__ = [
+    "RingSpectrum",
+    "fit_exponent",
+    "measure_response",
+    "random_displacement",
+    "ring_spectrum",
+    "window_weights",
+]
+
+_MIN_SIDE_PX = 32
+_MIN_RINGS = 4
+_EXPONENTS = -12.0, 6.0
+_MARGIN = 0.15  # of the image's side, around a random field
+_CORRECTIONS = 2  # of the spectrum by the response that belongs to it
+_SMALLEST_RESPONSE = 0.05
+
+
+def window_weights(mask: BoolArray, taper: float) -> FloatArray:
+    """Return weights that rise from 0 at the border and at masked pixels to 1.
+
+    Parameters
+    ----------
+    mask : ndarray of bool, shape (H, W)
+        Pixels to be used.
+    taper : float
+        Share of the shorter side, at each end, over which the weights rise as a squared sine.
+
+    Raises
+    ------
+    InputError
+        If the image is smaller than 32 px, or the masked pixels leave nothing.
+    """
+    side = min(mask.shape)
+    if side < _MIN_SIDE_PX:
+        raise InputError(
+            f"the image has {mask.shape[0]} × {mask.shape[1]} px, expected at least {_MIN_SIDE_PX} "
+            "px each way for a spectrum"
+        )
+    width = max(taper * side, 1.0)
+    weights = np.ones(mask.shape)
+    for axis, count in enumerate(mask.shape):
+        places = np.arange(count) + 0.5
+        rise = _rise(np.minimum(places, count - places) / width)
+        weights *= rise[:, None] if axis == 0 else rise
+    if not mask.all():
+        weights *= _rise((distance_transform_edt(mask) - 0.5) / width)
+    if not (weights > 0.5).any():
+        raise InputError(
+            f"masked pixels leave no region as wide as {2 * width:.0f} px, expected a wider one or "
+            "a smaller taper"
+        )
+    return weights
+
+
+def _rise(share: FloatArray) -> FloatArray:
+    return np.asarray(np.sin(np.pi / 2 * np.clip(share, 0.0, 1.0)) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class RingSpectrum:
+    """Power of the displacement in rings of wavenumbers.
+
+    Attributes
+    ----------
+    k : ndarray, shape (n,)
+        Wavenumbers of the rings, rad/px, multiples of their width.
+    power : ndarray, shape (n,)
+        Ring-summed spectrum P, px² for each rad/px.
+    modes : ndarray, shape (n,)
+        Number of independent modes in each ring, less than those of the grid by the window.
+    """
+
+    k: FloatArray
+    power: FloatArray
+    modes: FloatArray
+
+    @property
+    def width(self) -> float:
+        """Width of a ring in rad/px."""
+        return float(self.k[0])
+
+    @property
+    def density(self) -> FloatArray:
+        """Ring-averaged spectrum P/2πk, px² for each (rad/px)²."""
+        return np.asarray(self.power / (2 * np.pi * self.k))
+
+
+def ring_numbers(k: FloatArray, width: float) -> IntArray:
+    """Return the ring of each mode: 1 for wavenumbers around `width`."""
+    return np.rint(k / width).astype(np.int64)
+
+
+def ring_spectrum(potential: FloatArray, weights: FloatArray) -> RingSpectrum:
+    """Return the spectrum of the displacement d = -∇φ in a window.
+
+    Parameters
+    ----------
+    potential : ndarray, shape (H, W)
+        In px².
+    weights : ndarray, shape (H, W)
+        Of `window_weights`.
+
+    Returns
+    -------
+    RingSpectrum
+        From one wavelength in the shorter side up to 0.9 of the Nyquist frequency.
+    """
+    plane = np.pad(potential, 1, mode="edge")
+    curvature = plane[2:, 1:-1] + plane[:-2, 1:-1] + plane[1:-1, 2:] + plane[1:-1, :-2]
+    curvature = curvature - 4 * potential
+    norm = float((weights**2).sum())
+    mean = float((weights * curvature).sum() / weights.sum())
+    modes = np.abs(np.fft.fft2(weights * (curvature - mean))) ** 2 / (norm * potential.size)
+    k_y, k_x = (2 * np.pi * np.fft.fftfreq(count) for count in potential.shape)
+    k = np.hypot(k_y[:, None], k_x)
+    operator = 4 - 2 * np.cos(k_y)[:, None] - 2 * np.cos(k_x)
+    operator[0, 0] = 1.0
+    of_displacement = modes * k**2 / operator**2
+    width = 2 * np.pi / min(potential.shape)
+    count = int(0.9 * np.pi / width)
+    rings = np.minimum(ring_numbers(k, width), count + 1).ravel()
+    size = count + 2
+    summed = np.bincount(rings, of_displacement.ravel(), size)[1 : count + 1]
+    number = np.bincount(rings, minlength=size)[1 : count + 1]
+    # Half of the modes repeat the others, and a window correlates neighbours.
+    share = norm**2 / (float((weights**4).sum()) * weights.size)
+    at = width * np.arange(1, count + 1)
+    # The mean over the modes of a ring, times its exact area, is smoother than their sum.
+    power = summed / number * (2 * np.pi * at) * weights.size / (2 * np.pi) ** 2
+    return RingSpectrum(at, power, number / 2 * share)
+
+
+def fit_exponent(k: FloatArray, power: FloatArray, modes: FloatArray) -> tuple[float, float]:
+    """Return exponent and amplitude of a power law P = A kᵖ, by maximum likelihood.
+
+    The power of each mode is distributed exponentially about its mean (Whittle's likelihood), so
+    that rings count by their modes, and a ring with little power does not dominate as it would in a
+    fit of logarithms.
+
+    Parameters
+    ----------
+    k, power, modes : ndarray, shape (n,)
+        Of the rings of a range; at least 4, else an `InputError`.
+
+    Examples
+    --------
+    >>> k = np.arange(1.0, 9.0)
+    >>> exponent, amplitude = fit_exponent(k, 3 * k**-2.5, np.ones(8))
+    >>> round(exponent, 3), round(amplitude, 3)
+    (-2.5, 3.0)
+    """
+    if len(k) < _MIN_RINGS:
+        raise InputError(
+            f"the range of wavenumbers holds {len(k)} rings, expected at least {_MIN_RINGS} for a "
+            "slope: widen it"
+        )
+    centre = float(np.exp(np.average(np.log(k), weights=modes)))
+    ratio, share = k / centre, modes / modes.sum()
+
+    def amplitude(exponent: float) -> float:
+        return max(float(np.sum(share * power * ratio**-exponent)), 1e-300)
+
+    best = minimize_scalar(
+        lambda exponent: np.log(amplitude(exponent)) + exponent * np.sum(share * np.log(ratio)),
+        bounds=_EXPONENTS,
+        method="bounded",
+        options={"xatol": 1e-6},
+    )
+    exponent = float(best.x)
+    return exponent, float(amplitude(exponent) * centre**-exponent)
+
+
+def random_displacement(
+    density: Callable[[FloatArray], FloatArray], shape: tuple[int, int], rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return potential and displacement of a Gaussian random field, periodic in its shape.
+
+    Parameters
+    ----------
+    density : callable
+        Ring-averaged spectrum of the displacement at wavenumbers in rad/px, px² for each (rad/px)².
+    shape : tuple of int
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    potential : ndarray, shape (H, W)
+    displacement : ndarray, shape (2, H, W)
+    """
+    k_y, k_x = (2 * np.pi * np.fft.fftfreq(count) for count in shape)
+    k = np.hypot(k_y[:, None], k_x)
+    k[0, 0] = np.inf
+    size = float(np.prod(shape))
+    finite = np.isfinite(k)
+    of_mode = np.zeros(shape)
+    of_mode[finite] = np.maximum(density(k[finite]), 0.0) * (2 * np.pi) ** 2 / size
+    noise = np.fft.fft2(rng.normal(size=shape)) * np.sqrt(size)
+    waves = noise * np.sqrt(of_mode) / k
+    potential = np.fft.ifft2(waves).real
+    # Of an even side the highest frequency has no derivative.
+    slopes = [np.where(np.abs(each) < np.pi, each, 0.0) for each in (k_y, k_x)]
+    steps = (1j * slopes[0][:, None], 1j * slopes[1])
+    displacement = -np.stack([np.fft.ifft2(waves * step).real for step in steps])
+    return potential, displacement
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Spectrum of an inversion relative to that of the field, in the rings of a spectrum.
+
+    Attributes
+    ----------
+    ratio : ndarray, shape (n,)
+        Retrieved over true power.
+    spread : ndarray, shape (n,)
+        Standard error of the ratio, from the scatter of the phantoms; 0 of one phantom.
+    contrast : float
+        R.m.s. divergence of the displacement of the phantoms.
+    """
+
+    ratio: FloatArray
+    spread: FloatArray
+    contrast: float
+
+
+def measure_response(
+    spectrum: RingSpectrum, weights: FloatArray, n_sites: int, *, phantoms: int, seed: int
+) -> Response:
+    """Measure how an inversion changes a spectrum, on random fields with that spectrum.
+
+    Rays cross, and small structures are lost, the more the stronger the field. Random fields are
+    made with the measured spectrum, imaged, inverted and measured in the same window. As the
+    measured spectrum is too low where power is lost, it is corrected and the response measured
+    again.
+
+    Parameters
+    ----------
+    spectrum : RingSpectrum
+        As measured, less its noise.
+    weights : ndarray, shape (H, W)
+        Of the window.
+    n_sites : int
+        Number of sites of the inversion.
+    phantoms : int
+        Number of random fields for each of the two passes, at least 1.
+    seed : int
+    """
+    ratio = np.ones(len(spectrum.k))
+    spread, contrast = np.zeros(len(spectrum.k)), 0.0
+    for _ in range(_CORRECTIONS):
+        # The same random numbers in each pass, so that the passes differ by the spectrum alone.
+        rng = np.random.default_rng(seed)
+        power = spectrum.power / np.maximum(ratio, _SMALLEST_RESPONSE)
+        density = _density_of(spectrum.k, power)
+        pairs = [_phantom_spectra(density, weights, n_sites, rng) for _ in range(phantoms)]
+        true, retrieved = (np.array([pair[side].power for pair in pairs]) for side in (0, 1))
+        contrast = float(np.mean([pair[2] for pair in pairs]))
+        ratio = retrieved.sum(axis=0) / np.maximum(true.sum(axis=0), 1e-300)
+        if phantoms > 1:
+            ratios = retrieved / np.maximum(true, 1e-300)
+            spread = np.asarray(ratios.std(axis=0, ddof=1) / phantoms**0.5)
+    return Response(ratio, spread, contrast)
+
+
+def _density_of(k: FloatArray, power: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return a ring-averaged spectrum as a function; none beyond the rings."""
+    density = np.maximum(power, 0.0) / (2 * np.pi * k)
+    return lambda at: np.where(at <= k[-1], np.interp(at, k, density), 0.0)
+
+
+def _phantom_spectra(
+    density: Callable[[FloatArray], FloatArray],
+    weights: FloatArray,
+    n_sites: int,
+    rng: np.random.Generator,
+) -> tuple[RingSpectrum, RingSpectrum, float]:
+    """Return the spectra of a random field and of its inversion, and its r.m.s. divergence."""
+    margins = [int(np.ceil(_MARGIN * count)) for count in weights.shape]
+    shape = tuple(count + 2 * margin for count, margin in zip(weights.shape, margins, strict=True))
+    inner = tuple(
+        slice(margin, margin + count)
+        for count, margin in zip(weights.shape, margins, strict=True)
+    )
+    potential, displacement = random_displacement(density, (shape[0], shape[1]), rng)
+    image = synthetic_image(displacement)[inner]
+    options = InversionOptions(n_sites=n_sites, noise_level=1e-3)
+    inversion = invert(image, source=np.ones(weights.shape), options=options)
+    divergence = sum(np.gradient(part, axis=axis) for axis, part in enumerate(displacement))
+    contrast = float(np.std(np.asarray(divergence)[inner]))
+    true = ring_spectrum(potential[inner], weights)
+    return true, ring_spectrum(inversion.potential, weights), contrast
