@@ -202,9 +202,11 @@ class _Task:
             for cause, error in systematic.items():
                 if len(samples) and error[part].any() and cause not in causes[place]:
                     causes[place].append(cause)
+            value, scatter = evaluation.value[part], samples[:, part]
+            if self.products[place].subtracts_noise and len(scatter):
+                scatter = scatter + (value - scatter.mean(axis=0))
             quantities[place][name] = Quantity(
-                evaluation.value[part].reshape(shape),
-                samples[:, part].reshape(len(samples), *shape),
+                value.reshape(shape), scatter.reshape(len(samples), *shape)
             )
         frame = self.field.frame
         doubts = caution_facts(evaluation.cautions)

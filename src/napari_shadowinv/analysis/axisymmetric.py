@@ -26,9 +26,14 @@ from napari_shadowinv.analysis.axis import (
     sample_sides,
 )
 from napari_shadowinv.analysis.frame import FieldFrame
-from napari_shadowinv.analysis.lines import mask_cautions
 from napari_shadowinv.analysis.paths import interpolate_cubic
-from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Product, Variable
+from napari_shadowinv.analysis.product import (
+    Coordinate,
+    FieldNoise,
+    Product,
+    Variable,
+    mask_cautions,
+)
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.error_bars import Quantity

@@ -6,8 +6,8 @@
 - random displacements with a spectrum: `random_displacement`
 - how an inversion changes the spectrum: `measure_response`
 
-Wavenumbers k are angular, in rad/px. Of the displacement d two spectra are in use, which differ by a
-factor 2πk, and their exponents by one: the *ring-summed* P(k), with ∫P dk = ⟨|d|²⟩, and the
+Wavenumbers k are angular, in rad/px. Of the displacement d two spectra are in use, which differ by
+a factor 2πk, and their exponents by one: the *ring-summed* P(k), with ∫P dk = ⟨|d|²⟩, and the
 *ring-averaged* density P(k)/2πk, with ∫∫ P/2πk dk_x dk_y = ⟨|d|²⟩. Here P is ring-summed unless it
 is called a density.
 
@@ -44,8 +44,9 @@ _MIN_SIDE_PX = 32
 _MIN_RINGS = 4
 _EXPONENTS = -12.0, 6.0
 _MARGIN = 0.15  # of the image's side, around a random field
-_CORRECTIONS = 2  # of the spectrum by the response that belongs to it
+_CORRECTIONS = 2  # of the spectrum by a response of one phantom, before the final response
 _SMALLEST_RESPONSE = 0.05
+_SMOOTHED_SHARE = 0.1  # of k, over which the response is averaged
 
 
 def window_weights(mask: BoolArray, taper: float) -> FloatArray:
@@ -246,7 +247,7 @@ class Response:
     ratio : ndarray, shape (n,)
         Retrieved over true power.
     spread : ndarray, shape (n,)
-        Standard error of the ratio, from the scatter of the phantoms; 0 of one phantom.
+        Standard error of its logarithm, from the scatter of the phantoms; 0 of one phantom.
     contrast : float
         R.m.s. divergence of the displacement of the phantoms.
     """
@@ -263,8 +264,8 @@ def measure_response(
 
     Rays cross, and small structures are lost, the more the stronger the field. Random fields are
     made with the measured spectrum, imaged, inverted and measured in the same window. As the
-    measured spectrum is too low where power is lost, it is corrected and the response measured
-    again.
+    measured spectrum is too low where power is lost, it is corrected by the response of a first
+    field, and again by that of a second, before the response is measured.
 
     Parameters
     ----------
@@ -275,24 +276,37 @@ def measure_response(
     n_sites : int
         Number of sites of the inversion.
     phantoms : int
-        Number of random fields for each of the two passes, at least 1.
+        Number of random fields for the response itself, at least 1.
     seed : int
     """
     ratio = np.ones(len(spectrum.k))
     spread, contrast = np.zeros(len(spectrum.k)), 0.0
-    for _ in range(_CORRECTIONS):
+    for count in (*(1,) * _CORRECTIONS, phantoms):
         # The same random numbers in each pass, so that the passes differ by the spectrum alone.
         rng = np.random.default_rng(seed)
         power = spectrum.power / np.maximum(ratio, _SMALLEST_RESPONSE)
         density = _density_of(spectrum.k, power)
-        pairs = [_phantom_spectra(density, weights, n_sites, rng) for _ in range(phantoms)]
-        true, retrieved = (np.array([pair[side].power for pair in pairs]) for side in (0, 1))
+        pairs = [_phantom_spectra(density, weights, n_sites, rng) for _ in range(count)]
+        true = np.array([pair[0].power for pair in pairs])
+        retrieved = np.array([pair[1].power for pair in pairs])
         contrast = float(np.mean([pair[2] for pair in pairs]))
-        ratio = retrieved.sum(axis=0) / np.maximum(true.sum(axis=0), 1e-300)
-        if phantoms > 1:
-            ratios = retrieved / np.maximum(true, 1e-300)
-            spread = np.asarray(ratios.std(axis=0, ddof=1) / phantoms**0.5)
+        logarithms = np.log(np.maximum(retrieved, 1e-300) / np.maximum(true, 1e-300))
+        smooth = _ring_smoother(spectrum)
+        smoothed = logarithms @ smooth.T
+        ratio = np.exp(smoothed.mean(axis=0))
+        if count > 1:
+            spread = smoothed.std(axis=0, ddof=1) / count**0.5
+            spread = np.sqrt(smooth @ spread**2)  # itself known from few phantoms
     return Response(ratio, spread, contrast)
+
+
+def _ring_smoother(spectrum: RingSpectrum) -> FloatArray:
+    """Return the matrix of a mean over neighbouring rings, weighted by their modes."""
+    numbers = np.arange(1, len(spectrum.k) + 1)
+    reach = np.maximum(1.0, _SMOOTHED_SHARE * numbers)[:, None]
+    distance = np.abs(numbers[:, None] - numbers)
+    smoother = np.where(distance <= reach, spectrum.modes, 0.0)
+    return np.asarray(smoother / smoother.sum(axis=1, keepdims=True))
 
 
 def _density_of(k: FloatArray, power: FloatArray) -> Callable[[FloatArray], FloatArray]:
@@ -311,8 +325,7 @@ def _phantom_spectra(
     margins = [int(np.ceil(_MARGIN * count)) for count in weights.shape]
     shape = tuple(count + 2 * margin for count, margin in zip(weights.shape, margins, strict=True))
     inner = tuple(
-        slice(margin, margin + count)
-        for count, margin in zip(weights.shape, margins, strict=True)
+        slice(margin, margin + count) for count, margin in zip(weights.shape, margins, strict=True)
     )
     potential, displacement = random_displacement(density, (shape[0], shape[1]), rng)
     image = synthetic_image(displacement)[inner]

@@ -1,0 +1,515 @@
+"""The spectrum of a turbulent field, from its line integrals: `TurbulenceSpectrum`.
+
+The spectrum P(k) of the line integrals b = ∫B dz is *ring-summed*: ∫P dk = ⟨|b|²⟩. For isotropic,
+homogeneous turbulence over a path l_z much longer than its correlation length, the energy spectrum
+follows from it [1]_:
+
+====================  ==============================  ==========================
+field                 E(k)                            normalisation
+====================  ==============================  ==========================
+magnetic, solenoidal  k P(k) / (π l_z)                ∫E dk = ⟨|B|²⟩ / 2
+electric, a gradient  k P(k) / (2π l_z)               ∫E dk = ⟨|E|²⟩ / 2
+electron density      k P(k) / (π l_z)                ∫E dk = ⟨δn²⟩
+====================  ==============================  ==========================
+
+The factors hold for the ring-summed spectrum. With the ring-averaged density P/2πk it is
+E = 2 k² times the density / l_z, so a spectrum E ∝ k^(-5/3) has P ∝ k^(-8/3), which is -2.67, and a
+density ∝ k^(-11/3).
+
+References
+----------
+.. [1] A. F. A. Bott et al., "Proton imaging of stochastic magnetic fields", J. Plasma Phys. 83,
+   905830614 (2017).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from napari_shadowinv._system.validation import CombinationError
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.analysis.frame import FieldFrame
+from napari_shadowinv.analysis.power_spectra import (
+    RingSpectrum,
+    fit_exponent,
+    measure_response,
+    ring_spectrum,
+    window_weights,
+)
+from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Product, Variable
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Fact, Level
+from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.physics.units import PIXEL
+
+__all__ = ["TurbulenceSpectrum"]
+
+_B, _E, _N = "path_integrated_b", "path_integrated_e", "line_integrated_density"
+_PLANES = (_N, "line_integrated_log_index")
+_ENERGY_FACTORS = {_B: math.pi, _E: 2 * math.pi, _N: math.pi}
+_RMS_FACTORS = {_B: 2.0, _E: 2.0, _N: 1.0}  # ⟨|B|²⟩ over ∫E dk
+_SYMBOLS = {_B: ("T", "Magnetic field"), _E: ("V/m", "Electric field"), _N: ("m⁻³", "Density")}
+_MAX_CONTRAST = 1.0
+_MAX_RAW_CONTRAST = 0.8  # as the inversion returns less
+_LEAST_RING = 3  # three wavelengths in the window
+_MAX_NOISE = 0.25  # of the power
+_RESPONSE_RANGE = 0.5, 2.0
+_RESPONSE_SPREAD = 0.25
+_MAX_K = 0.5  # of the Nyquist frequency
+_MIN_SPACINGS = 4.0  # wavelength, in spacings of the sites
+_MIN_SUBWINDOW_PX = 64
+_SUBWINDOWS = 3  # along each axis, overlapping by half
+
+
+class TurbulenceSpectrum(Product):
+    """Power spectrum of the field, its slope, and energy spectrum and r.m.s. field of turbulence.
+
+    The mean power of the noise is subtracted, and the loss by the inversion, measured on random
+    fields with the same spectrum, is corrected. Slope and r.m.s. field are those of the range of
+    wavenumbers that can be trusted.
+    """
+
+    title = "turbulence spectrum"
+    place = 70
+    fields: ClassVar = ("displacement", "deflection_angle", *_PLANES, _E, _B)
+    reference: ClassVar = "A. F. A. Bott et al., J. Plasma Phys. 83, 905830614 (2017)"
+    subtracts_noise: ClassVar = True
+    product: Literal["spectrum"] = "spectrum"
+    path_length: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Path length (m)",
+        description=(
+            "Length l_z of the turbulence along the beam in m: gives the energy spectrum and the "
+            "r.m.s. field. Default: unknown."
+        ),
+    )
+    correlation_length: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Correlation length (m)",
+        description=(
+            "Correlation length of the field in m, for the r.m.s. field from ⟨|b|²⟩ alone. "
+            "Default: that of the spectrum, (π/2) ∫E/k dk / ∫E dk."
+        ),
+    )
+    longest: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Longest wavelength (px)",
+        description=(
+            "Longest wavelength of the range of slope and r.m.s. field, in px. Default: a third of "
+            "the window."
+        ),
+    )
+    shortest: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        title="Shortest wavelength (px)",
+        description=(
+            "Shortest wavelength of that range, in px. Default: where noise, resolution or the "
+            "response of the inversion end what can be trusted."
+        ),
+    )
+    slope: bool = Field(
+        default=True,
+        title="Slope",
+        description="Whether to fit a power law; refused where rays cross too often for one image.",
+    )
+    taper: float = Field(
+        default=0.125,
+        gt=0,
+        le=0.5,
+        title="Taper",
+        description="Share of the shorter side over which the window rises, at each end.",
+    )
+    phantoms: int = Field(
+        default=2,
+        ge=0,
+        le=50,
+        title="Phantoms",
+        description=(
+            "Number of random fields on which the response of the inversion is measured. 0: no "
+            "correction."
+        ),
+    )
+    seed: int = Field(default=0, ge=0, title="Seed", description="Seed of the random fields.")
+    noise_power: tuple[float, ...] = Field(
+        default=(),
+        title="Power of the noise",
+        description="Mean ring-summed power by noise. Default: measured.",
+        json_schema_extra={"hidden": True},
+    )
+    response: tuple[float, ...] = Field(
+        default=(),
+        title="Response",
+        description="Retrieved over true power of each ring. Default: measured.",
+        json_schema_extra={"hidden": True},
+    )
+    response_spread: tuple[float, ...] = Field(
+        default=(),
+        title="Spread of the response",
+        description="Standard error of the response. Default: measured.",
+        json_schema_extra={"hidden": True},
+    )
+    resolution: float = Field(
+        default=0.0,
+        ge=0,
+        title="Resolution (px)",
+        description="Spacing of the sites in px; 0 without sites. Default: that of the inversion.",
+        json_schema_extra={"hidden": True},
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        longest, shortest = self.longest, self.shortest
+        if longest is not None and shortest is not None and longest <= shortest:
+            raise CombinationError(
+                f"{{longest}} is {longest:g} px and {{shortest}} {shortest:g} px, "
+                "expected the longest wavelength to be the longer one"
+            )
+        if self.correlation_length is not None and self.path_length is None:
+            raise CombinationError(
+                "{correlation_length} is set without {path_length}, expected both for a r.m.s. "
+                "field"
+            )
+        return self
+
+    def check(self, frame: FieldFrame) -> None:
+        super().check(frame)
+        if self.path_length is not None and frame.unit.field not in _ENERGY_FACTORS:
+            raise InputError(
+                "a path length is set, but an energy spectrum is defined for a magnetic or "
+                "electric field or a density only, and the field is in "
+                f"{frame.unit.symbol}: choose another unit, or no path length"
+            )
+        window_weights(frame.mask, self.taper)
+
+    def adapt(self, potential: FloatArray, noise: FieldNoise | None, frame: FieldFrame) -> Self:
+        weights = window_weights(frame.mask, self.taper)
+        spectrum = ring_spectrum(potential, weights)
+        changes: dict[str, object] = {}
+        if noise is not None and not self.noise_power and len(noise.potentials):
+            draws = [ring_spectrum(change, weights).power for change in noise.potentials]
+            changes["noise_power"] = tuple(map(float, np.mean(draws, axis=0)))
+        if noise is not None and noise.spacing and not self.resolution:
+            changes["resolution"] = float(noise.spacing)
+        product = self.model_copy(update=changes)
+        is_inversion, phantom_contrast = product.resolution > 0, 0.0
+        if self.phantoms and is_inversion and not self.response:
+            less_noise = RingSpectrum(
+                spectrum.k, product._signal(spectrum), spectrum.modes
+            )  # fmt: skip
+            response = measure_response(
+                less_noise,
+                weights,
+                max(round(potential.size / product.resolution**2), 16),
+                phantoms=self.phantoms,
+                seed=self.seed,
+            )
+            phantom_contrast = response.contrast
+            changes["response"] = tuple(map(float, response.ratio))
+            changes["response_spread"] = tuple(map(float, response.spread))
+            product = self.model_copy(update=changes)
+        contrast = max(product._contrast(spectrum), phantom_contrast)
+        most = _MAX_CONTRAST if product.response else _MAX_RAW_CONTRAST
+        if self.slope and is_inversion and contrast > most:
+            raise InputError(
+                f"the contrast of the image is {contrast:.2g}, expected at most {most:g} for a "
+                "slope from one image: rays cross so often that the inversion returns a false one; fit "
+                "several images, or ask for the spectrum without a slope"
+            )
+        return product
+
+    def _signal(self, spectrum: RingSpectrum) -> FloatArray:
+        """Return the power less that of the noise."""
+        return spectrum.power - (np.array(self.noise_power) if self.noise_power else 0.0)
+
+    def _corrected(self, spectrum: RingSpectrum) -> FloatArray:
+        """Return the power less that of the noise, over the response where it is measured."""
+        signal = self._signal(spectrum)
+        if not self.response:
+            return signal
+        response = np.array(self.response)
+        low, high = _RESPONSE_RANGE
+        return np.asarray(signal / np.clip(response, low / 2, 2 * high))
+
+    def _contrast(self, spectrum: RingSpectrum) -> float:
+        """Return the r.m.s. divergence of the displacement."""
+        power = np.where(self._resolved(spectrum), self._corrected(spectrum), 0.0)
+        return float(np.sqrt(max((power * spectrum.k**2).sum(), 0.0) * spectrum.width))
+
+    def _resolved(self, spectrum: RingSpectrum) -> BoolArray:
+        """Return the rings above the noise and within the resolution."""
+        k = spectrum.k
+        rings = k <= _MAX_K * np.pi
+        if self.resolution:
+            rings &= k <= 2 * np.pi / (_MIN_SPACINGS * self.resolution)
+        if self.noise_power:
+            rings &= np.array(self.noise_power) <= _MAX_NOISE * spectrum.power
+        return np.asarray(rings)
+
+    def _trusted(self, spectrum: RingSpectrum) -> BoolArray:
+        """Return the rings whose response is near 1, too: the longest range without a gap."""
+        rings = self._resolved(spectrum)
+        if self.response:
+            response, (low, high) = np.array(self.response), _RESPONSE_RANGE
+            rings &= (response >= low) & (response <= high)
+        if self.response_spread:
+            rings &= np.array(self.response_spread) <= _RESPONSE_SPREAD
+        rings[: _LEAST_RING - 1] = False
+        return _longest_run(rings)
+
+    def _range(self, spectrum: RingSpectrum) -> BoolArray:
+        """Return the rings of slope and r.m.s. field: trusted, and within the chosen limits."""
+        k = spectrum.k
+        rings = self._trusted(spectrum)
+        if self.longest is not None:
+            rings &= k >= 2 * np.pi / self.longest * (1 - 1e-9)
+        if self.shortest is not None:
+            rings &= k <= 2 * np.pi / self.shortest * (1 + 1e-9)
+        return rings
+
+    def _scale(self, frame: FieldFrame) -> float:
+        """Return the field for a displacement of 1 px; of a plane for a potential of 1 px · m."""
+        field = frame.unit.field
+        if frame.setup is None or field == "displacement":
+            return 1.0
+        if field in _PLANES:
+            return abs(float(frame.setup.field_in_si(field, np.ones(1))[0])) / frame.pixel
+        return float(np.abs(frame.setup.field_in_si(field, np.ones((2, 1)))).max())
+
+    def _in_si(self, spectrum: RingSpectrum, power: FloatArray, frame: FieldFrame) -> FloatArray:
+        """Return a power of the displacement, for rad/px, as that of the field, for rad/m."""
+        in_si = self._scale(frame) ** 2 * frame.pixel * power
+        if frame.unit.field in _PLANES:  # of the potential instead of its gradient
+            in_si = in_si / (spectrum.k / frame.pixel) ** 2
+        return np.asarray(in_si)
+
+    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+        dims, unit, name = ("k",), frame.si_unit, frame.long_name.lower()
+        length = frame.length_unit
+        squared = f"({unit})²"
+        variables = {
+            "power": Variable(dims, f"{squared} {length}", f"Ring-summed spectrum P(k), {name}"),
+            "density": Variable(
+                dims, f"{squared} {length}²", f"Ring-averaged density P(k)/2πk, {name}"
+            ),
+            "noise": Variable(dims, f"{squared} {length}", "Ring-summed spectrum of the noise"),
+            "ratio": Variable(dims, "1", "Response of the inversion, retrieved over true power"),
+            "trusted": Variable(dims, "1", "Whether the ring is in the range of the slope"),
+            "rms": Variable((), unit, f"{frame.long_name}, r.m.s. in the range"),
+            "contrast": Variable((), "1", "Contrast, r.m.s. divergence of the displacement"),
+            "correlation_length": Variable(
+                (), length, "Correlation length in the range, (π/2) ∫E/k dk / ∫E dk"
+            ),
+        }
+        if self.slope:
+            variables["slope_power"] = Variable((), "1", "Slope of the ring-summed spectrum P(k)")
+            variables["slope"] = Variable((), "1", "Slope of the energy spectrum E(k) ∝ k P(k)")
+        if self.path_length is not None:
+            symbol, title = _SYMBOLS[frame.unit.field]
+            variables["energy"] = Variable(
+                dims, f"({symbol})² {length}", f"{title}, energy spectrum E(k)"
+            )
+            variables["rms_field"] = Variable(
+                (), symbol, f"{title}, r.m.s., by ∫E dk over the path length"
+            )
+            variables["rms_by_correlation"] = Variable(
+                (), symbol, f"{title}, r.m.s., by path and correlation length"
+            )
+        return variables
+
+    def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
+        k = ring_spectrum(np.zeros(frame.shape), window_weights(frame.mask, self.taper)).k
+        unit = "rad/m" if frame.setup is not None else f"rad/{PIXEL}"
+        return {"k": Coordinate(k / frame.pixel, unit, "Wavenumber k = 2π / wavelength")}
+
+    def measure(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
+        spectrum = ring_spectrum(potential, window_weights(frame.mask, self.taper))
+        return self._measure(spectrum, frame)
+
+    def _measure(self, spectrum: RingSpectrum, frame: FieldFrame) -> dict[str, FloatArray]:
+        rings = self._range(spectrum)
+        k, width = spectrum.k / frame.pixel, spectrum.width / frame.pixel
+        power = self._in_si(spectrum, self._corrected(spectrum), frame)
+        shape = np.ones_like(k)
+        noise = np.array(self.noise_power) if self.noise_power else np.nan * shape
+        total = max(float(power[rings].sum()) * width, 0.0)
+        weighted = max(float((k * power)[rings].sum()) * width, 0.0)
+        correlation = math.pi / 2 * total / weighted if weighted else math.nan
+        values = {
+            "power": power,
+            "density": power / (2 * np.pi * k),
+            "noise": self._in_si(spectrum, noise, frame),
+            "ratio": np.array(self.response) if self.response else np.nan * shape,
+            "trusted": rings.astype(np.float64),
+            "rms": np.asarray(math.sqrt(total)),
+            "contrast": np.asarray(self._contrast(spectrum)),
+            "correlation_length": np.asarray(correlation),
+        }
+        if self.slope:
+            exponent, _ = fit_exponent(k[rings], power[rings], spectrum.modes[rings])
+            values["slope_power"] = np.asarray(exponent)
+            values["slope"] = np.asarray(exponent + 1)
+        if self.path_length is not None:
+            field, path = frame.unit.field, self.path_length
+            energy = k * power / (_ENERGY_FACTORS[field] * path)
+            mean_square = _RMS_FACTORS[field] * weighted / (_ENERGY_FACTORS[field] * path)
+            # ⟨B²⟩ = ⟨|b|²⟩ / (l_z ℓ): the same with the correlation length of the spectrum.
+            length = self.correlation_length or correlation
+            by_length = total / (path * length) * _RMS_FACTORS[field] * math.pi / 2
+            values["energy"] = energy
+            values["rms_field"] = np.asarray(math.sqrt(mean_square))
+            values["rms_by_correlation"] = np.asarray(
+                math.sqrt(by_length / _ENERGY_FACTORS[field]) if by_length >= 0 else math.nan
+            )
+        return values
+
+    def systematic(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
+        """Return the errors by the finite number of structures in the window, and the response."""
+        weights = window_weights(frame.mask, self.taper)
+        spectrum = ring_spectrum(potential, weights)
+        values, rings = self._measure(spectrum, frame), self._range(spectrum)
+        share = 1 / np.sqrt(spectrum.modes)
+        if self.response_spread:
+            share = np.hypot(share, np.array(self.response_spread))
+        errors = {name: np.abs(values[name]) * share for name in ("power", "density")}
+        power = values["power"][rings]
+        for name, order in (("rms", 0), ("rms_field", 1), ("rms_by_correlation", 0)):
+            if name in values and power.sum() > 0:
+                part = spectrum.k[rings] ** order * power
+                relative = np.linalg.norm(part * share[rings]) / part.sum() / 2
+                errors[name] = np.abs(values[name]) * relative
+        if "energy" in values:
+            errors["energy"] = np.abs(values["energy"]) * share
+        if self.slope:
+            error = np.asarray(self._slope_error(potential, spectrum, frame))
+            errors |= {"slope": error, "slope_power": error}
+        return errors
+
+    def _slope_error(
+        self, potential: FloatArray, spectrum: RingSpectrum, frame: FieldFrame
+    ) -> float:
+        """Return the standard error of the slope, by its scatter over parts of the image."""
+        rings = self._range(spectrum)
+        k_range = spectrum.k[rings][[0, -1]]
+        size = [count // 2 for count in potential.shape]
+        slopes, modes = [], 0.0
+        steps = [np.linspace(0, count - side, _SUBWINDOWS).astype(int)
+                 for count, side in zip(potential.shape, size, strict=True)]  # fmt: skip
+        for top in steps[0]:
+            for left in steps[1]:
+                part = np.s_[top : top + size[0], left : left + size[1]]
+                if min(size) < _MIN_SUBWINDOW_PX or not frame.mask[part].all():
+                    continue
+                window = ring_spectrum(potential[part], window_weights(frame.mask[part], 0.5))
+                inside = (window.k >= k_range[0]) & (window.k <= k_range[1])
+                inside[: _LEAST_RING - 1] = False
+                if inside.sum() < 4:
+                    continue
+                power = self._interpolated(window, spectrum)
+                slopes.append(
+                    fit_exponent(window.k[inside], power[inside], window.modes[inside])[0]
+                )
+                modes = float(window.modes[inside].sum())
+        expected = _exponent_error(spectrum.k[rings], spectrum.modes[rings])
+        if len(slopes) < _SUBWINDOWS:
+            return expected
+        # The parts hold fewer modes than the window as a whole.
+        ratio = modes / float(spectrum.modes[rings].sum())
+        return max(float(np.std(slopes, ddof=1)) * math.sqrt(ratio), expected)
+
+    def _interpolated(self, window: RingSpectrum, spectrum: RingSpectrum) -> FloatArray:
+        """Return the power of a part of the image, corrected like that of the whole."""
+        power = window.power
+        if self.noise_power:
+            power = power - np.interp(window.k, spectrum.k, self.noise_power)
+        if self.response:
+            power = power / np.interp(window.k, spectrum.k, self.response)
+        return np.asarray(power)
+
+    def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
+        numbers = {
+            name: quantity
+            for name, quantity in quantities.items()
+            if not quantity.value.ndim or name in ("power", "energy")
+        }
+        facts = super().facts(numbers, frame)
+        rings = np.flatnonzero(quantities["trusted"].value)
+        k = self.coordinates(frame)["k"]
+        if len(rings):
+            low, high = 2 * np.pi / k.values[rings[[0, -1]]]
+            factor, unit = (1e3, "mm") if frame.setup is not None else (1.0, "px")
+            text = f"wavelengths of {factor * high:.3g} to {factor * low:.3g} {unit}"
+            facts.append(Fact("range", "Trusted range", text))
+        else:
+            facts.append(Fact("range", "Trusted range", "none", Level.DOUBTFUL))
+        return facts
+
+    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
+        cautions = []
+        contrast = float(quantities["contrast"].value)
+        if contrast > _MAX_CONTRAST and self.resolution:
+            text = (
+                f"the contrast is {contrast:.2g}, above {_MAX_CONTRAST:g}: rays cross so often "
+                "that the spectrum of one image is too weak, and its slope wrong; fit several "
+                "images"
+            )
+            cautions.append(Caution("folds", text))
+        if self.resolution and not self.response:
+            text = (
+                "the loss of small structures by the inversion is not corrected, which makes a "
+                "spectrum too steep; choose one phantom or more"
+            )
+            cautions.append(Caution("accuracy", text))
+        return cautions
+
+    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
+        remarks = [
+            "P(k) is summed over rings, so that its integral over k is the mean square; the "
+            "density is averaged over rings, and its slope is less by one."
+        ]
+        if self.path_length is not None:
+            remarks.append(
+                f"E(k) assumes isotropic, homogeneous turbulence over a path of "
+                f"{1e3 * self.path_length:.4g} mm, much longer than its correlation length; the "
+                "r.m.s. field is that of the trusted range."
+            )
+        remarks.append(
+            "Bands of slope and r.m.s. field hold the scatter between parts of the image, as the "
+            "window has a finite number of structures."
+        )
+        return tuple(remarks)
+
+
+def _longest_run(rings: BoolArray) -> BoolArray:
+    """Return the longest run of true values alone."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], rings.astype(int), [0]])))
+    run = np.zeros_like(rings)
+    if len(ends):
+        starts, stops = ends[::2], ends[1::2]
+        longest = int(np.argmax(stops - starts))
+        run[starts[longest] : stops[longest]] = True
+    return run
+
+
+def _exponent_error(k: FloatArray, modes: FloatArray) -> float:
+    """Return the standard error of an exponent for a power law with Gaussian modes."""
+    logarithm = np.log(k)
+    mean = np.average(logarithm, weights=modes)
+    return float(1 / np.sqrt(np.sum(modes * (logarithm - mean) ** 2)))
