@@ -46,6 +46,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.physics.beam import length_text
 from napari_shadowinv.physics.units import PIXEL
 
 __all__ = ["TurbulenceSpectrum"]
@@ -57,6 +58,7 @@ _RMS_FACTORS = {_B: 2.0, _E: 2.0, _N: 1.0}  # ⟨|B|²⟩ over ∫E dk
 _SYMBOLS = {_B: ("T", "Magnetic field"), _E: ("V/m", "Electric field"), _N: ("m⁻³", "Density")}
 _MAX_CONTRAST = 1.0
 _MAX_RAW_CONTRAST = 0.8  # as the inversion returns less
+_MIN_RINGS = 4
 _LEAST_RING = 3  # three wavelengths in the window
 _MAX_NOISE = 0.25  # of the power
 _RESPONSE_RANGE = 0.5, 2.0
@@ -162,6 +164,12 @@ class TurbulenceSpectrum(Product):
         description="Standard error of the response. Default: measured.",
         json_schema_extra={"hidden": True},
     )
+    rings: tuple[int, int] | None = Field(
+        default=None,
+        title="Rings",
+        description="First and last ring of the trusted range. Default: measured.",
+        json_schema_extra={"hidden": True},
+    )
     resolution: float = Field(
         default=0.0,
         ge=0,
@@ -226,8 +234,19 @@ class TurbulenceSpectrum(Product):
         if self.slope and is_inversion and contrast > most:
             raise InputError(
                 f"the contrast of the image is {contrast:.2g}, expected at most {most:g} for a "
-                "slope from one image: rays cross so often that the inversion returns a false one; fit "
-                "several images, or ask for the spectrum without a slope"
+                "slope from one image: rays cross so often that the inversion returns a false "
+                "one; fit several images, or ask for the spectrum without a slope"
+            )
+        trusted = np.flatnonzero(product._trusted(spectrum)) + 1
+        ends = (int(trusted[0]), int(trusted[-1])) if len(trusted) else (0, 0)
+        product = product.model_copy(update={"rings": ends})
+        count = int(product._range(spectrum).sum())
+        if self.slope and count < _MIN_RINGS:
+            raise InputError(
+                f"the range has {count} trusted rings of wavenumbers, expected at least "
+                f"{_MIN_RINGS} for a slope: noise, a spacing of the sites of "
+                f"{product.resolution:.2g} px and crossed rays end the range; ask for the spectrum "
+                "without a slope"
             )
         return product
 
@@ -273,7 +292,11 @@ class TurbulenceSpectrum(Product):
     def _range(self, spectrum: RingSpectrum) -> BoolArray:
         """Return the rings of slope and r.m.s. field: trusted, and within the chosen limits."""
         k = spectrum.k
-        rings = self._trusted(spectrum)
+        if self.rings is None:
+            rings = self._trusted(spectrum)
+        else:
+            number = np.arange(1, len(k) + 1)
+            rings = (number >= self.rings[0]) & (number <= self.rings[1])
         if self.longest is not None:
             rings &= k >= 2 * np.pi / self.longest * (1 - 1e-9)
         if self.shortest is not None:
@@ -305,8 +328,6 @@ class TurbulenceSpectrum(Product):
             "density": Variable(
                 dims, f"{squared} {length}²", f"Ring-averaged density P(k)/2πk, {name}"
             ),
-            "noise": Variable(dims, f"{squared} {length}", "Ring-summed spectrum of the noise"),
-            "ratio": Variable(dims, "1", "Response of the inversion, retrieved over true power"),
             "trusted": Variable(dims, "1", "Whether the ring is in the range of the slope"),
             "rms": Variable((), unit, f"{frame.long_name}, r.m.s. in the range"),
             "contrast": Variable((), "1", "Contrast, r.m.s. divergence of the displacement"),
@@ -314,6 +335,14 @@ class TurbulenceSpectrum(Product):
                 (), length, "Correlation length in the range, (π/2) ∫E/k dk / ∫E dk"
             ),
         }
+        if self.noise_power:
+            variables["noise"] = Variable(
+                dims, f"{squared} {length}", "Ring-summed spectrum of the noise"
+            )
+        if self.response:
+            variables["ratio"] = Variable(
+                dims, "1", "Response of the inversion, retrieved over true power"
+            )
         if self.slope:
             variables["slope_power"] = Variable((), "1", "Slope of the ring-summed spectrum P(k)")
             variables["slope"] = Variable((), "1", "Slope of the energy spectrum E(k) ∝ k P(k)")
@@ -331,7 +360,7 @@ class TurbulenceSpectrum(Product):
         return variables
 
     def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
-        k = ring_spectrum(np.zeros(frame.shape), window_weights(frame.mask, self.taper)).k
+        k = self._empty(frame).k
         unit = "rad/m" if frame.setup is not None else f"rad/{PIXEL}"
         return {"k": Coordinate(k / frame.pixel, unit, "Wavenumber k = 2π / wavelength")}
 
@@ -345,16 +374,12 @@ class TurbulenceSpectrum(Product):
         rings = self._range(spectrum)
         k, width = spectrum.k / frame.pixel, spectrum.width / frame.pixel
         power = self._in_si(spectrum, self._corrected(spectrum), frame)
-        shape = np.ones_like(k)
-        noise = np.array(self.noise_power) if self.noise_power else np.nan * shape
         total = max(float(power[rings].sum()) * width, 0.0)
         weighted = max(float((k * power)[rings].sum()) * width, 0.0)
         correlation = math.pi / 2 * total / weighted if weighted else math.nan
         values = {
             "power": power,
             "density": power / (2 * np.pi * k),
-            "noise": self._in_si(spectrum, noise, frame),
-            "ratio": np.array(self.response) if self.response else np.nan * shape,
             "trusted": rings.astype(np.float64),
             "rms": np.asarray(math.sqrt(total)),
             "contrast": np.asarray(self._contrast(spectrum)),
@@ -377,6 +402,19 @@ class TurbulenceSpectrum(Product):
                 math.sqrt(by_length / _ENERGY_FACTORS[field]) if by_length >= 0 else math.nan
             )
         return values
+
+    def constants(self, frame: FieldFrame) -> dict[str, FloatArray]:
+        spectrum = self._empty(frame)
+        constants = {}
+        if self.noise_power:
+            constants["noise"] = self._in_si(spectrum, np.array(self.noise_power), frame)
+        if self.response:
+            constants["ratio"] = np.array(self.response)
+        return constants
+
+    def _empty(self, frame: FieldFrame) -> RingSpectrum:
+        """Return the rings of the window, without power."""
+        return ring_spectrum(np.zeros(frame.shape), window_weights(frame.mask, self.taper))
 
     def systematic(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
@@ -420,7 +458,7 @@ class TurbulenceSpectrum(Product):
                 window = ring_spectrum(potential[part], window_weights(frame.mask[part], 0.5))
                 inside = (window.k >= k_range[0]) & (window.k <= k_range[1])
                 inside[: _LEAST_RING - 1] = False
-                if inside.sum() < 4:
+                if inside.sum() < _MIN_RINGS:
                     continue
                 power = self._interpolated(window, spectrum)
                 slopes.append(
@@ -444,18 +482,18 @@ class TurbulenceSpectrum(Product):
         return np.asarray(power)
 
     def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
-        numbers = {
-            name: quantity
-            for name, quantity in quantities.items()
-            if not quantity.value.ndim or name in ("power", "energy")
-        }
-        facts = super().facts(numbers, frame)
+        arrays = {name for name, each in self.variables(frame).items() if each.dims}
+        facts = [fact for fact in super().facts(quantities, frame) if fact.key not in arrays]
         rings = np.flatnonzero(quantities["trusted"].value)
         k = self.coordinates(frame)["k"]
         if len(rings):
-            low, high = 2 * np.pi / k.values[rings[[0, -1]]]
-            factor, unit = (1e3, "mm") if frame.setup is not None else (1.0, "px")
-            text = f"wavelengths of {factor * high:.3g} to {factor * low:.3g} {unit}"
+            low, high = (float(length) for length in 2 * np.pi / k.values[rings[[-1, 0]]])
+            texts = (
+                [f"{length:.3g} px" for length in (low, high)]
+                if frame.setup is None
+                else [length_text(length) for length in (low, high)]
+            )
+            text = f"wavelengths of {texts[0]} to {texts[1]}"
             facts.append(Fact("range", "Trusted range", text))
         else:
             facts.append(Fact("range", "Trusted range", "none", Level.DOUBTFUL))
