@@ -1,0 +1,278 @@
+"""Size, spacing and strength of filaments, from the autocorrelation of the field: `Filaments`.
+
+The autocorrelation is that of the field, not of the image: bright lines of an image are where rays
+are gathered, so their spacing is the size of filaments rather than the spacing of these [1]_.
+
+A filament whose potential is a Gaussian of radius a across it has a displacement across with the
+autocorrelation ∝ (1 - x²/2a²) exp(-x²/4a²), whether it is long or round. So the first zero is at
+x = √2 a. Regularly spaced filaments have a further maximum at their spacing; filaments at random
+places have none, and no spacing is stated for them.
+
+References
+----------
+.. [1] J. Levesque et al., "Characterizing filamentary magnetic structures in counter-streaming
+   plasmas by Fourier analysis of proton images", arXiv:1910.04070.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+from scipy.optimize import brentq
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.analysis.frame import FieldFrame
+from napari_shadowinv.analysis.paths import interpolate_cubic
+from napari_shadowinv.analysis.power_spectra import window_weights
+from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Product, Variable
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.physics.beam import displacement_from_potential
+
+__all__ = ["Filaments", "field_autocorrelation"]
+
+_TAPER = 0.05
+_STEP_PX = 0.25
+_MIN_LAG_SHARE = 0.4  # of the shorter side, up to which lags are used
+_MIN_ELONGATION = 1.3
+_PEAK_ERRORS = 2.0
+_PEAK_PERCENTILE = 99.0
+_NEIGHBOURS = 3
+_MERGED = 3.6  # spacing over radius at which filaments merge
+_FWHM = 2 * math.sqrt(2 * math.log(2))
+
+
+def field_autocorrelation(component: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the autocorrelation of one component of the field, 1 at no lag.
+
+    Parameters
+    ----------
+    component : ndarray, shape (H, W)
+    weights : ndarray, shape (H, W)
+        Of the pixels, 0 where masked. Each lag is divided by the overlap of the weights.
+
+    Returns
+    -------
+    ndarray, shape (2h + 1, 2w + 1)
+        By lags from -h to h along y and -w to w along x, with h and w 40 % of the sides.
+    """
+    mean = float((weights * component).sum() / weights.sum())
+    shape = [2 * count for count in component.shape]
+    waves = np.fft.rfft2(weights * (component - mean), shape)
+    overlap = np.fft.irfft2(np.abs(np.fft.rfft2(weights, shape)) ** 2, shape)
+    products = np.fft.irfft2(np.abs(waves) ** 2, shape)
+    lags = [int(_MIN_LAG_SHARE * count) for count in component.shape]
+    rows, columns = (np.arange(-lag, lag + 1) for lag in lags)
+    at = np.ix_(rows, columns)
+    covariance = products[at] / np.maximum(overlap[at], 1e-9 * overlap[0, 0])
+    variance = float(covariance[lags[0], lags[1]])
+    return np.asarray(covariance / variance if variance > 0 else np.zeros_like(covariance))
+
+
+class Filaments(Product):
+    """Radius, spacing and strength of filaments, by the autocorrelation of the field across them.
+
+    The radius is that of a Gaussian potential; the spacing is stated only where the
+    autocorrelation has a further maximum above its scatter.
+    """
+
+    title = "filaments"
+    place = 75
+    reference: ClassVar = "J. Levesque et al., arXiv:1910.04070"
+    product: Literal["filaments"] = "filaments"
+    angle: float | None = Field(
+        default=None,
+        ge=-180,
+        le=180,
+        title="Angle (°)",
+        description=(
+            "Direction of the filaments in degrees, from the x axis towards y (clockwise in the "
+            "image). Default: the direction along which the field varies least."
+        ),
+    )
+
+    def check(self, frame: FieldFrame) -> None:
+        super().check(frame)
+        window_weights(frame.mask, _TAPER)
+
+    def adapt(self, potential: FloatArray, noise: FieldNoise | None, frame: FieldFrame) -> Self:
+        if self.angle is not None:
+            return self
+        displacement = displacement_from_potential(potential)
+        angle, _ = _direction(displacement, window_weights(frame.mask, _TAPER))
+        return self.model_copy(update={"angle": float(angle)})
+
+    def _across(self, displacement: FloatArray, frame: FieldFrame) -> FloatArray:
+        """Return the unit vector (y, x) across the filaments."""
+        angle = self.angle
+        if angle is None:
+            angle, _ = _direction(displacement, window_weights(frame.mask, _TAPER))
+        radians = math.radians(angle)
+        return np.array([math.cos(radians), -math.sin(radians)])
+
+    def _lags(self, frame: FieldFrame) -> FloatArray:
+        most = int(_MIN_LAG_SHARE * min(frame.shape)) - 1
+        return np.arange(0.0, most, _STEP_PX)
+
+    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+        dims, length = ("lag",), frame.length_unit
+        unit = frame.si_unit
+        return {
+            "autocorrelation": Variable(dims, "1", "Autocorrelation of the field across filaments"),
+            "along": Variable(dims, "1", "Autocorrelation of that component along the filaments"),
+            "radius": Variable((), length, "Radius of a filament's Gaussian potential"),
+            "width": Variable((), length, "Width of a filament's potential at half its height"),
+            "spacing": Variable((), length, "Spacing of the filaments"),
+            "order": Variable((), "1", "Autocorrelation at the spacing"),
+            "elongation": Variable((), "1", "Length of filaments over their width"),
+            "rms": Variable((), unit, f"{frame.long_name} of the filaments, r.m.s."),
+            "peak": Variable((), unit, f"{frame.long_name} of the filaments, strongest per cent"),
+        }
+
+    def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
+        lags = frame.length(1.0) * self._lags(frame)
+        return {"lag": Coordinate(lags, frame.length_unit, "Lag")}
+
+    def measure(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
+        weights = window_weights(frame.mask, _TAPER)
+        across = self._across(displacement, frame)
+        component = np.tensordot(across, displacement, axes=1)
+        plane = field_autocorrelation(component, weights)
+        lags = self._lags(frame)
+        correlation = _along(plane, across, lags)
+        along = _along(plane, np.array([-across[1], across[0]]), lags)
+        zero = _first_zero(correlation, lags)
+        length, half = _reach(along, lags), _reach(correlation, lags)
+        scatter = _scatter(weights, zero / math.sqrt(2), length)
+        spacing, order = _next_maximum(correlation, lags, _PEAK_ERRORS * scatter)
+        radius = _radius(zero, spacing)
+        field = frame.field(potential, displacement)
+        strength = np.hypot(*field) if field.ndim == 3 else np.abs(field - np.median(field))
+        used = strength[frame.mask]
+        return {
+            "autocorrelation": correlation,
+            "along": along,
+            "radius": np.asarray(frame.length(radius)),
+            "width": np.asarray(frame.length(_FWHM * radius)),
+            "spacing": np.asarray(frame.length(spacing)),
+            "order": np.asarray(order),
+            "elongation": np.asarray(length / half),
+            "rms": np.asarray(math.sqrt(float((used**2).mean()))),
+            "peak": np.asarray(np.percentile(used, _PEAK_PERCENTILE)),
+        }
+
+    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
+        cautions = []
+        if not np.isfinite(quantities["radius"].value):
+            text = (
+                "the autocorrelation does not fall to zero within 40 % of the image: the "
+                "structures are too large for it, and have no size here"
+            )
+            cautions.append(Caution("cut-object", text))
+        elif float(quantities["elongation"].value) < _MIN_ELONGATION:
+            text = (
+                f"structures are only {float(quantities['elongation'].value):.2g} times as long as "
+                "wide: they are blobs rather than filaments, and their direction means nothing"
+            )
+            cautions.append(Caution("misfit", text))
+        return cautions
+
+    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
+        remarks = [
+            "Size and spacing are those of the field; the bright lines of the image are spaced by "
+            "the size of filaments (Levesque et al.), and their number along the beam is unknown."
+        ]
+        remarks.append(
+            "No spacing is stated (NaN) where the autocorrelation has no further maximum above "
+            "the scatter of structures at random places."
+        )
+        return tuple(remarks)
+
+
+def _direction(displacement: FloatArray, weights: FloatArray) -> tuple[float, float]:
+    """Return the angle of the filaments in degrees, and how far it is defined, from 0 to 1."""
+    y, x = displacement - (weights * displacement).sum(axis=(1, 2), keepdims=True) / weights.sum()
+    yy, xx, yx = (float((weights * each).sum()) for each in (y * y, x * x, y * x))
+    if not yy + xx > 0:
+        raise InputError("the field is zero everywhere, expected one with filaments")
+    # The displacement is strongest across filaments.
+    across = math.degrees(0.5 * math.atan2(2 * yx, xx - yy))
+    angle = across + 90 if across <= 0 else across - 90
+    return angle, math.hypot(xx - yy, 2 * yx) / (yy + xx)
+
+
+def _along(plane: FloatArray, direction: FloatArray, lags: FloatArray) -> FloatArray:
+    """Return the autocorrelation along a direction (y, x)."""
+    centre = (np.array(plane.shape) - 1) / 2
+    points = centre + lags[:, None] * direction
+    size = np.array(plane.shape) - 1
+    inside = ((points >= 0) & (points <= size)).all(axis=1)
+    values = interpolate_cubic(plane, np.clip(points, 0, size))
+    return np.asarray(np.where(inside, values, np.nan))
+
+
+def _first_below(values: FloatArray, lags: FloatArray, level: float) -> float:
+    """Return the first lag at which values fall below a level; NaN if none does."""
+    below = np.flatnonzero(values < level)
+    if not len(below) or below[0] == 0:
+        return math.nan
+    last = below[0]
+    step = (values[last - 1] - level) / (values[last - 1] - values[last])
+    return float(lags[last - 1] + step * (lags[last] - lags[last - 1]))
+
+
+def _first_zero(values: FloatArray, lags: FloatArray) -> float:
+    return _first_below(values, lags, 0.0)
+
+
+def _reach(values: FloatArray, lags: FloatArray) -> float:
+    """Return the lag at which values fall below ½; the largest lag if they do not."""
+    lag = _first_below(values, lags, 0.5)
+    return lag if np.isfinite(lag) else float(lags[-1])
+
+
+def _scatter(weights: FloatArray, radius: float, length: float) -> float:
+    """Return the scatter of the autocorrelation of structures at random places."""
+    if not np.isfinite(radius):
+        return 1.0
+    count = float(weights.sum()) / max(4 * radius * max(length, radius), 1.0)
+    return 1 / math.sqrt(max(count, 1.0))
+
+
+def _radius(zero: float, spacing: float) -> float:
+    """Return the radius that belongs to the first zero, with neighbours at multiples of a spacing.
+
+    Close neighbours move the zero inwards; of filaments that merge into a sine wave, with the zero
+    at a quarter of the spacing, it is the lower limit that a lone filament would have.
+    """
+    alone = zero / math.sqrt(2)
+    if not np.isfinite(spacing):
+        return alone
+    offsets = zero - spacing * np.arange(-_NEIGHBOURS, _NEIGHBOURS + 1)
+
+    def total(radius: float) -> float:
+        squares = (offsets / (2 * radius)) ** 2
+        return float(np.sum((1 - 2 * squares) * np.exp(-squares)))
+
+    if total(alone) * total(spacing / _MERGED) >= 0:
+        return alone
+    return float(brentq(total, alone, spacing / _MERGED))
+
+
+def _next_maximum(values: FloatArray, lags: FloatArray, least: float) -> tuple[float, float]:
+    """Return lag and height of the first maximum above `least` beyond the first zero."""
+    zero = np.flatnonzero(values < 0)
+    if len(zero):
+        inner = values[1:-1]
+        peaks = 1 + np.flatnonzero((inner >= values[:-2]) & (inner > values[2:]) & (inner > least))
+        peaks = peaks[peaks > zero[0]]
+        if len(peaks):
+            return float(lags[peaks[0]]), float(values[peaks[0]])
+    return math.nan, math.nan
