@@ -5,6 +5,8 @@
 - line integrals: `Flux`, `EnclosedCurrent`, `EnclosedCharge`
 - maps: `CurrentDensity`, `ChargeDensity`
 - how strongly the field structures the image: `Contrast`
+- objects with an axis: `AxisymmetricProfile` from the side, `AzimuthalProfile` face-on
+- turbulence and filaments: `TurbulenceSpectrum`, `Filaments`
 - all kinds: `PRODUCTS`; products of a table or a line of text: `product_from_dict`,
   `product_from_text`
 - products in files and tables: `add_products`, `products_in`, `products_table`

@@ -1,6 +1,8 @@
 from ._analyse import analyse
+from .axisymmetric import AxisymmetricProfile, AzimuthalProfile
 from .contrast import Contrast
 from .currents import EnclosedCharge, EnclosedCurrent, Flux
+from .filaments import Filaments
 from .frame import FIELD_UNITS, FieldFrame
 from .kinds import PRODUCTS, product_from_dict, product_from_text
 from .lines import LineProfile
@@ -9,22 +11,27 @@ from .product import Product
 from .regions import Region
 from .result import ProductResult, add_products, products_in, products_table
 from .series import TimeSeries, time_series
+from .spectra import TurbulenceSpectrum
 
 __all__ = [
     "FIELD_UNITS",
     "PRODUCTS",
+    "AxisymmetricProfile",
+    "AzimuthalProfile",
     "ChargeDensity",
     "Contrast",
     "CurrentDensity",
     "EnclosedCharge",
     "EnclosedCurrent",
     "FieldFrame",
+    "Filaments",
     "Flux",
     "LineProfile",
     "Product",
     "ProductResult",
     "Region",
     "TimeSeries",
+    "TurbulenceSpectrum",
     "add_products",
     "analyse",
     "product_from_dict",

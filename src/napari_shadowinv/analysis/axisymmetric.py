@@ -270,7 +270,7 @@ class AxisymmetricProfile(Product):
         return product
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
-        dims = ("along", "radius")
+        dims = ("along", "radius") if self._has_slices(frame) else ("radius",)
         variables = {
             name: Variable(dims, unit, long_name)
             for name, (unit, long_name) in self._names(frame).items()
@@ -316,10 +316,17 @@ class AxisymmetricProfile(Product):
         middles = (edges[:-1] + edges[1:] - 1) / 2
         unit = frame.length_unit
         radii = np.arange(float(self._radius_px(frame)))
-        return {
+        coordinates = {
             "along": Coordinate(frame.length(1.0) * middles, unit, "Distance along the axis"),
             "radius": Coordinate(frame.length(1.0) * radii, unit, "Distance from the axis"),
         }
+        if not self._has_slices(frame):
+            del coordinates["along"]
+        return coordinates
+
+    def _has_slices(self, frame: FieldFrame) -> bool:
+        """Return whether there are profiles of several slices, as a plane."""
+        return len(self._slices(frame)) > 1
 
     def measure(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
@@ -329,6 +336,8 @@ class AxisymmetricProfile(Product):
         values = self._profiles((right + left) / 2 @ inverse.T, frame)
         scale = self._scale(frame)
         values["half_difference"] = scale * (right - left) @ inverse.T
+        if not self._has_slices(frame):
+            values = {name: profiles[0] for name, profiles in values.items()}
         values["asymmetry"] = np.asarray(asymmetry(right, left))
         mean = np.abs((right + left) / 2)
         width = max(round(_EDGE_SHARE * mean.shape[1]), 2)
@@ -385,6 +394,8 @@ class AxisymmetricProfile(Product):
             for name, error in errors.items():
                 change = np.abs(moved[0][name] + moved[1][name] - 2 * values[name]) / 2
                 errors[name] = np.hypot(error, change)
+        if not self._has_slices(frame):
+            errors = {name: error[0] for name, error in errors.items()}
         return errors
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
@@ -404,7 +415,7 @@ class AxisymmetricProfile(Product):
                 "about this axis, and the profile is that of the mean of the halves"
             )
             cautions.append(Caution("misfit", text))
-        profile = quantities[next(iter(self._names(frame)))].value
+        profile = np.atleast_2d(quantities[next(iter(self._names(frame)))].value)
         return [*cautions, *_length_cautions(np.abs(profile), frame)]
 
     def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
@@ -439,6 +450,7 @@ class AzimuthalProfile(Product):
     title = "azimuthal field along the beam"
     place = 65
     fields: ClassVar = (_B,)
+    curves: ClassVar = ("azimuthal_field", "variation")
     product: Literal["azimuthal"] = "azimuthal"
     center: tuple[float, float] = Field(
         title="Centre (px)",

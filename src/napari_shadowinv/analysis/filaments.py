@@ -43,6 +43,7 @@ _MIN_ELONGATION = 1.3
 _PEAK_ERRORS = 2.0
 _PEAK_PERCENTILE = 99.0
 _NEIGHBOURS = 3
+_MERGED_ZERO = 0.26  # first zero over spacing, ¼ of a wave
 _MERGED = 3.6  # spacing over radius at which filaments merge
 _FWHM = 2 * math.sqrt(2 * math.log(2))
 
@@ -84,6 +85,7 @@ class Filaments(Product):
     title = "filaments"
     place = 75
     reference: ClassVar = "J. Levesque et al., arXiv:1910.04070"
+    curves: ClassVar = ("autocorrelation", "along")
     product: Literal["filaments"] = "filaments"
     angle: float | None = Field(
         default=None,
@@ -182,6 +184,13 @@ class Filaments(Product):
                 "wide: they are blobs rather than filaments, and their direction means nothing"
             )
             cautions.append(Caution("misfit", text))
+        spacing, radius = (float(quantities[name].value) for name in ("spacing", "radius"))
+        if spacing and math.sqrt(2) * radius < _MERGED_ZERO * spacing:
+            text = (
+                "the filaments nearly merge into a wave, whose first zero does not depend on their "
+                "size: the radius is a lower limit"
+            )
+            cautions.append(Caution("accuracy", text))
         return cautions
 
     def remarks(self, frame: FieldFrame) -> tuple[str, ...]:

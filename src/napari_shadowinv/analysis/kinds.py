@@ -13,14 +13,24 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Union, get_args, get_origin
 
 from napari_shadowinv._system.validation import suggestion, validate
-from napari_shadowinv.analysis import contrast, currents, lines, maps, regions
+from napari_shadowinv.analysis import (
+    axisymmetric,
+    contrast,
+    currents,
+    filaments,
+    lines,
+    maps,
+    regions,
+    spectra,
+)
 from napari_shadowinv.analysis.product import Product
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing.steps import choices_of
 
 __all__ = ["PRODUCTS", "product_from_dict", "product_from_text", "product_syntax"]
 
-_MODULES = (lines, regions, currents, maps, contrast)  # their products register themselves
+# Their products register themselves.
+_MODULES = (lines, regions, currents, maps, contrast, axisymmetric, spectra, filaments)
 
 PRODUCTS: dict[str, type[Product]] = choices_of(Product)
 """All kinds of products by their names."""
@@ -81,6 +91,8 @@ def product_syntax(kind: type[Product]) -> str:
     words = [kind.name()]
     for name, field in kind.parameters().items():
         extra = field.json_schema_extra
+        if isinstance(extra, dict) and extra.get("hidden"):
+            continue  # measured, not chosen
         value = str(extra.get("metavar", "N")) if isinstance(extra, dict) else "N"
         value = "TEXT" if name == "label" else value
         word = value if name == kind.primary else f"{name.replace('_', '-')}={value}"

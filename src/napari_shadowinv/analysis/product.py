@@ -104,6 +104,9 @@ class Product(Choice):
     recorded: ClassVar[tuple[str, ...]] = ()
     # Whether `measure` already corrects the mean effect of noise, so that bands need not.
     subtracts_noise: ClassVar[bool] = False
+    # Of several variables along an axis, those that figures show; empty for all.
+    curves: ClassVar[tuple[str, ...]] = ()
+    is_logarithmic: ClassVar[bool] = False  # whether their axes are
 
     label: str = Field(
         default="",

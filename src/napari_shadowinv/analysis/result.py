@@ -98,6 +98,20 @@ class ProductResult:
         """Whether the errors of the field are known."""
         return bool(self.causes)
 
+    @property
+    def curve_names(self) -> tuple[str, ...]:
+        """Variables along an axis that figures draw together, in one unit."""
+        chosen = self.product.curves or tuple(self.variables)
+        names = [
+            name
+            for name in chosen
+            if name in self.variables
+            and len(self.variables[name].dims) == 1
+            and name not in self.product.recorded
+        ]
+        units = {self.variables[name].unit for name in names[:1]}
+        return tuple(name for name in names if self.variables[name].unit in units)
+
     def __getitem__(self, name: str) -> Quantity:
         return self.quantities[name]
 

@@ -82,6 +82,8 @@ class TurbulenceSpectrum(Product):
     fields: ClassVar = ("displacement", "deflection_angle", *_PLANES, _E, _B)
     reference: ClassVar = "A. F. A. Bott et al., J. Plasma Phys. 83, 905830614 (2017)"
     subtracts_noise: ClassVar = True
+    curves: ClassVar = ("power", "noise")
+    is_logarithmic: ClassVar = True
     product: Literal["spectrum"] = "spectrum"
     path_length: float | None = Field(
         default=None,
@@ -145,7 +147,9 @@ class TurbulenceSpectrum(Product):
             "correction."
         ),
     )
-    seed: int = Field(default=0, ge=0, title="Seed", description="Seed of the random fields.")
+    phantom_seed: int = Field(
+        default=0, ge=0, title="Seed of the phantoms", description="Seed of the random fields."
+    )
     noise_power: tuple[float, ...] = Field(
         default=(),
         title="Power of the noise",
@@ -223,7 +227,7 @@ class TurbulenceSpectrum(Product):
                 weights,
                 max(round(potential.size / product.resolution**2), 16),
                 phantoms=self.phantoms,
-                seed=self.seed,
+                seed=self.phantom_seed,
             )
             phantom_contrast = response.contrast
             changes["response"] = tuple(map(float, response.ratio))

@@ -86,12 +86,12 @@ def _colour(level: Level) -> str:
 
 def _draw(axes: Axes, result: ProductResult) -> None:
     axes.set_title(result.title)
-    maps = [name for name, variable in result.variables.items() if variable.dims == PLANE]
+    maps = [name for name, variable in result.variables.items() if len(variable.dims) == 2]
     if maps:
         _draw_map(axes, result, maps[0])
         return
     curves = [name for name, variable in result.variables.items() if len(variable.dims) == 1]
-    draw_curves(axes, result, [name for name in curves if name not in result.product.recorded])
+    draw_curves(axes, result, result.curve_names)
     if "intensity" in curves:
         beside = axes.twinx()
         coordinate = result.coordinates[result.variables["intensity"].dims[0]]
@@ -129,6 +129,9 @@ def draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> None
     unit_of_places = f"{prefix}m" if in_metres else display_unit(coordinate.unit)
     axes.set_xlabel(f"{coordinate.long_name} ({unit_of_places})")
     axes.set_ylabel(f"field ({unit})")
+    if result.product.is_logarithmic:
+        axes.set_xscale("log")
+        axes.set_yscale("log", nonpositive="mask")
     axes.grid(alpha=0.25, linewidth=0.6)
     axes.margins(x=0)
     axes.legend(frameon=False, fontsize=8)
@@ -138,8 +141,9 @@ def _draw_map(axes: Axes, result: ProductResult, name: str) -> None:
     values = result[name].value
     limit = float(np.nanpercentile(np.abs(values), 99.8)) or 1.0
     factor, prefix = prefix_for(limit)
-    rows, columns = (result.coordinates[axis].values for axis in PLANE)
-    scale, letter = 1.0, display_unit(result.coordinates["x"].unit)
+    dims = result.variables[name].dims
+    rows, columns = (result.coordinates[axis].values for axis in dims)
+    scale, letter = 1.0, display_unit(result.coordinates[dims[1]].unit)
     if letter == "m":
         scale, letter = prefix_for(float(columns[-1]))
         letter = f"{letter}m"
@@ -153,7 +157,8 @@ def _draw_map(axes: Axes, result: ProductResult, name: str) -> None:
             -half, scale * columns[-1] + half, scale * rows[-1] + half, -half,
         ),
     )  # fmt: skip
-    axes.set_xlabel(f"x ({letter})")
-    axes.set_ylabel(f"y ({letter})")
+    down, right = ("y", "x") if dims == PLANE else (result.coordinates[d].long_name for d in dims)
+    axes.set_xlabel(f"{right} ({letter})")
+    axes.set_ylabel(f"{down} ({letter})")
     unit = f"{prefix}{result.variables[name].unit}"
     axes.figure.colorbar(image, ax=axes, label=unit)

@@ -84,11 +84,7 @@ class ProductPlot(Plot):
 
     def show_curves(self, result: ProductResult) -> bool:
         """Draw all curves but the image's intensity; return whether there is any."""
-        names = [
-            name
-            for name, variable in result.variables.items()
-            if len(variable.dims) == 1 and name not in result.product.recorded
-        ]
+        names = list(result.curve_names)
         if not names:
             return False
         (axes,) = self.fresh_axes()
@@ -106,6 +102,9 @@ class ProductPlot(Plot):
                     axes.fill_between(places, low, high, color=colour, alpha=opacity, linewidth=0)
         axes.set_xlabel(f"{coordinate.long_name.lower()} ({prefix}{unit})", color=self.ink)
         axes.set_ylabel(field_unit, color=self.ink)
+        if result.product.is_logarithmic:
+            axes.set_xscale("log")
+            axes.set_yscale("log", nonpositive="mask")
         self.add_legend(axes)
         self.draw()
         return True
