@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.analysis.abel import FIRST_OFFSET
 from napari_shadowinv.analysis.paths import interpolate_cubic
 
 __all__ = ["Axis", "asymmetry", "find_axis", "sample_sides"]
@@ -90,9 +91,10 @@ def sample_sides(
     Returns
     -------
     right, left : ndarray, shape (places, radius)
-        At the distances 0, 1, … px from the axis. They are equal if the field is symmetric.
+        At the distances of `abel.deflection_matrix`, or of `projection_matrix` if it is not odd. They are equal if the field is symmetric.
     """
-    offsets, places = np.arange(float(radius)), axis.places()
+    first = FIRST_OFFSET if is_odd else 0.0
+    offsets, places = first + np.arange(float(radius)), axis.places()
     right = interpolate_cubic(component, axis.points(places, offsets))
     left = interpolate_cubic(component, axis.points(places, -offsets))
     return right, -left if is_odd else left

@@ -40,10 +40,11 @@ _TAPER = 0.05
 _STEP_PX = 0.25
 _MIN_LAG_SHARE = 0.4  # of the shorter side, up to which lags are used
 _MIN_ELONGATION = 1.3
-_PEAK_ERRORS = 2.0
+_PEAK_ERRORS = 3.0
 _PEAK_PERCENTILE = 99.0
+_ROUND_RATIO = 1.88  # of the reaches of the autocorrelation of a round Gaussian
 _NEIGHBOURS = 3
-_MERGED_ZERO = 0.26  # first zero over spacing, ¼ of a wave
+_WAVE_ZERO, _WAVE_MARGIN = 0.25, 0.003  # first zero over spacing of a sine wave
 _MERGED = 3.6  # spacing over radius at which filaments merge
 _FWHM = 2 * math.sqrt(2 * math.log(2))
 
@@ -165,7 +166,7 @@ class Filaments(Product):
             "width": np.asarray(frame.length(_FWHM * radius)),
             "spacing": np.asarray(frame.length(spacing)),
             "order": np.asarray(order),
-            "elongation": np.asarray(length / half),
+            "elongation": np.asarray(length / half / _ROUND_RATIO),
             "rms": np.asarray(math.sqrt(float((used**2).mean()))),
             "peak": np.asarray(np.percentile(used, _PEAK_PERCENTILE)),
         }
@@ -185,7 +186,7 @@ class Filaments(Product):
             )
             cautions.append(Caution("misfit", text))
         spacing, radius = (float(quantities[name].value) for name in ("spacing", "radius"))
-        if spacing and math.sqrt(2) * radius < _MERGED_ZERO * spacing:
+        if abs(math.sqrt(2) * radius / spacing - _WAVE_ZERO) < _WAVE_MARGIN:
             text = (
                 "the filaments nearly merge into a wave, whose first zero does not depend on their "
                 "size: the radius is a lower limit"
@@ -270,7 +271,10 @@ def _radius(zero: float, spacing: float) -> float:
         squares = (offsets / (2 * radius)) ** 2
         return float(np.sum((1 - 2 * squares) * np.exp(-squares)))
 
-    if total(alone) * total(spacing / _MERGED) >= 0:
+    if (
+        abs(zero / spacing - _WAVE_ZERO) < _WAVE_MARGIN
+        or total(alone) * total(spacing / _MERGED) >= 0
+    ):
         return alone
     return float(brentq(total, alone, spacing / _MERGED))
 
