@@ -101,10 +101,10 @@ def main() -> None:
             product = AxisymmetricProfile(axis=result.product.axis, smoothing=1.0,
                                           slice_width=result.product.slice_width)  # fmt: skip
             exact = product.measure(moves[0], moves, result_frame(result))["profile"]
-            own = float(np.linalg.norm(exact - truth) / np.linalg.norm(truth))
+            of_operator = np.linalg.norm(exact - truth) / np.linalg.norm(truth)
             print(
-                f"| {name} | {share} | {np.hypot(*moves).max():.1f} | {100 * np.median(errors):.2f}, "
-                f"{100 * max(errors):.2f} | {100 * own:.2f} | {100 * np.mean(inside):.0f} |",
+                f"| {name} | {share} | {np.hypot(*moves).max():.1f} "
+                f"| {100 * np.median(errors):.2f}, {100 * max(errors):.2f} | {100 * of_operator:.2f} | {100 * np.mean(inside):.0f} |",
                 flush=True,
             )
 

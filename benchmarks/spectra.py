@@ -159,7 +159,7 @@ def main() -> None:
                 print(accuracy_row(arguments.size, name, contrast, seed), flush=True)
     print("\n| E(k) | contrast | size, px | band holds the slope, % | B_rms, % |")
     print("|---|---|---|---|---|")
-    for name in ("−5/3", "−11/3"):
+    for name in ("−5/3", "−11/3") if arguments.coverage_seeds else ():
         print(
             coverage_row(arguments.coverage_size, name, 0.3, arguments.coverage_seeds), flush=True
         )

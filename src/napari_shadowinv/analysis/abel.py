@@ -11,9 +11,9 @@ All lengths are in px. An object f(r) with the projection F(y) = ∫f dz deflect
 
 so that f follows from δ without a derivative: f(r) = (1/π) ∫ δ(y) / √(y² - r²) dy. Here f is
 continuous and linear between radii one pixel apart, and zero at the outermost radius R. The
-deflections are taken `FIRST_OFFSET` outside of these radii, projections at them. The integrals of the pieces are
-elementary, and f is found by least squares with a penalty on its second
-differences. As the result is linear in δ, its covariance is A C Aᵀ.
+deflections are taken `FIRST_OFFSET` outside of these radii, projections at them. The integrals of
+the pieces are elementary, and f is found by least squares with a penalty on its second differences.
+As the result is linear in δ, its covariance is A C Aᵀ.
 
 References
 ----------

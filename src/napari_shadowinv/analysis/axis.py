@@ -91,7 +91,8 @@ def sample_sides(
     Returns
     -------
     right, left : ndarray, shape (places, radius)
-        At the distances of `abel.deflection_matrix`, or of `projection_matrix` if it is not odd. They are equal if the field is symmetric.
+        At the distances of `abel.deflection_matrix`, or of `projection_matrix` if it is not odd.
+        They are equal if the field is symmetric.
     """
     first = FIRST_OFFSET if is_odd else 0.0
     offsets, places = first + np.arange(float(radius)), axis.places()

@@ -9,6 +9,7 @@ particles. An azimuthal magnetic field is seen along its axis only.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -36,6 +37,7 @@ from napari_shadowinv.analysis.product import (
 )
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Fact
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import displacement_from_potential, length_text
 from napari_shadowinv.physics.setup import OpticalSetup
@@ -47,6 +49,7 @@ _B, _E, _N = "path_integrated_b", "path_integrated_e", "line_integrated_density"
 _LENGTHS = ("displacement", "deflection_angle", "line_integrated_log_index")
 _MIN_RADIUS_PX = 8
 _DEFAULT_SMOOTHING = 1.0
+_MIN_DENSITY_RATIO = 0.02  # below it a temperature is only noise
 _EDGE_SHARE = 0.06  # of the radius, in which the field should have ended
 _NOTABLE_EDGE = 0.05  # of the largest deflection
 _NOTABLE_ASYMMETRY = 0.1
@@ -284,7 +287,7 @@ class AxisymmetricProfile(Product):
         )
         variables["edge"] = Variable((), "1", "Deflection at the edge, relative to the largest")
         variables["axis_offset"] = Variable(
-            (), frame.length_unit, "Symmetry axis of the field, offset from the axis"
+            (), PIXEL, "Symmetry axis of the field, offset from the axis"
         )
         return variables
 
@@ -343,7 +346,7 @@ class AxisymmetricProfile(Product):
         width = max(round(_EDGE_SHARE * mean.shape[1]), 2)
         edge = np.abs((right + left)[:, -width:].mean(axis=1) / 2).max()
         values["edge"] = np.asarray(edge / max(mean.max(), 1e-300))
-        values["axis_offset"] = np.asarray(frame.length(_axis_offset(right, left)))
+        values["axis_offset"] = np.asarray(_axis_offset(right, left))
         return values
 
     def _scale(self, frame: FieldFrame) -> float:
@@ -374,7 +377,7 @@ class AxisymmetricProfile(Product):
             values["density"] = self.ambient_density + values["density_change"]
         if self.ambient_temperature is not None and self.ambient_density is not None:
             ratio = values["density"] / self.ambient_density
-            hot = self.ambient_temperature / np.where(ratio > 0, ratio, np.nan)
+            hot = self.ambient_temperature / np.maximum(ratio, _MIN_DENSITY_RATIO)
             values["temperature"] = hot
         return values
 
@@ -397,6 +400,16 @@ class AxisymmetricProfile(Product):
         if not self._has_slices(frame):
             errors = {name: error[0] for name, error in errors.items()}
         return errors
+
+    def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
+        # Noise raises both shares, which say how far the object is from the assumptions.
+        shares = {name: float(quantities[name].value) for name in ("asymmetry", "edge")}
+        return [
+            replace(fact, text=f"{100 * shares[fact.key]:.2g} %", short="")
+            if fact.key in shares
+            else fact
+            for fact in super().facts(quantities, frame)
+        ]
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
         axis, radius = self._axis(frame), self._radius_px(frame)
