@@ -243,3 +243,27 @@ def test_the_film_without_reference_has_the_numbers_of_its_page(tmp_path, monkey
     assert fit_line.startswith("fit ")
     listing = CliRunner().invoke(app, ["fit", "--help-all"], env={"COLUMNS": "200"}).output
     assert set(re.findall(r"--[a-z-]+", fit_line)) <= set(re.findall(r"--[a-z-]+", listing))
+
+
+def test_the_flame_has_the_temperatures_of_its_page(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    page = text_of("flame.md")
+    names = run_blocks("flame.md")
+    printed = "".join(re.findall(r"```text\n(.*?)```", page, re.DOTALL))
+    start, _, _ = printed.partition("Axis offset")  # nearly 0, with random digits
+    assert_same_but_for_rounding(capsys.readouterr().out.partition("Axis offset")[0], start)
+    true = np.array([[names["temperature"](r, row) for r in range(40)] for row in names["rows"]])
+    hot = true > 600
+    error = np.abs(names["hot"][:, :40] - true)[hot] / true[hot]
+    assert error.max() < 0.05
+    low, high = names["profile"].band("temperature", 0.95)
+    inside = (low[:, :40] <= true) & (true <= high[:, :40])
+    assert inside[hot].mean() > 0.6
+
+    (line,) = re.findall(r"^    shadowinv (.*)$", page, re.MULTILINE)
+    from napari_shadowinv.analysis import product_from_text
+
+    product = product_from_text(shlex.split(line)[-1])
+    used = names["profile"].product
+    assert product.ambient_temperature == used.ambient_temperature
+    assert product.slice_width == used.slice_width

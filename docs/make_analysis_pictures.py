@@ -1,0 +1,136 @@
+"""Make the pictures of products: the burner's profile and the spectrum of turbulence.
+
+    python docs/make_analysis_pictures.py [BURNER]
+
+BURNER is the folder with the frames of the burner (doi:10.1016/j.expthermflusci.2025.111562); its
+picture is left out without it. The numbers of the tutorial on the flame are printed.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from _drawing import BLUE, DARK, ORANGE, save, show, tidy
+from matplotlib.figure import Figure
+
+from napari_shadowinv import (
+    InversionOptions,
+    OpticalSetup,
+    ProtonSetup,
+    analyse,
+    invert,
+    plan_sites,
+    read,
+    synthetic_image,
+)
+from napari_shadowinv.analysis.power_spectra import random_displacement, ring_spectrum
+from napari_shadowinv.inversion.result import RetrievedField
+from napari_shadowinv.inversion.variables import dataset_from_field
+
+BINNED = 8
+# Assumed: the distances of the burner were not published.
+PIXEL_M, DISTANCE_M = 0.1e-3, 1.0
+AIR = {"gladstone_dale": 2.26e-4, "ambient_density": 1.20, "ambient_temperature": 293.0}
+
+
+def burner_profile(folder: Path) -> None:
+    """Average the displacements of all frames, and draw the profiles of their mean."""
+    setup = OpticalSetup(
+        wavelength=532e-9, object_image_distance=DISTANCE_M, pixel_size=BINNED * PIXEL_M
+    )
+    reference = read(folder / "Image_00000.bmp").bin_pixels(BINNED).image
+    plan = plan_sites(reference, InversionOptions(n_sites=reference.size))
+    frames = [read(file).bin_pixels(BINNED).image for file in sorted(folder.glob("Image_2*.bmp"))]
+    fields = [invert(frame, plan=plan, options=InversionOptions(n_sites=reference.size))
+              for frame in frames]  # fmt: skip
+    displacement = np.mean([field.displacement for field in fields], axis=0)
+    potential = np.mean([field.potential for field in fields], axis=0)
+    mean = RetrievedField(dataset_from_field(displacement, potential, setup))
+    product = {"product": "axisymmetric", "slice_width": 15, **AIR}
+    (profile,) = analyse(mean, product, setup=setup)
+    for fact in profile.facts:
+        print(f"{fact.title}: {fact.text}")
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    strength = BINNED * np.hypot(*displacement)
+    top = float(np.percentile(strength, 99.8))
+    show(
+        left,
+        strength,
+        f"Mean of {len(fields)} frames",
+        "displacement (camera px)",
+        (0, top),
+        "inferno",
+    )
+    (y0, x0), (y1, x1) = profile.product.axis
+    left.plot([x0, x1], [y0, y1], color="white", lw=1)
+    radius = 1e3 * profile.coordinates["radius"].values
+    along = 1e3 * profile.coordinates["along"].values
+    for axes, name, label in (
+        (middle, "density", "density (kg/m³)"),
+        (right, "temperature", "temperature (K)"),
+    ):
+        values = profile[name].value
+        for number, colour in ((1, BLUE), (len(along) // 2, ORANGE), (len(along) - 2, DARK)):
+            axes.plot(radius, values[number], color=colour, label=f"{along[number]:.0f} mm")
+            print(f"{name} at {along[number]:.0f} mm: {values[number, 0]:.3g} on the axis")
+        tidy(axes, name.capitalize(), "distance from the axis (mm)", label, 0.9)
+    right.legend(title="from the top", frameon=False)
+    save(figure, "pictures/burner-profile.png", "0.1 mm a pixel and 1 m to the camera are assumed.")
+
+
+def turbulence(side: int = 200, slope: float = -5 / 3, contrast: float = 0.6) -> None:
+    """Invert a shot of turbulence, and draw its spectrum before and after the correction."""
+    setup = ProtonSetup(
+        energy=14.7, source_object_distance=1e-2, object_image_distance=0.3, pixel_size=5e-6
+    )
+    unit, size = 2 * np.pi / side, int(1.3 * side)
+    potential, displacement = random_displacement(
+        lambda k: np.where((k > 2 * unit) & (k < 25 * unit), (k / unit) ** (slope - 2), 0.0),
+        (size, size), np.random.default_rng(0),
+    )  # fmt: skip
+    divergence = sum(np.gradient(part, axis=axis) for axis, part in enumerate(displacement))
+    strength = contrast / float(np.std(divergence))
+    inner = slice((size - side) // 2, (size - side) // 2 + side)
+    image = np.random.default_rng(1).poisson(
+        250 * synthetic_image(strength * displacement)[inner, inner]
+    )
+    inversion = invert(image, source=np.full(image.shape, 250.0))
+    product = {"product": "spectrum", "path_length": 1e-3, "shortest": side / 23}
+    (spectrum,) = analyse(inversion, product, setup=setup, samples=40)
+    from napari_shadowinv.analysis.power_spectra import window_weights
+
+    weights = window_weights(inversion.mask, 0.125)
+    scale = float(np.abs(setup.path_integrated_b(np.ones((2, 1)))).max()) ** 2 * 5e-6
+    k = 1e-3 * spectrum.coordinates["k"].values
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    show(left, image / 250, "Proton image", "counts / beam", (0, 3))
+    true = scale * ring_spectrum(strength * potential[inner, inner], weights).power
+    raw = scale * ring_spectrum(inversion.potential, weights).power
+    right.loglog(k, true, color=DARK, lw=3, alpha=0.4, label="true field")
+    right.loglog(k, raw, color=ORANGE, lw=1, label="inversion as it is")
+    low, high = spectrum.band("power") or (raw, raw)
+    trusted = spectrum["trusted"].value > 0
+    right.loglog(k, spectrum["power"].value, color=BLUE, lw=1.3, label="corrected")
+    right.fill_between(k[trusted], low[trusted], high[trusted], color=BLUE, alpha=0.25, lw=0)
+    right.loglog(k, spectrum["noise"].value, color="0.6", lw=1, label="noise")
+    right.set_xlim(k[1], k[45])
+    right.set_ylim(true[2:24].min() / 300, true.max() * 3)
+    right.legend(frameon=False)
+    tidy(right, "Ring-summed spectrum P(k)", "k (rad/mm)", "P (T² m³)", 0.8)
+    for fact in spectrum.facts:
+        print(f"{fact.title}: {fact.text}")
+    save(figure, "pictures/turbulence-spectrum.png")
+
+
+def main() -> None:
+    turbulence()
+    if len(sys.argv) > 1:
+        burner_profile(Path(sys.argv[1]))
+
+
+if __name__ == "__main__":
+    main()
