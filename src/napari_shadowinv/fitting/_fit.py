@@ -203,11 +203,13 @@ def fit(
             # One image cannot tell the instrument from the object: its numbers stay at 0.
             scene = replace(scene, imperfect=EXACT)
         minima = [_with_numbers(scene, minimum) for minimum in minima]
-        if scene.imperfect.parts and min(data.size) < SMALL_PX:
+        if scene.imperfect.parts and min(data.size) < SMALL_PX and not options.quick:
             # In pixels of two, λ and the errors of the instrument's numbers come out too small.
             minima[0] = in_recorded_pixels(scene, minima[0])
     with _timed("smoothness", seconds):
-        scene, best = estimate_smoothness(scene, minima[0], rng, on_step)
+        scene, best = estimate_smoothness(
+            scene, minima[0], rng, on_step, is_quick=options.quick
+        )
         if data.counted:
             scene = reweight_counts(data, scene, best)
             best = settle_minimum(scene, best, on_step)
@@ -353,6 +355,8 @@ def collect_starts(data: FitData, on_step: Any, should_stop: ShouldStop | None) 
     """Return the starting points: no field, a field that is known, and inversions by transport."""
     scene = data.scene
     candidates = []
+    if data.near is not None:
+        return [Start("near field", ((2, 1.0),), data.start)]
     if data.start is not None:
         candidates.append(Start("given", ((2, 1.0),), data.start))
     if not data.single:
@@ -586,6 +590,7 @@ def _result(
         edge_is_free=options.boundary == "free",
         parts=parts,
         max_error=options.max_error,
+        searched=data.near is None,
     )
     return Fit(
         images=images,

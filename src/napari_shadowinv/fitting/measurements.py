@@ -29,7 +29,14 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import imperfect_instrument
-from napari_shadowinv.fitting.shots import Images, join_shots, list_shots, names_of, value_of_first
+from napari_shadowinv.fitting.shots import (
+    Images,
+    NearField,
+    join_shots,
+    list_shots,
+    names_of,
+    value_of_first,
+)
 from napari_shadowinv.fitting.unknowns import Fiducials, additive_blocks
 from napari_shadowinv.options import (
     KINDS_OF_NOISE,
@@ -96,6 +103,7 @@ class FitData:
     setups: tuple[Setup, ...] | None
     names: tuple[str, ...] | None  # if the images have any
     start: FloatArray | None  # potential in px² of the first field
+    near: NearField | None  # the only start, if there is one
 
     @property
     def around(self) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -129,6 +137,8 @@ class FitData:
     def scene_with(self, smoothness: float | None) -> Scene:
         """Return the scene with λ as it was given, or none yet, for each field."""
         fields = self.scene.strengths.shape[1]
+        if self.near is not None:
+            return replace(self.scene, smoothness=np.tile(self.near.smoothness, (fields, 1)))
         return replace(self.scene, smoothness=np.tile((smoothness or 0.0, 0.0), (fields, 1)))
 
 
@@ -237,6 +247,8 @@ def collect_data(
         added=additive_blocks(options),
         imperfect=imperfect,
     )
+    start = value_of_first(shots, "start")
+    near = start if isinstance(start, NearField) else None
     return FitData(
         scene=scene,
         size=(height, width),
@@ -250,7 +262,8 @@ def collect_data(
         beam=prior,
         setups=None if setups is None else tuple(setups),
         names=names if any(shot.name for shot in shots) else None,
-        start=_checked_start(value_of_first(shots, "start"), (height, width)),
+        start=_checked_start(near.potential if near else start, (height, width)),
+        near=near,
     )
 
 

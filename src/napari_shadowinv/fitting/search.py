@@ -63,6 +63,7 @@ SMOOTHNESS_RATIO = 0.1  # of them
 # are smoothed twice show it to a fifth.
 _PAIRS, _UNSURE_SLOPES = 2, 0.25
 _RESPONSE_ROUNDS, _NUMBERS_SETTLED = 8, 0.05  # squared distance in standard deviations
+_QUICK_ROUNDS, _QUICK_SPACING = 2, 0.3
 _LIKELY_NUMBER = 1.0  # where numbers begin, at most
 _SAME_FIELD = 0.03  # of the displacement, r.m.s.
 
@@ -186,11 +187,17 @@ def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
 
 
 def estimate_smoothness(
-    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep
+    scene: Scene,
+    end: Minimum,
+    rng: np.random.Generator,
+    on_step: OnStep,
+    *,
+    is_quick: bool = False,
 ) -> tuple[Scene, Minimum]:
     """Find λ and κ, unless they are given, and the unknowns that belong to them.
 
-    Numbers of an instrument that change the response to fields are found, too, and held.
+    Numbers of an instrument that change the response to fields are found, too, and held; quickly
+    in larger pixels.
     """
     is_fixed = bool(scene.smoothness.any())
     smoothness = scene.smoothness
@@ -204,11 +211,15 @@ def estimate_smoothness(
     if not is_fixed:
         smoothness, scene, end = _settle_smoothness(scene, end, rng, on_step)
         scene = replace(scene, smoothness=SMOOTHNESS_RATIO * smoothness)
-    if response and scene.images.size <= _MOST_RECORDED:
+    if response and scene.images.size <= _MOST_RECORDED and not is_quick:
         # In larger pixels fine structure is lost by which a blur differs from a smooth object.
         end = in_recorded_pixels(scene, end)
-    end = settle_minimum(scene, end, on_step, least_gain=_LAST_GAIN)
-    return _settle_response(scene, end, rng, on_step) if response else (scene, end)
+    least_gain = COARSE_GAIN if is_quick else _LAST_GAIN
+    end = settle_minimum(scene, end, on_step, least_gain=least_gain)
+    if not response:
+        return scene, end
+    rounds = _QUICK_ROUNDS if is_quick else _RESPONSE_ROUNDS
+    return _settle_response(scene, end, rng, on_step, rounds=rounds, least_gain=least_gain)
 
 
 def _settle_smoothness(
@@ -236,10 +247,16 @@ def _with_likely_numbers(scene: Scene, end: Minimum) -> Minimum:
 
 
 def _settle_response(
-    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep
+    scene: Scene,
+    end: Minimum,
+    rng: np.random.Generator,
+    on_step: OnStep,
+    *,
+    rounds: int,
+    least_gain: float,
 ) -> tuple[Scene, Minimum]:
     """Find the numbers that change the response to fields, and how uncertain they are."""
-    for _ in range(_RESPONSE_ROUNDS):
+    for _ in range(rounds):
         response = _posterior(scene, end, rng, on_step).response(_PAIRS)
         mean, precision = _mean_of_numbers(response)
         step = np.maximum(mean, scene.least_numbers()) - response.numbers
@@ -250,7 +267,7 @@ def _settle_response(
         for each, share in zip(response.changes, step, strict=True):
             unknowns = unknowns.plus(unknowns.like(share * each.flat()))
         end = replace(end, unknowns=unknowns)
-        end = settle_minimum(scene, end, on_step, least_gain=_LAST_GAIN)
+        end = settle_minimum(scene, end, on_step, least_gain=least_gain)
         if is_settled:
             break
     # Numbers that have not settled are at least as uncertain as they would still have moved.
@@ -295,13 +312,19 @@ def settle_minimum(
 
 
 def refine_minimum(
-    scene: Scene, minimum: Minimum, options: FitOptions, on_step: OnStep
+    scene: Scene,
+    minimum: Minimum,
+    options: FitOptions,
+    on_step: OnStep,
 ) -> tuple[Scene, Unknowns, float, int, bool]:
     """Descend with the pixels as recorded, with rays as dense as the data need.
 
-    Also returns the number of steps, and whether it converged within the allowed number.
+    Also returns the number of steps, and whether it converged within the allowed number. A quick
+    fit keeps the unknowns of larger pixels.
     """
     unknowns, steps = minimum.in_pixels(scene.bin), 0
+    if options.quick:
+        return replace(scene, spacing=_QUICK_SPACING), unknowns, minimum.value, 0, True
     usual = [_SPACING_WITH_NUMBERS] if scene.imperfect.parts else list(_SPACINGS)
     denser = usual if options.spacing is None else [options.spacing]
     most = -(-options.max_iterations // len(denser))

@@ -1,5 +1,6 @@
 """Images of a fit, each with all that is known of it: `FitShot`.
 
+- a field near which a fit is to end: `NearField`
 - values for all images, from those of each: `join_shots`
 - width of the point spread in px, from the beam's source and the detector: `point_spread`
 """
@@ -14,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import KindOfNoise
 from napari_shadowinv.physics.setup import Setup
@@ -22,6 +24,7 @@ from napari_shadowinv.preprocessing import Radiograph
 __all__ = [
     "FitShot",
     "Images",
+    "NearField",
     "common_values",
     "join_shots",
     "list_shots",
@@ -29,6 +32,22 @@ __all__ = [
     "point_spread",
     "value_of_first",
 ]
+
+
+@dataclass(frozen=True, eq=False)
+class NearField:
+    """A field near the true one, from which alone a fit starts: no alternatives are looked for.
+
+    Attributes
+    ----------
+    potential : ndarray, shape (H, W)
+        In px², of the first field.
+    smoothness : tuple of float
+        The weights λ and κ of a similar fit, as `FittedField.smoothness`; they are not estimated.
+    """
+
+    potential: FloatArray
+    smoothness: tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +78,9 @@ class FitShot:
     fiducials : array_like of shape (n, 5), or path of a table, optional
         Known displacements, in the first image only: rows of y, x, dy, dx and their σ, in px after
         all steps.
-    start : array_like of shape (H, W), optional
-        A potential in px² to start from, of the first field, in the first image only.
+    start : array_like of shape (H, W), or NearField, optional
+        A potential in px² to start from, of the first field, in the first image only. A fit
+        starts from other fields, too, unless it is a `NearField`.
     name : str, optional
         Its name in messages. Default: its file or its number.
     measured : bool, default True
@@ -81,7 +101,7 @@ class FitShot:
     psf: float | None = None
     noise: KindOfNoise | float | None = None
     fiducials: ArrayLike | Path | None = None
-    start: ArrayLike | None = None
+    start: ArrayLike | NearField | None = None
     name: str | None = None
     measured: bool = True
 

@@ -122,6 +122,7 @@ def assess_verdict(
     edge_is_free: bool,
     parts: Mapping[str, float],
     max_error: float,
+    searched: bool = True,
 ) -> tuple[Verdict, str]:
     """Return the verdict on a fit, and a sentence that says why.
 
@@ -161,6 +162,8 @@ def assess_verdict(
         What the uncertainty is made of, the largest first; empty without an instrument.
     max_error : float
         Largest total error of a determined fit, as a share of the displacement.
+    searched : bool, default True
+        Whether the fit has started from several fields.
     """
     if worst := _those(names, chi2, chi2 > _MISFIT):
         causes = "noise, source (uniform, measured or unknown) or point spread may be wrong"
@@ -269,8 +272,10 @@ def assess_verdict(
             f"bars {noise_amplification(pattern.correlation):.1f} times as large as for white noise"
         )
     several = "one image" if single else f"{len(chi2)} images"
+    starts = "all starts lead to" if searched else "the given start leads to"
+    unchecked += "" if searched else "; alternative solutions were not looked for"
     return Verdict.DETERMINED, (
-        f"all starts lead to one field, which explains {several} to the noise (χ² "
+        f"{starts} one field, which explains {several} to the noise (χ² "
         f"{np.min(chi2):.2f} to {np.max(chi2):.2f}){unchecked}"
     )
 

@@ -144,6 +144,14 @@ class FitOptions(CheckedModel):
         title="Iterations",
         description="Maximum solver iterations at full resolution.",
     )
+    quick: bool = Field(
+        default=False,
+        title="Quick",
+        description=(
+            "Fit in pixels of two, with fewer steps for the instrument's numbers: several times "
+            "faster, for a plan or a preview."
+        ),
+    )
     ambiguous: bool = Field(
         default=False,
         title="Allow an ambiguous fit",

@@ -1,6 +1,7 @@
 """One object in two experiments: invert a shot of one, predict the image of the other.
 
-- the displacement in another experiment: `transferred_displacement`
+- the displacement in another experiment: `transferred_displacement`; by how much it is larger:
+  `displacement_ratio`
 - the image there, from a displacement: `project`; from a potential in SI: `project_potential`
 - the cause of the deflection, which both experiments have in common: `deflector_titles`
 
@@ -168,15 +169,32 @@ def transferred_displacement(
     2.22
     """
     field = checked_displacement(displacement)
-    factor = _angle_ratio(recorded_with, setup, deflector, dispersion)
+    # One factor, so that nothing changes, not even by rounding, where nothing differs.
+    factor = displacement_ratio(recorded_with, setup, deflector=deflector, dispersion=dispersion)
     ratio = setup.object_pixel_size / recorded_with.object_pixel_size
     old = (field.shape[1], field.shape[2])
     size = _covered_shape(old, ratio) if shape is None else _checked_shape(shape, old, ratio, setup)
-    # One factor, so that nothing changes, not even by rounding, where nothing differs.
-    factor *= float(recorded_with.deflection_angle(1.0) / setup.deflection_angle(1.0))
     if size == old and math.isclose(ratio, 1, rel_tol=_SIZE_TOLERANCE):
         return factor * field
     return factor * _resample(field, size, ratio)
+
+
+def displacement_ratio(
+    recorded_with: Setup,
+    setup: Setup,
+    *,
+    deflector: str | None = None,
+    dispersion: float = 1.0,
+) -> float:
+    """Return the displacement in px of one experiment over that in px of another.
+
+    Parameters
+    ----------
+    recorded_with, setup, deflector, dispersion
+        As for `transferred_displacement`, whose errors this has.
+    """
+    factor = _angle_ratio(recorded_with, setup, deflector, dispersion)
+    return factor * float(recorded_with.deflection_angle(1.0) / setup.deflection_angle(1.0))
 
 
 def default_deflector(recorded_with: Setup, setup: Setup) -> str:

@@ -1,0 +1,612 @@
+"""An experiment before its shot: `plan_experiment`, `sweep_experiment`.
+
+Shots are simulated with imperfections drawn from the stated instrument, and inverted (one image) or
+fitted (several). The errors made, the errors reported and the verdicts say whether the field would
+be determined, what limits it, and what a change buys.
+
+- the quantities that can be varied: `SWEPT`
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel
+from scipy.ndimage import gaussian_filter
+
+from napari_shadowinv._system.machine import available_threads
+from napari_shadowinv._system.progress import OnProgress, Progress, Reporter, ShouldStop
+from napari_shadowinv._system.validation import as_model, check_instance, suggestion, validate
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Verdict
+from napari_shadowinv.fitting import Fit, FitShot, fit
+from napari_shadowinv.fitting.compilation import ensure_compiled as ensure_fit_compiled
+from napari_shadowinv.fitting.shots import NearField, point_spread
+from napari_shadowinv.inversion import invert
+from napari_shadowinv.inversion.budget import Errors
+from napari_shadowinv.inversion.compilation import ensure_compiled as ensure_inversion_compiled
+from napari_shadowinv.options import FitOptions, Instrument, InversionOptions
+from napari_shadowinv.physics.phantom_models import PhantomRecipe
+from napari_shadowinv.physics.beam import unit_in_title
+from napari_shadowinv.physics.poisson import potential_of
+from napari_shadowinv.physics.setup import SETUPS, BeamSetup, Setup, deflector_titles
+from napari_shadowinv.pipeline.experiment_object import PlannedObject, object_of_phantom
+from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
+from napari_shadowinv.pipeline.experiment_result import (
+    ExperimentPlan,
+    ExperimentSweep,
+    PlannedShot,
+)
+from napari_shadowinv.pipeline.experiment_shots import (
+    Beam,
+    Detector,
+    ShotSimulator,
+    SimulatedShots,
+)
+
+__all__ = ["SWEPT", "plan_experiment", "sweep_experiment"]
+
+_MIN_SIDE_PX = 32
+_MIN_DISPLACEMENT_PX = 1e-6
+_ERROR_SAMPLES = 6
+_SAME_SIZE = 1e-6
+# Verdicts that a fit without a search and without error bars cannot find itself.
+_OF_SEARCH = (Verdict.UNCERTAIN, Verdict.SEVERAL, Verdict.AMBIGUOUS)
+
+def plan_experiment(
+    object: PlannedObject | PhantomRecipe,
+    setups: Setup | Sequence[Setup] | None = None,
+    *,
+    shape: tuple[int, int] | None = None,
+    instrument: Instrument | None = None,
+    options: ExperimentOptions | None = None,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> ExperimentPlan:
+    """Simulate shots of an experiment, retrieve their fields, and compare these with the object.
+
+    Parameters
+    ----------
+    object : PlannedObject or PhantomRecipe
+        The object: a phantom, or a field that is known from elsewhere.
+    setups : Setup or sequence of Setup, optional
+        The experiment of each image, with the same pixels at the object. Default: one image, and
+        an object in pixels.
+    shape : tuple of int, optional
+        Height and width of an image in px. Default: of the known field, 200 × 200 for a phantom.
+    instrument : Instrument, optional
+        How well beam, detector and alignment are known: the imperfections are drawn from it, and
+        inversions and fits take it into account. Default: exact, with a beam that is assumed.
+    options : ExperimentOptions, optional
+        Counts, reference, point spread, number of shots.
+    on_progress, should_stop : callable, optional
+        Receives a `Progress` after each shot; ends the work when it returns true.
+
+    Returns
+    -------
+    ExperimentPlan
+
+    Raises
+    ------
+    InputError
+        If setups, object and shape do not fit together, or the object displaces no rays.
+    InversionCancelled
+        If `should_stop` returned true.
+
+    Notes
+    -----
+    With one image the field is inverted, with several it is fitted. Only the first fits search for
+    alternative solutions (`ExperimentOptions.searched`) and compute error bars; the others start
+    near the true field with the smoothness of the first.
+
+    Examples
+    --------
+    >>> from napari_shadowinv.physics.phantom_models import BlobRecipe
+    >>> options = ExperimentOptions(counts=500, draws=2)
+    >>> plan = plan_experiment(BlobRecipe(sigma=9), shape=(64, 64), options=options)
+    >>> len(plan.shots)
+    2
+    """
+    inputs = _checked_inputs(object, setups, shape, instrument, options)
+    return _plan(inputs, Reporter(on_progress, should_stop), should_stop)
+
+
+def sweep_experiment(
+    object: PlannedObject | PhantomRecipe,
+    setups: Setup | Sequence[Setup] | None = None,
+    *,
+    quantity: str,
+    values: Sequence[float],
+    shape: tuple[int, int] | None = None,
+    instrument: Instrument | None = None,
+    options: ExperimentOptions | None = None,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> ExperimentSweep:
+    """Plan an experiment for several values of one quantity.
+
+    Parameters
+    ----------
+    object, setups, shape, instrument, options, on_progress, should_stop
+        As for `plan_experiment`. The object stays the same.
+    quantity : str
+        Key of the quantity that is varied, one of `SWEPT`: "counts", "energy" of the last image,
+        "object_image_distance", a number of the instrument such as "beam_rms" or "blur".
+    values : sequence of float
+        Its values, two or more, in the unit of that field.
+
+    Returns
+    -------
+    ExperimentSweep
+        Each value has the same draws of the imperfections, so that a difference is one of the
+        quantity.
+
+    Raises
+    ------
+    InputError
+        As `plan_experiment`, and if the quantity is unknown or a value out of range.
+    InversionCancelled
+        If `should_stop` returned true.
+    """
+    if quantity not in SWEPT:
+        raise InputError(f"the quantity to vary is '{quantity}': {suggestion(quantity, SWEPT)}")
+    numbers = [float(value) for value in values]
+    if len(set(numbers)) < 2:
+        raise InputError(
+            f"received {len(set(numbers))} values of {quantity}: expected two or more that differ"
+        )
+    inputs = _checked_inputs(object, setups, shape, instrument, options)
+    changed = [_with_value(inputs, quantity, value) for value in numbers]
+    plans = []
+    for number, each in enumerate(changed):
+        report = Reporter(
+            None if on_progress is None else _shifted(on_progress, number, len(changed)),
+            should_stop,
+        )
+        plans.append(_plan(each, report, should_stop))
+    swept = SWEPT[quantity]
+    return ExperimentSweep(quantity, swept.title, swept.unit, tuple(numbers), tuple(plans))
+
+
+class Swept(NamedTuple):
+    """A quantity that can be varied: its name, its unit, and the model that has it."""
+
+    title: str
+    unit: str
+    owner: str
+
+
+def _swept() -> dict[str, Swept]:
+    quantities = {}
+    owners: dict[str, tuple[type[BaseModel], Sequence[str]]] = {
+        "options": (ExperimentOptions, _OF_OPTIONS),
+        "setup": (BeamSetup, _OF_SETUP),
+        "instrument": (Instrument, _OF_INSTRUMENT),
+    }
+    for owner, (model, names) in owners.items():
+        for name in names:
+            title = model.model_fields[_FIELDS.get(name, name)].title or name
+            title = f"{title} error" if name in _FIELDS else title
+            quantities[name] = Swept(title.partition(" (")[0], unit_in_title(title), owner)
+    for model in SETUPS.values():
+        quantity = model.beam_quantity()
+        quantities[quantity.name] = Swept(quantity.noun.capitalize(), quantity.unit, "last setup")
+    return quantities
+
+
+_OF_OPTIONS = (
+    "counts",
+    "reference_counts",
+    "beam_structure",
+    "psf",
+    "source_size",
+    "resolution",
+)
+# Names of fields that two models have.
+_FIELDS = {"energy_error": "energy"}
+_OF_SETUP = ("source_object_distance", "object_image_distance")
+_OF_INSTRUMENT = (
+    "beam_rms",
+    "beam_length",
+    "beam_between",
+    "energy_error",
+    "background",
+    "gamma",
+    "blur",
+    "absorption",
+    "registration",
+    "other_field",
+)
+SWEPT: dict[str, Swept] = _swept()
+"""Quantities that `sweep_experiment` can vary, by their keys."""
+
+
+def _shifted(on_progress: OnProgress, number: int, count: int) -> OnProgress:
+    """Count the shots of all values of a sweep together."""
+
+    def report(progress: Progress) -> None:
+        if progress.total is not None:
+            step = number * progress.total + progress.step
+            progress = replace(progress, step=step, total=count * progress.total)
+        on_progress(progress)
+
+    return report
+
+
+@dataclass(frozen=True)
+class _Inputs:
+    """Checked inputs of a plan."""
+
+    object: PlannedObject
+    setups: tuple[Setup | None, ...]
+    shape: tuple[int, int]
+    instrument: Instrument
+    options: ExperimentOptions
+
+    @property
+    def is_fit(self) -> bool:
+        if self.options.method == "automatic":
+            return len(self.setups) > 1
+        return self.options.method == "fit"
+
+    @property
+    def psf(self) -> tuple[float, ...]:
+        """Known point spread of each image, px."""
+        options = self.options
+        if options.psf is not None or self.setups == (None,):
+            return (options.psf or 0.0,) * len(self.setups)
+        lengths = options.source_size or 0.0, options.resolution or 0.0
+        return tuple(point_spread(setup, *lengths) for setup in self.setups if setup is not None)
+
+
+def _checked_inputs(
+    object: Any, setups: Any, shape: Any, instrument: Any, options: Any
+) -> _Inputs:
+    options = as_model(ExperimentOptions, options, "options")
+    instrument = as_model(Instrument, instrument, "instrument")
+    check_instance(object, (PlannedObject, PhantomRecipe), "object")
+    if object is None:
+        raise InputError("the object is None: expected a phantom or a field")
+    listed = (setups,) if setups is None or isinstance(setups, BeamSetup) else tuple(setups)
+    if not listed or (len(listed) > 1 and None in listed):
+        raise InputError("the setups have gaps: expected the setup of each image")
+    for setup in listed:
+        check_instance(setup, BeamSetup, "setup")
+    is_phantom = isinstance(object, PhantomRecipe)
+    size = shape or ((200, 200) if is_phantom else object.shape)
+    if len(size) != 2 or min(size) < _MIN_SIDE_PX:
+        raise InputError(
+            f"the shape is {tuple(size)}: expected height and width of {_MIN_SIDE_PX} px or more"
+        )
+    size = int(size[0]), int(size[1])
+    if is_phantom:
+        object = object_of_phantom(object, listed[0], size)
+    inputs = _Inputs(object, listed, size, instrument, options)
+    _refuse_unsuitable(inputs)
+    return inputs
+
+
+def _refuse_unsuitable(inputs: _Inputs) -> None:
+    options, instrument, setups = inputs.options, inputs.instrument, inputs.setups
+    if options.method == "inversion" and len(setups) > 1:
+        raise InputError(
+            f"received {len(setups)} setups and the method 'inversion', which takes one image: "
+            "choose a fit, or give one setup"
+        )
+    if setups == (None,):
+        for name in ("source_size", "resolution"):
+            if getattr(options, name):
+                raise InputError(
+                    f"received {name} in m without a setup: give the setup, or the point spread in "
+                    "px"
+                )
+    first = setups[0]
+    for number, setup in enumerate(setups[1:], start=2):
+        assert first is not None and setup is not None
+        ratio = setup.object_pixel_size / first.object_pixel_size
+        if abs(ratio - 1) > _SAME_SIZE:
+            raise InputError(
+                f"image {number} has pixels of {setup.object_pixel_size * 1e6:.6g} µm at the "
+                f"object, the first of {first.object_pixel_size * 1e6:.6g} µm: expected the same"
+            )
+    if len(setups) > 1 and len(set(setups)) < len(setups):
+        raise InputError("two setups are the same: give images of different energies")
+    if instrument.noise_correlation:
+        raise InputError(
+            "received a noise correlation, but simulated pixels have independent noise: leave it "
+            "out"
+        )
+    if instrument.beam_of(measured=options.is_recorded).components is not None:
+        raise InputError(
+            "received a beam with components of references, which is not simulated: state its "
+            "r.m.s. and its length"
+        )
+
+
+def _with_value(inputs: _Inputs, quantity: str, value: float) -> _Inputs:
+    """Return inputs with another value of a quantity."""
+    owner, name = SWEPT[quantity].owner, _FIELDS.get(quantity, quantity)
+    if owner == "options":
+        stated = inputs.options.model_dump(exclude_unset=True)
+        options = validate(ExperimentOptions, {**stated, name: value}, "")
+        changed = replace(inputs, options=options)
+    elif owner == "instrument":
+        stated = inputs.instrument.stated
+        changed = replace(inputs, instrument=validate(Instrument, {**stated, name: value}, ""))
+    else:
+        setups = inputs.setups
+        if None in setups or not hasattr(setups[-1], name):
+            kind = "a setup" if None in setups else f"{setups[-1].beam}"  # type: ignore[union-attr]
+            raise InputError(
+                f"received values of {quantity}, which {kind} has not: give setups that have it"
+                if None not in setups
+                else f"received values of {quantity} without a setup: give the setups"
+            )
+        chosen = setups[-1:] if owner == "last setup" else setups
+        others = setups[: len(setups) - len(chosen)]
+        changed_setups = [
+            validate(type(setup), {**setup.model_dump(), name: value}, "")  # type: ignore
+            for setup in chosen
+        ]
+        changed = replace(inputs, setups=(*others, *changed_setups))
+    _refuse_unsuitable(changed)
+    return changed
+
+
+def _plan(inputs: _Inputs, report: Reporter, should_stop: ShouldStop | None) -> ExperimentPlan:
+    start = time.perf_counter()
+    options = inputs.options
+    report("shots", 0, options.draws)
+    simulator = _simulator(inputs)
+    if float(np.abs(simulator.truth).max()) < _MIN_DISPLACEMENT_PX:
+        raise InputError(
+            "the object displaces rays by nothing in this experiment: check its strength, the "
+            "energy and the distances"
+        )
+    ensure = ensure_fit_compiled if inputs.is_fit else ensure_inversion_compiled
+    ensure(None, should_stop)
+    prepared = time.perf_counter()
+    retrieve = _fitted if inputs.is_fit else _inverted
+    searched = min(options.searched, options.draws) if inputs.is_fit else options.draws
+    done = 0
+
+    def draw_all(numbers: range, near: Fit | None) -> Iterator[_Retrieved]:
+        nonlocal done
+
+        def compute(number: int) -> _Retrieved:
+            return retrieve(inputs, simulator, number, near, should_stop)
+
+        with ThreadPoolExecutor(available_threads(options.threads)) as pool:
+            tasks = [pool.submit(compute, number) for number in numbers]
+            try:
+                for _ in as_completed(tasks):
+                    done += 1
+                    report("shots", done, options.draws)
+                yield from (task.result() for task in tasks)
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+    results = list(draw_all(range(searched), None))
+    first = results[0]
+    results += draw_all(range(searched, options.draws), first.fit)
+    ended = time.perf_counter()
+    return ExperimentPlan(
+        title=inputs.object.title,
+        setups=tuple(setup for setup in inputs.setups if setup is not None),
+        shape=inputs.shape,
+        instrument=inputs.instrument,
+        options=options,
+        method="fit" if inputs.is_fit else "inversion",
+        shots=_with_error_bars([each.shot for each in results]),
+        images=first.images,
+        truth=simulator.truth,
+        retrieved=first.displacement,
+        seconds={"prepare": prepared - start, "shots": ended - prepared},
+    )
+
+
+def _simulator(inputs: _Inputs) -> ShotSimulator:
+    options, instrument = inputs.options, inputs.instrument
+    beam = Beam(
+        counts=options.counts,
+        structure=options.beam_structure,
+        is_recorded=options.is_recorded,
+        reference_counts=options.reference_counts or options.counts,
+        prior=instrument.beam_of(measured=options.is_recorded),
+    )
+    detector = Detector(inputs.psf, instrument)
+    return ShotSimulator(
+        inputs.object, inputs.setups, inputs.shape, beam, detector, options.seed
+    )
+
+
+class _Retrieved(NamedTuple):
+    """The outcome of a draw, with its images and the displacement that was retrieved."""
+
+    shot: PlannedShot
+    images: FloatArray
+    displacement: FloatArray
+    fit: Fit | None
+
+
+def _inverted(
+    inputs: _Inputs,
+    simulator: ShotSimulator,
+    number: int,
+    near: Fit | None,
+    should_stop: ShouldStop | None,
+) -> _Retrieved:
+    shots = simulator.draw(number)
+    options, (setup,) = inputs.options, inputs.setups
+    # An inversion does not correct the known point spread: it adds to the unknown one.
+    blur = float(np.hypot(inputs.instrument.blur, inputs.psf[0]))
+    inversion = invert(
+        shots.images[0],
+        source=shots.source,
+        instrument=inputs.instrument.model_copy(update={"blur": blur}),
+        measured=options.is_recorded,
+        options=InversionOptions(max_error=options.max_error, threads=1),
+        should_stop=should_stop,
+    )
+    assessment, errors = inversion.assess_in(setup), inversion.errors_in(setup)
+    error, peak_error = _errors_made(inversion.displacement, simulator.truth)
+    shot = PlannedShot(
+        number,
+        assessment.verdict,
+        assessment.reason,
+        error,
+        peak_error,
+        total=np.nan if errors is None else errors.share,
+        parts={} if errors is None else _parts_of(errors),
+    )
+    return _Retrieved(shot, shots.images, inversion.displacement, None)
+
+
+def _fitted(
+    inputs: _Inputs,
+    simulator: ShotSimulator,
+    number: int,
+    near: Fit | None,
+    should_stop: ShouldStop | None,
+) -> _Retrieved:
+    shots = simulator.draw(number)
+    options, setups = inputs.options, inputs.setups
+    images = [
+        FitShot(image, setup=setup, psf=psf, measured=options.is_recorded)
+        for image, setup, psf in zip(shots.images, setups, inputs.psf, strict=True)
+    ]
+    if near is not None:
+        start = NearField(potential_of(simulator.truth), near.fields[0].smoothness)
+        images[0] = replace(images[0], start=start)
+    noise: Any = "poisson"
+    if shots.source is not None and shots.source_noise:
+        noise = _noise(shots)
+    result = fit(
+        images,
+        source=shots.source,
+        fields=_fields_of(inputs),
+        noise=noise,
+        instrument=inputs.instrument,
+        options=FitOptions(
+            samples=_ERROR_SAMPLES if near is None else 0,
+            max_error=options.max_error,
+            quick=True,
+            threads=1,
+        ),
+        should_stop=should_stop,
+    )
+    displacement = result.fields[0].displacement
+    error, peak_error = _errors_made(displacement, simulator.truth)
+    parts, total, verdict = _fit_errors(result, inputs)
+    shot = PlannedShot(
+        number,
+        verdict,
+        result.explanation,
+        error,
+        peak_error,
+        total=total,
+        parts=parts,
+        scales=_scales_of(result, inputs),
+        is_searched=near is None,
+    )
+    return _Retrieved(shot, shots.images, displacement, result)
+
+
+def _fields_of(inputs: _Inputs) -> tuple[str, ...]:
+    """Return the key of the cause of the deflection."""
+    setup = inputs.setups[0]
+    cause = inputs.object.cause(setup)
+    if setup is None or cause is None:
+        return ("B",)
+    return tuple(key for key, title in deflector_titles().items() if title == cause)
+
+
+def _noise(shots: SimulatedShots) -> FloatArray:
+    """Standard deviation by the counts of image and reference in each pixel."""
+    assert shots.source is not None
+    means = gaussian_filter(shots.images, (0, 1.0, 1.0))
+    return np.asarray(np.sqrt(np.maximum(means, 1.0) + shots.source * shots.source_noise))
+
+
+def _errors_made(displacement: FloatArray, truth: FloatArray) -> tuple[float, float]:
+    """Return the error over the image, r.m.s., and at the peak, as shares of the field."""
+    error = float(np.linalg.norm(displacement - truth) / np.linalg.norm(truth))
+    peaks = [float(np.hypot(*field).max()) for field in (displacement, truth)]
+    return error, peaks[0] / peaks[1] - 1
+
+
+def _parts_of(errors: Errors) -> dict[str, float]:
+    """Return the parts of a budget as shares of the field, by the causes' names."""
+    parts = {}
+    for name, part in errors.parts.items():
+        key = name.partition(",")[0].replace(" ", "_")
+        if part is errors.beam:
+            key = "beam"
+        elif part in errors.effects.values() and key in ("wavelength", "energy"):
+            key = "energy"
+        parts[key] = part.rms / errors.rms if errors.rms > 0 else np.inf
+    return parts
+
+
+def _fit_errors(
+    result: Fit, inputs: _Inputs
+) -> tuple[dict[str, float], float, Verdict]:
+    """Return the parts of a fit's error, the total, and the verdict, with the energy's error."""
+    report = result.report
+    if np.isnan(report.uncertainty):
+        return {}, np.nan, result.verdict
+    parts = dict(report.parts) or {"noise": report.uncertainty}
+    if report.beam is not None and report.beam.share:
+        parts["beam"] = report.beam.share
+    total, verdict, setup = report.total, result.verdict, inputs.setups[0]
+    if setup is not None and inputs.instrument.energy:
+        share = inputs.instrument.energy * abs(setup.sensitivity_to_beam(setup.main_field.name))
+        parts["energy"] = share
+        total = float(np.hypot(total, share))
+        if verdict is Verdict.DETERMINED and total > inputs.options.max_error:
+            verdict = Verdict.UNCERTAIN
+    return parts, total, verdict
+
+
+def _scales_of(result: Fit, inputs: _Inputs) -> dict[str, float]:
+    """Return standard deviations of the instrument's numbers over those that were stated."""
+    instrument = inputs.instrument
+    beam = instrument.beam_of(measured=inputs.options.is_recorded)
+    stated = {
+        "beam": beam.rms,
+        "beam_between": beam.between,
+        "gamma": instrument.gamma,
+        "background": instrument.background,
+        "blur": instrument.blur**2,
+        "absorption": instrument.absorption,
+        "other_field": 1.0,
+    }
+    scales = {}
+    for key, rows in result.report.numbers.items():
+        deviation = float(np.sqrt(np.mean([row[1] ** 2 for row in rows])))
+        if stated.get(key) and np.isfinite(deviation):
+            scales[key] = deviation / stated[key]
+    return scales
+
+
+def _with_error_bars(shots: Sequence[PlannedShot]) -> tuple[PlannedShot, ...]:
+    """Give fits without error bars those of the fits that have them, and what follows of them."""
+    searched = [shot for shot in shots if shot.is_searched]
+    if len(searched) == len(shots):
+        return tuple(shots)
+    total = float(np.median([shot.total for shot in searched]))
+    doubts = [shot for shot in searched if shot.verdict in _OF_SEARCH]
+    completed = []
+    for shot in shots:
+        if not shot.is_searched:
+            shot = replace(shot, total=total)
+            if shot.is_determined and doubts:
+                shot = replace(shot, verdict=doubts[0].verdict, reason=doubts[0].reason)
+        completed.append(shot)
+    return tuple(completed)

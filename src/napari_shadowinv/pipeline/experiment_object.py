@@ -1,0 +1,300 @@
+"""Objects of a planned experiment: `PlannedObject`.
+
+- a phantom, by its model: `object_of_phantom`
+- a field that was retrieved or computed before: `object_of_result`, `object_of_displacement`,
+  `object_of_potential`
+
+An object supplies the displacement of rays in any setup. A kind of object that knows more, such as
+a thick one whose particles are traced, overrides `PlannedObject.image`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.ndimage import map_coordinates, spline_filter
+
+from napari_shadowinv._system.arrays import as_numbers, plain_array
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.forward import checked_displacement, synthetic_image
+from napari_shadowinv.physics.phantom_models import PhantomRecipe
+from napari_shadowinv.physics.projection import default_deflector, displacement_ratio
+from napari_shadowinv.physics.setup import Setup, deflector_titles, displacement_from_potential
+
+__all__ = [
+    "Grid",
+    "PlannedObject",
+    "object_of_displacement",
+    "object_of_phantom",
+    "object_of_potential",
+    "object_of_result",
+]
+
+_FINER = 3  # samples of a phantom along a side of a pixel
+_TILES = 9  # of rays, in each sample of a grid
+
+
+class Grid(NamedTuple):
+    """Samples over an image of (height, width) px and beyond: `factor` along a side of a pixel."""
+
+    shape: tuple[int, int]
+    factor: int = 1
+    margin: int = 0  # px beyond each edge
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Number of samples along y and x."""
+        height, width = (self.factor * (side + 2 * self.margin) for side in self.shape)
+        return height, width
+
+    def lines(self) -> tuple[FloatArray, FloatArray]:
+        """Return the places of the samples along y and x, px."""
+        rows, columns = (
+            (np.arange(size) + 0.5) / self.factor - 0.5 - self.margin for size in self.sizes
+        )
+        return rows, columns
+
+    def in_pixels(self, values: FloatArray) -> FloatArray:
+        """Return means over the pixels, (H + 2 margin, W + 2 margin), of sampled values."""
+        height, width = (size // self.factor for size in self.sizes)
+        blocks = values.reshape(height, self.factor, width, self.factor)
+        return np.asarray(blocks.mean(axis=(1, 3)))
+
+    def inner(self, pixels: FloatArray) -> FloatArray:
+        """Return the pixels of the image, without the margin."""
+        height, width = self.shape
+        inside = (slice(self.margin, self.margin + side) for side in (height, width))
+        return pixels[tuple(inside)]
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedObject:
+    """A thin object, by the displacement of rays in one setup.
+
+    Attributes
+    ----------
+    samples : ndarray, shape (2, h, w)
+        Displacement in px of `setup`, at samples about the middle of the image.
+    title : str
+        In texts.
+    setup : Setup or None
+        Experiment of the displacement. Without one, the object can be planned in pixels only.
+    deflector : str or None
+        Title of the cause of the deflection. Default: see `default_deflector`.
+    finer : int, default 1
+        Samples along a side of a pixel.
+    shadow : ndarray of bool, shape (h, w), or None
+        Samples where the object stops the beam.
+    """
+
+    samples: FloatArray
+    title: str = "a displacement"
+    setup: Setup | None = None
+    deflector: str | None = None
+    finer: int = 1
+    shadow: FloatArray | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width in px of the setup."""
+        height, width = (size // self.finer for size in self.samples.shape[1:])
+        return height, width
+
+    def cause(self, setup: Setup | None) -> str | None:
+        """Return the title of the cause of the deflection in a setup; None without setups."""
+        if self.setup is None or setup is None:
+            return self.deflector
+        return self.deflector or default_deflector(self.setup, setup)
+
+    def displacement(self, setup: Setup | None, grid: Grid) -> FloatArray:
+        """Return the displacement in px of a setup at the samples of a grid, (2, h, w).
+
+        Beyond the samples it is that of the nearest one.
+
+        Raises
+        ------
+        InputError
+            If the deflector does not act on the beam, or only one experiment is described.
+        """
+        factor, ratio = 1.0, 1.0
+        if setup is not None and self.setup is not None:
+            factor = displacement_ratio(self.setup, setup, deflector=self.deflector)
+            ratio = setup.object_pixel_size / self.setup.object_pixel_size
+        elif setup is not None:
+            raise InputError(
+                f"the object is {self.title} in px without a setup, but the experiment has one: "
+                "give the setup of the displacement, or none at all"
+            )
+        places = self._places(grid, ratio)
+        values = [
+            map_coordinates(spline_filter(part, mode="nearest"), places, mode="nearest", prefilter=False)
+            for part in self.samples
+        ]
+        return factor * np.stack(values)
+
+    def transmission(self, setup: Setup | None, grid: Grid) -> FloatArray | None:
+        """Return the share of the beam that passes at each sample; None for a transparent one."""
+        if self.shadow is None:
+            return None
+        ratio = 1.0
+        if setup is not None and self.setup is not None:
+            ratio = setup.object_pixel_size / self.setup.object_pixel_size
+        places = self._places(grid, ratio)
+        return 1 - np.asarray(
+            map_coordinates(self.shadow.astype(np.float64), places, order=0, mode="nearest")
+        )
+
+    def image(self, beam: FloatArray, displacement: FloatArray, grid: Grid) -> FloatArray:
+        """Return the image of a beam that rays carry to where they are displaced.
+
+        Parameters
+        ----------
+        beam : ndarray, shape (h, w)
+            Flux density at the samples of the grid.
+        displacement : ndarray, shape (2, h, w)
+            Of the rays through the samples, px.
+        grid : Grid
+            Its margin is in the image, too.
+
+        Returns
+        -------
+        ndarray, shape (H + 2 margin, W + 2 margin)
+        """
+        fine = synthetic_image(
+            grid.factor * displacement, beam, rays_per_pixel=_TILES, threads=1
+        )
+        return grid.in_pixels(fine)
+
+    def _places(self, grid: Grid, ratio: float) -> FloatArray:
+        """Indices into the samples, (2, h, w), of the places of a grid."""
+        lines = []
+        for line, side, size in zip(
+            grid.lines(), grid.shape, self.samples.shape[1:], strict=True
+        ):
+            from_middle = (line - (side - 1) / 2) * ratio * self.finer
+            lines.append(from_middle + (size - 1) / 2)
+        return np.stack(np.meshgrid(*lines, indexing="ij"))
+
+
+def object_of_phantom(
+    recipe: PhantomRecipe, setup: Setup | None, shape: tuple[int, int]
+) -> PlannedObject:
+    """Return a simulated object.
+
+    Parameters
+    ----------
+    recipe : PhantomRecipe
+        The phantom and its parameters.
+    setup : Setup or None
+        The experiment that the parameters belong to, where they are in pixels or in shares of the
+        image.
+    shape : tuple of int
+        Height and width of the image in px.
+
+    Raises
+    ------
+    InputError
+        If the phantom needs another setup.
+    """
+    fine_shape = _FINER * shape[0], _FINER * shape[1]
+    fine_setup = None if setup is None else finer_setup(setup, _FINER)
+    fine = recipe.in_finer_pixels(_FINER)
+    shadow = fine.shadow(fine_shape, fine_setup)
+    return PlannedObject(
+        fine.phantom(fine_shape, fine_setup).displacement / _FINER,
+        title=recipe.title,
+        setup=setup,
+        deflector=_DEFLECTORS.get(recipe.probe),
+        finer=_FINER,
+        shadow=shadow,
+    )
+
+
+_DEFLECTORS = {"proton": "magnetic field", "optical": "plasma"}
+
+
+def finer_setup(setup: Setup, factor: int) -> Setup:
+    """Return a setup with pixels that are smaller by a factor."""
+    size = setup.object_pixel_size / factor
+    return setup.model_copy(update={"pixel_size": size, "detector_pixel_size": None})
+
+
+def object_of_displacement(
+    displacement: ArrayLike,
+    setup: Setup | None = None,
+    *,
+    deflector: str | None = None,
+    title: str = "a displacement",
+) -> PlannedObject:
+    """Return an object that displaces rays as given.
+
+    Parameters
+    ----------
+    displacement : array_like, shape (2, H, W)
+        In px of `setup`, axis order (y, x).
+    setup : Setup, optional
+        Its experiment.
+    deflector : str, optional
+        Title of the cause of the deflection.
+    title : str
+        In texts.
+
+    Raises
+    ------
+    InputError
+        If the shape is another or a value is not finite.
+    """
+    samples = checked_displacement(displacement)
+    if not np.isfinite(samples).all():
+        raise InputError(
+            "the displacement of the object has values that are not finite: expected numbers in px"
+        )
+    return PlannedObject(samples, title=title, setup=setup, deflector=deflector)
+
+
+def object_of_potential(
+    potential: ArrayLike, setup: Setup | None = None, *, deflector: str | None = None
+) -> PlannedObject:
+    """Return an object with a potential: in px², or with a setup in m, shape (H, W)."""
+    plane = as_numbers("potential", plain_array(potential, "potential"))
+    if setup is not None:
+        plane = setup.normalized_potential(plane)
+    moved = displacement_from_potential(plane)
+    return object_of_displacement(moved, setup, deflector=deflector, title="a potential")
+
+
+def object_of_result(result: Any, *, deflector: str | None = None) -> PlannedObject:
+    """Return the object that an inversion, a fit or a retrieved field has shown.
+
+    Parameters
+    ----------
+    result : Inversion, Fit or RetrievedField
+        As `read` returns it.
+    deflector : str, optional
+        Title of the cause of the deflection. Default: the fit's.
+
+    Raises
+    ------
+    InputError
+        If a fit has several fields.
+    """
+    fields = getattr(result, "fields", None)
+    if fields is None:
+        return object_of_displacement(
+            result.displacement, result.setup, deflector=deflector, title="an earlier result"
+        )
+    if len(fields) > 1:
+        names = " and ".join(field.name for field in fields)
+        raise InputError(
+            f"the result has the fields {names}: an experiment is planned for one of them; give "
+            "its displacement as an array"
+        )
+    (field,) = fields
+    return replace(
+        object_of_displacement(field.displacement, result.setup, title="an earlier result"),
+        deflector=deflector or deflector_titles()[field.name],
+    )

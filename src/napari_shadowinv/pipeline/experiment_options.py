@@ -1,0 +1,155 @@
+"""Choices of a planned experiment, as a model: `ExperimentOptions`."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, Self
+
+from pydantic import ConfigDict, Field, model_validator
+
+from napari_shadowinv._system.validation import CheckedModel, CombinationError
+
+__all__ = ["ExperimentOptions"]
+
+_RARE: Any = {"panel": "Rarely used options of a plan"}
+
+
+class ExperimentOptions(CheckedModel):
+    """Choices of a planned experiment, apart from its object, its setups and its instrument.
+
+    Raises
+    ------
+    InputError
+        If a value is out of range, or the point spread is given both in px and in m.
+
+    Examples
+    --------
+    >>> ExperimentOptions(counts=300, reference="recorded").is_recorded
+    True
+    """
+
+    model_config = ConfigDict(allow_inf_nan=False)
+
+    counts: float = Field(
+        default=1000.0,
+        gt=0,
+        le=1e9,
+        title="Counts",
+        description="Mean counts a pixel without the object, in each image.",
+    )
+    reference: Literal["none", "recorded"] = Field(
+        default="none",
+        title="Reference",
+        description=(
+            "'recorded': an image of the beam without the object is the source. 'none': a uniform "
+            "beam is assumed."
+        ),
+    )
+    reference_counts: float | None = Field(
+        default=None,
+        gt=0,
+        le=1e12,
+        title="Counts of the reference",
+        description="Mean counts a pixel of the reference. Default: as many as in an image.",
+    )
+    beam_structure: float = Field(
+        default=0.0,
+        ge=0,
+        lt=0.5,
+        title="Beam structure",
+        description=(
+            "Relative r.m.s. structure of the beam that the reference records, over the beam's "
+            "length. How far the beam differs from its reference is a number of the instrument."
+        ),
+    )
+    psf: float | None = Field(
+        default=None,
+        ge=0,
+        le=20,
+        title="Point spread (px)",
+        description="Known standard deviation of the point spread in px. Default: none.",
+    )
+    source_size: float | None = Field(
+        default=None,
+        ge=0,
+        title="Source size (m)",
+        description=(
+            "Standard deviation of the beam's source in m (FWHM / 2.355), for the point spread of "
+            "each setup."
+        ),
+    )
+    resolution: float | None = Field(
+        default=None,
+        ge=0,
+        title="Resolution (m)",
+        description="Standard deviation of the detector's point spread in m, at the detector.",
+    )
+    draws: int = Field(
+        default=20,
+        ge=2,
+        le=1000,
+        title="Draws",
+        description="Number of simulated shots, each with its own imperfections and noise.",
+    )
+    method: Literal["automatic", "inversion", "fit"] = Field(
+        default="automatic",
+        title="Method",
+        description=(
+            "'inversion' for one image, 'fit' for several or one. Default: an inversion for one "
+            "image."
+        ),
+        json_schema_extra=_RARE,
+    )
+    searched: int = Field(
+        default=1,
+        ge=1,
+        le=1000,
+        title="Draws with a full search",
+        description=(
+            "Number of draws whose fit looks for alternative solutions from all starting points "
+            "and computes error bars. The other fits start near the true field."
+        ),
+        json_schema_extra=_RARE,
+    )
+    max_error: float = Field(
+        default=0.05,
+        gt=0,
+        le=1,
+        title="Largest error",
+        description="Largest reported error of a determined field, as a share of it (r.m.s.).",
+    )
+    seed: int = Field(
+        default=0,
+        ge=0,
+        title="Random seed",
+        description="Seed of all random choices; the same seed gives the same plan.",
+        json_schema_extra=_RARE,
+    )
+    threads: int | None = Field(
+        default=None,
+        ge=1,
+        title="Number of threads",
+        description="Shots that are computed at once. Default: all cores. The result is the same.",
+        json_schema_extra=_RARE,
+    )
+
+    @model_validator(mode="after")
+    def _check_combinations(self) -> Self:
+        in_metres = [n for n in ("source_size", "resolution") if getattr(self, n) is not None]
+        if self.psf is not None and in_metres:
+            raise CombinationError(
+                f"received {{psf}}, a point spread in px, and {{{in_metres[0]}}} in m: expected "
+                "one or the other"
+            )
+        if self.reference == "none":
+            for name in ("reference_counts", "beam_structure"):
+                if getattr(self, name):
+                    raise CombinationError(
+                        f"received {{{name}}}, but {{reference}} is 'none': state that a reference "
+                        "is recorded, or leave it out"
+                    )
+        return self
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether a reference is recorded."""
+        return self.reference == "recorded"

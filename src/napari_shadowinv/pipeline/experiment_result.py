@@ -1,0 +1,517 @@
+"""What simulated shots of an experiment say about it: `ExperimentPlan`, of `PlannedShot`.
+
+- a quantity of the experiment that is varied: `ExperimentSweep`
+- what a change of a stated number buys: `Gain`
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.facts import Fact, Headline, Level, Verdict, time_fact
+from napari_shadowinv.options import Instrument
+from napari_shadowinv.physics.setup import Setup
+
+if TYPE_CHECKING:
+    import xarray
+
+    from napari_shadowinv.pipeline.experiment import ExperimentOptions
+
+__all__ = ["ExperimentPlan", "ExperimentSweep", "Gain", "PlannedShot", "Spread"]
+
+_DETERMINED_SHARE = 0.9  # of the shots, for a field that would be determined
+_SILENT_TOTALS = 3.0  # an error beyond so many reported ones is wrong in silence
+_LIMITS = (0.16, 0.84)
+_MIN_GAIN = 0.02  # of the error, worth a sentence
+_LISTED_GAINS = 3
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median of a quantity over the shots, and the interval that holds 68 % of them."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Spread:
+        """Return the spread of finite values; NaN without any."""
+        finite = [value for value in values if math.isfinite(value)]
+        if not finite:
+            return cls(math.nan, math.nan, math.nan)
+        low, high = np.quantile(finite, _LIMITS)
+        return cls(float(np.median(finite)), float(low), float(high))
+
+    @property
+    def text(self) -> str:
+        """In per cent, such as "2.1 % (68 % of the shots: 1.8 to 2.6 %)"."""
+        if math.isnan(self.median):
+            return "not known"
+        if self.low == self.high:
+            return percent(self.median)
+        bounds = f"{percent(self.low).removesuffix(' %')} to {percent(self.high)}"
+        return f"{percent(self.median)} (68 % of the shots: {bounds})"
+
+
+@dataclass(frozen=True)
+class PlannedShot:
+    """A simulated shot and its inversion or fit.
+
+    Attributes
+    ----------
+    number : int
+        Of the draw.
+    verdict : Verdict
+        Of the inversion or fit.
+    reason : str
+        The verdict's reason.
+    error : float
+        Error made: of the field, r.m.s. over the image, as a share of the r.m.s. field; it
+        includes a wrong energy.
+    peak_error : float
+        Of the largest magnitude of the field, as a share of it, with its sign.
+    total : float
+        Reported error as a share of the field (r.m.s.).
+    parts : dict of str to float
+        What the reported error is made of, as shares of the field (r.m.s.), by causes.
+    scales : dict of str to float
+        Standard deviations of the instrument's numbers after a fit over those before.
+    is_searched : bool
+        Whether a fit looked for alternative solutions and has error bars of its own.
+    """
+
+    number: int
+    verdict: Verdict
+    reason: str
+    error: float
+    peak_error: float
+    total: float
+    parts: dict[str, float] = field(default_factory=dict)
+    scales: dict[str, float] = field(default_factory=dict)
+    is_searched: bool = True
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the verdict is "determined"."""
+        return self.verdict is Verdict.DETERMINED
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Reported error after a change of one stated number, in the linear budget.
+
+    Attributes
+    ----------
+    cause : str
+        Part of the error that the change makes smaller.
+    text : str
+        The change in words.
+    total : float
+        Error after it, as a share of the field.
+    """
+
+    cause: str
+    text: str
+    total: float
+
+
+@dataclass(frozen=True, eq=False)
+class ExperimentPlan:
+    """Simulated shots of an experiment with their inversions or fits.
+
+    Attributes
+    ----------
+    title : str
+        The object.
+    setups : tuple of Setup
+        The experiment of each image; none if it is planned in pixels.
+    shape : tuple of int
+        Height and width of an image in px.
+    instrument : Instrument
+        As stated.
+    options : ExperimentOptions
+        As stated.
+    method : {"inversion", "fit"}
+        By which fields were retrieved.
+    shots : tuple of PlannedShot
+        One for each draw, in order.
+    images : ndarray, shape (L, H, W)
+        Counts of the first draw.
+    truth, retrieved : ndarray, shape (2, H, W)
+        Displacement in the first image, px: at the stated energy, and of the first draw.
+    seconds : dict of str to float
+        Time of each stage.
+    """
+
+    title: str
+    setups: tuple[Setup, ...]
+    shape: tuple[int, int]
+    instrument: Instrument
+    options: ExperimentOptions
+    method: str
+    shots: tuple[PlannedShot, ...]
+    images: FloatArray
+    truth: FloatArray
+    retrieved: FloatArray
+    seconds: dict[str, float]
+
+    @property
+    def verdicts(self) -> dict[Verdict, int]:
+        """How many shots have each verdict, the most frequent first."""
+        return dict(Counter(shot.verdict for shot in self.shots).most_common())
+
+    @property
+    def determined_share(self) -> float:
+        """Share of the shots whose field is determined."""
+        return sum(shot.is_determined for shot in self.shots) / len(self.shots)
+
+    @cached_property
+    def error(self) -> Spread:
+        """Error made, as a share of the field (r.m.s.)."""
+        return Spread.of([shot.error for shot in self.shots])
+
+    @cached_property
+    def peak_error(self) -> Spread:
+        """Error made at the peak, as a share of it, with its sign."""
+        return Spread.of([shot.peak_error for shot in self.shots])
+
+    @cached_property
+    def total(self) -> Spread:
+        """Error that the inversions or fits report, as a share of the field (r.m.s.)."""
+        return Spread.of([shot.total for shot in self.shots])
+
+    @property
+    def ratio(self) -> float:
+        """Error made over the reported one, r.m.s. over the shots; about 1 if that is right."""
+        ratios = [shot.error / shot.total for shot in self.shots if shot.total > 0]
+        return math.sqrt(np.mean(np.square(ratios))) if ratios else math.nan
+
+    @property
+    def silent(self) -> int:
+        """How many shots are called determined and are wrong, by far more than is reported."""
+        largest = self.options.max_error
+        return sum(
+            shot.is_determined and shot.error > max(largest, _SILENT_TOTALS * shot.total)
+            for shot in self.shots
+        )
+
+    @cached_property
+    def parts(self) -> dict[str, float]:
+        """Medians of the parts of the reported error, the largest first."""
+        names = dict.fromkeys(name for shot in self.shots for name in shot.parts)
+        medians = {
+            name: float(np.median([shot.parts[name] for shot in self.shots if name in shot.parts]))
+            for name in names
+        }
+        return dict(sorted(medians.items(), key=lambda part: -part[1]))
+
+    @cached_property
+    def gains(self) -> tuple[Gain, ...]:
+        """What a change of each stated number buys, the largest gain first.
+
+        The linear budget says so, without further simulations: the part of a number that is known
+        twice as well is half as large, or a quarter where it acts by its square; as far as the
+        images of a fit do not determine the number anyway.
+        """
+        squares = {name: share**2 for name, share in self.parts.items()}
+        total = math.sqrt(sum(squares.values()))
+        gains = []
+        for name, square in squares.items():
+            change = self._change_of(name)
+            if change is None:
+                continue
+            text, factor = change
+            less = math.sqrt(max(total**2 - square * (1 - factor**2), 0.0))
+            gains.append(Gain(name, text, less))
+        return tuple(sorted(gains, key=lambda gain: gain.total))
+
+    def _change_of(self, name: str) -> tuple[str, float] | None:
+        """Return a change in words, and the factor on the part that it acts on."""
+        if name == "noise":
+            counts = 2 * self.options.counts
+            return f"twice the counts ({counts:,.4g} a pixel)", math.sqrt(0.5)
+        size = self._stated(name)
+        if not size:
+            return None
+        power = 2.0 if name == "blur" else 1.0
+        scale = self._scale(name)
+        # Of a prior and data with known variances, in which the prior's becomes smaller.
+        factor = 1 / math.sqrt(1 + (4.0**power - 1) * scale**2)
+        unit, digits = ("px", 1.0) if name in ("blur", "registration") else ("%", 100.0)
+        unit, digits = ("", 1.0) if name == "gamma" else (unit, digits)
+        better, before = (f"{digits * x:.2g} {unit}".rstrip() for x in (size / 2, size))
+        noun = self._nouns.get(name, name.replace("_", " "))
+        return f"{noun} known to {better} instead of {before}", factor
+
+    @property
+    def _nouns(self) -> dict[str, str]:
+        noun = self.setups[0].beam_quantity().noun if self.setups else "energy"
+        return {"energy": noun, "beam_between": "beam between energies"}
+
+    def _stated(self, name: str) -> float:
+        """Standard deviation of a number of the instrument."""
+        if name == "beam":
+            return self.instrument.beam_of(measured=self.options.is_recorded).rms
+        return float(getattr(self.instrument, name, 0.0) or 0.0)
+
+    def _scale(self, name: str) -> float:
+        scales = [shot.scales[name] for shot in self.shots if name in shot.scales]
+        return min(float(np.median(scales)), 1.0) if scales else 1.0
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the field would be determined, in nine of ten shots or more."""
+        return self.determined_share >= _DETERMINED_SHARE and not self.silent
+
+    @property
+    def headline(self) -> Headline:
+        """Verdict on the experiment, error and its largest cause in one line."""
+        count = len(self.shots)
+        determined = round(self.determined_share * count)
+        would = "would" if self.is_determined else "would not reliably"
+        texts = [
+            f"the field {would} be determined: {determined} of {count} simulated shots",
+            f"error made {self.error.text}",
+        ]
+        if self.parts:
+            cause, share = next(iter(self.parts.items()))
+            texts.append(f"limited by {self._title(cause)} {percent(share)}")
+        if self.silent:
+            texts.append(f"{self.silent} of them wrong without a warning")
+        return Headline(Level.SOUND if self.is_determined else Level.DOUBTFUL, "; ".join(texts))
+
+    @property
+    def facts(self) -> tuple[Fact, ...]:
+        """The plan in words, as every face shows it below the headline."""
+        return tuple(self._facts())
+
+    def _facts(self) -> Iterator[Fact]:
+        level = Level.SOUND if self.is_determined else Level.DOUBTFUL
+        counts = ", ".join(f"{name} {n}" for name, n in self.verdicts.items())
+        yield Fact("verdicts", "Verdicts", f"of {len(self.shots)} shots: {counts}", level)
+        if reason := self._usual_reason:
+            yield Fact("reason", "Usual reason", reason, Level.DOUBTFUL)
+        if self.silent:
+            text = (
+                f"{self.silent} of {len(self.shots)} shots are called determined, but the field is "
+                f"off by more than {percent(self.options.max_error)} and {_SILENT_TOTALS:g} times "
+                "the reported error: do not rely on the verdict in this experiment"
+            )
+            yield Fact("silent", "Warning", text, Level.DOUBTFUL)
+        yield Fact("error", "Error made", f"{self.error.text} of the field (r.m.s.)")
+        yield Fact("peak_error", "Error at the peak", self.peak_error.text)
+        total = f"{self.total.text} of the field (r.m.s.)"
+        if not math.isnan(self.ratio):
+            total += f"; the error made is {self.ratio:.2g} times that (r.m.s.)"
+        yield Fact("total", "Error reported", total)
+        if self.parts:
+            ranking = ", ".join(f"{self._title(k)} {percent(v)}" for k, v in self.parts.items())
+            yield Fact("limits", "Limited by", ranking)
+        yield from self._gain_facts()
+        yield from self._caveat_facts()
+        yield time_fact(self.seconds)
+
+    @property
+    def _usual_reason(self) -> str:
+        reasons = [shot.reason for shot in self.shots if not shot.is_determined]
+        return reasons[0] if reasons else ""
+
+    def _gain_facts(self) -> Iterator[Fact]:
+        before = math.sqrt(sum(share**2 for share in self.parts.values()))
+        worth = [gain for gain in self.gains if gain.total < (1 - _MIN_GAIN) * before]
+        listed = "; ".join(
+            f"{gain.text}: {percent(gain.total)}" for gain in worth[:_LISTED_GAINS]
+        )
+        if listed:
+            text = f"reported error {percent(before)}; with {listed} (linear budget)"
+            yield Fact("gains", "What a change buys", text)
+
+    def _caveat_facts(self) -> Iterator[Fact]:
+        searched = sum(shot.is_searched for shot in self.shots)
+        if searched < len(self.shots):
+            text = (
+                f"alternative solutions were looked for in {searched} of {len(self.shots)} shots; "
+                "the other fits start near the true field and have the error bars of these"
+            )
+            yield Fact("searched", "Not tested", text, is_detail=True)
+        text = (
+            "the object is thin and does not change between images; scattering, diffraction and "
+            "the instrument's numbers that are not stated are left out"
+        )
+        yield Fact("assumed", "Assumed", text, is_detail=True)
+
+    def _title(self, name: str) -> str:
+        if name == "energy":
+            return self._nouns["energy"]
+        return self._nouns.get(name, name.replace("_", " "))
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a row for each shot, for a table."""
+        names = list(self.parts)
+        return [
+            {
+                "draw": shot.number,
+                "verdict": str(shot.verdict),
+                "error": shot.error,
+                "peak_error": shot.peak_error,
+                "reported_error": shot.total,
+                "searched": shot.is_searched,
+                **{f"part_{name}": shot.parts.get(name, math.nan) for name in names},
+            }
+            for shot in self.shots
+        ]
+
+    def to_dataset(self) -> xarray.Dataset:
+        """Return the plan as one labelled dataset.
+
+        Returns
+        -------
+        xarray.Dataset
+            Dimensions draw, image, component, y, x and cause. Errors are shares of the field. The
+            attributes hold setups, instrument and options as JSON texts, and the headline.
+        """
+        import xarray
+
+        causes = list(self.parts)
+        parts = [[shot.parts.get(name, math.nan) for name in causes] for shot in self.shots]
+        per_shot = {
+            "error": ("Error made, r.m.s.", [shot.error for shot in self.shots]),
+            "peak_error": ("Error made at the peak", [shot.peak_error for shot in self.shots]),
+            "reported_error": ("Error reported, r.m.s.", [shot.total for shot in self.shots]),
+            "searched": (
+                "Whether alternative solutions were looked for",
+                [shot.is_searched for shot in self.shots],
+            ),
+        }
+        variables: dict[str, Any] = {
+            name: ("draw", np.asarray(values), {"units": "1", "long_name": title})
+            for name, (title, values) in per_shot.items()
+        }
+        variables["verdict"] = "draw", [str(shot.verdict) for shot in self.shots]
+        label = {"units": "1", "long_name": "Parts of the reported error, r.m.s."}
+        variables["parts"] = ("draw", "cause"), np.reshape(parts, (len(self.shots), -1)), label
+        label = {"units": "1", "long_name": "Counts of the first draw"}
+        variables["images"] = ("image", "y", "x"), self.images, label
+        for name, values, title in (
+            ("true_displacement", self.truth, "Displacement at the stated energy"),
+            ("displacement", self.retrieved, "Displacement retrieved in the first draw"),
+        ):
+            label = {"units": "pixel", "long_name": title}
+            variables[name] = ("component", "y", "x"), values, label
+        attributes = {
+            "format": "shadowinv plan",
+            "object": self.title,
+            "method": self.method,
+            "setups": json.dumps([setup.model_dump(mode="json") for setup in self.setups]),
+            "instrument": self.instrument.model_dump_json(),
+            "options": self.options.model_dump_json(),
+            "gains": json.dumps([asdict(gain) for gain in self.gains]),
+            "headline": self.headline.text,
+        }
+        coordinates = {
+            "draw": [shot.number for shot in self.shots],
+            "cause": causes,
+            "component": ["y", "x"],
+        }
+        return xarray.Dataset(variables, coordinates, attributes)
+
+
+@dataclass(frozen=True, eq=False)
+class ExperimentSweep:
+    """Plans of an experiment in which one quantity is varied.
+
+    Attributes
+    ----------
+    quantity, title, unit : str
+        Its key, its name and its unit.
+    values : tuple of float
+        Its values, in order.
+    plans : tuple of ExperimentPlan
+        One for each value, by the same draws.
+    """
+
+    quantity: str
+    title: str
+    unit: str
+    values: tuple[float, ...]
+    plans: tuple[ExperimentPlan, ...]
+
+    @property
+    def best(self) -> int:
+        """Index of the value with the smallest error made."""
+        return int(np.argmin([plan.error.median for plan in self.plans]))
+
+    @property
+    def headline(self) -> Headline:
+        """Error made at the first, the best and the last value in one line."""
+        chosen = dict.fromkeys([0, self.best, len(self.values) - 1])
+        texts = ", ".join(
+            f"{percent(self.plans[k].error.median)} at {self.value_text(k)}" for k in chosen
+        )
+        sound = any(plan.is_determined for plan in self.plans)
+        level = Level.SOUND if sound else Level.DOUBTFUL
+        return Headline(level, f"error made: {texts}; smallest at {self.value_text(self.best)}")
+
+    @property
+    def facts(self) -> tuple[Fact, ...]:
+        """A fact for each value."""
+        return tuple(
+            Fact(
+                f"value_{k + 1}",
+                self.value_text(k),
+                f"error made {plan.error.text}, reported {percent(plan.total.median)}; determined "
+                f"in {round(plan.determined_share * len(plan.shots))} of {len(plan.shots)} shots",
+                Level.SOUND if plan.is_determined else Level.DOUBTFUL,
+            )
+            for k, plan in enumerate(self.plans)
+        )
+
+    def value_text(self, index: int) -> str:
+        """Return a value with the quantity's title and unit."""
+        return f"{self.title} {self.values[index]:.4g} {self.unit}".rstrip()
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a row for each value, for a table."""
+        return [
+            {
+                self.quantity: value,
+                "error": plan.error.median,
+                "error_low": plan.error.low,
+                "error_high": plan.error.high,
+                "peak_error": plan.peak_error.median,
+                "reported_error": plan.total.median,
+                "determined": plan.determined_share,
+                "silent": plan.silent,
+            }
+            for value, plan in zip(self.values, self.plans, strict=True)
+        ]
+
+
+def table_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return rows as comma-separated values with a line of names."""
+    import csv
+    import io
+
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        numbers = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()}
+        writer.writerow(numbers)
+    return text.getvalue()
+
+
+def percent(share: float) -> str:
+    """Return a share in per cent with two digits, such as "2.1 %"."""
+    size = 100 * share
+    return f"{size:.0f} %" if abs(size) >= 100 else f"{size:.2g} %"

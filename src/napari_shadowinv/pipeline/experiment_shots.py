@@ -1,0 +1,277 @@
+"""Simulated shots of a planned experiment: `ShotSimulator`, which draws `SimulatedShots`.
+
+The chain from the beam to the counts has its own imperfections, drawn from the stated instrument;
+none of it uses the models by which inversions and fits judge them. Rays start at nine samples a
+pixel, and each sample is cut into nine tiles; light that enters from beyond the edge is in it.
+
+Order: beam, transmission of the object, displacement, misalignment, blur, response, background,
+Poisson noise. Each imperfection has random numbers of its own, so that the others stay the same if
+one is changed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.options import BeamPrior, Instrument
+from napari_shadowinv.physics.projection import displacement_ratio
+from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.pipeline.experiment_object import Grid, PlannedObject
+
+__all__ = ["Beam", "Detector", "ShotSimulator", "SimulatedShots"]
+
+_FINER = 3  # samples along a side of a pixel
+_WAVES = 32
+_BEYOND_PX = 4  # more than rays are displaced
+_DIMMEST = 0.02  # of the mean, for a beam or a transmission
+_EDGE = 0.1  # of the largest displacement, where the object ends
+_STEEPNESS = 2.0
+_LEAST_EXPONENT = 0.2
+
+# Streams of random numbers.
+_STREAMS = (
+    "energy",
+    "structure",
+    "beam",
+    "between",
+    "absorption",
+    "other_field",
+    "alignment",
+    "registration",
+    "blur",
+    "gamma",
+    "background",
+    "counts",
+    "reference",
+)
+
+
+@dataclass(frozen=True)
+class Beam:
+    """The beam of an experiment.
+
+    Attributes
+    ----------
+    counts : float
+        Mean counts a pixel without the object.
+    structure : float
+        Relative r.m.s. of the structure that a reference records.
+    is_recorded : bool
+        Whether a reference is recorded.
+    reference_counts : float
+        Mean counts a pixel of the reference.
+    prior : BeamPrior
+        Of the difference of beam and reference, or of the beam and a uniform one.
+    """
+
+    counts: float
+    structure: float
+    is_recorded: bool
+    reference_counts: float
+    prior: BeamPrior
+
+
+@dataclass(frozen=True)
+class Detector:
+    """The stated point spread of each image (standard deviations in px), and the instrument."""
+
+    psf: tuple[float, ...]
+    instrument: Instrument
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedShots:
+    """Images of one object in one draw of the imperfections.
+
+    Attributes
+    ----------
+    images : ndarray, shape (L, H, W)
+        Counts.
+    source : ndarray, shape (H, W), or None
+        Recorded reference in counts of an image; None if none was recorded and the beam is open
+        everywhere.
+    source_noise : float
+        Variance of the reference over its counts.
+    """
+
+    images: FloatArray
+    source: FloatArray | None
+    source_noise: float
+
+
+class ShotSimulator:
+    """Draws shots of an object.
+
+    Parameters
+    ----------
+    object : PlannedObject
+        The object.
+    setups : sequence of Setup, or of None
+        The experiment of each image; None for one image in pixels.
+    shape : tuple of int
+        Height and width in px.
+    beam, detector
+        Stated quality of the experiment.
+    seed : int
+        Of all random choices.
+    """
+
+    def __init__(
+        self,
+        object: PlannedObject,
+        setups: Sequence[Setup | None],
+        shape: tuple[int, int],
+        beam: Beam,
+        detector: Detector,
+        seed: int,
+    ) -> None:
+        self._object, self._setups, self._beam, self._detector = object, setups, beam, detector
+        self._seed = seed
+        coarse = [object.displacement(setup, Grid(shape)) for setup in setups]
+        reach = max(float(np.abs(moved).max()) for moved in coarse)
+        margin = min(math.ceil(reach) + _BEYOND_PX, max(shape) // 2)
+        self._grid = Grid(shape, _FINER, margin)
+        self._nominal = [object.displacement(setup, self._grid) for setup in setups]
+        self.truth = coarse[0]
+
+    @property
+    def is_shadowed(self) -> bool:
+        """Whether the object stops a part of the beam."""
+        return self._object.shadow is not None
+
+    def draw(self, number: int) -> SimulatedShots:
+        """Return the shots of a draw; the same number gives the same shots."""
+        streams = {
+            name: np.random.default_rng([self._seed, number, stream])
+            for stream, name in enumerate(_STREAMS)
+        }
+        beam, grid, instrument = self._beam, self._grid, self._detector.instrument
+        scale = self._energy_factor(streams["energy"])
+        structure = 1 + beam.structure * self._wave(streams["structure"])
+        common = structure * (1 + beam.prior.rms * self._wave(streams["beam"]))
+        common = common * (1 + instrument.absorption * self._absorption(streams["absorption"]))
+        open_share = self._open_share
+        other = instrument.other_field * streams["other_field"].normal()
+        width = instrument.blur * abs(streams["blur"].normal())
+        exponent = max(1 + instrument.gamma * streams["gamma"].normal(), _LEAST_EXPONENT)
+        images = []
+        for image, setup in enumerate(self._setups):
+            between = beam.prior.between * self._wave(streams["between"]) if image else 0.0
+            light = np.maximum(common * (1 + between), _DIMMEST) * open_share
+            displacement = self._nominal[image] * (scale(setup) + other * self._other_ratio(setup))
+            if image:
+                displacement = self._misaligned(displacement, streams["alignment"])
+            flux = self._object.image(light, displacement, grid)
+            flux = gaussian_filter(flux, math.hypot(self._detector.psf[image], width), mode="nearest")
+            level = instrument.background * streams["background"].normal()
+            recorded = np.maximum(grid.inner(flux), 0) ** exponent + level
+            expected = beam.counts * np.maximum(recorded, 0)
+            images.append(streams["counts"].poisson(expected).astype(np.float64))
+        source, noise = None, 0.0
+        if beam.is_recorded:
+            reference = self._moved(structure * open_share, streams["registration"])
+            psf = self._detector.psf[0]
+            reference = gaussian_filter(reference, math.hypot(psf, width), mode="nearest")
+            level = instrument.background * streams["background"].normal()
+            recorded = np.maximum(grid.inner(reference), 0) ** exponent + level
+            expected = beam.reference_counts * np.maximum(recorded, 0)
+            counted = streams["reference"].poisson(expected).astype(np.float64)
+            source, noise = counted / beam.reference_counts, 1 / beam.reference_counts
+            source, noise = beam.counts * source, beam.counts * noise
+        elif self.is_shadowed:
+            source = beam.counts * grid.inner(grid.in_pixels(open_share))
+        return SimulatedShots(np.stack(images), source, noise)
+
+    @cached_property
+    def _open_share(self) -> FloatArray:
+        """Share of the beam that passes the object at each sample."""
+        passed = self._object.transmission(self._setups[0], self._grid)
+        return np.ones(self._grid.sizes) if passed is None else passed
+
+    def _energy_factor(self, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+        """Return the displacement of an image over that at its stated energy."""
+        error = 1 + self._detector.instrument.energy * rng.normal()
+        error = max(error, _DIMMEST)
+
+        def factor(setup: Setup | None) -> float:
+            if setup is None:
+                return 1.0
+            true = setup.model_copy(update={setup.beam_field: error * setup.beam_value})
+            return displacement_ratio(setup, true, deflector=self._object.cause(setup))
+
+        return factor
+
+    def _other_ratio(self, setup: Setup | None) -> float:
+        """Displacement by the other field over that by the object's, relative to image 1."""
+        first = self._setups[0]
+        if setup is None or first is None or self._object.cause(first) != "magnetic field":
+            return 1.0
+        electric, magnetic = (
+            displacement_ratio(first, setup, deflector=cause)
+            for cause in ("electric field", "magnetic field")
+        )
+        return electric / magnetic
+
+    def _wave(self, rng: np.random.Generator, length: float | None = None) -> FloatArray:
+        """Smooth noise at the samples: mean 0 and r.m.s. 1 over the image."""
+        if length is None:
+            length = self._beam.prior.length * min(self._grid.shape)
+        rows, columns = self._grid.lines()
+        numbers = rng.normal(size=(2, _WAVES)) / length
+        phases = rng.uniform(0, 2 * np.pi, _WAVES)
+        along_y = numbers[0] * rows[:, None] + phases
+        along_x = numbers[1] * columns[:, None]
+        field = np.cos(along_y) @ np.cos(along_x).T - np.sin(along_y) @ np.sin(along_x).T
+        inner = self._inner_samples(field)
+        return np.asarray((field - inner.mean()) / max(float(inner.std()), 1e-12))
+
+    def _inner_samples(self, field: FloatArray) -> FloatArray:
+        edge = self._grid.margin * self._grid.factor
+        return field[edge : field.shape[0] - edge, edge : field.shape[1] - edge]
+
+    def _absorption(self, rng: np.random.Generator) -> FloatArray:
+        """Smooth noise of the object's size inside the object."""
+        if not self._detector.instrument.absorption:
+            return np.zeros(self._grid.sizes)
+        size = np.hypot(*self._nominal[0])
+        depth = size / max(float(size.max()), 1e-12)
+        steep = _STEEPNESS * (np.log(np.maximum(depth, 1e-9)) - math.log(_EDGE))
+        inside = self._inner_samples(depth) > _EDGE
+        radius = math.sqrt(inside.sum() / np.pi) / self._grid.factor
+        return np.asarray(self._wave(rng, max(radius, 1.0)) / (1 + np.exp(-steep)))
+
+    def _misaligned(self, displacement: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Displacement onto a detector that is shifted, turned and scaled by random numbers."""
+        size = self._detector.instrument.registration
+        numbers = size * rng.normal(size=4)
+        if not size:
+            return displacement
+        landed = displacement + np.stack(np.meshgrid(*self._grid.lines(), indexing="ij"))
+        return displacement + self._motion(landed, numbers)
+
+    def _moved(self, reference: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Reference in pixels, out of register with the image."""
+        size = self._detector.instrument.registration
+        numbers = size * rng.normal(size=4)
+        if not size:
+            return self._grid.in_pixels(reference)
+        places = np.stack(np.meshgrid(*self._grid.lines(), indexing="ij"))
+        moved = places + self._motion(places, numbers)
+        indices = (moved + 0.5 + self._grid.margin) * self._grid.factor - 0.5
+        shifted = map_coordinates(reference, indices, order=3, mode="nearest")
+        return self._grid.in_pixels(np.maximum(shifted, 0))
+
+    def _motion(self, places: FloatArray, numbers: FloatArray) -> FloatArray:
+        """Shift, rotation and change of scale, each in px, the latter two at the corners."""
+        height, width = self._grid.shape
+        corner = np.hypot(height, width) / 2
+        y, x = (places[0] - (height - 1) / 2) / corner, (places[1] - (width - 1) / 2) / corner
+        down, right, turn, scale = numbers
+        return np.stack([down + turn * x + scale * y, right - turn * y + scale * x])
