@@ -18,6 +18,7 @@ from napari_shadowinv.cli import (
     _analyse_command,
     _film_command,
     _fit_command,
+    _plan_command,
     _shot_commands,
     _stack_commands,
 )
@@ -84,6 +85,7 @@ app.command(cls=HelpfulCommand, epilog=_fit_command.EPILOG)(_fit_command.fit)
 app.command(cls=HelpfulCommand, epilog=_film_command.EPILOG)(_film_command.film)
 app.command(cls=HelpfulCommand, epilog=_shot_commands.FORWARD_EPILOG)(_shot_commands.forward)
 app.command(cls=_analyse_command.AnalyseCommand)(_analyse_command.analyse)
+app.command(cls=HelpfulCommand, epilog=_plan_command.EPILOG)(_plan_command.plan)
 app.command(cls=HelpfulCommand)(_shot_commands.info)
 app.command(cls=HelpfulCommand)(_shot_commands.demo)
 app.command(cls=HelpfulCommand, epilog=_stack_commands.BATCH_EPILOG)(_stack_commands.batch)

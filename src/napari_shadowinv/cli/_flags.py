@@ -28,6 +28,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import IMAGE_TITLES
 from napari_shadowinv.options import FitChoices, FitOptions, Instrument, InversionOptions
 from napari_shadowinv.physics.trace_options import SizedView, TraceOptions
+from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 from napari_shadowinv.preprocessing import ESTIMATES, FIT_STEPS, STEPS, Recipe, Step
 
 HELP_NAMES = ("-h", "--help", "--help-all")
@@ -499,6 +500,22 @@ def trace_choices(flags: Mapping[str, Any]) -> tuple[SizedView, TraceOptions]:
         validate(SizedView, views, "", flag_names(SizedView)),
         validate(TraceOptions, options, "", flag_names(TraceOptions)),
     )
+
+
+def takes_plan(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the flags of a plan and of an instrument to a command with the argument `flags`."""
+    of_plan = _option_flags(ExperimentOptions, None)
+    return _with_flags(command, dict([*of_plan, *_option_flags(Instrument, _INSTRUMENT)]))
+
+
+def plan_choices(flags: Mapping[str, Any]) -> tuple[ExperimentOptions, Instrument]:
+    """Return the options and the instrument that flags of a plan state."""
+    models: list[Any] = []
+    for model in (ExperimentOptions, Instrument):
+        chosen = {name: flags[name] for name in model.model_fields if name in flags}
+        models.append(validate(model, chosen, "", flag_names(model)))
+    options, instrument = models
+    return options, instrument
 
 
 def _with_flags(

@@ -207,9 +207,7 @@ def fit(
             # In pixels of two, λ and the errors of the instrument's numbers come out too small.
             minima[0] = in_recorded_pixels(scene, minima[0])
     with _timed("smoothness", seconds):
-        scene, best = estimate_smoothness(
-            scene, minima[0], rng, on_step, is_quick=options.quick
-        )
+        scene, best = estimate_smoothness(scene, minima[0], rng, on_step, is_quick=options.quick)
         if data.counted:
             scene = reweight_counts(data, scene, best)
             best = settle_minimum(scene, best, on_step)

@@ -324,7 +324,9 @@ def refine_minimum(
     """
     unknowns, steps = minimum.in_pixels(scene.bin), 0
     if options.quick:
-        return replace(scene, spacing=_QUICK_SPACING), unknowns, minimum.value, 0, True
+        end = settle_minimum(scene, minimum, on_step, "full size", least_gain=_LAST_GAIN)
+        quick = replace(scene, spacing=_QUICK_SPACING)
+        return quick, end.in_pixels(scene.bin), end.value, 0, True
     usual = [_SPACING_WITH_NUMBERS] if scene.imperfect.parts else list(_SPACINGS)
     denser = usual if options.spacing is None else [options.spacing]
     most = -(-options.max_iterations // len(denser))

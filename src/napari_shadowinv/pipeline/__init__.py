@@ -8,6 +8,8 @@
   `run_windows`
 - refine an inversion by a fit that starts from it: `run_refinement`
 - repeat a result from its provenance: module `rerun`
+- an experiment before its shot, by simulated shots: `plan_experiment`, `sweep_experiment`, with
+  `ExperimentOptions`
 - recipes as files: `read_recipe`, `write_recipe`
 """
 

@@ -1,4 +1,6 @@
 from ._film import run_film
+from .experiment import plan_experiment, sweep_experiment
+from .experiment_options import ExperimentOptions
 from .files import read_recipe, write_recipe
 from .film_files import read_pack, write_layers
 from .fit_run import run_comparison, run_fit, run_refinement
@@ -7,8 +9,10 @@ from .static_checks import run_leave_one_out, run_windows
 
 __all__ = [
     "Cache",
+    "ExperimentOptions",
     "Inputs",
     "collect_inputs",
+    "plan_experiment",
     "read_pack",
     "read_recipe",
     "run",
@@ -19,6 +23,7 @@ __all__ = [
     "run_prepared",
     "run_refinement",
     "run_windows",
+    "sweep_experiment",
     "write_layers",
     "write_recipe",
 ]

@@ -32,8 +32,8 @@ from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.budget import Errors
 from napari_shadowinv.inversion.compilation import ensure_compiled as ensure_inversion_compiled
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions
-from napari_shadowinv.physics.phantom_models import PhantomRecipe
 from napari_shadowinv.physics.beam import unit_in_title
+from napari_shadowinv.physics.phantom_models import PhantomRecipe
 from napari_shadowinv.physics.poisson import potential_of
 from napari_shadowinv.physics.setup import SETUPS, BeamSetup, Setup, deflector_titles
 from napari_shadowinv.pipeline.experiment_object import PlannedObject, object_of_phantom
@@ -58,6 +58,7 @@ _ERROR_SAMPLES = 6
 _SAME_SIZE = 1e-6
 # Verdicts that a fit without a search and without error bars cannot find itself.
 _OF_SEARCH = (Verdict.UNCERTAIN, Verdict.SEVERAL, Verdict.AMBIGUOUS)
+
 
 def plan_experiment(
     object: PlannedObject | PhantomRecipe,
@@ -265,9 +266,7 @@ class _Inputs:
         return tuple(point_spread(setup, *lengths) for setup in self.setups if setup is not None)
 
 
-def _checked_inputs(
-    object: Any, setups: Any, shape: Any, instrument: Any, options: Any
-) -> _Inputs:
+def _checked_inputs(object: Any, setups: Any, shape: Any, instrument: Any, options: Any) -> _Inputs:
     options = as_model(ExperimentOptions, options, "options")
     instrument = as_model(Instrument, instrument, "instrument")
     check_instance(object, (PlannedObject, PhantomRecipe), "object")
@@ -308,7 +307,8 @@ def _refuse_unsuitable(inputs: _Inputs) -> None:
                 )
     first = setups[0]
     for number, setup in enumerate(setups[1:], start=2):
-        assert first is not None and setup is not None
+        assert first is not None
+        assert setup is not None
         ratio = setup.object_pixel_size / first.object_pixel_size
         if abs(ratio - 1) > _SAME_SIZE:
             raise InputError(
@@ -421,9 +421,7 @@ def _simulator(inputs: _Inputs) -> ShotSimulator:
         prior=instrument.beam_of(measured=options.is_recorded),
     )
     detector = Detector(inputs.psf, instrument)
-    return ShotSimulator(
-        inputs.object, inputs.setups, inputs.shape, beam, detector, options.seed
-    )
+    return ShotSimulator(inputs.object, inputs.setups, inputs.shape, beam, detector, options.seed)
 
 
 class _Retrieved(NamedTuple):
@@ -554,9 +552,7 @@ def _parts_of(errors: Errors) -> dict[str, float]:
     return parts
 
 
-def _fit_errors(
-    result: Fit, inputs: _Inputs
-) -> tuple[dict[str, float], float, Verdict]:
+def _fit_errors(result: Fit, inputs: _Inputs) -> tuple[dict[str, float], float, Verdict]:
     """Return the parts of a fit's error, the total, and the verdict, with the energy's error."""
     report = result.report
     if np.isnan(report.uncertainty):

@@ -1,6 +1,6 @@
 """Objects of a planned experiment: `PlannedObject`.
 
-- a phantom, by its model: `object_of_phantom`
+- a phantom, by its model: `object_of_phantom`; by a text: `phantom_of_text`
 - a field that was retrieved or computed before: `object_of_result`, `object_of_displacement`,
   `object_of_potential`
 
@@ -18,10 +18,11 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates, spline_filter
 
 from napari_shadowinv._system.arrays import as_numbers, plain_array
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._system.validation import suggestion, validate
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import checked_displacement, synthetic_image
-from napari_shadowinv.physics.phantom_models import PhantomRecipe
+from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
 from napari_shadowinv.physics.projection import default_deflector, displacement_ratio
 from napari_shadowinv.physics.setup import Setup, deflector_titles, displacement_from_potential
 
@@ -32,6 +33,7 @@ __all__ = [
     "object_of_phantom",
     "object_of_potential",
     "object_of_result",
+    "phantom_of_text",
 ]
 
 _FINER = 3  # samples of a phantom along a side of a pixel
@@ -96,7 +98,7 @@ class PlannedObject:
     setup: Setup | None = None
     deflector: str | None = None
     finer: int = 1
-    shadow: FloatArray | None = None
+    shadow: BoolArray | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -131,7 +133,9 @@ class PlannedObject:
             )
         places = self._places(grid, ratio)
         values = [
-            map_coordinates(spline_filter(part, mode="nearest"), places, mode="nearest", prefilter=False)
+            map_coordinates(
+                spline_filter(part, mode="nearest"), places, mode="nearest", prefilter=False
+            )
             for part in self.samples
         ]
         return factor * np.stack(values)
@@ -164,17 +168,13 @@ class PlannedObject:
         -------
         ndarray, shape (H + 2 margin, W + 2 margin)
         """
-        fine = synthetic_image(
-            grid.factor * displacement, beam, rays_per_pixel=_TILES, threads=1
-        )
+        fine = synthetic_image(grid.factor * displacement, beam, rays_per_pixel=_TILES, threads=1)
         return grid.in_pixels(fine)
 
     def _places(self, grid: Grid, ratio: float) -> FloatArray:
         """Indices into the samples, (2, h, w), of the places of a grid."""
         lines = []
-        for line, side, size in zip(
-            grid.lines(), grid.shape, self.samples.shape[1:], strict=True
-        ):
+        for line, side, size in zip(grid.lines(), grid.shape, self.samples.shape[1:], strict=True):
             from_middle = (line - (side - 1) / 2) * ratio * self.finer
             lines.append(from_middle + (size - 1) / 2)
         return np.stack(np.meshgrid(*lines, indexing="ij"))
@@ -212,6 +212,34 @@ def object_of_phantom(
         finer=_FINER,
         shadow=shadow,
     )
+
+
+def phantom_of_text(text: str) -> PhantomRecipe:
+    """Return a phantom by its name and parameters, such as "toroid:peak=60,radius=3e-5".
+
+    Raises
+    ------
+    InputError
+        If the name or a parameter is unknown, or a value is no number.
+    """
+    name, _, parameters = text.partition(":")
+    key = name.strip().lower().replace("-", "_")
+    if key not in PHANTOMS:
+        raise InputError(
+            f"the object is '{name}', which is neither a file nor a phantom: "
+            f"{suggestion(key, PHANTOMS)}"
+        )
+    values = {}
+    for part in filter(None, parameters.split(",")):
+        parameter, _, number = part.partition("=")
+        try:
+            values[parameter.strip()] = float(number)
+        except ValueError:
+            raise InputError(
+                f"the object has the parameter '{part}': expected a name and a number, such as "
+                "peak=60"
+            ) from None
+    return validate(PHANTOMS[key], values, f"the object {key}")
 
 
 _DEFLECTORS = {"proton": "magnetic field", "optical": "plasma"}

@@ -11,6 +11,7 @@ from napari_shadowinv._system.validation import CheckedModel, CombinationError
 __all__ = ["ExperimentOptions"]
 
 _RARE: Any = {"panel": "Rarely used options of a plan"}
+_DETAILS: Any = {"panel": "Point spread, and the reference in detail"}
 
 
 class ExperimentOptions(CheckedModel):
@@ -50,6 +51,7 @@ class ExperimentOptions(CheckedModel):
         le=1e12,
         title="Counts of the reference",
         description="Mean counts a pixel of the reference. Default: as many as in an image.",
+        json_schema_extra=_DETAILS,
     )
     beam_structure: float = Field(
         default=0.0,
@@ -60,6 +62,7 @@ class ExperimentOptions(CheckedModel):
             "Relative r.m.s. structure of the beam that the reference records, over the beam's "
             "length. How far the beam differs from its reference is a number of the instrument."
         ),
+        json_schema_extra=_DETAILS,
     )
     psf: float | None = Field(
         default=None,
@@ -67,6 +70,7 @@ class ExperimentOptions(CheckedModel):
         le=20,
         title="Point spread (px)",
         description="Known standard deviation of the point spread in px. Default: none.",
+        json_schema_extra=_DETAILS,
     )
     source_size: float | None = Field(
         default=None,
@@ -76,12 +80,14 @@ class ExperimentOptions(CheckedModel):
             "Standard deviation of the beam's source in m (FWHM / 2.355), for the point spread of "
             "each setup."
         ),
+        json_schema_extra=_DETAILS,
     )
     resolution: float | None = Field(
         default=None,
         ge=0,
         title="Resolution (m)",
         description="Standard deviation of the detector's point spread in m, at the detector.",
+        json_schema_extra=_DETAILS,
     )
     draws: int = Field(
         default=20,

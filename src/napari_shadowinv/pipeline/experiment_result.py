@@ -329,9 +329,7 @@ class ExperimentPlan:
     def _gain_facts(self) -> Iterator[Fact]:
         before = math.sqrt(sum(share**2 for share in self.parts.values()))
         worth = [gain for gain in self.gains if gain.total < (1 - _MIN_GAIN) * before]
-        listed = "; ".join(
-            f"{gain.text}: {percent(gain.total)}" for gain in worth[:_LISTED_GAINS]
-        )
+        listed = "; ".join(f"{gain.text}: {percent(gain.total)}" for gain in worth[:_LISTED_GAINS])
         if listed:
             text = f"reported error {percent(before)}; with {listed} (linear budget)"
             yield Fact("gains", "What a change buys", text)
@@ -447,6 +445,11 @@ class ExperimentSweep:
     plans: tuple[ExperimentPlan, ...]
 
     @property
+    def is_determined(self) -> bool:
+        """Whether the field would be determined with any of the values."""
+        return any(plan.is_determined for plan in self.plans)
+
+    @property
     def best(self) -> int:
         """Index of the value with the smallest error made."""
         return int(np.argmin([plan.error.median for plan in self.plans]))
@@ -458,8 +461,7 @@ class ExperimentSweep:
         texts = ", ".join(
             f"{percent(self.plans[k].error.median)} at {self.value_text(k)}" for k in chosen
         )
-        sound = any(plan.is_determined for plan in self.plans)
-        level = Level.SOUND if sound else Level.DOUBTFUL
+        level = Level.SOUND if self.is_determined else Level.DOUBTFUL
         return Headline(level, f"error made: {texts}; smallest at {self.value_text(self.best)}")
 
     @property

@@ -169,7 +169,9 @@ class ShotSimulator:
             if image:
                 displacement = self._misaligned(displacement, streams["alignment"])
             flux = self._object.image(light, displacement, grid)
-            flux = gaussian_filter(flux, math.hypot(self._detector.psf[image], width), mode="nearest")
+            flux = gaussian_filter(
+                flux, math.hypot(self._detector.psf[image], width), mode="nearest"
+            )
             level = instrument.background * streams["background"].normal()
             recorded = np.maximum(grid.inner(flux), 0) ** exponent + level
             expected = beam.counts * np.maximum(recorded, 0)

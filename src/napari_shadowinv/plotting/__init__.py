@@ -4,6 +4,7 @@
   `pack_figure`
 - products with their bands: `products_figure`
 - tests of one static field: `left_out_figure`, `windows_figure`
+- planned experiments: `plan_figure`, `sweep_figure`
 - fields side by side: `comparison_figure`; a figure's file: `save_figure`
 - a stack as a movie: `write_film`
 
@@ -14,6 +15,7 @@ disturb the figures of a notebook.
 from napari_shadowinv.plotting._film_figure import pack_figure
 from napari_shadowinv.plotting._fit_figure import fit_figure, left_out_figure, windows_figure
 from napari_shadowinv.plotting._movie import in_few_colours, stack_frames, write_film
+from napari_shadowinv.plotting._plan_figure import plan_figure, sweep_figure
 from napari_shadowinv.plotting._product_figure import products_figure
 from napari_shadowinv.plotting.figures import (
     comparison_figure,
@@ -28,11 +30,13 @@ __all__ = [
     "in_few_colours",
     "left_out_figure",
     "pack_figure",
+    "plan_figure",
     "products_figure",
     "report_figure",
     "result_figure",
     "save_figure",
     "stack_frames",
+    "sweep_figure",
     "windows_figure",
     "write_film",
 ]

@@ -1,0 +1,190 @@
+"""The command `plan`: whether an experiment would determine a field, before its shot."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from napari_shadowinv.cli import _flags, _inputs
+from napari_shadowinv.cli._terminal import (
+    is_interrupted,
+    notify_errors,
+    progress_bars,
+    say,
+    warn_of_setups,
+)
+from napari_shadowinv.errors import InputError
+
+if TYPE_CHECKING:
+    from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.pipeline.experiment_object import PlannedObject
+
+# Help of arguments, where it is longer than a line.
+HELP = {
+    "object": "A phantom with its parameters, such as toroid:peak=60,radius=3e-5, or the file of an "
+    "earlier result or of a displacement (.npy).",
+    "energies": "Energy of each image in MeV (of light: wavelength in m), separated by commas. "
+    "Default: one image with the energy of --setup.",
+    "size": "Height and width of an image in px, such as 200x200. Default: of the file, or 200x200.",
+    "recorded_with": "TOML file with the setup of the object's file, if the file does not have it.",
+    "sweep": "A quantity and its values, such as counts=100,300,1000 or energy=5,10,20 (of the last "
+    "image): a curve of the error.",
+    "out": "Table (.csv) with a row for each draw, or for each value of --sweep. Default: plan.csv.",
+    "figure": "Figure file: .png, .pdf or .svg. Default: a PNG next to the table.",
+}
+_OF_FILE = "Object of a file"
+_EXIT_NOT_DETERMINED = 3
+EPILOG = r"""
+[bold]Examples[/bold]
+shadowinv plan toroid --setup setup.toml --detector film --beam-source TNSA
+shadowinv plan toroid:peak=60 --setup setup.toml --energies 5,15
+shadowinv plan shot.shadowinv --setup next.toml --sweep counts=100,300,1000
+shadowinv plan toroid --setup setup.toml --energies 5,15 --sweep energy=7,10,15,30
+shadowinv plan toroid --setup setup.toml --reference recorded --sweep beam_rms=0.01,0.03,0.1
+
+[bold]Phantoms[/bold]
+toroid, four_toroids, coaxial, wakefield, blob; parameters as in the window Forward model.
+
+[bold]Quantities of --sweep[/bold]
+counts, energy or wavelength (of the last image), source_object_distance, object_image_distance,
+psf, source_size, resolution, reference_counts, beam_structure, and numbers of the instrument:
+beam_rms, beam_length, beam_between, energy_error, background, gamma, blur, absorption,
+registration, other_field.
+
+[bold]Exit codes[/bold]
+0 the field would be determined; 2 invalid input, nothing written;
+3 table written, but the field would not be determined reliably; 130 cancelled.
+"""
+
+
+@notify_errors
+@_flags.takes_plan
+def plan(
+    object: Annotated[str, typer.Argument(help=HELP["object"], show_default=False)],
+    setup: _flags.SetupFile = None,
+    energies: Annotated[
+        str | None, typer.Option(metavar="NUMBER,NUMBER,…", help=HELP["energies"])
+    ] = None,
+    size: Annotated[str | None, typer.Option(metavar="HxW", help=HELP["size"])] = None,
+    recorded_with: Annotated[
+        Path | None, typer.Option(help=HELP["recorded_with"], rich_help_panel=_OF_FILE)
+    ] = None,
+    deflector: Annotated[
+        str | None,
+        typer.Option(metavar="WHAT", help="Cause of the deflection.", rich_help_panel=_OF_FILE),
+    ] = None,
+    sweep: Annotated[str | None, typer.Option(metavar="NAME=VALUES", help=HELP["sweep"])] = None,
+    out: Annotated[Path, typer.Option(help=HELP["out"])] = Path("plan.csv"),
+    figure: Annotated[Path | None, typer.Option(help=HELP["figure"])] = None,
+    overwrite: _flags.Overwrite = False,
+    quiet: _flags.Quiet = False,
+    *,
+    flags: dict[str, Any],
+) -> None:
+    """Simulate shots of an experiment, and report whether the field would be determined.
+
+    Each shot has imperfections drawn from the stated instrument. One image is inverted, several
+    are fitted. The report has the error made, the error reported, what limits it, and what a
+    change buys.
+    """
+    from napari_shadowinv.cli._summary import fact_rows, headline_row, two_columns, written_rows
+    from napari_shadowinv.io.files import replacing
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES
+    from napari_shadowinv.pipeline.experiment import plan_experiment, sweep_experiment
+    from napari_shadowinv.pipeline.experiment_result import ExperimentSweep, table_text
+    from napari_shadowinv.pipeline.files import setup_from
+    from napari_shadowinv.plotting import plan_figure, sweep_figure
+    from napari_shadowinv.plotting.figures import save_figure
+
+    page = figure or out.with_suffix(".png")
+    _inputs.check_outputs({out: (".csv",), page: FIGURE_SUFFIXES}, overwrite)
+    _inputs.protect([out, page], [setup, recorded_with, _file_of(object)])
+    options, instrument = _flags.plan_choices(flags)
+    first = None if setup is None else setup_from(setup)
+    setups = _setups(first, energies)
+    shape = None if size is None else _shape(size)
+    planned: Any = _object(object, recorded_with, deflector)
+    choices: dict[str, Any] = {"shape": shape, "instrument": instrument, "options": options}
+    warn_of_setups((each, shape) for each in setups or ())
+    result: Any
+    with nullcontext() if quiet else progress_bars() as show:
+        choices |= {"on_progress": show, "should_stop": is_interrupted}
+        if sweep is None:
+            result = plan_experiment(planned, setups, **choices)
+        else:
+            quantity, values = _sweep(sweep)
+            result = sweep_experiment(planned, setups, quantity=quantity, values=values, **choices)
+    is_sweep = isinstance(result, ExperimentSweep)
+    drawn = sweep_figure(result) if is_sweep else plan_figure(result)
+    with replacing(out, overwrite) as temporary:
+        temporary.write_text(table_text(result.rows()), encoding="utf-8")
+    save_figure(page, drawn, overwrite)
+    if not quiet:
+        rows = [headline_row(result.headline), *fact_rows(result.facts), *written_rows([out, page])]
+        say(two_columns("Sweep" if is_sweep else "Plan", rows))
+    if not result.is_determined:
+        raise typer.Exit(_EXIT_NOT_DETERMINED)
+
+
+def _file_of(text: str) -> Path | None:
+    return Path(text) if Path(text).suffix else None
+
+
+def _object(text: str, recorded_with: Path | None, deflector: str | None) -> PlannedObject | Any:
+    """Return the phantom of a text, or the object of a file."""
+    from napari_shadowinv.pipeline.experiment_object import object_of_displacement, phantom_of_text
+
+    if _file_of(text.partition(":")[0]) is None:
+        if recorded_with is not None or deflector is not None:
+            flag = "--deflector" if recorded_with is None else "--recorded-with"
+            raise InputError(f"received {flag}: it belongs to the object of a file, not a phantom")
+        return phantom_of_text(text)
+    from napari_shadowinv.cli._shot_commands import field_from
+    from napari_shadowinv.pipeline.files import setup_from
+
+    path = Path(text)
+    content = field_from(path)
+    if content.setup is not None and recorded_with is not None:
+        raise InputError(f"{path} has its setup: leave out --recorded-with")
+    original = content.setup if recorded_with is None else setup_from(recorded_with)
+    return object_of_displacement(
+        content.displacement, original, deflector=deflector, title=path.name
+    )
+
+
+def _setups(setup: Setup | None, energies: str | None) -> list[Setup] | None:
+    from napari_shadowinv._system.validation import validate
+
+    if energies is None:
+        return None if setup is None else [setup]
+    if setup is None:
+        raise InputError("received --energies: it needs --setup, the geometry of all images")
+    name = setup.beam_field
+    return [
+        validate(type(setup), {**setup.model_dump(), name: value}, "--energies")
+        for value in _numbers("--energies", energies)
+    ]
+
+
+def _numbers(flag: str, text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"{flag} is '{text}': expected numbers separated by commas") from None
+
+
+def _shape(text: str) -> tuple[int, int]:
+    parts = text.lower().replace("×", "x").split("x")
+    if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
+        raise InputError(f"--size is '{text}': expected height and width in px, such as 200x200")
+    return int(parts[0]), int(parts[1])
+
+
+def _sweep(text: str) -> tuple[str, list[float]]:
+    name, equals, values = text.partition("=")
+    if not equals:
+        raise InputError(f"--sweep is '{text}': expected NAME=VALUES, such as counts=100,300,1000")
+    return name.strip().replace("-", "_"), _numbers("--sweep", values)

@@ -1,0 +1,138 @@
+"""Figures of planned experiments: `plan_figure`, and of one quantity varied, `sweep_figure`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from napari_shadowinv.physics.units import intensity_limits, shown_fields
+from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep, percent
+from napari_shadowinv.plotting import _panels
+from napari_shadowinv.plotting._panels import (
+    ALARM_COLOUR,
+    GOOD_COLOUR,
+    QUIET_COLOUR,
+    draw_intensity,
+    draw_side_by_side,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_MAX_PARTS = 8
+_LOG_RANGE = 8.0  # of the values of a sweep, for a logarithmic axis
+
+
+def plan_figure(plan: ExperimentPlan) -> Figure:
+    """Show a plan on a page.
+
+    Six panels: the image of the first draw, the field of the object and the one retrieved in the
+    first draw, cuts through both along the dashed lines, the errors made and reported of all
+    draws, and what the reported error is made of. The headline stands above the panels.
+
+    Parameters
+    ----------
+    plan : ExperimentPlan
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure with an Agg canvas; write it with `save_figure`.
+    """
+    import matplotlib as mpl
+
+    setup = plan.setups[0] if plan.setups else None
+    true, retrieved = shown_fields([plan.truth, plan.retrieved], setup)
+    width = _panels.choose_grid(plan.shape, panels=6).figure_size[0]
+    header = _panels.wrapped([_panels.headline_sentence(plan.headline)], int(width * 12))
+    grid = _panels.choose_grid(plan.shape, panels=6, foot=0.12, title=True)
+    grid = replace(grid, head=0.52 + 0.18 * len(header))
+    with mpl.rc_context(_panels.STYLE):
+        figure, panels = _panels.new_page(grid, _panels.image_scale(plan.shape, setup), plan.title)
+        _panels.write_header(figure, header, grid)
+        mean = plan.options.counts
+        image = plan.images[0] / mean
+        draw_intensity(panels[0], image, "Image of the first draw", intensity_limits(image))
+        draw_side_by_side(panels[1:4], {"object": true, "retrieved in the first draw": retrieved})
+        _draw_errors(panels[4].axes, plan)
+        _draw_parts(panels[5].axes, plan)
+    return figure
+
+
+def sweep_figure(sweep: ExperimentSweep) -> Figure:
+    """Show the error of a planned experiment as a curve over the quantity that is varied.
+
+    The band holds 68 % of the draws; the dashed line is the error that is reported. Below stands
+    the share of the draws whose field is determined.
+
+    Parameters
+    ----------
+    sweep : ExperimentSweep
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure with an Agg canvas; write it with `save_figure`.
+    """
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(_panels.STYLE):
+        figure = Figure(figsize=(6.4, 4.8), layout="constrained")
+        FigureCanvasAgg(figure)
+        draw_sweep(figure, sweep)
+    return figure
+
+
+def draw_sweep(figure: Figure, sweep: ExperimentSweep) -> None:
+    """Draw a sweep into a figure, which may be a window's."""
+    order = np.argsort(sweep.values)
+    values = np.array(sweep.values)[order]
+    plans = [sweep.plans[k] for k in order]
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
+    spreads = [plan.error for plan in plans]
+    low, high = ([100 * getattr(each, end) for each in spreads] for end in ("low", "high"))
+    above.fill_between(values, low, high, color=GOOD_COLOUR, alpha=0.2, label="68 % of the draws")
+    medians = [100 * each.median for each in spreads]
+    above.plot(values, medians, "o-", color=GOOD_COLOUR, label="error made")
+    totals = [100 * plan.total.median for plan in plans]
+    above.plot(values, totals, "--", color=QUIET_COLOUR, label="error reported")
+    above.set_ylabel("error of the field (%, r.m.s.)")
+    above.set_ylim(bottom=0)
+    above.legend()
+    above.set_title(plans[0].title)
+    shares = [100 * plan.determined_share for plan in plans]
+    below.plot(values, shares, "s-", color=QUIET_COLOUR)
+    below.set_ylim(-5, 105)
+    below.set_ylabel("determined\n(% of draws)")
+    below.set_xlabel(f"{sweep.title} ({sweep.unit})" if sweep.unit else sweep.title)
+    if values[0] > 0 and values[-1] / values[0] > _LOG_RANGE:
+        below.set_xscale("log")
+
+
+def _draw_errors(axes: Axes, plan: ExperimentPlan) -> None:
+    """Errors made and reported in each draw; draws that are not determined in another colour."""
+    numbers = [shot.number for shot in plan.shots]
+    colours = [GOOD_COLOUR if shot.is_determined else ALARM_COLOUR for shot in plan.shots]
+    axes.bar(numbers, [100 * shot.error for shot in plan.shots], color=colours)
+    totals = [100 * shot.total for shot in plan.shots]
+    axes.plot(numbers, totals, "_", color="black", markersize=7, label="reported")
+    axes.set_xlabel("draw")
+    axes.set_ylabel("error of the field (%)")
+    axes.set_title(f"Error made: {percent(plan.error.median)}")
+    axes.legend(fontsize=7)
+
+
+def _draw_parts(axes: Axes, plan: ExperimentPlan) -> None:
+    parts = list(plan.parts.items())[:_MAX_PARTS]
+    if not parts:
+        axes.axis("off")
+        return
+    names = [name.replace("_", " ") for name, _ in parts]
+    axes.barh(names[::-1], [100 * share for _, share in parts[::-1]], color=QUIET_COLOUR)
+    axes.set_xlabel("share of the field (%)")
+    axes.set_title(f"Error reported: {percent(plan.total.median)}")
