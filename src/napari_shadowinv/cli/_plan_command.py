@@ -24,15 +24,17 @@ if TYPE_CHECKING:
 
 # Help of arguments, where it is longer than a line.
 HELP = {
-    "object": "A phantom with its parameters, such as toroid:peak=60,radius=3e-5, or the file of an "
-    "earlier result or of a displacement (.npy).",
+    "object": "A phantom with its parameters, such as toroid:peak=60,radius=3e-5, or the file of "
+    "an earlier result or of a displacement (.npy).",
     "energies": "Energy of each image in MeV (of light: wavelength in m), separated by commas. "
     "Default: one image with the energy of --setup.",
-    "size": "Height and width of an image in px, such as 200x200. Default: of the file, or 200x200.",
+    "size": "Height and width of an image in px, such as 200x200. Default: of the file, or "
+    "200x200.",
     "recorded_with": "TOML file with the setup of the object's file, if the file does not have it.",
-    "sweep": "A quantity and its values, such as counts=100,300,1000 or energy=5,10,20 (of the last "
-    "image): a curve of the error.",
-    "out": "Table (.csv) with a row for each draw, or for each value of --sweep. Default: plan.csv.",
+    "sweep": "A quantity and its values, such as counts=100,300,1000 or energy=5,10,20 (of the "
+    "last image): a curve of the error.",
+    "out": "Table (.csv) with a row for each draw, or for each value of --sweep. Default: "
+    "plan.csv.",
     "figure": "Figure file: .png, .pdf or .svg. Default: a PNG next to the table.",
 }
 _OF_FILE = "Object of a file"

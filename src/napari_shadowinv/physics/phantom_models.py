@@ -67,6 +67,8 @@ def _peak(default: float, where: str) -> Any:
 
 
 class ToroidRecipe(PhantomRecipe):
+    """A magnetic field that runs around an axis along the beam."""
+
     title = "toroidal magnetic field"
     probe = "proton"
     peak: float = _peak(97.0, "the radius")
@@ -77,6 +79,8 @@ class ToroidRecipe(PhantomRecipe):
 
 
 class FourToroidsRecipe(PhantomRecipe):
+    """The paper's four toroids, which scale with the image."""
+
     title = "four toroids"
     probe = "proton"
     strength: float = Field(
@@ -145,6 +149,8 @@ class WakefieldRecipe(PhantomRecipe):
 
 
 class BlobRecipe(PhantomRecipe):
+    """A Gaussian potential, in pixels."""
+
     title = "Gaussian potential"
     amplitude: float = Field(
         default=50.0,

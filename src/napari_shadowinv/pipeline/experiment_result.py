@@ -20,11 +20,10 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import Fact, Headline, Level, Verdict, time_fact
 from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 
 if TYPE_CHECKING:
     import xarray
-
-    from napari_shadowinv.pipeline.experiment import ExperimentOptions
 
 __all__ = ["ExperimentPlan", "ExperimentSweep", "Gain", "PlannedShot", "Spread"]
 
