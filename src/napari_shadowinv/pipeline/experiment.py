@@ -42,6 +42,7 @@ from napari_shadowinv.pipeline.experiment_result import (
     ExperimentPlan,
     ExperimentSweep,
     PlannedShot,
+    percent,
 )
 from napari_shadowinv.pipeline.experiment_shots import (
     Beam,
@@ -362,7 +363,7 @@ def _with_value(inputs: _Inputs, quantity: str, value: float) -> _Inputs:
 def _plan(inputs: _Inputs, report: Reporter, should_stop: ShouldStop | None) -> ExperimentPlan:
     start = time.perf_counter()
     options = inputs.options
-    report("shots", 0, options.draws)
+    report("draws", 0, options.draws)
     simulator = _simulator(inputs)
     if float(np.abs(simulator.truth).max()) < _MIN_DISPLACEMENT_PX:
         raise InputError(
@@ -374,20 +375,18 @@ def _plan(inputs: _Inputs, report: Reporter, should_stop: ShouldStop | None) -> 
     prepared = time.perf_counter()
     retrieve = _fitted if inputs.is_fit else _inverted
     searched = min(options.searched, options.draws) if inputs.is_fit else options.draws
-    done = 0
+    done: list[PlannedShot] = []
 
     def draw_all(numbers: range, near: Fit | None) -> Iterator[_Retrieved]:
-        nonlocal done
-
         def compute(number: int) -> _Retrieved:
             return retrieve(inputs, simulator, number, near, should_stop)
 
         with ThreadPoolExecutor(available_threads(options.threads)) as pool:
             tasks = [pool.submit(compute, number) for number in numbers]
             try:
-                for _ in as_completed(tasks):
-                    done += 1
-                    report("shots", done, options.draws)
+                for task in as_completed(tasks):
+                    done.append(task.result().shot)
+                    report("draws", len(done), options.draws, _tally(done))
                 yield from (task.result() for task in tasks)
             finally:
                 pool.shutdown(cancel_futures=True)
@@ -409,6 +408,13 @@ def _plan(inputs: _Inputs, report: Reporter, should_stop: ShouldStop | None) -> 
         retrieved=first.displacement,
         seconds={"prepare": prepared - start, "shots": ended - prepared},
     )
+
+
+def _tally(shots: Sequence[PlannedShot]) -> str:
+    """Return the errors made until now in a few words."""
+    determined = sum(shot.is_determined for shot in shots)
+    error = percent(float(np.median([shot.error for shot in shots])))
+    return f"error made {error}, determined {determined} of {len(shots)}"
 
 
 def _simulator(inputs: _Inputs) -> ShotSimulator:

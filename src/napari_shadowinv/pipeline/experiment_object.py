@@ -258,7 +258,7 @@ def object_of_displacement(
     deflector: str | None = None,
     title: str = "a displacement",
 ) -> PlannedObject:
-    """Return an object that displaces rays as given.
+    """Return an object with a displacement.
 
     Parameters
     ----------

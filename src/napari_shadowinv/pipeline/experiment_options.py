@@ -7,6 +7,7 @@ from typing import Any, Literal, Self
 from pydantic import ConfigDict, Field, model_validator
 
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
+from napari_shadowinv.options._errors import MaxError
 
 __all__ = ["ExperimentOptions"]
 
@@ -116,13 +117,7 @@ class ExperimentOptions(CheckedModel):
         ),
         json_schema_extra=_RARE,
     )
-    max_error: float = Field(
-        default=0.05,
-        gt=0,
-        le=1,
-        title="Largest error",
-        description="Largest reported error of a determined field, as a share of it (r.m.s.).",
-    )
+    max_error: MaxError = 0.05
     seed: int = Field(
         default=0,
         ge=0,

@@ -1,4 +1,4 @@
-"""What simulated shots of an experiment say about it: `ExperimentPlan`, of `PlannedShot`.
+"""Results of a planned experiment: `ExperimentPlan`, of `PlannedShot`.
 
 - a quantity of the experiment that is varied: `ExperimentSweep`
 - what a change of a stated number buys: `Gain`
@@ -216,7 +216,7 @@ class ExperimentPlan:
 
     @cached_property
     def gains(self) -> tuple[Gain, ...]:
-        """What a change of each stated number buys, the largest gain first.
+        """Gains by a change of each stated number, the largest first.
 
         The linear budget says so, without further simulations: the part of a number that is known
         twice as well is half as large, or a quarter where it acts by its square; as far as the

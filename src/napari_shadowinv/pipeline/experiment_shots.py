@@ -154,17 +154,18 @@ class ShotSimulator:
         }
         beam, grid, instrument = self._beam, self._grid, self._detector.instrument
         scale = self._energy_factor(streams["energy"])
-        structure = 1 + beam.structure * self._wave(streams["structure"])
-        common = structure * (1 + beam.prior.rms * self._wave(streams["beam"]))
-        common = common * (1 + instrument.absorption * self._absorption(streams["absorption"]))
+        structure = 1 + self._wave(streams["structure"], beam.structure)
+        common = structure * (1 + self._wave(streams["beam"], beam.prior.rms))
+        common = common * (1 + self._absorption(streams["absorption"]))
         open_share = self._open_share
         other = instrument.other_field * streams["other_field"].normal()
         width = instrument.blur * abs(streams["blur"].normal())
         exponent = max(1 + instrument.gamma * streams["gamma"].normal(), _LEAST_EXPONENT)
         images = []
         for image, setup in enumerate(self._setups):
-            between = beam.prior.between * self._wave(streams["between"]) if image else 0.0
-            light = np.maximum(common * (1 + between), _DIMMEST) * open_share
+            between = beam.prior.between if image else 0.0
+            light = common * (1 + self._wave(streams["between"], between))
+            light = np.maximum(light, _DIMMEST) * open_share
             displacement = self._nominal[image] * (scale(setup) + other * self._other_ratio(setup))
             if image:
                 displacement = self._misaligned(displacement, streams["alignment"])
@@ -221,8 +222,12 @@ class ShotSimulator:
         )
         return electric / magnetic
 
-    def _wave(self, rng: np.random.Generator, length: float | None = None) -> FloatArray:
-        """Smooth noise at the samples: mean 0 and r.m.s. 1 over the image."""
+    def _wave(
+        self, rng: np.random.Generator, rms: float, length: float | None = None
+    ) -> FloatArray:
+        """Smooth noise at the samples, with a mean of 0 and an r.m.s. over the image."""
+        if not rms:
+            return np.zeros(self._grid.sizes)
         if length is None:
             length = self._beam.prior.length * min(self._grid.shape)
         rows, columns = self._grid.lines()
@@ -232,7 +237,7 @@ class ShotSimulator:
         along_x = numbers[1] * columns[:, None]
         field = np.cos(along_y) @ np.cos(along_x).T - np.sin(along_y) @ np.sin(along_x).T
         inner = self._inner_samples(field)
-        return np.asarray((field - inner.mean()) / max(float(inner.std()), 1e-12))
+        return np.asarray(rms * (field - inner.mean()) / max(float(inner.std()), 1e-12))
 
     def _inner_samples(self, field: FloatArray) -> FloatArray:
         edge = self._grid.margin * self._grid.factor
@@ -240,14 +245,15 @@ class ShotSimulator:
 
     def _absorption(self, rng: np.random.Generator) -> FloatArray:
         """Smooth noise of the object's size inside the object."""
-        if not self._detector.instrument.absorption:
+        rms = self._detector.instrument.absorption
+        if not rms:
             return np.zeros(self._grid.sizes)
         size = np.hypot(*self._nominal[0])
         depth = size / max(float(size.max()), 1e-12)
         steep = _STEEPNESS * (np.log(np.maximum(depth, 1e-9)) - math.log(_EDGE))
         inside = self._inner_samples(depth) > _EDGE
         radius = math.sqrt(inside.sum() / np.pi) / self._grid.factor
-        return np.asarray(self._wave(rng, max(radius, 1.0)) / (1 + np.exp(-steep)))
+        return np.asarray(self._wave(rng, rms, max(radius, 1.0)) / (1 + np.exp(-steep)))
 
     def _misaligned(self, displacement: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Displacement onto a detector that is shifted, turned and scaled by random numbers."""

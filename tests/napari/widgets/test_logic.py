@@ -33,6 +33,7 @@ from napari_shadowinv.analysis.paths import (
 )
 from napari_shadowinv.inversion import Inversion, compilation, invert
 from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantom_models import BlobRecipe, ToroidRecipe
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.physics.trace_options import GridView
 from napari_shadowinv.pipeline import Cache, run

@@ -39,6 +39,7 @@ NAMES = (
     "Estimate source",
     "Forward model",
     "Analyse",
+    "Plan an experiment",
 )
 
 

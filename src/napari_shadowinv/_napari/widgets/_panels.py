@@ -198,6 +198,7 @@ _STAGES = {
     "field": "Computing the field",
     "image": "Tracing the rays",
     "shots": "Inverting",
+    "draws": "Simulating shots",
     "wait": "Waiting for shots",
     "fit": "Fitting",
     "read": "Reading the scans",

@@ -1,0 +1,325 @@
+"""The widget that plans an experiment before its shot: `PlanExperiment`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from qtpy.QtWidgets import QLineEdit
+
+from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.jobs import Finished, Job
+from napari_shadowinv._napari.layer_metadata import Frame, frame_for
+from napari_shadowinv._napari.layers import FullLayerData
+from napari_shadowinv._napari.widgets import _forms as forms
+from napari_shadowinv._napari.widgets import _panels as panels
+from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
+from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
+from napari_shadowinv._napari.widgets._layers import LayerPicker
+from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
+from napari_shadowinv._napari.widgets._results import LastResults
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
+from napari_shadowinv._system.validation import validate
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.options import Instrument
+from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
+from napari_shadowinv.physics.setup import SETUPS, Setup
+from napari_shadowinv.physics.units import intensity_limits
+from napari_shadowinv.pipeline.experiment import SWEPT, plan_experiment, sweep_experiment
+from napari_shadowinv.pipeline.experiment_object import PlannedObject, object_of_displacement
+from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
+from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep
+
+if TYPE_CHECKING:
+    import napari
+
+_LAYER = "layer"
+_NOTHING = ""
+_PLOT_HEIGHT_PX = 260
+_LOG_RANGE = 8.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlanJob(Job):
+    """A plan of an experiment, or a sweep of one of its quantities."""
+
+    object: PhantomRecipe | PlannedObject
+    setups: tuple[Setup, ...]
+    shape: tuple[int, int] | None
+    instrument: Instrument
+    options: ExperimentOptions
+    quantity: str = _NOTHING
+    values: tuple[float, ...] = ()
+
+    def run(
+        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
+    ) -> ExperimentPlan | ExperimentSweep:
+        choices: dict[str, Any] = {
+            "shape": self.shape,
+            "instrument": self.instrument,
+            "options": self.options,
+            "on_progress": on_progress,
+            "should_stop": should_stop,
+        }
+        setups = self.setups or None
+        if self.quantity:
+            choices |= {"quantity": self.quantity, "values": self.values}
+            return sweep_experiment(self.object, setups, **choices)
+        return plan_experiment(self.object, setups, **choices)
+
+    def layers(self, content: ExperimentPlan | ExperimentSweep) -> list[FullLayerData]:
+        """Describe the image of the first draw."""
+        plan = content.plans[content.best] if isinstance(content, ExperimentSweep) else content
+        setup = plan.setups[0] if plan.setups else None
+        frame = frame_for(plan.shape, setup) if setup is not None else Frame()
+        keywords = {
+            "name": f"{plan.title}, planned",
+            "metadata": about.metadata_for(about.SHOT, "counts", setup),
+            "contrast_limits": intensity_limits(plan.images[0]),
+            **frame.keywords(),
+        }
+        return [(plan.images[0], keywords, "image")]
+
+
+class PlanPlot(Plot):
+    """Errors of the draws of a plan, or the error over the quantity of a sweep."""
+
+    def __init__(self) -> None:
+        super().__init__(_PLOT_HEIGHT_PX)
+        self.setFixedHeight(_PLOT_HEIGHT_PX)
+        self.setVisible(False)
+
+    def show_plan(self, plan: ExperimentPlan) -> None:
+        """Draw the errors made and reported in each draw."""
+        self.setVisible(True)
+        (axis,) = self.fresh_axes()
+        numbers = [shot.number for shot in plan.shots]
+        axis.bar(numbers, [100 * shot.error for shot in plan.shots], color=COLOURS[0], label="made")
+        totals = [100 * shot.total for shot in plan.shots]
+        axis.plot(numbers, totals, "_", color=self.ink, markersize=8, label="reported")
+        self._finish(axis, "draw")
+
+    def show_sweep(self, sweep: ExperimentSweep) -> None:
+        """Draw the error made with the band of 68 % of the draws, and the error reported."""
+        self.setVisible(True)
+        (axis,) = self.fresh_axes()
+        order = np.argsort(sweep.values)
+        values = np.array(sweep.values)[order]
+        chosen = [sweep.plans[k] for k in order]
+        spreads = [plan.error for plan in chosen]
+        low, high = ([100 * getattr(each, end) for each in spreads] for end in ("low", "high"))
+        axis.fill_between(values, low, high, color=COLOURS[0], alpha=0.25)
+        medians = [100 * each.median for each in spreads]
+        axis.plot(values, medians, "o-", color=COLOURS[0], label="made")
+        totals = [100 * plan.total.median for plan in chosen]
+        axis.plot(values, totals, "--", color=self.ink, label="reported")
+        if values[0] > 0 and values[-1] / values[0] > _LOG_RANGE:
+            axis.set_xscale("log")
+        unit = f" ({sweep.unit})" if sweep.unit else ""
+        self._finish(axis, f"{sweep.title}{unit}")
+
+    def _finish(self, axis: Any, name: str) -> None:
+        axis.set_ylim(bottom=0)
+        axis.set_xlabel(name, color=self.ink, fontsize=8)
+        axis.set_ylabel("error of the field (%)", color=self.ink, fontsize=8)
+        self.add_legend(axis)
+        self.draw()
+
+
+class PlanExperiment(panels.ToolPanel):
+    """Choose an object and an experiment, and see whether its field would be determined."""
+
+    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+        panel = panels.RunPanel(
+            "Plan an experiment",
+            "Plan",
+            "Simulate shots with random imperfections, retrieve their fields, and compare these "
+            "with the object.",
+        )
+        super().__init__(viewer, "plan-experiment", panel)
+        self.object = forms.ModelPicker(
+            "Object", {**forms.kinds_of(PHANTOMS), _LAYER: ("the field of a result", None)}
+        )
+        self.object.choice.setToolTip("Object that deflects the beam.")
+        self.field = LayerPicker(
+            viewer, ("image",), "A layer of a result, whose field is the object.", suits=_has_field
+        )
+        self._field_row = forms.labelled("Result", self.field)
+        self.setup = SetupPicker()
+        self.energies = _line(
+            "14.7, 30",
+            "Energies of several images of a shot in MeV (of light: wavelengths in m), separated "
+            "by commas. Empty: one image with the setup's.",
+        )
+        self.side = _line("200 x 200", "Height and width of an image in px, such as 200 x 200.")
+        self.instrument = InstrumentForm()
+        self.options = forms.ModelForm(ExperimentOptions)
+        self.quantity = SteadyComboBox()
+        self.quantity.addItem("nothing", _NOTHING)
+        for key, swept in SWEPT.items():
+            self.quantity.addItem(swept.title, key)
+        self.quantity.setToolTip("Quantity of the experiment that is varied.")
+        self.values = _line(
+            "100, 300, 1000", "Values of the quantity, separated by commas, in its unit."
+        )
+        self._values_row = forms.labelled("Values", self.values)
+        self.verdict, self.report, self.plot = (
+            panels.VerdictLine(),
+            panels.FoldedReport(),
+            PlanPlot(),
+        )
+        self._last = LastResults(viewer, self)
+        self.add(
+            self.object,
+            self._field_row,
+            forms.labelled("Size (px)", self.side),
+            self.setup,
+            forms.labelled("Energies", self.energies),
+            forms.section("Instrument", self.instrument),
+            forms.section("Simulated shots", self.options),
+            forms.labelled("Vary", self.quantity),
+            self._values_row,
+            self._last.keep_earlier,
+            self.panel,
+            self.verdict,
+            self.plot,
+            self.report,
+        )
+        self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
+        self.quantity.currentIndexChanged.connect(lambda _: self._on_change())
+        for part in (self.object, self.setup, self.instrument, self.options):
+            part.changed.connect(self._on_change)
+        for line in (self.energies, self.side, self.values):
+            line.textChanged.connect(lambda _: self.keep())
+        self.restore_last()
+        self._ready = True
+        self._on_object()
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "object": self.object.state(),
+            "setup": {**self.setup.state(), "kind": self.setup.picker.kind},
+            "energies": self.energies.text(),
+            "size": self.side.text(),
+            "options": self.options.values(),
+            "quantity": self.quantity.currentData(),
+            "values": self.values.text(),
+        }
+
+    def restore(self, state: Any) -> None:
+        self.object.restore(state.get("object", {}))
+        self.setup.restore(state.get("setup", {}))
+        if kind := state.get("setup", {}).get("kind"):
+            self.setup.picker.set_kind(str(kind))
+        self.options.set_values(state.get("options", {}))
+        self.energies.setText(str(state.get("energies", "")))
+        self.side.setText(str(state.get("size", "")))
+        self.values.setText(str(state.get("values", "")))
+        index = self.quantity.findData(str(state.get("quantity", _NOTHING)))
+        self.quantity.setCurrentIndex(max(index, 0))
+
+    def request(self) -> PlanJob:
+        setup = self.setup.setup()
+        quantity = str(self.quantity.currentData())
+        options: Any = self.options.model()
+        return PlanJob(
+            object=self._object(),
+            setups=self._setups(setup),
+            shape=_shape(self.side.text()),
+            instrument=validate(Instrument, self.instrument.values(), "instrument"),
+            options=options,
+            quantity=quantity,
+            values=tuple(_numbers("the values", self.values.text())) if quantity else (),
+        )
+
+    def forget(self) -> None:
+        self.verdict.empty()
+        self.report.empty()
+        self.plot.setVisible(False)
+
+    def show_result(self, finished: Finished, job: PlanJob) -> None:
+        self._last.layers_for_next(job.quantity or "plan").show(finished.layer_data)
+        content = finished.content
+        self.verdict.show_headline(content.headline)
+        if isinstance(content, ExperimentSweep):
+            self.plot.show_sweep(content)
+        else:
+            self.plot.show_plan(content)
+        rows, details = (panels.fact_rows(content.facts, details=flag) for flag in (False, True))
+        self.report.show_rows(rows, details)
+        self.reveal(self.report)
+
+    def _object(self) -> PhantomRecipe | PlannedObject:
+        if self.object.kind != _LAYER:
+            recipe: Any = self.object.model()
+            return recipe
+        layer = self.field.layer
+        if layer is None:
+            raise InputError(
+                "there is no result whose field could be the object: open one, or choose a phantom"
+            )
+        result = about.result_of(layer)
+        setup = None if result is None else result.setup
+        displacement = np.asarray(about.displacement_of(layer))
+        return object_of_displacement(displacement, setup, title=layer.name)
+
+    def _setups(self, setup: Setup | None) -> tuple[Setup, ...]:
+        text = self.energies.text().strip()
+        if not text:
+            return () if setup is None else (setup,)
+        if setup is None:
+            raise InputError("received energies without a setup: choose the setup of all images")
+        quantity = setup.beam_quantity()
+        return tuple(
+            validate(type(setup), {**setup.model_dump(), quantity.name: value}, quantity.plural)
+            for value in _numbers(quantity.plural, text, quantity.unit)
+        )
+
+    def _on_object(self) -> None:
+        """Show the kind of setup that a phantom requires."""
+        recipe = PHANTOMS.get(self.object.kind)
+        if self._ready and recipe is not None and recipe.probe:
+            self.setup.picker.set_kind(recipe.probe)
+            form = self.setup.picker.form
+            if form is not None and form.is_empty:
+                self.setup.suggest(SETUPS[recipe.probe].example(), "example from the paper")
+        self._on_change()
+
+    def _on_change(self) -> None:
+        self._field_row.setVisible(self.object.kind == _LAYER)
+        self._values_row.setVisible(bool(self.quantity.currentData()))
+        self.keep()
+
+
+def _has_field(layer: Any) -> bool:
+    return about.displacement_of(layer) is not None
+
+
+def _line(example: str, tip: str) -> QLineEdit:
+    line = QLineEdit()
+    line.setPlaceholderText(example)
+    line.setToolTip(f"<qt>{tip}</qt>")
+    return line
+
+
+def _numbers(name: str, text: str, unit: str = "") -> Sequence[float]:
+    parts = [part for part in text.split(",") if part.strip()]
+    try:
+        return [parse_number(part, unit) for part in parts]
+    except InputError:
+        raise InputError(
+            f"{name}: received '{text}', expected numbers separated by commas"
+        ) from None
+
+
+def _shape(text: str) -> tuple[int, int] | None:
+    if not text.strip():
+        return None
+    parts = text.lower().replace("×", "x").split("x")
+    if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
+        raise InputError(
+            f"the size is '{text}': expected height and width in px, such as 200 x 200"
+        )
+    return int(parts[0]), int(parts[1])

@@ -1,0 +1,93 @@
+"""The command `shadowinv plan`."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.command_line import content, flat, shadowinv
+from napari_shadowinv.physics.phantoms import gaussian_blob
+
+SETUP = """
+kind = "proton"
+energy = 14.7
+source_object_distance = 1.3e-3
+object_image_distance = 2e-2
+pixel_size = 1.5e-6
+"""
+QUICK = ("--size", "64x64", "--draws", 2)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "setup.toml").write_text(SETUP)
+    return tmp_path
+
+
+def test_a_plan_writes_a_row_for_each_draw_and_a_figure(folder):
+    answer = shadowinv(
+        *("plan", "toroid:peak=20,radius=9e-6", "--setup", "setup.toml", *QUICK),
+        *("--beam-rms", 0, "--counts", 3000),
+    )
+    assert answer.exit_code == 0, answer.output
+    assert "would be determined: 2 of 2" in flat(answer.output)
+    with (folder / "plan.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["draw"] for row in rows] == ["0", "1"]
+    assert all(0 < float(row["error"]) < 0.05 for row in rows)
+    assert (folder / "plan.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_sweep_has_a_row_for_each_value(folder):
+    answer = shadowinv(
+        *("plan", "blob:amplitude=15,sigma=6", *QUICK, "--beam-rms", 0),
+        *("--sweep", "counts=100,1600", "--out", "counts.csv"),
+    )
+    assert answer.exit_code in (0, 3), answer.output
+    with (folder / "counts.csv").open() as file:
+        few, many = csv.DictReader(file)
+    assert float(few["error"]) > 2 * float(many["error"])
+
+
+def test_the_object_of_a_file_is_a_displacement(folder):
+    np.save(folder / "field.npy", gaussian_blob((64, 64), 15, 6).displacement)
+    answer = shadowinv("plan", "field.npy", "--draws", 2, "--beam-rms", 0, "--quiet")
+    assert answer.exit_code == 0, answer.output
+    assert answer.output == ""
+
+
+def test_a_field_that_would_not_be_determined_has_an_exit_code(folder):
+    arguments = ("plan", "blob:amplitude=3,sigma=6", *QUICK, "--counts", 10)
+    answer = shadowinv(*arguments)
+    assert answer.exit_code == 3
+    assert (folder / "plan.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("plan", "torus"), "did you mean 'toroid'"),
+        (("plan", "toroid"), "particles"),
+        (("plan", "blob", "--energies", "3,15"), "--energies: it needs --setup"),
+        (("plan", "toroid", "--setup", "setup.toml", "--energies", "3;15"), "separated by commas"),
+        (("plan", "blob", "--size", "200"), "expected height and width"),
+        (("plan", "blob", "--sweep", "counts"), "expected NAME=VALUES"),
+        (("plan", "blob", "--sweep", "count=1,2"), "did you mean 'counts'"),
+        (("plan", "blob", "--counts", "-1"), "--counts is -1"),
+        (("plan", "blob", "--background", "2"), "--background is 2"),
+        (("plan", "blob", "--deflector", "plasma"), "not a phantom"),
+        (("plan", "missing.shadowinv"), "missing.shadowinv"),
+        (("plan", "blob", "--out", "plan.txt"), "plan.txt cannot be written"),
+    ],
+)
+def test_wrong_input_is_one_sentence_and_writes_nothing(folder, arguments, message):
+    before = content(folder)
+    answer = shadowinv(*arguments)
+    assert answer.exit_code == 2, answer.output
+    assert message in flat(answer.output)
+    assert "Traceback" not in answer.output
+    assert content(folder) == before

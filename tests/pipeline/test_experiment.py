@@ -1,0 +1,394 @@
+"""Planned experiments: simulated shots obey what is stated, and errors are what is made."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from napari_shadowinv import Instrument, InversionCancelled
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Verdict
+from napari_shadowinv.options import BeamPrior
+from napari_shadowinv.physics.phantom_models import BlobRecipe, FourToroidsRecipe, ToroidRecipe
+from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup, toroid
+from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment, sweep_experiment
+from napari_shadowinv.pipeline.experiment_object import (
+    Grid,
+    PlannedObject,
+    object_of_displacement,
+    object_of_phantom,
+    phantom_of_text,
+)
+from napari_shadowinv.pipeline.experiment_result import (
+    ExperimentPlan,
+    PlannedShot,
+    Spread,
+    table_text,
+)
+from napari_shadowinv.pipeline.experiment_shots import Beam, Detector, ShotSimulator
+
+SETUP = paper_setup()
+SLOWER = SETUP.model_copy(update={"energy": 6.0})
+EXACT = Instrument(beam_rms=0.0)
+
+
+def simulator(
+    instrument: Instrument = EXACT,
+    *,
+    counts: float = 1e9,
+    structure: float = 0.0,
+    planned: PlannedObject | None = None,
+    psf: float = 0.0,
+    seed: int = 0,
+) -> ShotSimulator:
+    recipe = ToroidRecipe(peak=30, radius=12e-6)
+    planned = planned or object_of_phantom(recipe, SETUP, (64, 64))
+    prior = BeamPrior(rms=instrument.beam_rms or 0.0, length=instrument.beam_length)
+    beam = Beam(counts, structure, structure > 0, 1e12, prior)
+    return ShotSimulator(planned, [SETUP], (64, 64), beam, Detector((psf,), instrument), seed)
+
+
+def image_of(instrument: Instrument = EXACT, number: int = 0, **choices) -> NDArray[np.float64]:
+    return simulator(instrument, **choices).draw(number).images[0] / 1e9
+
+
+# Objects
+
+
+def test_a_phantom_displaces_by_its_formula():
+    planned = object_of_phantom(ToroidRecipe(peak=60), SETUP, (80, 90))
+    exact = toroid((80, 90), SETUP, 60, 30e-6).displacement
+    moved = planned.displacement(SETUP, Grid((80, 90)))
+    np.testing.assert_allclose(moved, exact, atol=2e-4 * np.abs(exact).max())
+
+
+def test_a_blob_in_pixels_is_the_same_in_finer_ones():
+    planned = object_of_phantom(BlobRecipe(amplitude=40, sigma=9), None, (64, 64))
+    exact = gaussian_blob((64, 64), 40, 9).displacement
+    np.testing.assert_allclose(planned.displacement(None, Grid((64, 64))), exact, atol=2e-3)
+
+
+def test_an_object_keeps_its_field_at_another_energy():
+    planned = object_of_phantom(ToroidRecipe(peak=60), SETUP, (80, 80))
+    moved = planned.displacement(SLOWER, Grid((80, 80)))
+    field = SLOWER.path_integrated_b(moved, "MG um")
+    assert np.hypot(*field).max() == pytest.approx(60, rel=2e-3)
+
+
+def test_an_object_keeps_its_size_in_other_pixels():
+    coarse = SETUP.model_copy(update={"pixel_size": 3e-6})
+    planned = object_of_phantom(ToroidRecipe(peak=60), SETUP, (120, 120))
+    exact = toroid((60, 60), coarse, 60, 30e-6).displacement
+    moved = planned.displacement(coarse, Grid((60, 60)))
+    np.testing.assert_allclose(moved, exact, atol=5e-3 * np.abs(exact).max())
+
+
+def test_a_displacement_without_setup_is_refused_in_an_experiment():
+    planned = object_of_displacement(gaussian_blob((64, 64), 40, 9).displacement)
+    with pytest.raises(InputError, match="without a setup"):
+        plan_experiment(planned, SETUP)
+
+
+def test_phantoms_are_read_from_texts():
+    assert phantom_of_text("toroid:peak=60,radius=2e-5") == ToroidRecipe(peak=60, radius=2e-5)
+    assert phantom_of_text("four-toroids") == FourToroidsRecipe()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("torroid", "did you mean 'toroid'"),
+        ("toroid:peek=60", "did you mean 'peak'"),
+        ("toroid:peak=strong", "expected a name and a number"),
+        ("toroid:radius=-1", "must be greater than 0"),
+    ],
+)
+def test_a_wrong_phantom_is_refused_in_a_sentence(text, message):
+    with pytest.raises(InputError, match=message):
+        phantom_of_text(text)
+
+
+# Simulated shots
+
+
+def test_flux_is_conserved_by_an_exact_instrument():
+    assert image_of().mean() == pytest.approx(1, abs=1e-3)
+
+
+def test_a_draw_is_the_same_again_and_others_differ():
+    instrument = Instrument.of("film", source="TNSA")
+    first, again = (simulator(instrument, counts=100).draw(3) for _ in range(2))
+    np.testing.assert_array_equal(first.images, again.images)
+    assert (first.images != simulator(instrument, counts=100).draw(4).images).any()
+    assert (first.images != simulator(instrument, counts=100, seed=1).draw(3).images).any()
+
+
+def test_counts_scatter_as_poisson():
+    blank = PlannedObject(np.zeros((2, 64, 64)), setup=SETUP)
+    image = simulator(counts=50, planned=blank).draw(0).images[0]
+    assert image.mean() == pytest.approx(50, rel=0.01)
+    assert image.var() == pytest.approx(50, rel=0.1)
+
+
+def test_the_beam_varies_by_the_stated_share_in_each_draw():
+    blank = PlannedObject(np.zeros((2, 64, 64)), setup=SETUP)
+    chosen = simulator(Instrument(beam_rms=0.05), planned=blank)
+    deviations = [chosen.draw(number).images[0].std() / 1e9 for number in range(3)]
+    np.testing.assert_allclose(deviations, 0.05, rtol=0.05)
+
+
+def test_backgrounds_scatter_by_the_stated_share():
+    chosen = simulator(Instrument(beam_rms=0.0, background=0.1))
+    levels = [chosen.draw(number).images[0].mean() / 1e9 - 1 for number in range(60)]
+    assert np.std(levels) == pytest.approx(0.1, rel=0.25)
+
+
+def test_a_gamma_is_an_exponent():
+    exact, image = image_of(), image_of(Instrument(beam_rms=0.0, gamma=0.1))
+    ratio = np.log(image) / np.log(exact)
+    is_bright = np.abs(np.log(exact)) > 0.05
+    assert ratio[is_bright].std() < 0.01
+    assert abs(ratio[is_bright].mean() - 1) > 0.001
+
+
+def test_the_stated_point_spread_adds_to_the_unknown_one():
+    # A Gaussian of σ takes exp(-k² σ² / 2) of a wave; variances add.
+    y, x = np.indices((64, 64), dtype=float)
+    wave = np.cos(2 * np.pi * 8 * (x + 0.5) / 64)
+    amplitudes = [float((image_of(psf=psf) * wave).mean()) for psf in (0.0, 2.0)]
+    expected = np.exp(-((2 * np.pi * 8 / 64) ** 2) * 4 / 2)
+    assert amplitudes[1] / amplitudes[0] == pytest.approx(expected, rel=0.05)
+    assert y.shape == (64, 64)
+
+
+def test_numbers_of_an_imperfection_stay_if_another_changes():
+    blank = PlannedObject(np.zeros((2, 64, 64)), setup=SETUP)
+    beam = Instrument(beam_rms=0.05)
+    both = Instrument(beam_rms=0.05, background=0.1)
+    first, second = (simulator(each, planned=blank).draw(2).images[0] for each in (beam, both))
+    difference = (second - first) / 1e9
+    assert difference.std() < 1e-3 < abs(difference.mean())
+
+
+def test_the_reference_shows_the_structure_out_of_register():
+    # A shift by much more than a pixel makes image and reference differ.
+    blank = PlannedObject(np.zeros((2, 64, 64)), setup=SETUP)
+    residuals = []
+    for registration in (0.0, 3.0):
+        instrument = Instrument(beam_rms=0.0, beam_length=0.1, registration=registration)
+        shots = simulator(instrument, planned=blank, structure=0.1).draw(1)
+        assert shots.source is not None
+        residuals.append(float((shots.images[0] / shots.source - 1).std()))
+    assert residuals[0] < 2e-4
+    assert residuals[1] > 0.02
+
+
+# Plans
+
+
+def small_plan(**choices) -> ExperimentPlan:
+    options = ExperimentOptions(**{"counts": 300, "draws": 6, "reference": "none", **choices})
+    return plan_experiment(
+        BlobRecipe(amplitude=15, sigma=6), shape=(64, 64), instrument=EXACT, options=options
+    )
+
+
+def test_more_counts_lower_the_error_by_their_root():
+    sweep = sweep_experiment(
+        BlobRecipe(amplitude=10, sigma=6),
+        quantity="counts",
+        values=[100, 1600],
+        shape=(64, 64),
+        instrument=EXACT,
+        options=ExperimentOptions(draws=8),
+    )
+    few, many = (plan.error.median for plan in sweep.plans)
+    assert few / many == pytest.approx(4, rel=0.25)
+
+
+def test_the_reported_error_is_the_error_made():
+    plan = small_plan(draws=12)
+    assert 0.7 < plan.ratio < 1.4
+
+
+def test_plans_repeat_on_any_number_of_threads():
+    first, second = small_plan(threads=1), small_plan(threads=2)
+    assert first.shots == second.shots
+    assert first.shots != small_plan(seed=1).shots
+
+
+def test_a_wrong_energy_is_in_the_error_made_and_reported():
+    # The field scales with the momentum, by half the error of the energy.
+    instrument = Instrument(beam_rms=0.0, energy=0.2)
+    plan = plan_experiment(
+        ToroidRecipe(peak=20, radius=9e-6),
+        SETUP,
+        shape=(64, 64),
+        instrument=instrument,
+        options=ExperimentOptions(counts=1e6, draws=8),
+    )
+    assert plan.parts["energy"] == pytest.approx(0.1, rel=0.03)
+    assert next(iter(plan.parts)) == "energy"
+    energies = [np.random.default_rng([0, number, 0]).normal() for number in range(8)]
+    made = [shot.error for shot in plan.shots]
+    expected = np.abs((1 + 0.2 * np.array(energies)) ** -0.5 - 1)
+    np.testing.assert_allclose(made, expected, atol=0.02)
+
+
+def test_two_energies_are_fitted_and_the_searches_are_stated():
+    plan = plan_experiment(
+        ToroidRecipe(peak=30, radius=9e-6),
+        [SETUP, SLOWER],
+        shape=(48, 48),
+        instrument=EXACT,
+        options=ExperimentOptions(draws=3),
+    )
+    assert plan.method == "fit"
+    assert [shot.is_searched for shot in plan.shots] == [True, False, False]
+    assert plan.error.median < 0.05
+    assert "1 of 3" in next(fact.text for fact in plan.facts if fact.key == "searched")
+    assert not np.isnan([shot.total for shot in plan.shots]).any()
+
+
+def test_a_plan_stops_on_request():
+    with pytest.raises(InversionCancelled):
+        plan_experiment(BlobRecipe(), shape=(64, 64), should_stop=lambda: True)
+
+
+def test_progress_counts_the_draws_of_a_whole_sweep():
+    steps = []
+    sweep_experiment(
+        BlobRecipe(amplitude=15, sigma=6),
+        quantity="counts",
+        values=[100, 200],
+        shape=(48, 48),
+        options=ExperimentOptions(draws=2, threads=1),
+        on_progress=lambda progress: steps.append((progress.step, progress.total)),
+    )
+    assert steps == [(0, 4), (1, 4), (2, 4), (2, 4), (3, 4), (4, 4)]
+
+
+@pytest.mark.parametrize(
+    ("choices", "message"),
+    [
+        ({"setups": [SETUP, SETUP]}, "two setups are the same"),
+        ({"setups": [SETUP, SLOWER.model_copy(update={"pixel_size": 3e-6})]}, "pixels of 3 µm"),
+        ({"shape": (8, 64)}, "expected height and width of 32 px"),
+        ({"object": ToroidRecipe(peak=0)}, "displaces rays by nothing"),
+        ({"setups": None}, "select the setup 'particles'"),
+        ({"instrument": Instrument(noise_correlation=1.0)}, "noise correlation"),
+        ({"object": None}, "expected a phantom or a field"),
+    ],
+)
+def test_wrong_inputs_are_refused_in_a_sentence(choices, message):
+    inputs = {"object": ToroidRecipe(peak=30), "setups": [SETUP], "shape": (64, 64), **choices}
+    planned, setups = inputs.pop("object"), inputs.pop("setups")
+    with pytest.raises(InputError, match=message) as raised:
+        plan_experiment(planned, setups, **inputs)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("choices", "message"),
+    [
+        ({"counts": 0}, "must be greater than 0"),
+        ({"psf": 1.0, "resolution": 1e-5}, "one or the other"),
+        ({"beam_structure": 0.1}, "reference"),
+        ({"draws": 1}, "at least 2"),
+    ],
+)
+def test_wrong_options_are_refused_in_a_sentence(choices, message):
+    with pytest.raises(InputError, match=message):
+        ExperimentOptions(**choices)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "values", "message"),
+    [
+        ("count", [1, 2], "did you mean 'counts'"),
+        ("counts", [100], "two or more"),
+        ("counts", [100, -5], "must be greater than 0"),
+        ("energy", [3, 5], "without a setup"),
+    ],
+)
+def test_a_wrong_sweep_is_refused_in_a_sentence(quantity, values, message):
+    with pytest.raises(InputError, match=message):
+        sweep_experiment(BlobRecipe(), quantity=quantity, values=values, shape=(64, 64))
+
+
+# Results
+
+
+def plan_of(shots: list[PlannedShot], instrument: Instrument = EXACT) -> ExperimentPlan:
+    return ExperimentPlan(
+        title="an object",
+        setups=(),
+        shape=(4, 4),
+        instrument=instrument,
+        options=ExperimentOptions(draws=len(shots)),
+        method="inversion",
+        shots=tuple(shots),
+        images=np.ones((1, 4, 4)),
+        truth=np.ones((2, 4, 4)),
+        retrieved=np.ones((2, 4, 4)),
+        seconds={"shots": 1.0},
+    )
+
+
+def shot(number: int, error: float, total: float = 0.02, **parts: float) -> PlannedShot:
+    return PlannedShot(number, Verdict.DETERMINED, "", error, 0.0, total, parts)
+
+
+def test_an_interval_holds_two_thirds_of_the_draws():
+    spread = Spread.of(list(np.arange(101) / 100))
+    assert (spread.median, spread.low, spread.high) == pytest.approx((0.5, 0.16, 0.84))
+
+
+def test_half_a_number_halves_its_part_of_the_budget():
+    instrument = Instrument(beam_rms=0.0, background=0.04, blur=2.0)
+    plan = plan_of(
+        [shot(k, 0.05, background=0.03, blur=0.04, noise=0.0) for k in range(2)], instrument
+    )
+    gains = {gain.cause: gain.total for gain in plan.gains}
+    assert gains["background"] == pytest.approx(np.hypot(0.015, 0.04))
+    assert gains["blur"] == pytest.approx(np.hypot(0.03, 0.01))
+
+
+def test_twice_the_counts_lower_the_noise_by_their_root():
+    plan = plan_of([shot(k, 0.05, noise=0.04, background=0.03) for k in range(2)])
+    (gain,) = (each for each in plan.gains if each.cause == "noise")
+    assert gain.total == pytest.approx(np.hypot(0.04 / np.sqrt(2), 0.03))
+
+
+def test_a_number_that_the_images_determine_gains_nothing():
+    instrument = Instrument(beam_rms=0.0, background=0.04)
+    known = [
+        PlannedShot(
+            k, Verdict.DETERMINED, "", 0.03, 0.0, 0.03, {"background": 0.03}, {"background": 0.01}
+        )
+        for k in range(2)
+    ]
+    (gain,) = plan_of(known, instrument).gains
+    assert gain.total == pytest.approx(0.03, rel=1e-3)
+
+
+def test_a_determined_field_that_is_wrong_is_reported():
+    plan = plan_of([shot(0, 0.01), shot(1, 0.2)])
+    assert plan.silent == 1
+    assert not plan.is_determined
+    assert "do not rely" in next(fact.text for fact in plan.facts if fact.key == "silent")
+
+
+def test_tables_have_a_row_for_each_draw():
+    plan = plan_of([shot(0, 0.01, noise=0.02), shot(1, 0.2, noise=0.02)])
+    header, *rows = table_text(plan.rows()).splitlines()
+    assert header == "draw,verdict,error,peak_error,reported_error,searched,part_noise"
+    assert rows[1].startswith("1,determined,0.2,")
+
+
+def test_a_dataset_has_units_and_all_draws():
+    dataset = plan_of([shot(0, 0.01, noise=0.02), shot(1, 0.2, noise=0.02)]).to_dataset()
+    assert dataset["error"].values.tolist() == [0.01, 0.2]
+    assert dataset["parts"].sel(cause="noise").values.tolist() == [0.02, 0.02]
+    assert dataset["displacement"].attrs["units"] == "pixel"
