@@ -55,7 +55,9 @@ def test_a_sweep_has_a_row_for_each_value(folder):
 
 def test_the_object_of_a_file_is_a_displacement(folder):
     np.save(folder / "field.npy", gaussian_blob((64, 64), 15, 6).displacement)
-    answer = shadowinv("plan", "field.npy", "--draws", 2, "--beam-rms", 0, "--quiet")
+    answer = shadowinv(
+        *("plan", "field.npy", "--draws", 2, "--beam-rms", 0, "--counts", 10_000, "--quiet")
+    )
     assert answer.exit_code == 0, answer.output
     assert answer.output == ""
 
@@ -70,7 +72,7 @@ def test_a_field_that_would_not_be_determined_has_an_exit_code(folder):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("plan", "torus"), "did you mean 'toroid'"),
+        (("plan", "torroid"), "did you mean 'toroid'"),
         (("plan", "toroid"), "particles"),
         (("plan", "blob", "--energies", "3,15"), "--energies: it needs --setup"),
         (("plan", "toroid", "--setup", "setup.toml", "--energies", "3;15"), "separated by commas"),

@@ -32,6 +32,7 @@ _SILENT_TOTALS = 3.0  # an error beyond so many reported ones is wrong in silenc
 _LIMITS = (0.16, 0.84)
 _MIN_GAIN = 0.02  # of the error, worth a sentence
 _LISTED_GAINS = 3
+_LEAST_PART = 0.01  # of the largest one
 
 
 @dataclass(frozen=True)
@@ -314,7 +315,12 @@ class ExperimentPlan:
             total += f"; the error made is {self.ratio:.2g} times that (r.m.s.)"
         yield Fact("total", "Error reported", total)
         if self.parts:
-            ranking = ", ".join(f"{self._title(k)} {percent(v)}" for k, v in self.parts.items())
+            least = _LEAST_PART * next(iter(self.parts.values()))
+            ranking = ", ".join(
+                f"{self._title(name)} {percent(share)}"
+                for name, share in self.parts.items()
+                if share >= least
+            )
             yield Fact("limits", "Limited by", ranking)
         yield from self._gain_facts()
         yield from self._caveat_facts()

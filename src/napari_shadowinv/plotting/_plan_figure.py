@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MAX_PARTS = 8
+_LEAST_PART = 0.01  # of the largest one
 _LOG_RANGE = 8.0  # of the values of a sweep, for a logarithmic axis
 
 
@@ -55,7 +56,7 @@ def plan_figure(plan: ExperimentPlan) -> Figure:
         _panels.write_header(figure, header, grid)
         mean = plan.options.counts
         image = plan.images[0] / mean
-        draw_intensity(panels[0], image, "Image of the first draw", intensity_limits(image))
+        draw_intensity(panels[0], image, "First draw", intensity_limits(image))
         draw_side_by_side(panels[1:4], {"object": true, "retrieved in the first draw": retrieved})
         _draw_errors(panels[4].axes, plan)
         _draw_parts(panels[5].axes, plan)
@@ -112,6 +113,8 @@ def draw_sweep(figure: Figure, sweep: ExperimentSweep) -> None:
     below.set_xlabel(f"{sweep.title} ({sweep.unit})" if sweep.unit else sweep.title)
     if values[0] > 0 and values[-1] / values[0] > _LOG_RANGE:
         below.set_xscale("log")
+        below.minorticks_off()
+    below.set_xticks(values, [f"{value:.3g}" for value in values])
 
 
 def _draw_errors(axes: Axes, plan: ExperimentPlan) -> None:
@@ -121,14 +124,15 @@ def _draw_errors(axes: Axes, plan: ExperimentPlan) -> None:
     axes.bar(numbers, [100 * shot.error for shot in plan.shots], color=colours)
     totals = [100 * shot.total for shot in plan.shots]
     axes.plot(numbers, totals, "_", color="black", markersize=7, label="reported")
-    axes.set_xlabel("draw")
+    axes.set_xlabel("draw (red: not determined)")
     axes.set_ylabel("error of the field (%)")
     axes.set_title(f"Error made: {percent(plan.error.median)}")
     axes.legend(fontsize=7)
 
 
 def _draw_parts(axes: Axes, plan: ExperimentPlan) -> None:
-    parts = list(plan.parts.items())[:_MAX_PARTS]
+    least = _LEAST_PART * max(plan.parts.values(), default=0.0)
+    parts = [part for part in plan.parts.items() if part[1] >= least][:_MAX_PARTS]
     if not parts:
         axes.axis("off")
         return

@@ -35,6 +35,7 @@ def test_a_plan_shows_its_verdict_and_the_first_image(tool: Any, window: Any, qt
     finished(tool, qtbot)
     assert "would be determined: 3 of 3" in tool.verdict.text()
     assert "Error made" in tool.report.texts()
+    qtbot.waitUntil(lambda: len(window.layers) == 1, timeout=PATIENCE)
     (layer,) = window.layers
     assert role_of(layer) == "shot"
     assert layer.data.mean() == pytest.approx(3000, rel=0.01)

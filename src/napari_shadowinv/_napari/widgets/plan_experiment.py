@@ -19,7 +19,7 @@ from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_numb
 from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
 from napari_shadowinv._napari.widgets._layers import LayerPicker
 from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
-from napari_shadowinv._napari.widgets._results import LastResults
+from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
@@ -171,6 +171,7 @@ class PlanExperiment(panels.ToolPanel):
             PlanPlot(),
         )
         self._last = LastResults(viewer, self)
+        self.results: ResultLayers | None = None
         self.add(
             self.object,
             self._field_row,
@@ -240,7 +241,8 @@ class PlanExperiment(panels.ToolPanel):
         self.plot.setVisible(False)
 
     def show_result(self, finished: Finished, job: PlanJob) -> None:
-        self._last.layers_for_next(job.quantity or "plan").show(finished.layer_data)
+        self.results = self._last.layers_for_next(job.quantity or "plan")
+        self.results.show(finished.layer_data)
         content = finished.content
         self.verdict.show_headline(content.headline)
         if isinstance(content, ExperimentSweep):
