@@ -28,7 +28,7 @@ from napari_shadowinv.pipeline.experiment_object import object_of_displacement, 
 from napari_shadowinv.pipeline.experiment_shots import Beam, Detector, ShotSimulator
 
 INSTRUMENTS = {
-    "noise, beam assumed to 5 %": Instrument(),
+    "noise only": Instrument(beam_rms=0.0),
     "beam stated to 2 %": Instrument(beam_rms=0.02),
     "camera, implosion": Instrument.of("camera", source="implosion"),
 }

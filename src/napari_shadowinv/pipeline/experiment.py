@@ -258,6 +258,16 @@ class _Inputs:
         return self.options.method == "fit"
 
     @property
+    def fitted_instrument(self) -> Instrument:
+        """The instrument with the beam that is assumed, which a fit takes as exact otherwise."""
+        instrument = self.instrument
+        if instrument.beam_rms is not None or self.options.is_recorded:
+            return instrument
+        return Instrument(
+            **{**instrument.stated, "beam_rms": instrument.beam_of(measured=False).rms}
+        )
+
+    @property
     def psf(self) -> tuple[float, ...]:
         """Known point spread of each image, px."""
         options = self.options
@@ -496,7 +506,7 @@ def _fitted(
         source=shots.source,
         fields=_fields_of(inputs),
         noise=noise,
-        instrument=inputs.instrument,
+        instrument=inputs.fitted_instrument,
         options=FitOptions(
             samples=_ERROR_SAMPLES if near is None else 0,
             max_error=options.max_error,
