@@ -63,7 +63,7 @@ SMOOTHNESS_RATIO = 0.1  # of them
 # are smoothed twice show it to a fifth.
 _PAIRS, _UNSURE_SLOPES = 2, 0.25
 _RESPONSE_ROUNDS, _NUMBERS_SETTLED = 8, 0.05  # squared distance in standard deviations
-_QUICK_ROUNDS, _QUICK_SPACING = 2, 0.3
+_QUICK_ROUNDS = 2
 _LIKELY_NUMBER = 1.0  # where numbers begin, at most
 _SAME_FIELD = 0.03  # of the displacement, r.m.s.
 
@@ -319,15 +319,11 @@ def refine_minimum(
 ) -> tuple[Scene, Unknowns, float, int, bool]:
     """Descend with the pixels as recorded, with rays as dense as the data need.
 
-    Also returns the number of steps, and whether it converged within the allowed number. A quick
-    fit keeps the unknowns of larger pixels.
+    Also returns the number of steps, and whether it converged within the allowed number.
     """
     unknowns, steps = minimum.in_pixels(scene.bin), 0
-    if options.quick:
-        end = settle_minimum(scene, minimum, on_step, "full size", least_gain=_LAST_GAIN)
-        quick = replace(scene, spacing=_QUICK_SPACING)
-        return quick, end.in_pixels(scene.bin), end.value, 0, True
-    usual = [_SPACING_WITH_NUMBERS] if scene.imperfect.parts else list(_SPACINGS)
+    has_dense_rays = bool(scene.imperfect.parts) and not options.quick
+    usual = [_SPACING_WITH_NUMBERS] if has_dense_rays else list(_SPACINGS)
     denser = usual if options.spacing is None else [options.spacing]
     most = -(-options.max_iterations // len(denser))
     scene = replace(scene, spacing=denser.pop(0))

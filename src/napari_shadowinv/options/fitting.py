@@ -148,8 +148,8 @@ class FitOptions(CheckedModel):
         default=False,
         title="Quick",
         description=(
-            "Fit in pixels of two, with fewer steps for the instrument's numbers: several times "
-            "faster, for a plan or a preview."
+            "Estimate the instrument's numbers in pixels of two with fewer steps, and trace fewer "
+            "rays: several times faster, for a plan or a preview."
         ),
     )
     ambiguous: bool = Field(
