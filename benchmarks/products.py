@@ -105,7 +105,9 @@ def recorded(toroid: Toroid, counts: float, seed: int | None) -> Inversion:
     image = counts * synthetic_image(toroid.displacement)
     if seed is not None:
         image = np.random.default_rng(seed).poisson(image).astype(float)
-    return invert(image, source=np.full(image.shape, counts))
+    # Bands of all images would share the chance of their samples.
+    options = {"seed": seed or 0}
+    return invert(image, source=np.full(image.shape, counts), options=options)
 
 
 def exact_field(toroid: Toroid) -> RetrievedField:
