@@ -31,9 +31,9 @@ def test_figure_draws_curves_with_bands_and_maps_in_their_units():
     assert profile.get_xlabel() == "Distance along the line (µm)"
     (line,) = (line for line in profile.lines if line.get_label() == "normal")
     np.testing.assert_allclose(line.get_ydata(), results[0]["normal"].value / 1e-4)
-    assert len(profile.collections) == 6
+    assert len(profile.collections) == 4  # two bands of two components
     band = results[0].band("normal", 0.95)
-    edges = profile.collections[5].get_paths()[0].vertices[:, 1]
+    edges = profile.collections[3].get_paths()[0].vertices[:, 1]
     np.testing.assert_allclose(edges.max(), band[1].max() / 1e-4)
     (shown,) = (axes.images[0] for axes in figure.axes if axes.images)
     ratio = shown.get_array() / results[2]["density"].value
