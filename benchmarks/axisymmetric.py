@@ -104,7 +104,8 @@ def main() -> None:
             of_operator = np.linalg.norm(exact - truth) / np.linalg.norm(truth)
             print(
                 f"| {name} | {share} | {np.hypot(*moves).max():.1f} "
-                f"| {100 * np.median(errors):.2f}, {100 * max(errors):.2f} | {100 * of_operator:.2f} | {100 * np.mean(inside):.0f} |",
+                f"| {100 * np.median(errors):.2f}, {100 * max(errors):.2f} "
+                f"| {100 * of_operator:.2f} | {100 * np.mean(inside):.0f} |",
                 flush=True,
             )
 
