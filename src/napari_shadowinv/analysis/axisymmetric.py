@@ -40,13 +40,13 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import displacement_from_potential, length_text
-from napari_shadowinv.physics.setup import OpticalSetup
 from napari_shadowinv.physics.units import PIXEL
 
 __all__ = ["AxisymmetricProfile", "AzimuthalProfile"]
 
 _B, _E, _N = "path_integrated_b", "path_integrated_e", "line_integrated_density"
-_LENGTHS = ("displacement", "deflection_angle", "line_integrated_log_index")
+_INDEX = "line_integrated_log_index"
+_LENGTHS = ("displacement", "deflection_angle", _INDEX)
 _MIN_RADIUS_PX = 8
 _DEFAULT_SMOOTHING = 1.0
 _MIN_DENSITY_RATIO = 0.02  # below it a temperature is only noise
@@ -538,8 +538,10 @@ class AzimuthalProfile(Product):
 
 def _is_index(frame: FieldFrame) -> bool:
     """Return whether the field is that of the refractive index, in SI units."""
-    is_light = isinstance(frame.setup, OpticalSetup)
-    return is_light and frame.unit.field in ("deflection_angle", "line_integrated_log_index")
+    if frame.setup is None:
+        return False
+    is_light = any(each.name == _INDEX for each in frame.setup.si_fields)
+    return is_light and frame.unit.field in ("deflection_angle", _INDEX)
 
 
 def _found_axis(

@@ -27,7 +27,7 @@ from scipy.optimize import minimize_scalar
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion._invert import invert
+from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 

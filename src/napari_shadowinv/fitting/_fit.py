@@ -203,17 +203,20 @@ def fit(
             # One image cannot tell the instrument from the object: its numbers stay at 0.
             scene = replace(scene, imperfect=EXACT)
         minima = [_with_numbers(scene, minimum) for minimum in minima]
-        if scene.imperfect.parts and min(data.size) < SMALL_PX and not options.quick:
+        if scene.imperfect.parts and min(data.size) < SMALL_PX and data.near is None:
             # In pixels of two, λ and the errors of the instrument's numbers come out too small.
             minima[0] = in_recorded_pixels(scene, minima[0])
+    is_near = data.near is not None
     with _timed("smoothness", seconds):
-        scene, best = estimate_smoothness(scene, minima[0], rng, on_step, is_quick=options.quick)
+        scene, best = estimate_smoothness(scene, minima[0], rng, on_step, is_near=is_near)
         if data.counted:
             scene = reweight_counts(data, scene, best)
             best = settle_minimum(scene, best, on_step)
         basins = _basins(scene, best, minima[1:], on_step)
     with _timed("full size", seconds):
-        fine, unknowns, value, taken, ended = refine_minimum(scene, best, options, on_step)
+        fine, unknowns, value, taken, ended = refine_minimum(
+            scene, best, options, on_step, is_near=is_near
+        )
     with _timed("residual", seconds):
         # A fit of one image absorbs too much of its noise for the counts to be tested.
         is_counted = data.counted and not data.single

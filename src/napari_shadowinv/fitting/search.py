@@ -63,7 +63,7 @@ SMOOTHNESS_RATIO = 0.1  # of them
 # are smoothed twice show it to a fifth.
 _PAIRS, _UNSURE_SLOPES = 2, 0.25
 _RESPONSE_ROUNDS, _NUMBERS_SETTLED = 8, 0.05  # squared distance in standard deviations
-_QUICK_ROUNDS = 2
+_NEAR_ROUNDS = 2
 _LIKELY_NUMBER = 1.0  # where numbers begin, at most
 _SAME_FIELD = 0.03  # of the displacement, r.m.s.
 
@@ -192,7 +192,7 @@ def estimate_smoothness(
     rng: np.random.Generator,
     on_step: OnStep,
     *,
-    is_quick: bool = False,
+    is_near: bool = False,
 ) -> tuple[Scene, Minimum]:
     """Find λ and κ, unless they are given, and the unknowns that belong to them.
 
@@ -211,14 +211,14 @@ def estimate_smoothness(
     if not is_fixed:
         smoothness, scene, end = _settle_smoothness(scene, end, rng, on_step)
         scene = replace(scene, smoothness=SMOOTHNESS_RATIO * smoothness)
-    if response and scene.images.size <= _MOST_RECORDED and not is_quick:
+    if response and scene.images.size <= _MOST_RECORDED and not is_near:
         # In larger pixels fine structure is lost by which a blur differs from a smooth object.
         end = in_recorded_pixels(scene, end)
-    least_gain = COARSE_GAIN if is_quick else _LAST_GAIN
+    least_gain = COARSE_GAIN if is_near else _LAST_GAIN
     end = settle_minimum(scene, end, on_step, least_gain=least_gain)
     if not response:
         return scene, end
-    rounds = _QUICK_ROUNDS if is_quick else _RESPONSE_ROUNDS
+    rounds = _NEAR_ROUNDS if is_near else _RESPONSE_ROUNDS
     return _settle_response(scene, end, rng, on_step, rounds=rounds, least_gain=least_gain)
 
 
@@ -316,13 +316,15 @@ def refine_minimum(
     minimum: Minimum,
     options: FitOptions,
     on_step: OnStep,
+    *,
+    is_near: bool = False,
 ) -> tuple[Scene, Unknowns, float, int, bool]:
     """Descend with the pixels as recorded, with rays as dense as the data need.
 
     Also returns the number of steps, and whether it converged within the allowed number.
     """
     unknowns, steps = minimum.in_pixels(scene.bin), 0
-    has_dense_rays = bool(scene.imperfect.parts) and not options.quick
+    has_dense_rays = bool(scene.imperfect.parts) and not is_near
     usual = [_SPACING_WITH_NUMBERS] if has_dense_rays else list(_SPACINGS)
     denser = usual if options.spacing is None else [options.spacing]
     most = -(-options.max_iterations // len(denser))

@@ -7,6 +7,7 @@ window, and is saved with each result: there is no second list of defaults.
 - unknowns of a fit and knowledge about its images: `FitChoices`
 """
 
+from napari_shadowinv.options._errors import MaxError
 from napari_shadowinv.options.beam_prior import ASSUMED_BEAM, BeamComponents, BeamPrior
 from napari_shadowinv.options.fitting import (
     KINDS_OF_NOISE,
@@ -33,5 +34,6 @@ __all__ = [
     "Instrument",
     "InversionOptions",
     "KindOfNoise",
+    "MaxError",
     "Noise",
 ]

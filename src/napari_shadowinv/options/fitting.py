@@ -144,14 +144,6 @@ class FitOptions(CheckedModel):
         title="Iterations",
         description="Maximum solver iterations at full resolution.",
     )
-    quick: bool = Field(
-        default=False,
-        title="Quick",
-        description=(
-            "Estimate the instrument's numbers in pixels of two with fewer steps, and trace fewer "
-            "rays: several times faster, for a plan or a preview."
-        ),
-    )
     ambiguous: bool = Field(
         default=False,
         title="Allow an ambiguous fit",

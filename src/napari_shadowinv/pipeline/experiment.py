@@ -510,7 +510,6 @@ def _fitted(
         options=FitOptions(
             samples=_ERROR_SAMPLES if near is None else 0,
             max_error=options.max_error,
-            quick=True,
             threads=1,
         ),
         should_stop=should_stop,

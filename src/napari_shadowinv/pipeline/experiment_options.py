@@ -7,7 +7,7 @@ from typing import Any, Literal, Self
 from pydantic import ConfigDict, Field, model_validator
 
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
-from napari_shadowinv.options._errors import MaxError
+from napari_shadowinv.options import MaxError
 
 __all__ = ["ExperimentOptions"]
 
