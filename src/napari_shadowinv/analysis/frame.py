@@ -18,7 +18,9 @@ from napari_shadowinv.physics.units import PIXEL
 
 __all__ = ["FIELD_UNITS", "FieldFrame", "FieldUnit", "field_unit"]
 
-_THIN_SCREEN_ERRORS = (0.017, 0.1), (0.055, 0.2)  # error, object's length over source distance
+# Error of rods whose rays nearly cross, and their length over the distance to the source, by
+# `benchmarks/tracing.py length`.
+_THIN_SCREEN_ERRORS = (0.015, 0.1), (0.032, 0.2)
 
 
 @dataclass(frozen=True)
@@ -215,7 +217,10 @@ class FieldFrame:
                 f"{100 * error:.2g} % for an object of {1e3 * share * source:.3g} mm along the beam"
                 for error, share in _THIN_SCREEN_ERRORS
             )
-            sentences.append(f"The object is taken as thin: this errs by {errors}.")
+            sentences.append(
+                f"The object is taken as thin: this errs by about {errors}; fields along the beam add "
+                "to it."
+            )
         return tuple(sentences)
 
     def check_points(self, points: FloatArray, name: str) -> None:
