@@ -218,8 +218,8 @@ class FieldFrame:
                 for error, share in _THIN_SCREEN_ERRORS
             )
             sentences.append(
-                f"The object is taken as thin: this errs by about {errors}; fields along the beam add "
-                "to it."
+                f"The object is taken as thin: this errs by about {errors}; fields along the beam "
+                "add to it."
             )
         return tuple(sentences)
 
