@@ -94,15 +94,15 @@ def plan(
     """
     from napari_shadowinv.cli._summary import fact_rows, headline_row, two_columns, written_rows
     from napari_shadowinv.io.files import replacing
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, SITES
     from napari_shadowinv.pipeline.experiment import plan_experiment, sweep_experiment
     from napari_shadowinv.pipeline.experiment_result import ExperimentSweep, table_text
     from napari_shadowinv.pipeline.files import setup_from
     from napari_shadowinv.plotting import plan_figure, sweep_figure
     from napari_shadowinv.plotting.figures import save_figure
 
-    page = figure or out.with_suffix(".png")
-    _inputs.check_outputs({out: (".csv",), page: FIGURE_SUFFIXES}, overwrite)
+    page = figure or out.with_suffix(PNG.suffix)
+    _inputs.check_outputs({out: SITES.suffixes, page: FIGURE_SUFFIXES}, overwrite)
     _inputs.protect([out, page], [setup, recorded_with, _file_of(object)])
     options, instrument = _flags.plan_choices(flags)
     first = None if setup is None else setup_from(setup)
