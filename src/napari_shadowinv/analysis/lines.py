@@ -63,6 +63,7 @@ class LineProfile(Product):
     title = "profile along a line"
     primary = "path"
     place = 10
+    curves = ("value", "along", "normal")  # the components show the magnitude, too
     recorded = ("intensity",)
     product: Literal["profile"] = "profile"
     path: Path = path_field("Corners of the line or path, (y, x) in px.")

@@ -112,8 +112,6 @@ def draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> None
     names : sequence of str
         Variables with one common axis.
     """
-    if "along" in names:  # the components show the magnitude, too
-        names = [name for name in names if name != "magnitude"]
     coordinate = result.coordinates[result.variables[names[0]].dims[0]]
     factor, prefix = prefix_for(float(np.max(np.abs(coordinate.values), initial=0.0)))
     in_metres = coordinate.unit == "m"

@@ -82,8 +82,8 @@ def test_profile_is_drawn_with_its_bands(form: Any, qtbot: Any) -> None:
     assert measured.unit.symbol == "MG µm"
     (axes,) = form.plot.figure.axes
     assert axes.get_ylabel() == "MG µm"
-    assert len(axes.lines) == 3
-    assert len(axes.collections) == 6  # two bands each
+    assert [line.get_label() for line in axes.lines] == ["along", "normal"]
+    assert len(axes.collections) == 4  # two bands each
 
 
 def test_map_becomes_a_layer_on_its_result(form: Any, window: Any, qtbot: Any) -> None:
