@@ -38,15 +38,15 @@ def simulator(
     *,
     counts: float = 1e9,
     structure: float = 0.0,
-    planned: PlannedObject | None = None,
+    target: PlannedObject | None = None,
     psf: float = 0.0,
     seed: int = 0,
 ) -> ShotSimulator:
     recipe = ToroidRecipe(peak=30, radius=12e-6)
-    planned = planned or object_of_phantom(recipe, SETUP, (64, 64))
+    target = target or object_of_phantom(recipe, SETUP, (64, 64))
     prior = BeamPrior(rms=instrument.beam_rms or 0.0, length=instrument.beam_length)
     beam = Beam(counts, structure, structure > 0, 1e12, prior)
-    return ShotSimulator(planned, [SETUP], (64, 64), beam, Detector((psf,), instrument), seed)
+    return ShotSimulator(target, [SETUP], (64, 64), beam, Detector((psf,), instrument), seed)
 
 
 def image_of(instrument: Instrument = EXACT, number: int = 0, **choices) -> NDArray[np.float64]:
@@ -57,37 +57,37 @@ def image_of(instrument: Instrument = EXACT, number: int = 0, **choices) -> NDAr
 
 
 def test_a_phantom_displaces_by_its_formula():
-    planned = object_of_phantom(ToroidRecipe(peak=60), SETUP, (80, 90))
+    target = object_of_phantom(ToroidRecipe(peak=60), SETUP, (80, 90))
     exact = toroid((80, 90), SETUP, 60, 30e-6).displacement
-    moved = planned.displacement(SETUP, Grid((80, 90)))
+    moved = target.displacement(SETUP, Grid((80, 90)))
     np.testing.assert_allclose(moved, exact, atol=2e-4 * np.abs(exact).max())
 
 
 def test_a_blob_in_pixels_is_the_same_in_finer_ones():
-    planned = object_of_phantom(BlobRecipe(amplitude=40, sigma=9), None, (64, 64))
+    target = object_of_phantom(BlobRecipe(amplitude=40, sigma=9), None, (64, 64))
     exact = gaussian_blob((64, 64), 40, 9).displacement
-    np.testing.assert_allclose(planned.displacement(None, Grid((64, 64))), exact, atol=2e-3)
+    np.testing.assert_allclose(target.displacement(None, Grid((64, 64))), exact, atol=2e-3)
 
 
 def test_an_object_keeps_its_field_at_another_energy():
-    planned = object_of_phantom(ToroidRecipe(peak=60), SETUP, (80, 80))
-    moved = planned.displacement(SLOWER, Grid((80, 80)))
+    target = object_of_phantom(ToroidRecipe(peak=60), SETUP, (80, 80))
+    moved = target.displacement(SLOWER, Grid((80, 80)))
     field = SLOWER.path_integrated_b(moved, "MG um")
     assert np.hypot(*field).max() == pytest.approx(60, rel=2e-3)
 
 
 def test_an_object_keeps_its_size_in_other_pixels():
     coarse = SETUP.model_copy(update={"pixel_size": 3e-6})
-    planned = object_of_phantom(ToroidRecipe(peak=60), SETUP, (120, 120))
+    target = object_of_phantom(ToroidRecipe(peak=60), SETUP, (120, 120))
     exact = toroid((60, 60), coarse, 60, 30e-6).displacement
-    moved = planned.displacement(coarse, Grid((60, 60)))
+    moved = target.displacement(coarse, Grid((60, 60)))
     np.testing.assert_allclose(moved, exact, atol=5e-3 * np.abs(exact).max())
 
 
 def test_a_displacement_without_setup_is_refused_in_an_experiment():
-    planned = object_of_displacement(gaussian_blob((64, 64), 40, 9).displacement)
+    target = object_of_displacement(gaussian_blob((64, 64), 40, 9).displacement)
     with pytest.raises(InputError, match="without a setup"):
-        plan_experiment(planned, SETUP)
+        plan_experiment(target, SETUP)
 
 
 def test_phantoms_are_read_from_texts():
@@ -126,14 +126,14 @@ def test_a_draw_is_the_same_again_and_others_differ():
 
 def test_counts_scatter_as_poisson():
     blank = PlannedObject(np.zeros((2, 64, 64)), setup=SETUP)
-    image = simulator(counts=50, planned=blank).draw(0).images[0]
+    image = simulator(counts=50, target=blank).draw(0).images[0]
     assert image.mean() == pytest.approx(50, rel=0.01)
     assert image.var() == pytest.approx(50, rel=0.1)
 
 
 def test_the_beam_varies_by_the_stated_share_in_each_draw():
     blank = PlannedObject(np.zeros((2, 64, 64)), setup=SETUP)
-    chosen = simulator(Instrument(beam_rms=0.05), planned=blank)
+    chosen = simulator(Instrument(beam_rms=0.05), target=blank)
     deviations = [chosen.draw(number).images[0].std() / 1e9 for number in range(3)]
     np.testing.assert_allclose(deviations, 0.05, rtol=0.05)
 
@@ -165,7 +165,7 @@ def test_numbers_of_an_imperfection_stay_if_another_changes():
     blank = PlannedObject(np.zeros((2, 64, 64)), setup=SETUP)
     beam = Instrument(beam_rms=0.05)
     both = Instrument(beam_rms=0.05, background=0.1)
-    first, second = (simulator(each, planned=blank).draw(2).images[0] for each in (beam, both))
+    first, second = (simulator(each, target=blank).draw(2).images[0] for each in (beam, both))
     difference = (second - first) / 1e9
     assert difference.std() < 1e-3 < abs(difference.mean())
 
@@ -176,7 +176,7 @@ def test_the_reference_shows_the_structure_out_of_register():
     residuals = []
     for registration in (0.0, 3.0):
         instrument = Instrument(beam_rms=0.0, beam_length=0.1, registration=registration)
-        shots = simulator(instrument, planned=blank, structure=0.1).draw(1)
+        shots = simulator(instrument, target=blank, structure=0.1).draw(1)
         assert shots.source is not None
         residuals.append(float((shots.images[0] / shots.source - 1).std()))
     assert residuals[0] < 2e-4
@@ -230,9 +230,9 @@ def test_a_wrong_energy_is_in_the_error_made_and_reported():
     assert plan.parts["energy"] == pytest.approx(0.1, rel=0.03)
     assert next(iter(plan.parts)) == "energy"
     energies = [np.random.default_rng([0, number, 0]).normal() for number in range(8)]
-    made = [shot.error for shot in plan.shots]
+    errors = [shot.error for shot in plan.shots]
     expected = np.abs((1 + 0.2 * np.array(energies)) ** -0.5 - 1)
-    np.testing.assert_allclose(made, expected, atol=0.02)
+    np.testing.assert_allclose(errors, expected, atol=0.02)
 
 
 def test_two_energies_are_fitted_and_the_searches_are_stated():
@@ -283,9 +283,9 @@ def test_progress_counts_the_draws_of_a_whole_sweep():
 )
 def test_wrong_inputs_are_refused_in_a_sentence(choices, message):
     inputs = {"object": ToroidRecipe(peak=30), "setups": [SETUP], "shape": (64, 64), **choices}
-    planned, setups = inputs.pop("object"), inputs.pop("setups")
+    target, setups = inputs.pop("object"), inputs.pop("setups")
     with pytest.raises(InputError, match=message) as raised:
-        plan_experiment(planned, setups, **inputs)
+        plan_experiment(target, setups, **inputs)
     assert "\n" not in str(raised.value)
 
 
@@ -363,13 +363,13 @@ def test_twice_the_counts_lower_the_noise_by_their_root():
 
 def test_a_number_that_the_images_determine_gains_nothing():
     instrument = Instrument(beam_rms=0.0, background=0.04)
-    known = [
+    shots = [
         PlannedShot(
             k, Verdict.DETERMINED, "", 0.03, 0.0, 0.03, {"background": 0.03}, {"background": 0.01}
         )
         for k in range(2)
     ]
-    (gain,) = plan_of(known, instrument).gains
+    (gain,) = plan_of(shots, instrument).gains
     assert gain.total == pytest.approx(0.03, rel=1e-3)
 
 

@@ -327,8 +327,8 @@ def sampled_fields(
         )
     fields = list(makers[str(kind)](result, setup, unit, deflector))
     if not fields:
-        wanted = deflector if unit is None else unit.symbol
-        raise InputError(f"the result has no field for {wanted!r}: choose another unit")
+        symbol = deflector if unit is None else unit.symbol
+        raise InputError(f"the result has no field for {symbol!r}: choose another unit")
     return fields
 
 

@@ -1,7 +1,7 @@
 """Abel inversion of a deflection by a small linear operator.
 
 - what an axisymmetric object does to rays: `deflection_matrix`, `projection_matrix`
-- its inverse, regularised: `inverse_matrix`; the error that follows: `profile_covariance`
+- its inverse, regularised: `inverse_matrix`
 - how far to smooth, by the difference of the object's sides: `choose_smoothing`
 
 All lengths are in px. An object f(r) with the projection F(y) = ∫f dz deflects by
@@ -37,7 +37,6 @@ __all__ = [
     "choose_smoothing",
     "deflection_matrix",
     "inverse_matrix",
-    "profile_covariance",
     "projection_matrix",
 ]
 
@@ -135,19 +134,6 @@ def inverse_matrix(matrix: FloatArray, smoothing: float) -> FloatArray:
     bends = _second_differences(matrix.shape[1])
     normal = matrix.T @ matrix + smoothing * bends.T @ bends
     return np.asarray(np.linalg.solve(normal, matrix.T))
-
-
-def profile_covariance(inverse: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return A C Aᵀ, the covariance of the profile.
-
-    Parameters
-    ----------
-    inverse : ndarray, shape (n, m)
-        The operator A of `inverse_matrix`.
-    covariance : ndarray, shape (m, m)
-        Covariance C of the deflections.
-    """
-    return np.asarray(inverse @ covariance @ inverse.T)
 
 
 def choose_smoothing(matrix: FloatArray, side: FloatArray, opposite_side: FloatArray) -> float:

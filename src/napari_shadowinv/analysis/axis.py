@@ -96,15 +96,15 @@ def sample_sides(
     """
     first = FIRST_OFFSET if is_odd else 0.0
     offsets, places = first + np.arange(float(radius)), axis.places()
-    right = interpolate_cubic(component, axis.points(places, offsets))
-    left = interpolate_cubic(component, axis.points(places, -offsets))
-    return right, -left if is_odd else left
+    right_side = interpolate_cubic(component, axis.points(places, offsets))
+    left_side = interpolate_cubic(component, axis.points(places, -offsets))
+    return right_side, -left_side if is_odd else left_side
 
 
-def asymmetry(right: FloatArray, left: FloatArray) -> float:
+def asymmetry(right_side: FloatArray, left_side: FloatArray) -> float:
     """Return the difference of two sides relative to their mean (r.m.s.)."""
-    mean = float(np.linalg.norm(right + left)) / 2
-    return float(np.linalg.norm(right - left)) / mean if mean > 0 else math.inf
+    mean = float(np.linalg.norm(right_side + left_side)) / 2
+    return float(np.linalg.norm(right_side - left_side)) / mean if mean > 0 else math.inf
 
 
 def component_across(displacement: FloatArray, axis: Axis) -> FloatArray:

@@ -238,8 +238,10 @@ class AxisymmetricProfile(Product):
         sides = sample_sides(component, axis, self._radius_px(frame), is_odd=is_odd)
         edges = self._slices(frame)
         widths = np.diff([*edges, len(axis.places())])
-        right, left = (np.add.reduceat(side, edges, axis=0) / widths[:, None] for side in sides)
-        return right, left
+        right_side, left_side = (
+            np.add.reduceat(side, edges, axis=0) / widths[:, None] for side in sides
+        )
+        return right_side, left_side
 
     def _slices(self, frame: FieldFrame) -> list[int]:
         """Return the first place of each slice along the axis."""
@@ -334,19 +336,19 @@ class AxisymmetricProfile(Product):
     def measure(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
     ) -> dict[str, FloatArray]:
-        right, left = self._sides(displacement, frame)
+        right_side, left_side = self._sides(displacement, frame)
         _, inverse = self._operators(frame)
-        values = self._profiles((right + left) / 2 @ inverse.T, frame)
+        values = self._profiles((right_side + left_side) / 2 @ inverse.T, frame)
         scale = self._scale(frame)
-        values["half_difference"] = scale * (right - left) @ inverse.T
+        values["half_difference"] = scale * (right_side - left_side) @ inverse.T
         if not self._has_slices(frame):
             values = {name: profiles[0] for name, profiles in values.items()}
-        values["asymmetry"] = np.asarray(asymmetry(right, left))
-        mean = np.abs((right + left) / 2)
+        values["asymmetry"] = np.asarray(asymmetry(right_side, left_side))
+        mean = np.abs((right_side + left_side) / 2)
         width = max(round(_EDGE_SHARE * mean.shape[1]), 2)
-        edge = np.abs((right + left)[:, -width:].mean(axis=1) / 2).max()
+        edge = np.abs((right_side + left_side)[:, -width:].mean(axis=1) / 2).max()
         values["edge"] = np.asarray(edge / max(mean.max(), 1e-300))
-        values["axis_offset"] = np.asarray(_axis_offset(right, left))
+        values["axis_offset"] = np.asarray(_axis_offset(right_side, left_side))
         return values
 
     def _scale(self, frame: FieldFrame) -> float:
@@ -364,10 +366,10 @@ class AxisymmetricProfile(Product):
         return -float(setup.potential(unit_plane)[0]) / pixel
 
     def _profiles(self, profile: FloatArray, frame: FieldFrame) -> dict[str, FloatArray]:
-        first, *others = self._names(frame)
+        first, *further = self._names(frame)
         change = self._scale(frame) * profile
         values = {first: change}
-        if "radial_field" in others:
+        if "radial_field" in further:
             # The profile is even at the axis and ends at 0.
             padded = np.concatenate([change[:, 1:2], change, 0 * change[:, :1]], axis=1)
             values["radial_field"] = -(padded[:, 2:] - padded[:, :-2]) / (2 * frame.pixel)
@@ -386,8 +388,8 @@ class AxisymmetricProfile(Product):
     ) -> dict[str, FloatArray]:
         """Return the change of the profile by one more smoothing, and by the error of the axis."""
         matrix, inverse = self._operators(frame)
-        right, left = self._sides(displacement, frame)
-        profile = (right + left) / 2 @ inverse.T
+        right_side, left_side = self._sides(displacement, frame)
+        profile = (right_side + left_side) / 2 @ inverse.T
         values = self._profiles(profile, frame)
         again = self._profiles(profile @ matrix.T @ inverse.T, frame)
         errors = {name: np.abs(again[name] - values[name]) for name in values}
@@ -563,14 +565,14 @@ def _found_axis(
     return axis, float(np.sqrt((np.var(start, ddof=1) + np.var(end, ddof=1)) / 2))
 
 
-def _axis_offset(right: FloatArray, left: FloatArray) -> float:
+def _axis_offset(right_side: FloatArray, left_side: FloatArray) -> float:
     """Return by how many px the axis of the field is to the right of the assumed axis.
 
     To first order, halves (δ(y), -δ(-y)) differ by -2 Δ δ'(y) of a field that is shifted by Δ.
     """
-    slope = np.gradient((right + left) / 2, axis=1)
+    slope = np.gradient((right_side + left_side) / 2, axis=1)
     size = float(np.sum(slope**2))
-    return -float(np.sum((right - left) * slope)) / (2 * size) if size > 0 else 0.0
+    return -float(np.sum((right_side - left_side) * slope)) / (2 * size) if size > 0 else 0.0
 
 
 def _length_cautions(profile: FloatArray, frame: FieldFrame) -> list[Caution]:

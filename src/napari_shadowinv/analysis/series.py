@@ -53,8 +53,8 @@ class TimeSeries:
             If there is no such number, or it does not keep its sign.
         """
         if name not in self.quantities:
-            known = ", ".join(self.quantities)
-            raise InputError(f"got the number {name!r}, expected one of {known}")
+            names = ", ".join(self.quantities)
+            raise InputError(f"got the number {name!r}, expected one of {names}")
         quantity = self.quantities[name]
         sign = np.sign(quantity.value[0])
         if not (sign * quantity.value > 0).all():

@@ -219,9 +219,7 @@ class TurbulenceSpectrum(Product):
         product = self.model_copy(update=changes)
         is_inversion, phantom_contrast = product.resolution > 0, 0.0
         if self.phantoms and is_inversion and not self.response:
-            less_noise = RingSpectrum(
-                spectrum.k, product._signal(spectrum), spectrum.modes
-            )  # fmt: skip
+            less_noise = RingSpectrum(spectrum.k, product._signal(spectrum), spectrum.modes)
             response = measure_response(
                 less_noise,
                 weights,
@@ -454,9 +452,9 @@ class TurbulenceSpectrum(Product):
         slopes, modes = [], 0.0
         steps = [np.linspace(0, count - side, _SUBWINDOWS).astype(int)
                  for count, side in zip(potential.shape, size, strict=True)]  # fmt: skip
-        for top in steps[0]:
-            for left in steps[1]:
-                part = np.s_[top : top + size[0], left : left + size[1]]
+        for row in steps[0]:
+            for column in steps[1]:
+                part = np.s_[row : row + size[0], column : column + size[1]]
                 if min(size) < _MIN_SUBWINDOW_PX or not frame.mask[part].all():
                     continue
                 window = ring_spectrum(potential[part], window_weights(frame.mask[part], 0.5))

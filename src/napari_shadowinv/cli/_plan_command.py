@@ -96,6 +96,7 @@ def plan(
     from napari_shadowinv.io.files import replacing
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, SITES
     from napari_shadowinv.pipeline.experiment import plan_experiment, sweep_experiment
+    from napari_shadowinv.pipeline.experiment_object import shape_of_text
     from napari_shadowinv.pipeline.experiment_result import ExperimentSweep, table_text
     from napari_shadowinv.pipeline.files import setup_from
     from napari_shadowinv.plotting import plan_figure, sweep_figure
@@ -107,23 +108,23 @@ def plan(
     options, instrument = _flags.plan_choices(flags)
     first = None if setup is None else setup_from(setup)
     setups = _setups(first, energies)
-    shape = None if size is None else _shape(size)
-    planned: Any = _object(object, recorded_with, deflector)
+    shape = None if size is None else shape_of_text(size, "--size")
+    target: Any = _object(object, recorded_with, deflector)
     choices: dict[str, Any] = {"shape": shape, "instrument": instrument, "options": options}
     warn_of_setups((each, shape) for each in setups or ())
     result: Any
     with nullcontext() if quiet else progress_bars() as show:
         choices |= {"on_progress": show, "should_stop": is_interrupted}
         if sweep is None:
-            result = plan_experiment(planned, setups, **choices)
+            result = plan_experiment(target, setups, **choices)
         else:
             quantity, values = _sweep(sweep)
-            result = sweep_experiment(planned, setups, quantity=quantity, values=values, **choices)
+            result = sweep_experiment(target, setups, quantity=quantity, values=values, **choices)
     is_sweep = isinstance(result, ExperimentSweep)
-    drawn = sweep_figure(result) if is_sweep else plan_figure(result)
+    drawing = sweep_figure(result) if is_sweep else plan_figure(result)
     with replacing(out, overwrite) as temporary:
         temporary.write_text(table_text(result.rows()), encoding="utf-8")
-    save_figure(page, drawn, overwrite)
+    save_figure(page, drawing, overwrite)
     if not quiet:
         rows = [headline_row(result.headline), *fact_rows(result.facts), *written_rows([out, page])]
         say(two_columns("Sweep" if is_sweep else "Plan", rows))
@@ -176,13 +177,6 @@ def _numbers(flag: str, text: str) -> list[float]:
         return [float(part) for part in text.split(",")]
     except ValueError:
         raise InputError(f"{flag} is '{text}': expected numbers separated by commas") from None
-
-
-def _shape(text: str) -> tuple[int, int]:
-    parts = text.lower().replace("×", "x").split("x")
-    if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
-        raise InputError(f"--size is '{text}': expected height and width in px, such as 200x200")
-    return int(parts[0]), int(parts[1])
 
 
 def _sweep(text: str) -> tuple[str, list[float]]:

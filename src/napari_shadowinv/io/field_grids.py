@@ -128,13 +128,13 @@ def _choose_iteration(path: Path, content: Any, iteration: str | int | None) -> 
         listed = sorted(names, key=int)[:_MAX_LISTED]
         more = ", …" if len(names) > _MAX_LISTED else ""
         raise InputError(f"{path} has the iterations {', '.join(listed)}{more}: choose one of them")
-    wanted = names[0] if iteration is None else str(iteration)
-    if wanted not in names:
+    number = names[0] if iteration is None else str(iteration)
+    if number not in names:
         raise InputError(
-            f"{path} has no iteration {wanted}: expected one of "
+            f"{path} has no iteration {number}: expected one of "
             f"{', '.join(sorted(names, key=int)[:_MAX_LISTED])}"
         )
-    return member(path, parent, wanted)
+    return member(path, parent, number)
 
 
 def _read_mesh(path: Path, record: Any, symbol: str) -> tuple[FloatArray, FloatArray, FloatArray]:

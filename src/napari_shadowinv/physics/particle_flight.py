@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import constants
 
 from napari_shadowinv._system.arrays import as_numbers, check_finite
 from napari_shadowinv._system.machine import available_threads, in_ranges
@@ -36,8 +37,8 @@ from napari_shadowinv.physics.trace_options import TraceOptions
 
 Shape = tuple[int, int]
 
-_JOULES_PER_MEV = 1.602176634e-13
-_LIGHT_SPEED = 299792458.0
+_JOULES_PER_MEV = 1e6 * constants.e
+_LIGHT_SPEED = constants.c
 PARTICLES_PER_BLOCK = 1 << 17
 """Particles that are traced, and drawn, together: the random numbers depend on it."""
 _SMALLEST_RANGE = 256  # particles for a thread

@@ -120,24 +120,6 @@ def border_mean(potential: ArrayLike) -> float:
     return float(values[border].mean())
 
 
-def potential_of(displacement: FloatArray) -> FloatArray:
-    """Return the potential whose gradient is nearest to minus a displacement that fades away.
-
-    Parameters
-    ----------
-    displacement : ndarray, shape (2, H, W)
-        In px, axis order (y, x). No gradient is assumed across the border.
-
-    Returns
-    -------
-    ndarray, shape (H, W)
-        Normalised potential in px²; its mean over the image's border is 0.
-    """
-    along_y, along_x = (np.gradient(part, axis=axis) for axis, part in enumerate(displacement))
-    potential = _solve_neumann(-(along_y + along_x))
-    return potential - border_mean(potential)
-
-
 def _solve_neumann(laplacian: FloatArray) -> FloatArray:
     """Solve ∇²φ = laplacian - mean(laplacian) with no gradient across the border."""
     # The cosines are even about the image's edges, half a pixel outside the outermost centres.

@@ -436,7 +436,7 @@ def _count(
 
 
 def _is_inside(landing: FloatArray, shape: Shape) -> AnyArray:
-    """Whether points in px lie in the image; NaN does not."""
+    """Return whether points in px lie in the image; NaN does not."""
     inside = np.ones(landing.shape[1], np.bool_)
     for at, count in zip(landing, shape, strict=True):
         inside &= (at >= -0.5) & (at < count - 0.5)
@@ -489,8 +489,7 @@ def _draw_from(energy: FloatArray, density: FloatArray, share: FloatArray) -> Fl
     root = np.sqrt(np.maximum(low**2 + 2 * slope * excess, 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
         way = np.where(excess > 0, 2 * excess / (low + root), 0.0)
-    drawn: FloatArray = energy[part] + np.clip(way, 0.0, width)
-    return drawn
+    return np.asarray(energy[part] + np.clip(way, 0.0, width))
 
 
 def _beam(

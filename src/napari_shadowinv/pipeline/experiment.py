@@ -34,7 +34,7 @@ from napari_shadowinv.inversion.compilation import ensure_compiled as ensure_inv
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions
 from napari_shadowinv.physics.beam import unit_in_title
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
-from napari_shadowinv.physics.poisson import potential_of
+from napari_shadowinv.physics.poisson import potential_from_displacement
 from napari_shadowinv.physics.setup import SETUPS, BeamSetup, Setup, deflector_titles
 from napari_shadowinv.pipeline.experiment_object import PlannedObject, object_of_phantom
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
@@ -352,20 +352,21 @@ def _with_value(inputs: _Inputs, quantity: str, value: float) -> _Inputs:
         changed = replace(inputs, instrument=validate(Instrument, {**stated, name: value}, ""))
     else:
         setups = inputs.setups
-        if None in setups or not hasattr(setups[-1], name):
-            kind = "a setup" if None in setups else f"{setups[-1].beam}"  # type: ignore[union-attr]
+        last = setups[-1]
+        if last is None:
+            raise InputError(f"received values of {quantity} without a setup: give the setups")
+        if not hasattr(last, name):
             raise InputError(
-                f"received values of {quantity}, which {kind} has not: give setups that have it"
-                if None not in setups
-                else f"received values of {quantity} without a setup: give the setups"
+                f"received values of {quantity}, which {last.beam} has not: give setups that have "
+                "it"
             )
         chosen = setups[-1:] if owner == "last setup" else setups
-        others = setups[: len(setups) - len(chosen)]
+        unchanged = setups[: len(setups) - len(chosen)]
         changed_setups = [
             validate(type(setup), {**setup.model_dump(), name: value}, "")  # type: ignore
             for setup in chosen
         ]
-        changed = replace(inputs, setups=(*others, *changed_setups))
+        changed = replace(inputs, setups=(*unchanged, *changed_setups))
     _refuse_unsuitable(changed)
     return changed
 
@@ -496,7 +497,7 @@ def _fitted(
         for image, setup, psf in zip(shots.images, setups, inputs.psf, strict=True)
     ]
     if near is not None:
-        start = NearField(potential_of(simulator.truth), near.fields[0].smoothness)
+        start = NearField(potential_from_displacement(simulator.truth), near.fields[0].smoothness)
         images[0] = replace(images[0], start=start)
     noise: Any = "poisson"
     if shots.source is not None and shots.source_noise:

@@ -1,6 +1,7 @@
 """Objects of a planned experiment: `PlannedObject`.
 
-- a phantom, by its model: `object_of_phantom`; by a text: `phantom_of_text`
+- a phantom, by its model: `object_of_phantom`; by a text: `phantom_of_text`; the size of an image
+  by a text: `shape_of_text`
 - a field that was retrieved or computed before: `object_of_result`, `object_of_displacement`,
   `object_of_potential`
 
@@ -34,6 +35,7 @@ __all__ = [
     "object_of_potential",
     "object_of_result",
     "phantom_of_text",
+    "shape_of_text",
 ]
 
 _FINER = 3  # samples of a phantom along a side of a pixel
@@ -240,6 +242,14 @@ def phantom_of_text(text: str) -> PhantomRecipe:
                 "peak=60"
             ) from None
     return validate(PHANTOMS[key], values, f"the object {key}")
+
+
+def shape_of_text(text: str, name: str) -> tuple[int, int]:
+    """Return height and width from a text such as "200x200"; `name` is that of the text."""
+    parts = text.lower().replace("×", "x").split("x")
+    if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
+        raise InputError(f"{name} is '{text}': expected height and width in px, such as 200x200")
+    return int(parts[0]), int(parts[1])
 
 
 _DEFLECTORS = {"proton": "magnetic field", "optical": "plasma"}

@@ -250,8 +250,7 @@ class ExperimentPlan:
         unit, digits = ("px", 1.0) if name in ("blur", "registration") else ("%", 100.0)
         unit, digits = ("", 1.0) if name == "gamma" else (unit, digits)
         better, before = (f"{digits * x:.2g} {unit}".rstrip() for x in (size / 2, size))
-        noun = self._nouns.get(name, name.replace("_", " "))
-        return f"{noun} known to {better} instead of {before}", factor
+        return f"{self._title(name)} known to {better} instead of {before}", factor
 
     @property
     def _nouns(self) -> dict[str, str]:
@@ -354,8 +353,6 @@ class ExperimentPlan:
         yield Fact("assumed", "Assumed", text, is_detail=True)
 
     def _title(self, name: str) -> str:
-        if name == "energy":
-            return self._nouns["energy"]
         return self._nouns.get(name, name.replace("_", " "))
 
     def rows(self) -> list[dict[str, Any]]:

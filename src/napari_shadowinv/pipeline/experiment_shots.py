@@ -158,7 +158,7 @@ class ShotSimulator:
         common = structure * (1 + self._wave(streams["beam"], beam.prior.rms))
         common = common * (1 + self._absorption(streams["absorption"]))
         open_share = self._open_share
-        other = instrument.other_field * streams["other_field"].normal()
+        admixture = instrument.other_field * streams["other_field"].normal()
         width = instrument.blur * abs(streams["blur"].normal())
         exponent = max(1 + instrument.gamma * streams["gamma"].normal(), _LEAST_EXPONENT)
         images = []
@@ -166,7 +166,9 @@ class ShotSimulator:
             between = beam.prior.between if image else 0.0
             light = common * (1 + self._wave(streams["between"], between))
             light = np.maximum(light, _DIMMEST) * open_share
-            displacement = self._nominal[image] * (scale(setup) + other * self._other_ratio(setup))
+            displacement = self._nominal[image] * (
+                scale(setup) + admixture * self._other_ratio(setup)
+            )
             if image:
                 displacement = self._misaligned(displacement, streams["alignment"])
             flux = self._object.image(light, displacement, grid)

@@ -85,12 +85,11 @@ def sweep_figure(sweep: ExperimentSweep) -> Figure:
     with mpl.rc_context(_panels.STYLE):
         figure = Figure(figsize=(6.4, 4.8), layout="constrained")
         FigureCanvasAgg(figure)
-        draw_sweep(figure, sweep)
+        _draw_sweep(figure, sweep)
     return figure
 
 
-def draw_sweep(figure: Figure, sweep: ExperimentSweep) -> None:
-    """Draw a sweep into a figure, which may be a window's."""
+def _draw_sweep(figure: Figure, sweep: ExperimentSweep) -> None:
     order = np.argsort(sweep.values)
     values = np.array(sweep.values)[order]
     plans = [sweep.plans[k] for k in order]

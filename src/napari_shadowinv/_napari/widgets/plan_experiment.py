@@ -28,7 +28,11 @@ from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
 from napari_shadowinv.physics.setup import SETUPS, Setup
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.experiment import SWEPT, plan_experiment, sweep_experiment
-from napari_shadowinv.pipeline.experiment_object import PlannedObject, object_of_displacement
+from napari_shadowinv.pipeline.experiment_object import (
+    PlannedObject,
+    object_of_displacement,
+    shape_of_text,
+)
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep
 
@@ -223,12 +227,12 @@ class PlanExperiment(panels.ToolPanel):
 
     def request(self) -> PlanJob:
         setup = self.setup.setup()
-        quantity = str(self.quantity.currentData())
+        quantity, size = str(self.quantity.currentData()), self.side.text().strip()
         options: Any = self.options.model()
         return PlanJob(
             object=self._object(),
             setups=self._setups(setup),
-            shape=_shape(self.side.text()),
+            shape=shape_of_text(size, "the size") if size else None,
             instrument=validate(Instrument, self.instrument.values(), "instrument"),
             options=options,
             quantity=quantity,
@@ -314,14 +318,3 @@ def _numbers(name: str, text: str, unit: str = "") -> Sequence[float]:
         raise InputError(
             f"{name}: received '{text}', expected numbers separated by commas"
         ) from None
-
-
-def _shape(text: str) -> tuple[int, int] | None:
-    if not text.strip():
-        return None
-    parts = text.lower().replace("×", "x").split("x")
-    if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
-        raise InputError(
-            f"the size is '{text}': expected height and width in px, such as 200 x 200"
-        )
-    return int(parts[0]), int(parts[1])
