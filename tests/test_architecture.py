@@ -36,6 +36,7 @@ ROOMS = (
     ("transport",),
     ("inversion",),
     ("fitting",),
+    ("results",),
     ("analysis",),
     ("io",),
     ("pipeline",),

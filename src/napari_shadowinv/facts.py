@@ -4,7 +4,7 @@ Results describe themselves once, as facts. The command prints them as a table, 
 as a report, a figure writes them below its panels; none of them words or rounds anything itself.
 
 A room that treats kinds of results differently has one table with an entry for each `ResultKind`:
-the class in `io.read_write`, the writers in `io.formats`, the figures in `plotting`, the rerun and
+the class in `results`, the writers in `io.formats`, the figures in `plotting`, the rerun and
 the file's description in `cli`, the layers in `_napari`.
 """
 

@@ -72,9 +72,12 @@ def test_bands_are_those_of_uncertainty(inversion: Inversion):
 
 
 def test_a_saved_inversion_has_the_same_bands(inversion: Inversion):
-    again = Inversion.from_dataset(inversion.to_dataset())
-    before, after = (analyse(each, LINE, samples=20)[0] for each in (inversion, again))
+    dataset = inversion.to_dataset(SETUP)
+    again = Inversion.from_dataset(dataset)
+    before, after = (analyse(each, LINE, samples=20, setup=SETUP)[0] for each in (inversion, again))
     np.testing.assert_array_equal(before["magnitude"].samples, after["magnitude"].samples)
+    (of_file,) = analyse(dataset, LINE, samples=20)  # with its setup
+    np.testing.assert_array_equal(before["magnitude"].samples, of_file["magnitude"].samples)
 
 
 def test_bands_follow_the_stated_noise(inversion: Inversion):
@@ -256,7 +259,7 @@ def test_a_stack_is_refused(exact: RetrievedField):
     for wrong in (stack, RetrievedField(stack)):
         with pytest.raises(InputError, match="expected the result of one shot"):
             analyse(wrong, LINE)
-    with pytest.raises(InputError, match="expected the result of an inversion or a fit"):
+    with pytest.raises(InputError, match="got ndarray, expected a result or its dataset"):
         analyse(np.zeros((5, 5)), LINE)
     with pytest.raises(InputError, match="got no product"):
         analyse(exact, [])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from napari_shadowinv import Instrument, InversionCancelled
+from napari_shadowinv import Instrument, InversionCancelled, invert, read, write
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.options import BeamPrior
@@ -18,6 +18,7 @@ from napari_shadowinv.pipeline.experiment_object import (
     PlannedObject,
     object_of_displacement,
     object_of_phantom,
+    object_of_result,
     phantom_of_text,
 )
 from napari_shadowinv.pipeline.experiment_result import (
@@ -82,6 +83,16 @@ def test_an_object_keeps_its_size_in_other_pixels():
     exact = toroid((60, 60), coarse, 60, 30e-6).displacement
     moved = target.displacement(coarse, Grid((60, 60)))
     np.testing.assert_allclose(moved, exact, atol=5e-3 * np.abs(exact).max())
+
+
+def test_a_saved_result_is_an_object_with_its_setup(tmp_path):
+    result = invert(image_of())
+    path = tmp_path / "shot.shadowinv"
+    write(path, result.to_dataset(SETUP))
+    target = object_of_result(read(path))
+    np.testing.assert_allclose(
+        target.displacement(SETUP, Grid((64, 64))), result.displacement, atol=1e-9
+    )
 
 
 def test_a_displacement_without_setup_is_refused_in_an_experiment():

@@ -14,8 +14,8 @@ import numpy as np
 from napari_shadowinv._typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
-    from napari_shadowinv.io.read_write import AnyResult
     from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.results import AnyResult
 
 Matrix = tuple[tuple[float, ...], ...]
 

@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.inversion.result import RetrievedField
-    from napari_shadowinv.io.read_write import AnyResult
     from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.results import AnyResult
 
 FullLayerData = tuple[Any, dict[str, Any], str]
 Limits = tuple[float, float]

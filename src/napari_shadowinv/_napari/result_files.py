@@ -35,12 +35,12 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.formats import PRADFORMAT, RESULT, SITES, Format
-from napari_shadowinv.io.read_write import result_from_dataset
+from napari_shadowinv.results import result_from_dataset
 
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.io.read_write import AnyResult
+    from napari_shadowinv.results import AnyResult
 
 _LOOKS, _NAME = "napari_layers", "napari_name"
 _MAX_NAMES = 3  # in a message

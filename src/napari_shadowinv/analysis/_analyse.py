@@ -26,6 +26,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level, caution_facts
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.results import unpack_result
 
 __all__ = ["analyse"]
 
@@ -53,8 +54,8 @@ def analyse(
 
     Parameters
     ----------
-    result : Inversion, Fit or RetrievedField
-        Of one shot.
+    result : Inversion, Fit, RetrievedField or Dataset
+        Of one shot; a dataset as `read` returns it.
     products : Product, mapping, or sequence of these
         Products, or tables of their fields, such as ``{"product": "flux", "path": …}``.
     samples : int
@@ -101,14 +102,15 @@ def analyse(
     if samples < _MIN_SAMPLES:
         raise InputError(f"samples is {samples}, expected at least {_MIN_SAMPLES}")
     chosen_unit = None if unit is None else field_unit(unit)
-    fields = sampled_fields(result, setup, chosen_unit, deflector)
+    content, own_setup = unpack_result(result)
+    fields = sampled_fields(content, setup or own_setup, chosen_unit, deflector)
     callbacks = Callbacks(on_progress, should_stop)
     tasks = [_Task(each, _products_for(listed, each.frame, len(fields))) for each in fields]
     missing = [each for each in listed if not any(each in task.products for task in tasks)]
     if missing:
         missing[0].check(fields[0].frame)
     names = _names([product for task in tasks for product in task.products])
-    headline = Fact("result", "Field", result.headline.text, result.headline.level)
+    headline = Fact("result", "Field", content.headline.text, content.headline.level)
     results: list[ProductResult] = []
     for task in tasks:
         if not task.products:

@@ -315,17 +315,11 @@ def sampled_fields(
         "shadowinv fit": _of_fit,
         "shadowinv field": _of_field,
     }
-    kind = getattr(result, "kind", None)
-    if kind not in makers:
-        dims = getattr(result, "dims", ())
-        if "shot" in dims:
-            raise InputError(
-                "got a stack of shots, expected the result of one shot: choose one by its index"
-            )
+    if str(result.kind) not in makers:
         raise InputError(
-            f"got {type(result).__name__}, expected the result of an inversion or a fit"
+            f"got a {result.kind.noun}, expected the result of an inversion or a fit, or a field"
         )
-    fields = list(makers[str(kind)](result, setup, unit, deflector))
+    fields = list(makers[str(result.kind)](result, setup, unit, deflector))
     if not fields:
         symbol = deflector if unit is None else unit.symbol
         raise InputError(f"the result has no field for {symbol!r}: choose another unit")

@@ -16,7 +16,7 @@ from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
     from napari_shadowinv.analysis import Product, ProductResult
-    from napari_shadowinv.io.read_write import AnyResult
+    from napari_shadowinv.results import AnyResult
 
 HELP = {
     "result": "Result of an inversion or a fit, .shadowinv; or pradformat, .h5.",
@@ -80,8 +80,8 @@ def analyse(
     from napari_shadowinv.inversion.variables import setup_from_dataset
     from napari_shadowinv.io import read_dataset
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, SITES
-    from napari_shadowinv.io.read_write import result_from_dataset
     from napari_shadowinv.pipeline.files import setup_from
+    from napari_shadowinv.results import result_from_dataset
 
     chosen = _products(product or [], products)
     suffixes = {csv: SITES.suffixes, figure: FIGURE_SUFFIXES, out: RESULT.suffixes}

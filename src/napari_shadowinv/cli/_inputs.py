@@ -16,10 +16,10 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import PNG, PRADFORMAT, RESULT
 
 if TYPE_CHECKING:
-    from napari_shadowinv.io.read_write import AnyResult
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.pipeline.static_checks import StaticChecks
     from napari_shadowinv.preprocessing import Radiograph, Recipe
+    from napari_shadowinv.results import AnyResult
 
 
 def result_and_figure(image: Path, out: Path | None, report: Path | None) -> tuple[Path, Path]:

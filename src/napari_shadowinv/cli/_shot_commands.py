@@ -526,7 +526,7 @@ def _field_of_result(path: Path, dataset: xarray.Dataset) -> Field:
     import numpy as np
 
     from napari_shadowinv.inversion.variables import setup_from_dataset
-    from napari_shadowinv.io.read_write import result_from_dataset
+    from napari_shadowinv.results import result_from_dataset
 
     result = result_from_dataset(dataset)
     names = json.loads(dataset.attrs.get("fields", "[]"))

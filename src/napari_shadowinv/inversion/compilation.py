@@ -63,4 +63,4 @@ def compile_rest() -> None:
         diagram = PowerDiagram(triangulation, density, with_moments=with_moments)
     laplacian = diagram.laplacian()
     LaplacianSolver(laplacian).solve(diagram.masses)
-    FactorisedLaplacian(laplacian).solve(diagram.masses[:, None])
+    FactorisedLaplacian(laplacian, sites).solve(diagram.masses[:, None])

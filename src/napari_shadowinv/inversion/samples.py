@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from napari_shadowinv._system.arrays import plain_array, unpack_array
+from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -143,7 +144,8 @@ Seed = np.random.SeedSequence
 
 _SAMPLE_SHARE = 0.2  # of the noise's flux errors that a sample may leave unsolved
 _LOOSEST_TOLERANCE = 0.1
-_MOST_FACTORISED = 300_000  # sites; their factors take 0.2 GB and two seconds
+_MOST_FACTORISED = 1_100_000  # sites; their factors take 0.7 GB and 18 seconds
+_BYTES_FACTORISED = 2_600  # a site, at most, while they are factorised
 _LINEAR_TOLERANCE = 0.02
 _ROWS = 64  # read out between two calls of `should_stop`
 
@@ -301,6 +303,12 @@ def _subtract_product(factors: FloatArray, strengths: FloatArray, values: FloatA
             values[i, s] = row[s]
 
 
+def _room_for_factors() -> int:
+    """Return the number of sites that half of the memory factorises."""
+    memory = physical_memory()
+    return _MOST_FACTORISED if memory is None else memory // 2 // _BYTES_FACTORISED
+
+
 class LinearResampling:
     """Linear response of an inversion to the changes of the image in its samples."""
 
@@ -318,9 +326,10 @@ class LinearResampling:
         self._shares = pixel_shares(diagram, level.shape, threads=threads)
         self._network = diagram.laplacian(), objective.ground(samples.start)
         self._factors = None
-        if len(level.sites) <= _MOST_FACTORISED:
+        if len(level.sites) <= min(_MOST_FACTORISED, _room_for_factors()):
             with suppress(RuntimeError):  # the multigrid reports it if it fails as well
-                self._factors = FactorisedLaplacian(*self._network)
+                laplacian, ground = self._network
+                self._factors = FactorisedLaplacian(laplacian, level.sites, ground)
         self._readout = LinearReadout(plan, level, threads)
         self._solvers = threading.local()  # each has vectors of its own
         self._gains = None if samples.instrument is None else self._flux_gains(threads)

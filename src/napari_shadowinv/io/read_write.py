@@ -6,7 +6,6 @@
 - a file with options or a setup: `read_toml`
 - a result or an image, whole or not at all: `write`; a result becomes one NetCDF4 file,
   ``.shadowinv``, or a table of its sites
-- the result in a dataset: `result_from_dataset`
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from __future__ import annotations
 import re
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
@@ -41,24 +40,17 @@ from napari_shadowinv.preprocessing import Radiograph
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.film_doses import FilmDoses
-    from napari_shadowinv.fitting import Fit
-    from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.inversion.error_bars import Uncertainty
-    from napari_shadowinv.inversion.result import RetrievedField
     from napari_shadowinv.physics.setup import Setup
-
-    AnyResult: TypeAlias = Inversion | Fit | FilmDoses | RetrievedField
+    from napari_shadowinv.results import AnyResult
 
 __all__ = [
-    "AnyResult",
     "Radiograph",
     "read",
     "read_cpsa",
     "read_dataset",
     "read_radiograph",
     "read_toml",
-    "result_from_dataset",
     "write",
 ]
 
@@ -262,28 +254,6 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(
             f"{path} has tables or lists nested too deeply: check that it is the right file"
         ) from None
-
-
-def result_from_dataset(dataset: xarray.Dataset) -> AnyResult:
-    """Return the result in a dataset; its attributes decide on the kind.
-
-    Raises
-    ------
-    InputError
-        If a variable or attribute is missing or damaged.
-    """
-    from napari_shadowinv.film_doses import FilmDoses
-    from napari_shadowinv.fitting import Fit
-    from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.inversion.result import RetrievedField
-
-    classes: dict[ResultKind, type[AnyResult]] = {
-        ResultKind.INVERSION: Inversion,
-        ResultKind.FIT: Fit,
-        ResultKind.FILM_DOSES: FilmDoses,
-        ResultKind.FIELD: RetrievedField,
-    }
-    return classes[ResultKind.of(dataset.attrs)].from_dataset(dataset)
 
 
 _SITE_COLUMNS = "y_px,x_px,weight_px2,mass,flux,displacement_y_px,displacement_x_px"

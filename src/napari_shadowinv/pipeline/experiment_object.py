@@ -26,6 +26,7 @@ from napari_shadowinv.physics.forward import checked_displacement, synthetic_ima
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
 from napari_shadowinv.physics.projection import default_deflector, displacement_ratio
 from napari_shadowinv.physics.setup import Setup, deflector_titles, displacement_from_potential
+from napari_shadowinv.results import unpack_result
 
 __all__ = [
     "Grid",
@@ -310,21 +311,18 @@ def object_of_result(result: Any, *, deflector: str | None = None) -> PlannedObj
 
     Parameters
     ----------
-    result : Inversion, Fit or RetrievedField
-        As `read` returns it.
+    result : Inversion, Fit, RetrievedField or Dataset
+        Of one shot; a dataset as `read` returns it.
     deflector : str, optional
         Title of the cause of the deflection. Default: the fit's.
 
     Raises
     ------
     InputError
-        If a fit has several fields.
+        If it has no field or several, or is not of one shot.
     """
-    fields = getattr(result, "fields", None)
-    if fields is None:
-        return object_of_displacement(
-            result.displacement, result.setup, deflector=deflector, title="an earlier result"
-        )
+    content, setup = unpack_result(result)
+    fields: tuple[Any, ...] = getattr(content, "fields", (content,))
     if len(fields) > 1:
         names = " and ".join(field.name for field in fields)
         raise InputError(
@@ -332,7 +330,10 @@ def object_of_result(result: Any, *, deflector: str | None = None) -> PlannedObj
             "its displacement as an array"
         )
     (field,) = fields
+    displacement = getattr(field, "displacement", None)
+    if displacement is None:
+        raise InputError(f"got a {content.kind.noun}, expected a result with a field")
     return replace(
-        object_of_displacement(field.displacement, result.setup, title="an earlier result"),
-        deflector=deflector or deflector_titles()[field.name],
+        object_of_displacement(displacement, setup, title="an earlier result"),
+        deflector=deflector or deflector_titles().get(getattr(field, "name", "")),
     )

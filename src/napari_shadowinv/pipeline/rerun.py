@@ -27,7 +27,6 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read_dataset
 from napari_shadowinv.io.files import sha256
-from napari_shadowinv.io.read_write import result_from_dataset
 from napari_shadowinv.pipeline._film import run_film
 from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import run_fit, run_refinement
@@ -35,11 +34,12 @@ from napari_shadowinv.pipeline.inversion_run import Shot, picture_mask, radiogra
 from napari_shadowinv.pipeline.static_checks import StaticChecks, run_checks
 from napari_shadowinv.preprocessing import MeasuredSource, Radiograph, Recipe
 from napari_shadowinv.provenance import MaskOrigin, Origin, Provenance
+from napari_shadowinv.results import result_from_dataset
 
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.io.read_write import AnyResult
+    from napari_shadowinv.results import AnyResult
 
 IDENTICAL = "none: the same result, bit for bit"
 _PAINTED = {"caustic"}  # may have been corrected by hand

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.io.read_write import AnyResult
     from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.results import AnyResult
 
 DOTS_PER_INCH = 160  # of a figure's file
 _MAX_RESIDUAL_PERCENT = 50.0  # % of the mean

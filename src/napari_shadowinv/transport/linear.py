@@ -19,11 +19,12 @@ the vectors of all levels are single arrays.
 References
 ----------
 Y. Notay, Electron. Trans. Numer. Anal. 37, 123 (2010); A. Napov and Y. Notay, SIAM J.
-Sci. Comput. 34, A1079 (2012).
+Sci. Comput. 34, A1079 (2012); A. George, SIAM J. Numer. Anal. 10, 345 (1973) (dissection).
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +39,7 @@ from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.geometry.triangle_mesh import Indices
 
 _MAX_COARSEST_NODES = 60
+_MAX_UNDIVIDED = 16  # nodes
 _MIN_TIE = 0.2
 _MAX_PAIRED_SHARE = 0.75
 _NOT_CONNECTED = (
@@ -364,21 +366,34 @@ def _substitute(
 class FactorisedLaplacian:
     """Factors of a Laplacian as `LaplacianSolver` takes it, which threads may share.
 
-    A graph that is not connected, or that rounding makes look so, raises a RuntimeError.
+    The positions of its nodes, (n, 2), keep the factors sparse (nested dissection). A graph that
+    is not connected, or that rounding makes look so, raises a RuntimeError.
     """
 
-    def __init__(self, laplacian: csr_array, ground: FloatArray | None = None) -> None:
+    def __init__(
+        self, laplacian: csr_array, positions: FloatArray, ground: FloatArray | None = None
+    ) -> None:
         require_connected(laplacian)
-        factors = factorise(laplacian, ground)
         self._n, self._pinned = int(laplacian.shape[0]), int(ground is None)
+        order = self._pinned + _dissection_order(
+            laplacian[self._pinned :, self._pinned :], positions[self._pinned :]
+        )
+        grounded = _with_ground(laplacian, ground)
+        factors = _factors(grounded[order][:, order], "NATURAL")
         self._pivots = factors.U.diagonal()
-        self._places = factors.perm_c.copy()  # itself, it would keep all factors
         # Rows are exchanged as the columns are, so U = D Lᵀ, as long as each pivot is positive.
-        if not (np.array_equal(factors.perm_r, self._places) and (self._pivots > 0).all()):
+        if not (np.array_equal(factors.perm_r, factors.perm_c) and (self._pivots > 0).all()):
             raise RuntimeError("the Laplacian is not positive")
+        self._places = np.empty(len(order), dtype=np.intp)
+        self._places[order - self._pinned] = factors.perm_c
         lower = factors.L
         lower.sort_indices()
         self._lower = lower.indptr, lower.indices, lower.data
+
+    @property
+    def size(self) -> int:
+        """Count of the numbers in one factor."""
+        return len(self._lower[2])
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve L x = b for each column of b, (n, k).
@@ -703,9 +718,37 @@ def _solve_by_factors(
 def factorise(laplacian: csr_array, ground: FloatArray | None) -> SuperLU:
     """Factorise a Laplacian with its ground; without one, all of it but its first node."""
     matrix = laplacian[1:, 1:] if ground is None else _with_ground(laplacian, ground)
+    return _factors(matrix, "MMD_AT_PLUS_A")
+
+
+def _factors(matrix: csr_array, order: str) -> SuperLU:
     return splu(
         matrix.tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
+        permc_spec=order,
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
+
+
+def _dissection_order(matrix: csr_array, positions: FloatArray) -> NDArray[np.intp]:
+    """Order nodes so that those which separate two halves come after both, in each half again."""
+    n = len(positions)
+    depth = max(0, math.ceil(math.log2(max(n, 1) / _MAX_UNDIVIDED)))
+    halves = np.zeros(n, dtype=np.intp)  # a binary digit for each division
+    divisions = np.full(n, depth + 1)  # the one that a node separates
+    edges = matrix.tocoo()
+    first, second = edges.row, edges.col
+    spans = np.ptp(positions, axis=0) if n else np.zeros(2)
+    for division in range(1, depth + 1):
+        axis = int(np.argmax(spans))
+        spans[axis] /= 2
+        ranks = np.empty(n, dtype=np.intp)
+        ranks[np.lexsort((positions[:, axis], halves))] = np.arange(n)
+        starts = np.concatenate([[0], np.cumsum(np.bincount(halves))])
+        halves = 2 * halves + (ranks >= ((starts[:-1] + starts[1:]) // 2)[halves])
+        divisions[first[halves[first] < halves[second]]] = division
+        is_inside = np.minimum(divisions[first], divisions[second]) > division
+        first, second = first[is_inside], second[is_inside]
+    above = depth + 1 - divisions
+    ends = ((halves >> above) + 1) << above
+    return np.lexsort((-divisions, ends))

@@ -1,0 +1,65 @@
+"""The result of one shot, of any kind: `AnyResult`, `result_from_dataset`, `unpack_result`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import ResultKind
+
+if TYPE_CHECKING:
+    import xarray
+
+    from napari_shadowinv.film_doses import FilmDoses
+    from napari_shadowinv.fitting import Fit
+    from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.inversion.result import RetrievedField
+    from napari_shadowinv.physics.setup import Setup
+
+    AnyResult: TypeAlias = Inversion | Fit | FilmDoses | RetrievedField
+
+__all__ = ["AnyResult", "result_from_dataset", "unpack_result"]
+
+
+def result_from_dataset(dataset: xarray.Dataset) -> AnyResult:
+    """Return the result in a dataset; its attributes decide on the kind.
+
+    Raises
+    ------
+    InputError
+        If a variable or attribute is missing or damaged.
+    """
+    from napari_shadowinv.film_doses import FilmDoses
+    from napari_shadowinv.fitting import Fit
+    from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.inversion.result import RetrievedField
+
+    classes: dict[ResultKind, type[AnyResult]] = {
+        ResultKind.INVERSION: Inversion,
+        ResultKind.FIT: Fit,
+        ResultKind.FILM_DOSES: FilmDoses,
+        ResultKind.FIELD: RetrievedField,
+    }
+    return classes[ResultKind.of(dataset.attrs)].from_dataset(dataset)
+
+
+def unpack_result(result: Any) -> tuple[AnyResult, Setup | None]:
+    """Return a result, or the result in a dataset, of a single shot, and its setup.
+
+    Raises
+    ------
+    InputError
+        If it is neither, or is a stack or a damaged dataset.
+    """
+    from napari_shadowinv.inversion.variables import setup_from_dataset
+
+    if hasattr(type(result), "headline"):
+        return result, getattr(result, "setup", None)
+    if not hasattr(result, "data_vars"):
+        raise InputError(f"got {type(result).__name__}, expected a result or its dataset")
+    if "shot" in result.dims:
+        raise InputError(
+            "got a stack of shots, expected the result of one shot: choose one by its index"
+        )
+    content = result_from_dataset(result)
+    return content, setup_from_dataset(result) or getattr(content, "setup", None)
