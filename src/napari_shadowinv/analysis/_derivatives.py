@@ -10,7 +10,7 @@ from napari_shadowinv._typing import FloatArray
 def laplacian(potential: FloatArray) -> FloatArray:
     """Laplacian of a potential, of fourth order in the size of a pixel.
 
-    Within two pixels of the border it is that of the nearest pixel inside.
+    Within two pixels of the border it equals the nearest pixel's inside.
     """
     inner = second_derivative(potential, 0)[:, 2:-2] + second_derivative(potential, 1)[2:-2]
     return np.asarray(np.pad(inner, 2, mode="edge"))

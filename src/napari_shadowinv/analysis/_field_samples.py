@@ -296,7 +296,7 @@ def check_samples(count: int, size: int) -> None:
 
 
 def sample_type(size: int) -> type[Any]:
-    """Return the type of samples of some numbers: those of maps in single precision."""
+    """Return the type of samples of some numbers: single precision for maps."""
     return np.float32 if size > _MANY_NUMBERS else np.float64
 
 

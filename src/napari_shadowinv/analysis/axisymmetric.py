@@ -539,7 +539,7 @@ class AzimuthalProfile(Product):
 
 
 def _is_index(frame: FieldFrame) -> bool:
-    """Return whether the field is that of the refractive index, in SI units."""
+    """Return whether the field is a refractive index in SI units."""
     if frame.setup is None:
         return False
     is_light = any(each.name == _INDEX for each in frame.setup.si_fields)

@@ -79,7 +79,7 @@ def field_autocorrelation(component: FloatArray, weights: FloatArray) -> FloatAr
 class Filaments(Product):
     """Radius, spacing and strength of filaments, by the autocorrelation of the field across them.
 
-    The radius is that of a Gaussian potential; the spacing is stated only where the
+    The radius belongs to a Gaussian potential; the spacing is stated only where the
     autocorrelation has a further maximum above its scatter.
     """
 

@@ -222,7 +222,7 @@ def add_products(dataset: xarray.Dataset, results: Sequence[ProductResult]) -> x
 
 
 def _dims(name: str, variable: Variable) -> tuple[str, ...]:
-    """Return the axes of a variable in a file; those of maps are those of the image."""
+    """Return the axes of a variable in a file; maps have the image's."""
     return tuple(axis if axis in PLANE else f"{name}_{axis}" for axis in variable.dims)
 
 
@@ -289,7 +289,7 @@ def _from_entry(dataset: xarray.Dataset, entry: dict[str, Any]) -> ProductResult
 
 
 def products_table(results: Sequence[ProductResult]) -> str:
-    """Return all numbers but those of maps as comma-separated values, one in each row.
+    """Return all numbers except maps as comma-separated values, one in each row.
 
     Columns: product, quantity, place along its axis with its unit, value, unit, bias by noise,
     standard deviation and the ends of the bands, all in the unit of the row. Fields are in the

@@ -45,7 +45,7 @@ class TimeSeries:
         """Return the rate γ in 1/s of exponential growth, such as of the r.m.s. of a region.
 
         It is the slope of the logarithm over time, by least squares in which a shot counts as its
-        relative error allows; the band is that of the samples.
+        relative error allows; the band follows from the samples.
 
         Raises
         ------

@@ -253,11 +253,11 @@ class TurbulenceSpectrum(Product):
         return product
 
     def _signal(self, spectrum: RingSpectrum) -> FloatArray:
-        """Return the power less that of the noise."""
+        """Return the power without the noise."""
         return spectrum.power - (np.array(self.noise_power) if self.noise_power else 0.0)
 
     def _corrected(self, spectrum: RingSpectrum) -> FloatArray:
-        """Return the power less that of the noise, over the response where it is measured."""
+        """Return the power without the noise, over the response where it is measured."""
         signal = self._signal(spectrum)
         if not self.response:
             return signal
@@ -475,7 +475,7 @@ class TurbulenceSpectrum(Product):
         return max(float(np.std(slopes, ddof=1)) * math.sqrt(ratio), expected)
 
     def _interpolated(self, window: RingSpectrum, spectrum: RingSpectrum) -> FloatArray:
-        """Return the power of a part of the image, corrected like that of the whole."""
+        """Return the power of a part of the image, corrected as in the whole image."""
         power = window.power
         if self.noise_power:
             power = power - np.interp(window.k, spectrum.k, self.noise_power)

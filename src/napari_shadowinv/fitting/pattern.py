@@ -249,7 +249,7 @@ class Pattern:
 
     @property
     def lacks_counts(self) -> bool:
-        """Whether the noise is certainly smaller than that of the counts."""
+        """Whether the noise is certainly smaller than counts would make it."""
         return self.missing_counts > _LACKING * self.counts_deviation
 
 

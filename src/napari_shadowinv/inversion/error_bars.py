@@ -112,8 +112,8 @@ class Quantity:
     def band(self, share: float = 0.68) -> tuple[FloatArray, FloatArray]:
         """Return the lower and the upper end of the interval with a share of probability.
 
-        Samples stray from the inversion as the inversion does from the truth, so the interval is
-        that of the samples, mirrored at the value (the basic bootstrap). It corrects a bias, such
+        Samples stray from the inversion as the inversion does from the truth, so the samples'
+        interval is mirrored at the value (the basic bootstrap). It corrects a bias, such
         as that of a maximum, which noise raises. Of fewer than 40 samples, such as those of a fit,
         it is Student's interval for the next sample, which takes their spread as normal.
 

@@ -246,7 +246,7 @@ def phantom_of_text(text: str) -> PhantomRecipe:
 
 
 def shape_of_text(text: str, name: str) -> tuple[int, int]:
-    """Return height and width from a text such as "200x200"; `name` is that of the text."""
+    """Return height and width from a text such as "200x200"; `name` is what the text states."""
     parts = text.lower().replace("×", "x").split("x")
     if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
         raise InputError(f"{name} is '{text}': expected height and width in px, such as 200x200")
