@@ -4,7 +4,7 @@
         [--side 128] [--times 2]
 
 Each image is counted rays (`counted` of `fit.py`; the package's forward model is not used) of one
-of six objects, with an imperfection drawn from its stated prior: a beam of random waves, a
+of six objects, with an imperfection drawn from its stated prior: a smooth random beam, a
 background, a gamma, a blur, a transmission of smooth noise, a reference out of register. The noise
 is that of 1,000 counts a pixel.
 
@@ -36,7 +36,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.stats import kstest
 
 from fit import Beam, Field, blobs, counted
@@ -55,7 +55,8 @@ from napari_shadowinv.facts import Verdict
 from reference import toroid_case
 
 FloatArray = NDArray[np.float64]
-COUNTS, RAYS, WAVES = 1000.0, 12, 12
+COUNTS, RAYS = 1000.0, 12
+HIGHEST_WAVE = 7.0  # times the length
 BANDS, RANKS = 100, 199  # samples
 
 
@@ -100,19 +101,38 @@ class Shot:
         self.instrument = Instrument()
 
     def waves(self, length: float) -> Beam:
-        """Return smooth noise with a mean of 0 and an r.m.s. of 1 over the image."""
-        waves = self.rng.normal(size=(2, WAVES)) / (length * self.side)
-        phases = self.rng.uniform(0, 2 * np.pi, WAVES)
+        """Return a random field of Gaussian correlation with an expected r.m.s. over the image.
 
-        def height(y: FloatArray, x: FloatArray) -> FloatArray:
-            total = np.zeros_like(y)
-            for along_y, along_x, phase in zip(*waves, phases, strict=True):
-                total += np.cos(along_y * y + along_x * x + phase)
-            return total
+        A Fourier series with normal coefficients, whose period is longer than any correlation. Its
+        mean over the image is 0, its expected r.m.s. 1.
+        """
+        side = self.side
+        period = side * (2 + 4 * length)
+        highest = int(np.ceil(HIGHEST_WAVE * period / (2 * np.pi * length * side)))
+        orders = np.arange(-highest, highest + 1) * 2 * np.pi / period
+        spectrum = np.exp(-((orders * length * side) ** 2) / 4)
+        spectrum /= np.sqrt((spectrum**2).sum())
+        size = len(orders), len(orders)
+        numbers = self.rng.normal(size=size) + 1j * self.rng.normal(size=size)
+        numbers *= spectrum[:, None] * spectrum
+        pixels = np.arange(side)
+        apart = np.subtract.outer(pixels, pixels) / (length * side)
+        of_mean = np.exp(-(apart**2) / 2).mean() ** 2
+        step = length * side / 12
+        places = np.arange(-0.5 * side, 1.5 * side + step, step)
 
-        level = height(*np.indices((self.side, self.side), dtype=np.float64))
-        mean, deviation = level.mean(), level.std()
-        return lambda y, x: (height(y, x) - mean) / deviation
+        def height(places: FloatArray) -> FloatArray:
+            waves = np.exp(1j * np.multiply.outer(places, orders))
+            return np.asarray((waves @ numbers @ waves.T).real)
+
+        mean, deviation = height(pixels.astype(float)).mean(), np.sqrt(1 - of_mean)
+        smooth = spline_filter((height(places) - mean) / deviation)
+
+        def at(y: FloatArray, x: FloatArray) -> FloatArray:
+            indices = (np.stack([y, x]) - places[0]) / step
+            return np.asarray(map_coordinates(smooth, indices, prefilter=False, mode="nearest"))
+
+        return at
 
     def image(self) -> FloatArray:
         """Return the counts of a shot."""

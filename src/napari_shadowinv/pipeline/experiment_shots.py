@@ -28,7 +28,7 @@ from napari_shadowinv.pipeline.experiment_object import Grid, PlannedObject
 __all__ = ["Beam", "Detector", "ShotSimulator", "SimulatedShots"]
 
 _FINER = 3  # samples along a side of a pixel
-_WAVES = 32
+_NEGLIGIBLE = 1e-12  # of the largest variance
 _BEYOND_PX = 4  # more than rays are displaced
 _DIMMEST = 0.02  # of the mean, for a beam or a transmission
 _EDGE = 0.1  # of the largest displacement, where the object ends
@@ -134,6 +134,7 @@ class ShotSimulator:
     ) -> None:
         self._object, self._setups, self._beam, self._detector = object, setups, beam, detector
         self._seed = seed
+        self._roots_by_length: dict[float, list[tuple[FloatArray, float]]] = {}
         coarse = [object.displacement(setup, Grid(shape)) for setup in setups]
         reach = max(float(np.abs(moved).max()) for moved in coarse)
         margin = min(math.ceil(reach) + _BEYOND_PX, max(shape) // 2)
@@ -227,19 +228,31 @@ class ShotSimulator:
     def _wave(
         self, rng: np.random.Generator, rms: float, length: float | None = None
     ) -> FloatArray:
-        """Smooth noise at the samples, with a mean of 0 and an r.m.s. over the image."""
+        """Smooth noise at the samples, with a mean of 0 over the image and an expected r.m.s."""
         if not rms:
             return np.zeros(self._grid.sizes)
         if length is None:
             length = self._beam.prior.length * min(self._grid.shape)
-        rows, columns = self._grid.lines()
-        numbers = rng.normal(size=(2, _WAVES)) / length
-        phases = rng.uniform(0, 2 * np.pi, _WAVES)
-        along_y = numbers[0] * rows[:, None] + phases
-        along_x = numbers[1] * columns[:, None]
-        field = np.cos(along_y) @ np.cos(along_x).T - np.sin(along_y) @ np.sin(along_x).T
-        inner = self._inner_samples(field)
-        return np.asarray(rms * (field - inner.mean()) / max(float(inner.std()), 1e-12))
+        (along_y, mean_y), (along_x, mean_x) = self._roots(length)
+        field = along_y @ rng.normal(size=(along_y.shape[1], along_x.shape[1])) @ along_x.T
+        # The mean over the image takes a share of the variance.
+        size = rms / math.sqrt(max(1 - mean_y * mean_x, 1e-12))
+        return np.asarray(size * (field - self._inner_samples(field).mean()))
+
+    def _roots(self, length: float) -> list[tuple[FloatArray, float]]:
+        """Roots of the correlation along y and x, and its mean over pairs inside the image."""
+        if length not in self._roots_by_length:
+            edge = self._grid.margin * self._grid.factor
+            roots = []
+            for places in self._grid.lines():
+                correlation = np.exp(-((places[:, None] - places) ** 2) / (2 * length**2))
+                inner = slice(edge, len(places) - edge)
+                variances, vectors = np.linalg.eigh(correlation)
+                kept = variances > _NEGLIGIBLE * variances[-1]
+                root = vectors[:, kept] * np.sqrt(variances[kept])
+                roots.append((root, float(correlation[inner, inner].mean())))
+            self._roots_by_length[length] = roots
+        return self._roots_by_length[length]
 
     def _inner_samples(self, field: FloatArray) -> FloatArray:
         edge = self._grid.margin * self._grid.factor
