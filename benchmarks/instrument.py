@@ -56,7 +56,7 @@ from reference import toroid_case
 
 FloatArray = NDArray[np.float64]
 COUNTS, RAYS = 1000.0, 12
-HIGHEST_WAVE = 7.0  # times the length
+HIGHEST_WAVE, ROUGH_WAVE = 7.0, 30.0  # times the length
 BANDS, RANKS = 100, 199  # samples
 
 
@@ -92,6 +92,8 @@ def objects(side: int) -> dict[str, Field]:
 class Shot:
     """An image of an object while it is simulated, its source, and what is stated of both."""
 
+    smoothness: float | None = None
+
     def __init__(self, side: int, displaced: Field, seed: int, times: float = 1.0) -> None:
         self.side, self.displaced, self.times = side, displaced, times
         self.rng = np.random.default_rng([seed, 28])
@@ -101,32 +103,36 @@ class Shot:
         self.instrument = Instrument()
 
     def waves(self, length: float) -> Beam:
-        """Return a random field of Gaussian correlation with an expected r.m.s. over the image.
+        """Return a random field of Gaussian correlation, or of Matérn's if it is less smooth.
 
         A Fourier series with normal coefficients, whose period is longer than any correlation. Its
         mean over the image is 0, its expected r.m.s. 1.
         """
         side = self.side
         period = side * (2 + 4 * length)
-        highest = int(np.ceil(HIGHEST_WAVE * period / (2 * np.pi * length * side)))
+        smoothness = self.smoothness
+        highest_wave = HIGHEST_WAVE if smoothness is None else ROUGH_WAVE
+        highest = int(np.ceil(highest_wave * period / (2 * np.pi * length * side)))
         orders = np.arange(-highest, highest + 1) * 2 * np.pi / period
-        spectrum = np.exp(-((orders * length * side) ** 2) / 4)
+        squares = (length * side) ** 2 * (orders[:, None] ** 2 + orders**2)
+        if smoothness is None:
+            spectrum = np.exp(-squares / 4)
+        else:  # of Matérn
+            spectrum = (2 * smoothness + squares) ** (-(smoothness + 1) / 2)
         spectrum /= np.sqrt((spectrum**2).sum())
-        size = len(orders), len(orders)
-        numbers = self.rng.normal(size=size) + 1j * self.rng.normal(size=size)
-        numbers *= spectrum[:, None] * spectrum
-        pixels = np.arange(side)
-        apart = np.subtract.outer(pixels, pixels) / (length * side)
-        of_mean = np.exp(-(apart**2) / 2).mean() ** 2
-        step = length * side / 12
+        pixels = np.arange(side, dtype=np.float64)
+        of_mean = np.abs(np.exp(1j * np.multiply.outer(pixels, orders)).mean(axis=0)) ** 2
+        variance = 1 - of_mean @ spectrum**2 @ of_mean  # without the mean over the image
+        numbers = self.rng.normal(size=spectrum.shape) + 1j * self.rng.normal(size=spectrum.shape)
+        numbers *= spectrum / np.sqrt(variance)
+        step = 0.6 * length * side / highest_wave
         places = np.arange(-0.5 * side, 1.5 * side + step, step)
 
         def height(places: FloatArray) -> FloatArray:
             waves = np.exp(1j * np.multiply.outer(places, orders))
             return np.asarray((waves @ numbers @ waves.T).real)
 
-        mean, deviation = height(pixels.astype(float)).mean(), np.sqrt(1 - of_mean)
-        smooth = spline_filter((height(places) - mean) / deviation)
+        smooth = spline_filter(height(places) - height(pixels).mean())
 
         def at(y: FloatArray, x: FloatArray) -> FloatArray:
             indices = (np.stack([y, x]) - places[0]) / step
@@ -615,7 +621,9 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--times", type=float, default=1.0, help="imperfections of fits as stated")
     parser.add_argument("--method", choices=["linear", "resolve"], default="linear")
+    parser.add_argument("--smoothness", type=float, help="of beams: a Matérn correlation's")
     arguments = parser.parse_args()
+    Shot.smoothness = arguments.smoothness
     size = arguments.side, arguments.shots, arguments.first_seed
     if "totals" in arguments.tables:
         table_of_totals(*size)

@@ -28,6 +28,7 @@ from napari_shadowinv import (
 from napari_shadowinv.analysis.power_spectra import random_displacement, ring_spectrum
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.inversion.variables import dataset_from_field
+from napari_shadowinv.plotting import make_logarithmic
 
 BINNED = 8
 # Assumed: the distances of the burner were not published.
@@ -110,13 +111,14 @@ def turbulence(side: int = 200, slope: float = -5 / 3, contrast: float = 0.6) ->
     show(left, image / 250, "Proton image", "counts / beam", (0, 3))
     true = scale * ring_spectrum(strength * potential[inner, inner], weights).power
     raw = scale * ring_spectrum(inversion.potential, weights).power
-    right.loglog(k, true, color=DARK, lw=3, alpha=0.4, label="true field")
-    right.loglog(k, raw, color=ORANGE, lw=1, label="inversion as it is")
+    make_logarithmic(right)
+    right.plot(k, true, color=DARK, lw=3, alpha=0.4, label="true field")
+    right.plot(k, raw, color=ORANGE, lw=1, label="inversion as it is")
     low, high = spectrum.band("power") or (raw, raw)
     trusted = spectrum["trusted"].value > 0
-    right.loglog(k, spectrum["power"].value, color=BLUE, lw=1.3, label="corrected")
+    right.plot(k, spectrum["power"].value, color=BLUE, lw=1.3, label="corrected")
     right.fill_between(k[trusted], low[trusted], high[trusted], color=BLUE, alpha=0.25, lw=0)
-    right.loglog(k, spectrum["noise"].value, color="0.6", lw=1, label="noise")
+    right.plot(k, spectrum["noise"].value, color="0.6", lw=1, label="noise")
     right.set_xlim(k[1], k[45])
     right.set_ylim(true[2:24].min() / 300, true.max() * 3)
     right.legend(frameon=False)

@@ -2,7 +2,7 @@
 
 - the figure of any result: `result_figure`; of each kind: `report_figure`, `fit_figure`,
   `pack_figure`
-- products with their bands: `products_figure`
+- products with their bands: `products_figure`; axes of their spectra: `make_logarithmic`
 - tests of one static field: `left_out_figure`, `windows_figure`
 - planned experiments: `plan_figure`, `sweep_figure`
 - fields side by side: `comparison_figure`; a figure's file: `save_figure`
@@ -16,7 +16,7 @@ from napari_shadowinv.plotting._film_figure import pack_figure
 from napari_shadowinv.plotting._fit_figure import fit_figure, left_out_figure, windows_figure
 from napari_shadowinv.plotting._movie import in_few_colours, stack_frames, write_film
 from napari_shadowinv.plotting._plan_figure import plan_figure, sweep_figure
-from napari_shadowinv.plotting._product_figure import products_figure
+from napari_shadowinv.plotting._product_figure import make_logarithmic, products_figure
 from napari_shadowinv.plotting.figures import (
     comparison_figure,
     report_figure,
@@ -29,6 +29,7 @@ __all__ = [
     "fit_figure",
     "in_few_colours",
     "left_out_figure",
+    "make_logarithmic",
     "pack_figure",
     "plan_figure",
     "products_figure",

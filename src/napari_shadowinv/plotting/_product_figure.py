@@ -102,6 +102,22 @@ def _draw(axes: Axes, result: ProductResult) -> None:
         beside.margins(x=0)
 
 
+def make_logarithmic(axes: Axes) -> None:
+    """Make both axes logarithmic, with plain numbers at 1, 2 and 5 below.
+
+    Parameters
+    ----------
+    axes : Axes
+    """
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_xscale("log")
+    axes.set_yscale("log", nonpositive="mask")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.6g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
 def draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> None:
     """Draw variables along an axis with their bands, in the unit that they are shown in.
 
@@ -128,8 +144,7 @@ def draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> None
     axes.set_xlabel(f"{coordinate.long_name} ({unit_of_places})")
     axes.set_ylabel(f"field ({unit})")
     if result.product.is_logarithmic:
-        axes.set_xscale("log")
-        axes.set_yscale("log", nonpositive="mask")
+        make_logarithmic(axes)
     axes.grid(alpha=0.25, linewidth=0.6)
     axes.margins(x=0)
     axes.legend(frameon=False, fontsize=8)

@@ -40,6 +40,7 @@ from napari_shadowinv.analysis.outlines import Outlined
 from napari_shadowinv.analysis.product import BANDS
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.units import display_unit, prefix_for
+from napari_shadowinv.plotting import make_logarithmic
 
 if TYPE_CHECKING:
     import napari
@@ -103,8 +104,7 @@ class ProductPlot(Plot):
         axes.set_xlabel(f"{coordinate.long_name.lower()} ({prefix}{unit})", color=self.ink)
         axes.set_ylabel(field_unit, color=self.ink)
         if result.product.is_logarithmic:
-            axes.set_xscale("log")
-            axes.set_yscale("log", nonpositive="mask")
+            make_logarithmic(axes)
         self.add_legend(axes)
         self.draw()
         return True
