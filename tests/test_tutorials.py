@@ -245,6 +245,26 @@ def test_the_film_without_reference_has_the_numbers_of_its_page(tmp_path, monkey
     assert set(re.findall(r"--[a-z-]+", fit_line)) <= set(re.findall(r"--[a-z-]+", listing))
 
 
+def test_the_turbulence_has_the_spectrum_of_its_cube(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    page = text_of("turbulence.md")
+    names = run_blocks("turbulence.md")
+    printed = "".join(re.findall(r"```text\n(.*?)```", page, re.DOTALL))
+    assert_same_but_for_rounding(capsys.readouterr().out, printed)
+    power, is_in_range = names["power"], names["in_range"]
+    true = {"slope": -5 / 3, "rms_field": np.sqrt(power[is_in_range].sum())}
+    for name, value in true.items():
+        low, high = names["spectrum"].band(name, 0.95)
+        assert low < value < high
+
+    (line,) = re.findall(r"^    shadowinv (.*)$", page, re.MULTILINE)
+    from napari_shadowinv.analysis import product_from_text
+
+    product = product_from_text(shlex.split(line)[-1])
+    used = names["spectrum"].product
+    assert (product.path_length, product.shortest) == (used.path_length, used.shortest)
+
+
 def test_the_flame_has_the_temperatures_of_its_page(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     page = text_of("flame.md")
