@@ -9,7 +9,8 @@ import pytest
 
 from helpers.exact_fields import SETUP
 from helpers.turbulence import solenoidal_field
-from napari_shadowinv import OpticalSetup, invert, synthetic_image
+from napari_shadowinv import InversionCancelled, OpticalSetup, invert, synthetic_image
+from napari_shadowinv._system.progress import Progress, Reporter
 from napari_shadowinv.analysis import TurbulenceSpectrum, analyse
 from napari_shadowinv.analysis.power_spectra import (
     fit_exponent,
@@ -235,9 +236,26 @@ def test_response_is_the_same_for_the_same_seed(shot):
     weights = window_weights(all_of(96), 0.125)
     spectrum = ring_spectrum(inversion.potential, weights)
     first, second = (
-        measure_response(spectrum, weights, 576, phantoms=1, seed=4).ratio for _ in range(2)
+        measure_response(spectrum, weights, 576, phantoms=1, seed=4, report=Reporter()).ratio
+        for _ in range(2)
     )
     np.testing.assert_array_equal(first, second)
+
+
+def test_random_fields_report_and_stop_on_request(shot):
+    inversion, _ = shot
+    steps: list[Progress] = []
+
+    def is_second() -> bool:
+        return any(each.stage == "response" and each.step == 1 for each in steps)
+
+    with pytest.raises(InversionCancelled):
+        analyse(
+            inversion, TurbulenceSpectrum(phantoms=2), samples=20,
+            on_progress=steps.append, should_stop=is_second,
+        )  # fmt: skip
+    counted = [(each.step, each.total) for each in steps if each.stage == "response"]
+    assert counted == [(0, 4), (1, 4)]
 
 
 def test_slope_of_one_image_is_refused_past_a_contrast_of_one():

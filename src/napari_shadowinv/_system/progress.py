@@ -38,7 +38,7 @@ class Reporter:
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
     ) -> None:
         self._on_progress = on_progress
-        self._should_stop = should_stop
+        self.should_stop = should_stop
 
     def __call__(
         self,
@@ -48,7 +48,7 @@ class Reporter:
         message: str = "",
         objective: float | None = None,
     ) -> None:
-        if self._should_stop is not None and self._should_stop():
+        if self.should_stop is not None and self.should_stop():
             raise InversionCancelled(f"stopped on request during {stage}")
         if self._on_progress is not None:
             self._on_progress(Progress(stage, step, total, message, objective))

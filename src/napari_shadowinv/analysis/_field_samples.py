@@ -162,7 +162,7 @@ class ResampledInversion:
 
         def quantities(changes: FloatArray) -> dict[str, Measure]:
             spacing = (inversion.image.size / number_of_inner_sites(inversion)) ** 0.5
-            measures.append(choose(FieldNoise(changes, spacing)))
+            measures.append(choose(FieldNoise(changes, spacing, Reporter(**report.keywords))))
             size = measures[0](self.potential, self.displacement).size
             check_samples(samples, size)
             kind = sample_type(size)

@@ -25,6 +25,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.optimize import minimize_scalar
 
+from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import invert
@@ -258,7 +259,13 @@ class Response:
 
 
 def measure_response(
-    spectrum: RingSpectrum, weights: FloatArray, n_sites: int, *, phantoms: int, seed: int
+    spectrum: RingSpectrum,
+    weights: FloatArray,
+    n_sites: int,
+    *,
+    phantoms: int,
+    seed: int,
+    report: Reporter,
 ) -> Response:
     """Measure how an inversion changes a spectrum, on random fields with that spectrum.
 
@@ -278,15 +285,27 @@ def measure_response(
     phantoms : int
         Number of random fields for the response itself, at least 1.
     seed : int
+    report : Reporter
+        Called before each random field.
+
+    Raises
+    ------
+    InversionCancelled
+        If the reporter is asked to stop.
     """
     ratio = np.ones(len(spectrum.k))
     spread, contrast = np.zeros(len(spectrum.k)), 0.0
+    total, done = _CORRECTIONS + phantoms, 0
     for count in (*(1,) * _CORRECTIONS, phantoms):
         # The same random numbers in each pass, so that the passes differ by the spectrum alone.
         rng = np.random.default_rng(seed)
         power = spectrum.power / np.maximum(ratio, _SMALLEST_RESPONSE)
         density = _density_of(spectrum.k, power)
-        pairs = [_phantom_spectra(density, weights, n_sites, rng) for _ in range(count)]
+        pairs = []
+        for _ in range(count):
+            report("response", done, total)
+            pairs.append(_phantom_spectra(density, weights, n_sites, rng, report.should_stop))
+            done += 1
         true = np.array([pair[0].power for pair in pairs])
         retrieved = np.array([pair[1].power for pair in pairs])
         contrast = float(np.mean([pair[2] for pair in pairs]))
@@ -320,6 +339,7 @@ def _phantom_spectra(
     weights: FloatArray,
     n_sites: int,
     rng: np.random.Generator,
+    should_stop: ShouldStop | None,
 ) -> tuple[RingSpectrum, RingSpectrum, float]:
     """Return the spectra of a random field and of its inversion, and its r.m.s. divergence."""
     margins = [int(np.ceil(_MARGIN * count)) for count in weights.shape]
@@ -330,7 +350,8 @@ def _phantom_spectra(
     potential, displacement = random_displacement(density, (shape[0], shape[1]), rng)
     image = synthetic_image(displacement)[inner]
     options = InversionOptions(n_sites=n_sites, noise_level=1e-3)
-    inversion = invert(image, source=np.ones(weights.shape), options=options)
+    source = np.ones(weights.shape)
+    inversion = invert(image, source=source, options=options, should_stop=should_stop)
     divergence = sum(np.gradient(part, axis=axis) for axis, part in enumerate(displacement))
     contrast = float(np.std(np.asarray(divergence)[inner]))
     true = ring_spectrum(potential[inner], weights)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from typing import ClassVar, Self
 import numpy as np
 from pydantic import Field
 
+from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.cautions import Caution
@@ -83,10 +85,13 @@ class FieldNoise:
         Changes of the potential in px² by noise and instrument.
     spacing : float
         Spacing of the sites in px; 0 for a field without sites.
+    report : Reporter
+        For choices that take long.
     """
 
     potentials: FloatArray
     spacing: float = 0.0
+    report: Reporter = dataclasses.field(default_factory=Reporter)
 
 
 class Product(Choice):

@@ -31,6 +31,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._system.validation import CombinationError
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.analysis.frame import FieldFrame
@@ -226,6 +227,7 @@ class TurbulenceSpectrum(Product):
                 max(round(potential.size / product.resolution**2), 16),
                 phantoms=self.phantoms,
                 seed=self.phantom_seed,
+                report=Reporter() if noise is None else noise.report,
             )
             phantom_contrast = response.contrast
             changes["response"] = tuple(map(float, response.ratio))

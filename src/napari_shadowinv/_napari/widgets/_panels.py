@@ -199,6 +199,8 @@ _STAGES = {
     "image": "Tracing the rays",
     "shots": "Inverting",
     "draws": "Simulating shots",
+    "samples": "Drawing samples",
+    "response": "Inverting random fields",
     "wait": "Waiting for shots",
     "fit": "Fitting",
     "read": "Reading the scans",
