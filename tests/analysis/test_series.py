@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import xarray as xr
 
 from helpers.exact_fields import SETUP, field_of
-from napari_shadowinv.analysis import Flux, Region, analyse, time_series
+from napari_shadowinv.analysis import (
+    Flux,
+    LineProfile,
+    Region,
+    analyse,
+    analyse_shots,
+    time_series,
+)
+from napari_shadowinv.analysis.series import TimeSeries
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import invert
+from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import toroid
 
@@ -28,6 +40,51 @@ def test_growth_rate_of_an_exponential_is_exact():
     assert series.variables["rms"].unit == "T m"
     ratio = series["peak"].value[1:] / series["peak"].value[:-1]
     np.testing.assert_allclose(ratio, np.exp(RATE * 1e-9))
+
+
+def stack_of(times, gap: int | None = None) -> xr.Dataset:
+    """Return exact fields along an axis of shots, without that of one."""
+    stack = xr.concat([field_of(field_at(time)).dataset for time in times], "shot")
+    if gap is not None:
+        stack["displacement"][gap] = np.nan
+    return stack.assign_attrs(field_of(field_at(0)).dataset.attrs)
+
+
+def test_each_shot_of_a_stack_with_a_field_is_measured():
+    times = 1e-9 * np.array([0.0, 1.0, 1.5, 3.0])
+    (series,) = analyse_shots(stack_of(times, gap=1), REGION, times)
+    np.testing.assert_allclose(series.times, times[[0, 2, 3]])
+    (last,) = analyse(field_of(field_at(times[3])), REGION)
+    assert series["rms"].value[-1] == pytest.approx(float(last["rms"].value), rel=1e-12)
+    assert series.growth_rate("rms").value == pytest.approx(RATE, rel=1e-9)
+    assert series.result["rms"].value.shape == (3,)
+    (by_shot,) = analyse_shots(stack_of(TIMES), REGION)
+    assert by_shot.growth_rate("rms").value == pytest.approx(RATE * 1e-9, rel=1e-9)
+
+
+def test_band_of_a_growth_rate_follows_from_the_scatter_of_the_shots():
+    inside, times = [], 1e-9 * np.arange(6)
+    (exact,) = analyse_shots(stack_of(times), REGION, times)
+    for seed in range(200):
+        scatter = np.exp(0.05 * np.random.default_rng(seed).normal(size=6))
+        values = Quantity(exact["rms"].value * scatter, np.zeros((0, 6)))
+        series = TimeSeries(replace(exact.result, quantities={"rms": values}))
+        low, high = series.growth_rate("rms").band(0.68)
+        inside.append(low <= RATE <= high)
+    assert np.mean(inside) == pytest.approx(0.68, abs=0.1)
+
+
+def test_wrong_stacks_and_times_are_refused():
+    stack = stack_of(TIMES)
+    for wrong, times, message in (
+        (stack.isel(shot=0), None, "no stack of shots"),
+        (stack, [0.0, 1.0], "one for each of 3 shots"),
+        (stack_of(TIMES[:2], gap=0), None, "1 of 2 shots have a field"),
+    ):
+        with pytest.raises(InputError, match=message):
+            analyse_shots(wrong, REGION, times)
+    with pytest.raises(InputError, match="no single number to follow"):
+        analyse_shots(stack, LineProfile(path=[(2, 2), (9, 9)]))
 
 
 def test_interval_of_a_growth_rate_holds_it():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 
 import numpy as np
@@ -143,3 +144,37 @@ def test_field_of_another_program_has_no_bands(tmp_path: Path) -> None:
     outcome = shadowinv("analyse", path, "current center=19.5,19.5 radius=8")
     assert outcome.exit_code == 0, outcome.output
     assert "none: the errors of this field are not known" in flat(outcome.output)
+
+
+def test_numbers_are_followed_through_the_shots_of_a_store(setup_file: Path, tmp_path: Path):
+    folder = tmp_path / "shots"
+    folder.mkdir()
+    for number in range(3):
+        phantom = toroid((32, 32), SETUP, 20 * np.exp(0.2 * number), 6e-6)
+        np.save(folder / f"{number}.npy", 300 * synthetic_image(phantom.displacement))
+    store, table = tmp_path / "night.shadowinv.zarr", tmp_path / "growth.csv"
+    assert shadowinv(
+        "batch", f"{folder}/*.npy", "--setup", setup_file, "--out", store, "-q"
+    ).exit_code == 0  # fmt: skip
+    region = "region center=15.5,15.5 radius=10"
+    outcome = shadowinv("analyse", store, region, "--times", "2e-9", "--csv", table)
+    assert outcome.exit_code == 0, outcome.output
+    assert re.search(r"growth of rms 0\.(099|100)\d* 1/ns", flat(outcome.output))
+    rows = [row for row in csv.DictReader(table.open()) if row["quantity"] == "rms"]
+    assert [float(row["place"]) for row in rows] == [0, 2e-9, 4e-9]
+    growth = np.log(float(rows[2]["value"]) / float(rows[0]["value"])) / 4
+    assert growth == pytest.approx(0.1, rel=0.05)
+    for flags, message in (
+        (["--times", "1,2"], "--times is '1,2', expected the time between two shots in s"),
+        (["--out", tmp_path / "a.shadowinv"], "use --csv"),
+        (["--shots", "9"], "shots are '9': expected numbers from 0 to 2"),
+    ):
+        refused = shadowinv("analyse", store, region, *flags)
+        assert refused.exit_code == 2
+        assert message in flat(refused.output)
+
+
+def test_a_single_result_has_no_shots(result: Path):
+    outcome = shadowinv("analyse", result, CIRCLE, "--times", "1e-9")
+    assert outcome.exit_code == 2
+    assert "--shots and --times belong to a store of shots" in flat(outcome.output)

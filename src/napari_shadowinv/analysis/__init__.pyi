@@ -10,7 +10,7 @@ from .maps import ChargeDensity, CurrentDensity
 from .product import Product
 from .regions import Region
 from .result import ProductResult, add_products, products_in, products_table
-from .series import TimeSeries, time_series
+from .series import TimeSeries, analyse_shots, time_series
 from .spectra import TurbulenceSpectrum
 
 __all__ = [
@@ -34,6 +34,7 @@ __all__ = [
     "TurbulenceSpectrum",
     "add_products",
     "analyse",
+    "analyse_shots",
     "product_from_dict",
     "product_from_text",
     "products_in",

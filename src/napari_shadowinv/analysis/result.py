@@ -101,16 +101,20 @@ class ProductResult:
     @property
     def curve_names(self) -> tuple[str, ...]:
         """Variables along an axis that figures draw together, in one unit."""
-        chosen = self.product.curves or tuple(self.variables)
+        drawn = [name for name in self.product.curves if name in self.variables]
+        chosen = drawn or list(self.variables)
         names = [
             name
             for name in chosen
-            if name in self.variables
-            and len(self.variables[name].dims) == 1
-            and name not in self.product.recorded
+            if len(self.variables[name].dims) == 1 and name not in self.product.recorded
         ]
         units = {self.variables[name].unit for name in names[:1]}
         return tuple(name for name in names if self.variables[name].unit in units)
+
+    @property
+    def is_logarithmic(self) -> bool:
+        """Whether the axes of its curves are logarithmic."""
+        return self.product.is_logarithmic and "k" in self.coordinates
 
     def __getitem__(self, name: str) -> Quantity:
         return self.quantities[name]

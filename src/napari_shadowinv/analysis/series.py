@@ -1,23 +1,42 @@
-"""A product over the shots of a stack: `time_series`, with growth rates of a `TimeSeries`."""
+"""A product over the shots of a stack: `time_series`, `analyse_shots`; `TimeSeries`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.analysis.product import Variable, has_bands
+from napari_shadowinv.analysis._analyse import analyse
+from napari_shadowinv.analysis.product import (
+    BANDS,
+    Coordinate,
+    Product,
+    Variable,
+    has_bands,
+    value_text,
+)
 from napari_shadowinv.analysis.result import ProductResult
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.physics.units import PIXEL, prefix_for
 
-__all__ = ["TimeSeries", "time_series"]
+if TYPE_CHECKING:
+    import xarray
+
+    from napari_shadowinv.physics.setup import Setup
+
+__all__ = ["TimeSeries", "analyse_shots", "time_series"]
 
 _MIN_SHOTS = 2
 _LEAST = 1e-300
+_SAMPLES = 1000  # of a growth rate by the scatter of the shots
+_AXES = {"s": ("time", "time"), "": ("shot", "number of the shot")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,17 +45,28 @@ class TimeSeries:
 
     Attributes
     ----------
-    times : ndarray, shape (n,)
-        In s.
-    quantities : dict of str to Quantity
-        Values (n,) in SI units; errors of different shots are independent in their samples.
-    variables : dict of str to Variable
-        Unit and long name of each.
+    result : ProductResult
+        The numbers along the axis of the shots, for tables, figures and files; errors of different
+        shots are independent in its samples. Its facts are the growth rates.
     """
 
-    times: FloatArray
-    quantities: dict[str, Quantity]
-    variables: dict[str, Variable]
+    result: ProductResult
+
+    @property
+    def times(self) -> FloatArray:
+        """Time of each shot in s, or its number where no times are stated, shape (n,)."""
+        (places,) = self.result.coordinates.values()
+        return np.asarray(places.values)
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Values (n,) in SI units by the names of the numbers."""
+        return self.result.quantities
+
+    @property
+    def variables(self) -> dict[str, Variable]:
+        """Unit and long name of each number."""
+        return self.result.variables
 
     def __getitem__(self, name: str) -> Quantity:
         return self.quantities[name]
@@ -45,7 +75,8 @@ class TimeSeries:
         """Return the rate γ in 1/s of exponential growth, such as of the r.m.s. of a region.
 
         It is the slope of the logarithm over time, by least squares in which a shot counts as its
-        relative error allows; the band follows from the samples.
+        relative error allows; the band follows from the samples. Without them it follows from the
+        scatter of at least three shots about the line (Student's t).
 
         Raises
         ------
@@ -55,34 +86,48 @@ class TimeSeries:
         if name not in self.quantities:
             names = ", ".join(self.quantities)
             raise InputError(f"got the number {name!r}, expected one of {names}")
-        quantity = self.quantities[name]
-        sign = np.sign(quantity.value[0])
-        if not (sign * quantity.value > 0).all():
+        if not _keeps_sign(self.quantities[name]):
             raise InputError(
                 f"{name} is zero or changes its sign in the series: expected numbers that grow or "
                 "decay, such as an r.m.s."
             )
-        weights = np.ones(len(self.times))
-        if has_bands(quantity):
-            weights = (quantity.value / np.maximum(quantity.std, _LEAST)) ** 2
-        from_middle = self.times - (weights * self.times).sum() / weights.sum()
-        factors = weights * from_middle / (weights * from_middle**2).sum()
-
-        def slope(values: FloatArray) -> FloatArray:
-            return np.asarray(np.log(np.maximum(sign * values, _LEAST)) @ factors)
-
-        return Quantity(slope(quantity.value), slope(quantity.samples))
+        return _growth_rate(self.quantities[name], self.times)
 
 
-def time_series(results: Sequence[ProductResult], times: ArrayLike) -> TimeSeries:
+def _keeps_sign(quantity: Quantity) -> bool:
+    return bool((np.sign(quantity.value[0]) * quantity.value > 0).all())
+
+
+def _growth_rate(quantity: Quantity, times: FloatArray) -> Quantity:
+    sign, count = np.sign(quantity.value[0]), len(times)
+    weights = np.ones(count)
+    if has_bands(quantity):
+        weights = (quantity.value / np.maximum(quantity.std, _LEAST)) ** 2
+    from_middle = times - (weights * times).sum() / weights.sum()
+    factors = weights * from_middle / (weights * from_middle**2).sum()
+
+    def slope(values: FloatArray) -> FloatArray:
+        return np.asarray(np.log(np.maximum(sign * values, _LEAST)) @ factors)
+
+    rate = slope(quantity.value)
+    if has_bands(quantity) or count <= _MIN_SHOTS:
+        return Quantity(rate, slope(quantity.samples))
+    logarithms = np.log(sign * quantity.value)
+    residual = logarithms - logarithms.mean() - rate * from_middle
+    error = np.sqrt((residual**2).sum() / (count - 2) / (from_middle**2).sum())
+    normal = np.random.default_rng(0).standard_t(count - 2, _SAMPLES)
+    return Quantity(rate, rate + error * normal)
+
+
+def time_series(results: Sequence[ProductResult], times: ArrayLike | None = None) -> TimeSeries:
     """Join the numbers of one product in several shots.
 
     Parameters
     ----------
     results : sequence of ProductResult
         Of the same product and field, one for each shot, as `analyse` returns them.
-    times : array_like, shape (n,)
-        Of the shots, in s, increasing.
+    times : array_like, shape (n,), optional
+        Of the shots, in s, increasing. Default: shots are numbered, and growth rates are by shot.
 
     Returns
     -------
@@ -99,7 +144,8 @@ def time_series(results: Sequence[ProductResult], times: ArrayLike) -> TimeSerie
     Errors that all shots share, such as the energy's, then count as independent, which makes the
     interval of a growth rate too wide rather than too narrow.
     """
-    places = np.asarray(times, dtype=np.float64)
+    unit = "" if times is None else "s"
+    places = np.arange(float(len(results))) if times is None else np.asarray(times, float)
     if len(results) < _MIN_SHOTS or places.shape != (len(results),):
         raise InputError(
             f"got {len(results)} results and times of shape {places.shape}, expected a time for "
@@ -113,15 +159,122 @@ def time_series(results: Sequence[ProductResult], times: ArrayLike) -> TimeSerie
         raise InputError("the results are of different products or fields, expected one of each")
     count = min(len(next(iter(each.quantities.values())).samples) for each in results)
     orders = [np.random.default_rng(shot).permutation(count) for shot in range(len(results))]
+    axis, long_name = _AXES[unit]
     variables = {
-        name: variable
+        name: replace(variable, dims=(axis,))
         for name, variable in first.variables.items()
         if not variable.dims and name not in first.product.recorded
     }
+    if not variables:
+        raise InputError(
+            f"{first.title} has no single number to follow over the shots: expected a product with "
+            "one, such as a region or a flux"
+        )
     quantities = {}
     for name in variables:
         shots = [each.quantities[name] for each in results]
         samples = [shot.samples[:count][order] for shot, order in zip(shots, orders, strict=True)]
         values = np.array([float(shot.value) for shot in shots])
         quantities[name] = Quantity(values, np.stack(samples, axis=1))
-    return TimeSeries(places, quantities, variables)
+    result = replace(
+        first,
+        quantities=quantities,
+        variables=variables,
+        coordinates={axis: Coordinate(places, unit, long_name)},
+        stored={},
+    )
+    return TimeSeries(replace(result, facts=tuple(_facts(result, places, unit))))
+
+
+def _facts(series: ProductResult, times: FloatArray, unit: str) -> Iterator[Fact]:
+    """Yield each number in the first and last shot, its growth, and what the band holds."""
+    for name, quantity in series.quantities.items():
+        variable = series.variables[name]
+        title = variable.title or name.replace("_", " ")
+        factor, shown = series.scale_of(name)
+        first, last = factor * quantity.value[[0, -1]]
+        text = f"{first:.4g} to {last:.4g} {shown}, first to last shot"
+        yield Fact(name, f"{title[:1].upper()}{title[1:]}", text, short=text)
+        is_place = variable.unit in ("m", PIXEL)
+        if is_place or not _keeps_sign(quantity) or np.ptp(quantity.value) == 0:
+            continue
+        rate = _growth_rate(quantity, times)
+        factor, shown = _rate_unit(float(rate.value), unit)
+        bands = [rate.band(share) for share in BANDS] if has_bands(rate) else []
+        ends = [(factor * float(low), factor * float(high)) for low, high in bands]
+        text = value_text(factor * float(rate.value), ends, shown)
+        yield Fact(f"growth_{name}", f"Growth of {title}", text, short=text)
+    if series.has_bands:
+        yield from (fact for fact in series.facts if fact.key == "bands")
+    else:
+        text = "of growth rates, by the scatter of the shots about exponential growth"
+        yield Fact("bands", "Bands", text, Level.DOUBTFUL)
+
+
+def _rate_unit(rate: float, unit: str) -> tuple[float, str]:
+    """Return the factor from a rate to one in a handy unit, and that unit."""
+    if not unit:
+        return 1.0, "per shot"
+    factor, prefix = prefix_for(1 / max(abs(rate), _LEAST))
+    return 1 / factor, f"1/{prefix}{unit}"
+
+
+def analyse_shots(
+    stack: xarray.Dataset,
+    products: Product | Mapping[str, Any] | Sequence[Product | Mapping[str, Any]],
+    times: ArrayLike | None = None,
+    *,
+    unit: str | None = None,
+    deflector: str | None = None,
+    setup: Setup | None = None,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> list[TimeSeries]:
+    """Measure products in each shot of a stack.
+
+    A store keeps fields without the errors of their pixels, so the numbers have no bands; growth
+    rates have one by the scatter of the shots.
+
+    Parameters
+    ----------
+    stack : xarray.Dataset
+        Shots of a store, as `read` returns them, along the axis ``shot``. Those without a field
+        are left out.
+    products, unit, deflector, setup, on_progress, should_stop
+        As of `analyse`.
+    times : array_like, shape (n,), optional
+        Of all shots in s. Default: shots are numbered.
+
+    Returns
+    -------
+    list of TimeSeries
+        For each product, and each field that it is defined for.
+
+    Raises
+    ------
+    InputError
+        If it is no stack, fewer than two shots have a field, or as of `analyse` and `time_series`.
+    InversionCancelled
+        If `should_stop` returned true.
+    """
+    if "shot" not in getattr(stack, "dims", ()) or "displacement" not in stack:
+        raise InputError("got no stack of shots with fields, expected that of a store")
+    places = None if times is None else np.asarray(times, dtype=np.float64)
+    count = stack.sizes["shot"]
+    if places is not None and places.shape != (count,):
+        raise InputError(
+            f"got times of shape {places.shape}, expected one for each of {count} shots"
+        )
+    report = Reporter(on_progress, should_stop)
+    used, shots = [], []
+    for index in range(count):
+        report("shots", index, count)
+        shot = stack.isel(shot=index).load()
+        if not np.isfinite(shot["displacement"].values).any():
+            continue
+        used.append(index)
+        shots.append(analyse(shot, products, unit=unit, deflector=deflector, setup=setup))
+    if len(shots) < _MIN_SHOTS:
+        raise InputError(f"{len(shots)} of {count} shots have a field, expected at least two")
+    chosen = None if places is None else places[used]
+    return [time_series(results, chosen) for results in zip(*shots, strict=True)]

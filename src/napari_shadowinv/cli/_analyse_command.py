@@ -19,13 +19,17 @@ if TYPE_CHECKING:
     from napari_shadowinv.results import AnyResult
 
 HELP = {
-    "result": "Result of an inversion or a fit, .shadowinv; or pradformat, .h5.",
+    "result": "Result of an inversion or a fit, .shadowinv; pradformat, .h5; or a store of shots, "
+    ".shadowinv.zarr, whose numbers are followed from shot to shot.",
     "products": "Products, each in quotes: its name, points y,x in px, and name=value.",
     "file": "TOML file with a table [[products]] for each product.",
     "unit": "Unit of the field: T m, T mm, MG µm, kG cm, G cm, V, m⁻², m, rad or px. It chooses "
     "the field, too. Default: SI.",
     "deflector": "Field of a fit with several: B, E, plasma or phase. Default: all.",
     "samples": "Samples of the field for the bands.",
+    "shots": "Shots of a store, such as 3:20. Default: all finished ones.",
+    "times": "Times of these shots in s: the time between two, or a list 0,1e-9,3e-9. Default: "
+    "shots are numbered.",
     "csv": "Table of all numbers with their bands.",
     "figure": "Figure of the products: .png, .pdf or .svg.",
     "out": "Copy of the result with the products, .shadowinv.",
@@ -35,6 +39,7 @@ _EPILOG = r"""
 shadowinv analyse a.shadowinv "profile 99,20 99,180 width=5" --unit "MG um"
 shadowinv analyse a.shadowinv "current center=99,99 radius=40" --csv a.csv
 shadowinv analyse a.shadowinv current-density contrast --figure map.png
+shadowinv analyse night.shadowinv.zarr "region center=99,99 radius=40" --times 1e-9
 
 [bold]Products[/bold]
 {products}
@@ -66,6 +71,8 @@ def analyse(
     deflector: Annotated[str | None, typer.Option(help=HELP["deflector"])] = None,
     samples: Annotated[int, typer.Option(help=HELP["samples"], metavar="N")] = 100,
     setup: _flags.SetupFile = None,
+    shots: Annotated[str | None, typer.Option(help=HELP["shots"])] = None,
+    times: Annotated[str | None, typer.Option(help=HELP["times"])] = None,
     csv: Annotated[Path | None, typer.Option(help=HELP["csv"])] = None,
     figure: Annotated[Path | None, typer.Option(help=HELP["figure"])] = None,
     out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
@@ -77,9 +84,11 @@ def analyse(
     Bands hold the noise of the image, the discretisation and what was stated of the instrument.
     """
     from napari_shadowinv.analysis import analyse as measure
-    from napari_shadowinv.inversion.variables import setup_from_dataset
+    from napari_shadowinv.analysis import analyse_shots
+    from napari_shadowinv.cli._export import open_shots
     from napari_shadowinv.io import read_dataset
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, SITES
+    from napari_shadowinv.io.store import is_stack
     from napari_shadowinv.pipeline.files import setup_from
     from napari_shadowinv.results import result_from_dataset
 
@@ -88,30 +97,61 @@ def analyse(
     outputs = {path: endings for path, endings in suffixes.items() if path is not None}
     _inputs.check_outputs(outputs, overwrite)
     _inputs.protect(list(outputs), [result, setup, products])
-    dataset = read_dataset(result)
-    if "shot" in dataset.dims:
-        raise InputError(
-            f"{result} is a stack of shots, expected the result of one: write one of them by "
-            "shadowinv export --shots N"
-        )
-    content = result_from_dataset(dataset)
+    if is_stack(result):
+        _check_series(out)
+        dataset = open_shots(result, shots)
+        content: AnyResult | None = None
+    elif shots is not None or times is not None:
+        raise InputError(f"{result} is one result: --shots and --times belong to a store of shots")
+    else:
+        dataset = read_dataset(result)
+        content = result_from_dataset(dataset)
     with nullcontext() if quiet else progress_bars() as show:
-        results = measure(
-            content,
-            chosen,
-            samples=samples,
-            unit=unit,
-            deflector=deflector,
-            setup=setup_from_dataset(dataset) if setup is None else setup_from(setup),
-            on_progress=show,
-            should_stop=is_interrupted,
-        )
+        common: dict[str, Any] = {
+            "unit": unit,
+            "deflector": deflector,
+            "setup": None if setup is None else setup_from(setup),
+            "on_progress": show,
+            "should_stop": is_interrupted,
+        }
+        if content is None:
+            seconds = _times(times, dataset.sizes["shot"])
+            series = analyse_shots(dataset, chosen, seconds, **common)
+            results = [each.result for each in series]
+        else:
+            results = measure(dataset, chosen, samples=samples, **common)
     _write(results, content, dataset, {"csv": csv, "figure": figure, "out": out}, overwrite)
     if not quiet:
         for table in _tables(results):
             say(table)
         if outputs:
             say(two_columns("Files", written_rows(outputs)))
+
+
+def _check_series(out: Path | None) -> None:
+    """Refuse a copy of a store."""
+    if out is not None:
+        raise InputError(
+            f"--out {out} is a copy of one result with its products, and the numbers of a store "
+            "have none: use --csv"
+        )
+
+
+def _times(text: str | None, count: int) -> list[float] | None:
+    """Return the times of shots from the time between two, or from a list of all."""
+    if text is None:
+        return None
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) == 1 and count > 1:
+        return [number * numbers[0] for number in range(count)]
+    if len(numbers) != count:
+        raise InputError(
+            f"--times is {text!r}, expected the time between two shots in s, or a list of {count}"
+        )
+    return numbers
 
 
 def _products(texts: list[str], file: Path | None) -> list[Product]:
@@ -134,7 +174,7 @@ def _products(texts: list[str], file: Path | None) -> list[Product]:
 
 def _write(
     results: list[ProductResult],
-    content: AnyResult,
+    content: AnyResult | None,
     dataset: Any,
     paths: dict[str, Path | None],
     overwrite: bool,

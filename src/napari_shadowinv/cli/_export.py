@@ -30,7 +30,7 @@ _FORMULA_SIGNS = ("=", "+", "-", "@")
 FORMATS = ("tiff", "pradformat", "csv")
 
 
-def _open_shots(path: Path, shots: str | None) -> xarray.Dataset:
+def open_shots(path: Path, shots: str | None) -> xarray.Dataset:
     """Open a store and select shots from it; only finished ones."""
     dataset = read_stack(path)
     count = dataset.sizes["shot"]
@@ -85,7 +85,7 @@ def export_shots(
         raise InputError(
             f"{store} holds fits, expected inversions for pradformat: use --format tiff or csv"
         )
-    dataset = _open_shots(store, shots)
+    dataset = open_shots(store, shots)
     jobs = list(_tiff_jobs(dataset, variables) if form == "tiff" else _pradformat_jobs(dataset))
     make_folder(out)
     for name, *_ in jobs:
@@ -200,5 +200,5 @@ def write_movie(
         raise InputError(
             f"--rate is {rate:g}: expected more than 0 and at most 120 frames a second"
         )
-    frames = stack_frames(_open_shots(store, shots), variable, limits=limits)
+    frames = stack_frames(open_shots(store, shots), variable, limits=limits)
     return write_film(out, frames, rate, overwrite=overwrite)

@@ -24,7 +24,7 @@ _WIDTH_IN = 8.0
 _HEIGHT_IN = 3.2  # of a panel
 _LINE_IN = 0.19  # of the text
 _LETTERS = 125
-_COLOURS = ("#1f77b4", "#d95f02", "#1b9e77")
+_COLOURS = ("#1f77b4", "#d95f02", "#1b9e77", "#7a5195", "0.4")
 _OPACITIES = (0.35, 0.18)
 
 
@@ -130,8 +130,8 @@ def draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> None
     """
     coordinate = result.coordinates[result.variables[names[0]].dims[0]]
     factor, prefix = prefix_for(float(np.max(np.abs(coordinate.values), initial=0.0)))
-    in_metres = coordinate.unit == "m"
-    places = coordinate.values * (factor if in_metres else 1.0)
+    has_prefix = coordinate.unit in ("m", "s")
+    places = coordinate.values * (factor if has_prefix else 1.0)
     for number, name in enumerate(names):
         scale, unit = result.scale_of(name)
         colour = _COLOURS[number % len(_COLOURS)]
@@ -140,10 +140,10 @@ def draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> None
             if (band := result.band(name, share)) is not None:
                 style: Any = {"color": colour, "alpha": opacity, "linewidth": 0}
                 axes.fill_between(places, scale * band[0], scale * band[1], **style)
-    unit_of_places = f"{prefix}m" if in_metres else display_unit(coordinate.unit)
-    axes.set_xlabel(f"{coordinate.long_name} ({unit_of_places})")
-    axes.set_ylabel(f"field ({unit})")
-    if result.product.is_logarithmic:
+    shown = f"{prefix}{coordinate.unit}" if has_prefix else display_unit(coordinate.unit)
+    axes.set_xlabel(f"{coordinate.long_name} ({shown})" if shown else coordinate.long_name)
+    axes.set_ylabel(f"field ({unit})" if unit == result.unit.symbol else unit)
+    if result.is_logarithmic:
         make_logarithmic(axes)
     axes.grid(alpha=0.25, linewidth=0.6)
     axes.margins(x=0)

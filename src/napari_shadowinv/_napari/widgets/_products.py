@@ -103,7 +103,7 @@ class ProductPlot(Plot):
                     axes.fill_between(places, low, high, color=colour, alpha=opacity, linewidth=0)
         axes.set_xlabel(f"{coordinate.long_name.lower()} ({prefix}{unit})", color=self.ink)
         axes.set_ylabel(field_unit, color=self.ink)
-        if result.product.is_logarithmic:
+        if result.is_logarithmic:
             make_logarithmic(axes)
         self.add_legend(axes)
         self.draw()
