@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from helpers.command_line import content, flat, shadowinv
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -51,6 +52,31 @@ def test_a_sweep_has_a_row_for_each_value(folder):
     with (folder / "counts.csv").open() as file:
         few, many = csv.DictReader(file)
     assert float(few["error"]) > 2 * float(many["error"])
+
+
+def test_particles_are_traced_through_a_field_on_a_grid(folder):
+    places = np.linspace(-6e-5, 6e-5, 33)
+    z, y, x = np.meshgrid(places, places, places, indexing="ij")
+    bell = 8e6 * np.exp(-(x**2 + y**2 + z**2) / (2 * 1.2e-5**2))
+    values = {"Bx": bell * 0, "By": -z * bell, "Bz": y * bell}  # seen along x
+    magnetic = {name: (("z", "y", "x"), value, {"units": "T"}) for name, value in values.items()}
+    axes = {name: (name, places, {"units": "m"}) for name in "zyx"}
+    xr.Dataset(magnetic, axes).to_netcdf(folder / "cube.nc", engine="h5netcdf")
+    seen = ("--setup", "setup.toml", "--beam", "x", "--right", "y")
+    answer = shadowinv(
+        *("plan", "cube.nc", *seen, "--draws", 2, "--beam-rms", 0, "--counts", 100_000)
+    )
+    assert answer.exit_code == 0, answer.output
+    assert "would be determined: 2 of 2" in flat(answer.output)
+    for arguments, message in (
+        (("cube.nc",), "particles through it need --setup"),
+        (("cube.nc", *seen, "--deflector", "magnetic field"), "which needs only --setup"),
+        (("toroid", *seen), "received --beam, --right, but toroid is no 3-D field"),
+    ):
+        refused = shadowinv("plan", *arguments, "--out", "other.csv")
+        assert refused.exit_code == 2
+        assert message in flat(refused.output)
+    assert not (folder / "other.csv").exists()
 
 
 def test_the_object_of_a_file_is_a_displacement(folder):

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from napari_shadowinv import Instrument, InversionCancelled, invert, read, write
+from napari_shadowinv import (
+    FieldGrid,
+    Instrument,
+    InversionCancelled,
+    OpticalSetup,
+    invert,
+    read,
+    trace,
+    write,
+)
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.options import BeamPrior
@@ -17,6 +26,7 @@ from napari_shadowinv.pipeline.experiment_object import (
     Grid,
     PlannedObject,
     object_of_displacement,
+    object_of_field,
     object_of_phantom,
     object_of_result,
     phantom_of_text,
@@ -93,6 +103,47 @@ def test_a_saved_result_is_an_object_with_its_setup(tmp_path):
     np.testing.assert_allclose(
         target.displacement(SETUP, Grid((64, 64))), result.displacement, atol=1e-9
     )
+
+
+def bubble(strength: float, length: float = 1.2e-4) -> FieldGrid:
+    """Return an azimuthal field about the beam, of a Gaussian ellipsoid."""
+    places, depth = np.linspace(-5e-5, 5e-5, 41), np.linspace(-4 * length, 4 * length, 41)
+    z, y, x = np.meshgrid(depth, places, places, indexing="ij")
+    bell = strength * np.exp(-(x**2 + y**2) / (2 * 1.2e-5**2) - z**2 / (2 * length**2))
+    spacing = (depth[1] - depth[0], places[1] - places[0], places[1] - places[0])
+    return FieldGrid(np.stack([0 * x, -x * bell, y * bell]), spacing=spacing)
+
+
+def test_particles_are_traced_through_a_planned_field_in_each_setup():
+    target = object_of_field(bubble(2e6, 1e-5), SETUP)
+    for setup in (SETUP, SLOWER):
+        grid = Grid((60, 60), 2, margin=1)
+        half = setup.model_copy(update={"pixel_size": setup.object_pixel_size / 2})
+        exact = trace(bubble(2e6, 1e-5), half, grid.sizes).displacement / 2
+        np.testing.assert_allclose(target.displacement(setup, grid), exact, atol=1e-12)
+    # A thin field is displaced by its line integral.
+    line = SETUP.path_integrated_b(target.displacement(SETUP, Grid((60, 60))))
+    peak = 2e6 * 1.2e-5 * np.exp(-0.5) * 1e-5 * np.sqrt(2 * np.pi)
+    assert np.hypot(*line).max() == pytest.approx(peak, rel=0.02)
+
+
+def test_a_field_is_planned_and_a_wrong_one_refused():
+    target = object_of_field(bubble(2e6, 1e-5), SETUP)
+    assert target.shape == (66, 66)
+    plan = plan_experiment(
+        target, SETUP, instrument=EXACT, options=ExperimentOptions(counts=1e5, draws=2)
+    )
+    assert plan.is_determined
+    assert plan.error.median < 0.02
+    (assumed,) = [fact.text for fact in plan.facts if fact.key == "assumed"]
+    assert "thin" not in assumed
+    light = OpticalSetup(wavelength=5e-7, object_image_distance=0.1, pixel_size=1e-6)
+    for wrong, field, message in (
+        (light, bubble(2e6), "expected one of charged particles"),
+        (SETUP, bubble(1e12), "expected a weaker field"),
+    ):
+        with pytest.raises(InputError, match=message):
+            object_of_field(field, wrong)
 
 
 def test_a_displacement_without_setup_is_refused_in_an_experiment():

@@ -27,7 +27,7 @@ from napari_shadowinv._system.validation import Model, suggestion, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import IMAGE_TITLES
 from napari_shadowinv.options import FitChoices, FitOptions, Instrument, InversionOptions
-from napari_shadowinv.physics.trace_options import SizedView, TraceOptions
+from napari_shadowinv.physics.trace_options import GridView, SizedView, TraceOptions
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 from napari_shadowinv.preprocessing import ESTIMATES, FIT_STEPS, STEPS, Recipe, Step
 
@@ -503,8 +503,8 @@ def trace_choices(flags: Mapping[str, Any]) -> tuple[SizedView, TraceOptions]:
 
 
 def takes_plan(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the flags of a plan and of an instrument to a command with the argument `flags`."""
-    of_plan = _option_flags(ExperimentOptions, None)
+    """Add the flags of a plan, an instrument and a 3-D field to a command with `flags`."""
+    of_plan = _option_flags(ExperimentOptions, None) + _option_flags(GridView, _TRACE)
     return _with_flags(command, dict([*of_plan, *_option_flags(Instrument, _INSTRUMENT)]))
 
 

@@ -17,6 +17,7 @@ from napari_shadowinv.cli._terminal import (
     warn_of_setups,
 )
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.trace_options import GridView
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
@@ -25,7 +26,8 @@ if TYPE_CHECKING:
 # Help of arguments, where it is longer than a line.
 HELP = {
     "object": "A phantom with its parameters, such as toroid:peak=60,radius=3e-5, or the file of "
-    "an earlier result or of a displacement (.npy).",
+    "an earlier result, of a displacement (.npy), or of E and B on a 3-D grid (openPMD or NetCDF), "
+    "through which particles are traced.",
     "energies": "Energy of each image in MeV (of light: wavelength in m), separated by commas. "
     "Default: one image with the energy of --setup.",
     "size": "Height and width of an image in px, such as 200x200. Default: of the file, or "
@@ -44,6 +46,7 @@ EPILOG = r"""
 shadowinv plan toroid --setup setup.toml --detector film --beam-source TNSA
 shadowinv plan toroid:peak=60 --setup setup.toml --energies 5,15
 shadowinv plan shot.shadowinv --setup next.toml --sweep counts=100,300,1000
+shadowinv plan fields.h5 --setup setup.toml --beam x --right y --centre
 shadowinv plan toroid --setup setup.toml --energies 5,15 --sweep energy=7,10,15,30
 shadowinv plan toroid --setup setup.toml --reference recorded --sweep beam_rms=0.01,0.03,0.1
 
@@ -105,11 +108,12 @@ def plan(
     page = figure or out.with_suffix(PNG.suffix)
     _inputs.check_outputs({out: SITES.suffixes, page: FIGURE_SUFFIXES}, overwrite)
     _inputs.protect([out, page], [setup, recorded_with, _file_of(object)])
+    view = {name: flags.pop(name) for name in GridView.model_fields if name in flags}
     options, instrument = _flags.plan_choices(flags)
     first = None if setup is None else setup_from(setup)
     setups = _setups(first, energies)
     shape = None if size is None else shape_of_text(size, "--size")
-    target: Any = _object(object, recorded_with, deflector)
+    target: Any = _object(object, recorded_with, deflector, setups, view)
     choices: dict[str, Any] = {"shape": shape, "instrument": instrument, "options": options}
     warn_of_setups((each, shape) for each in setups or ())
     result: Any
@@ -136,11 +140,37 @@ def _file_of(text: str) -> Path | None:
     return Path(text) if Path(text).suffix else None
 
 
-def _object(text: str, recorded_with: Path | None, deflector: str | None) -> PlannedObject | Any:
+def _object(
+    text: str,
+    recorded_with: Path | None,
+    deflector: str | None,
+    setups: list[Setup] | None,
+    view: dict[str, Any],
+) -> PlannedObject | Any:
     """Return the phantom of a text, or the object of a file."""
-    from napari_shadowinv.pipeline.experiment_object import object_of_displacement, phantom_of_text
+    from napari_shadowinv.io import is_field_grid, read_field_grid
+    from napari_shadowinv.pipeline.experiment_object import (
+        object_of_displacement,
+        object_of_field,
+        phantom_of_text,
+    )
 
-    if _file_of(text.partition(":")[0]) is None:
+    is_file = _file_of(text.partition(":")[0]) is not None
+    is_grid = is_file and is_field_grid(Path(text))
+    if view and not is_grid:
+        names = ", ".join(f"--{name}" for name in view)
+        raise InputError(f"received {names}, but {text} is no 3-D field: leave them out")
+    if is_grid:
+        if recorded_with is not None or deflector is not None:
+            raise InputError(
+                f"received --recorded-with or --deflector, but {text} is a 3-D field, which needs "
+                "only --setup: leave them out"
+            )
+        if setups is None:
+            raise InputError(f"{text} is a 3-D field: particles through it need --setup")
+        grid = GridView(**view).apply(read_field_grid(Path(text)))
+        return object_of_field(grid, setups[0], title=Path(text).name)
+    if not is_file:
         if recorded_with is not None or deflector is not None:
             flag = "--deflector" if recorded_with is None else "--recorded-with"
             raise InputError(f"received {flag}: it belongs to the object of a file, not a phantom")

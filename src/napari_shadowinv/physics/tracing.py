@@ -1,6 +1,7 @@
 """Images by charged particles that are traced through a 3-D field: `trace`.
 
 - the image of a field on a grid: `trace`, with `TraceOptions`; the answer is a `TracedImage`
+- displacements alone: `traced_displacement`
 - particles with chosen starting points: `trace_particles`; they are `TracedParticles`
 - the exact line integrals of a grid along straight rays: `line_integrals`
 
@@ -61,6 +62,7 @@ __all__ = [
     "line_integrals",
     "trace",
     "trace_particles",
+    "traced_displacement",
 ]
 
 Profile = ArrayLike | Callable[[FloatArray, FloatArray], ArrayLike]
@@ -341,6 +343,45 @@ def trace(
         steps=int(straight.steps.sum()) + tally.steps,
         particles=particles,
     )
+
+
+def traced_displacement(
+    field: FieldGrid,
+    setup: ProtonSetup,
+    shape: Shape = (200, 200),
+    *,
+    options: TraceOptions | None = None,
+    threads: int | None = None,
+) -> FloatArray:
+    """Return the displacement of the ray through each pixel as `trace` does, without an image.
+
+    Parameters
+    ----------
+    field, setup, shape, options, threads
+        As of `trace`.
+
+    Returns
+    -------
+    ndarray, shape (2, H, W)
+        In px.
+
+    Raises
+    ------
+    InputError
+        As of `trace`, or if a ray does not reach the detector.
+    """
+    check_particles(setup)
+    options = as_model(TraceOptions, options, "options")
+    size = checked_shape(shape)
+    count = available_threads(checked_threads(threads))
+    flight = Flight(field_grid(field), setup, size, options, count, Reporter())
+    rays = flight.push(pixel_centres(*image_range(size), 1), "rays")
+    if rays.lost.any():
+        raise InputError(
+            f"{rays.lost.sum()} of {rays.lost.size} particles do not reach the detector: expected "
+            "a weaker field or a higher energy"
+        )
+    return np.asarray(rays.displacement.reshape(2, *size))
 
 
 @dataclass(frozen=True)

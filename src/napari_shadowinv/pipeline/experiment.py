@@ -418,6 +418,7 @@ def _plan(inputs: _Inputs, report: Reporter, should_stop: ShouldStop | None) -> 
         truth=simulator.truth,
         retrieved=first.displacement,
         seconds={"prepare": prepared - start, "shots": ended - prepared},
+        is_thin=inputs.object.is_thin,
     )
 
 

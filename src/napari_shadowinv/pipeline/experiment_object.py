@@ -2,17 +2,17 @@
 
 - a phantom, by its model: `object_of_phantom`; by a text: `phantom_of_text`; the size of an image
   by a text: `shape_of_text`
+- a 3-D field, through which particles are traced: `object_of_field`
 - a field that was retrieved or computed before: `object_of_result`, `object_of_displacement`,
   `object_of_potential`
 
-An object supplies the displacement of rays in any setup. A kind of object that knows more, such as
-a thick one whose particles are traced, overrides `PlannedObject.image`.
+An object supplies the displacement of rays in any setup.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,16 +22,21 @@ from napari_shadowinv._system.arrays import as_numbers, plain_array
 from napari_shadowinv._system.validation import suggestion, validate
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.field_grid import FieldGrid
 from napari_shadowinv.physics.forward import checked_displacement, synthetic_image
+from napari_shadowinv.physics.particle_flight import check_particles
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
 from napari_shadowinv.physics.projection import default_deflector, displacement_ratio
 from napari_shadowinv.physics.setup import Setup, deflector_titles, displacement_from_potential
+from napari_shadowinv.physics.tracing import traced_displacement
 from napari_shadowinv.results import unpack_result
 
 __all__ = [
     "Grid",
     "PlannedObject",
+    "TracedObject",
     "object_of_displacement",
+    "object_of_field",
     "object_of_phantom",
     "object_of_potential",
     "object_of_result",
@@ -95,6 +100,8 @@ class PlannedObject:
     shadow : ndarray of bool, shape (h, w), or None
         Samples where the object stops the beam.
     """
+
+    is_thin: ClassVar[bool] = True
 
     samples: FloatArray
     title: str = "a displacement"
@@ -181,6 +188,67 @@ class PlannedObject:
             from_middle = (line - (side - 1) / 2) * ratio * self.finer
             lines.append(from_middle + (size - 1) / 2)
         return np.stack(np.meshgrid(*lines, indexing="ij"))
+
+
+@dataclass(frozen=True, eq=False)
+class TracedObject(PlannedObject):
+    """A 3-D field, through which particles are traced in every setup; it may be thick.
+
+    Attributes
+    ----------
+    field : FieldGrid
+        E and B around the object.
+    """
+
+    is_thin: ClassVar[bool] = False
+
+    field: FieldGrid = None  # type: ignore[assignment]
+
+    def displacement(self, setup: Setup | None, grid: Grid) -> FloatArray:
+        """Return the displacement in px of a setup at the samples of a grid, (2, h, w).
+
+        Raises
+        ------
+        InputError
+            If the setup is none of particles, or a particle does not reach the detector.
+        """
+        particles = check_particles(setup)
+        finer = check_particles(finer_setup(particles, grid.factor))
+        return traced_displacement(self.field, finer, grid.sizes) / grid.factor
+
+
+def object_of_field(
+    field: FieldGrid, setup: Setup | None, *, title: str = "a 3-D field"
+) -> TracedObject:
+    """Return an object through which particles are traced.
+
+    The displacement of a fit of several energies is that of its first image: what the energies do
+    not share, because the object is thick or E and B act together, is in the error.
+
+    Parameters
+    ----------
+    field : FieldGrid
+        E and B in the frame of the experiment.
+    setup : Setup
+        Its first image; pixels of this size cover the grid if no other shape is chosen.
+    title : str
+        In texts.
+
+    Raises
+    ------
+    InputError
+        If the setup is none of particles, or as of `traced_displacement`.
+    """
+    checked = check_particles(setup)
+    sides = [(last - first) / checked.object_pixel_size for first, last in field.extent[1:]]
+    height, width = (max(int(side), 1) for side in sides)
+    return TracedObject(
+        traced_displacement(field, checked, (height, width)),
+        title=title,
+        setup=checked,
+        deflector="magnetic field" if field.peak("magnetic") else "electric field",
+        field=field,
+    )
 
 
 def object_of_phantom(

@@ -151,6 +151,8 @@ class ExperimentPlan:
         Displacement in the first image, px: at the stated energy, and of the first draw.
     seconds : dict of str to float
         Time of each stage.
+    is_thin : bool
+        Whether the object is taken as thin, not traced.
     """
 
     title: str
@@ -164,6 +166,7 @@ class ExperimentPlan:
     truth: FloatArray
     retrieved: FloatArray
     seconds: dict[str, float]
+    is_thin: bool = True
 
     @property
     def verdicts(self) -> dict[Verdict, int]:
@@ -346,10 +349,13 @@ class ExperimentPlan:
                 "the other fits start near the true field and have the error bars of these"
             )
             yield Fact("searched", "Not tested", text, is_detail=True)
+        is_thin = "is thin and " if self.is_thin else ""
         text = (
-            "the object is thin and does not change between images; scattering, diffraction and "
-            "the instrument's numbers that are not stated are left out"
+            f"the object {is_thin}does not change between images; scattering, diffraction and the "
+            "instrument's numbers that are not stated are left out"
         )
+        if not self.is_thin:
+            text += "; errors are those of the traced displacement, not of the line integral"
         yield Fact("assumed", "Assumed", text, is_detail=True)
 
     def _title(self, name: str) -> str:
