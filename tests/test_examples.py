@@ -133,6 +133,23 @@ def test_film_layers_give_dose_and_displacement(run: Run) -> None:
         assert np.std(inversion.residual) < 0.35 * missing
 
 
+def test_traced_fields_are_found_again(run: Run) -> None:
+    rows = run("traced_fields")["rows"]
+    limits = {"bubble": 0.05, "rod of current": 0.06, "turbulence": 0.1}
+    for name, (traced, _, truth, _, error, (current, true)) in rows.items():
+        assert error < limits[name]
+        assert traced.thin_screen_error < 0.03
+        largest = np.hypot(*truth).max()  # px
+        assert largest > 1
+        if name != "turbulence":
+            assert current == pytest.approx(true, rel=0.03)
+    # ∮ (∫B dz) · dl / µ0 of a rod, exactly, at the radius of the circle.
+    radius, width = 1.2e-4, 8e-5
+    depth = np.trapezoid(1 / (1 + (np.linspace(-6e-4, 6e-4, 97) / 5e-4) ** 16), dx=1.25e-5)
+    exact = 2 * np.pi * radius**2 * 6 / width * np.exp(-(radius**2) / (2 * width**2)) * depth
+    assert abs(rows["rod of current"][5][1]) == pytest.approx(exact / (4e-7 * np.pi), rel=0.02)
+
+
 def test_every_script_is_in_the_gallery_with_its_picture() -> None:
     text = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
     assert set(re.findall(r"python examples/(\w+)\.py", text)) == set(SCRIPTS)
