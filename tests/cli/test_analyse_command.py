@@ -165,6 +165,12 @@ def test_numbers_are_followed_through_the_shots_of_a_store(setup_file: Path, tmp
     assert [float(row["place"]) for row in rows] == [0, 2e-9, 4e-9]
     growth = np.log(float(rows[2]["value"]) / float(rows[0]["value"])) / 4
     assert growth == pytest.approx(0.1, rel=0.05)
+    first_and_last = shadowinv("analyse", store, region, "--shots", "0,2", "--times", "2e-9")
+    (without_middle,) = re.findall(r"growth of rms ([\d.]+) 1/ns", flat(first_and_last.output))
+    assert float(without_middle) == pytest.approx(float(stated), rel=0.01)
+    by_shot = shadowinv("analyse", store, region, "--shots", "0,2")
+    (of_shots,) = re.findall(r"growth of rms ([\d.]+) per shot", flat(by_shot.output))
+    assert float(of_shots) == pytest.approx(2 * float(stated), rel=0.01)
     for flags, message in (
         (["--times", "1,2"], "--times is '1,2', expected the time between two shots in s"),
         (["--out", tmp_path / "a.shadowinv"], "use --csv"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -144,8 +145,13 @@ def time_series(results: Sequence[ProductResult], times: ArrayLike | None = None
     Errors that all shots share, such as the energy's, then count as independent, which makes the
     interval of a growth rate too wide rather than too narrow.
     """
-    unit = "" if times is None else "s"
-    places = np.arange(float(len(results))) if times is None else np.asarray(times, float)
+    if times is None:
+        return _join(results, np.arange(float(len(results))), "")
+    return _join(results, np.asarray(times, dtype=np.float64), "s")
+
+
+def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> TimeSeries:
+    """Join results at times in s, or at numbers of shots."""
     if len(results) < _MIN_SHOTS or places.shape != (len(results),):
         raise InputError(
             f"got {len(results)} results and times of shape {places.shape}, expected a time for "
@@ -243,7 +249,7 @@ def analyse_shots(
     products, unit, deflector, setup, on_progress, should_stop
         As of `analyse`.
     times : array_like, shape (n,), optional
-        Of all shots in s. Default: shots are numbered.
+        Of all shots in s. Default: shots have their numbers in the stack's coordinate ``shot``.
 
     Returns
     -------
@@ -259,12 +265,17 @@ def analyse_shots(
     """
     if "shot" not in getattr(stack, "dims", ()) or "displacement" not in stack:
         raise InputError("got no stack of shots with fields, expected that of a store")
-    places = None if times is None else np.asarray(times, dtype=np.float64)
     count = stack.sizes["shot"]
-    if places is not None and places.shape != (count,):
+    numbers = stack["shot"].values  # 0, 1, … if the stack has no coordinate
+    if numbers.dtype.kind not in "iuf":
+        numbers = np.arange(count)
+    places = np.asarray(numbers if times is None else times, dtype=np.float64)
+    if places.shape != (count,):
         raise InputError(
             f"got times of shape {places.shape}, expected one for each of {count} shots"
         )
+    fitted = json.loads(stack.attrs.get("fields", "[]"))
+    deflector = deflector or (fitted[0] if fitted else None)
     report = Reporter(on_progress, should_stop)
     used, shots = [], []
     for index in range(count):
@@ -276,5 +287,5 @@ def analyse_shots(
         shots.append(analyse(shot, products, unit=unit, deflector=deflector, setup=setup))
     if len(shots) < _MIN_SHOTS:
         raise InputError(f"{len(shots)} of {count} shots have a field, expected at least two")
-    chosen = None if places is None else places[used]
-    return [time_series(results, chosen) for results in zip(*shots, strict=True)]
+    unit_of_places = "" if times is None else "s"
+    return [_join(results, places[used], unit_of_places) for results in zip(*shots, strict=True)]

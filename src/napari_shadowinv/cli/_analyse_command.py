@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -28,8 +29,8 @@ HELP = {
     "deflector": "Field of a fit with several: B, E, plasma or phase. Default: all.",
     "samples": "Samples of the field for the bands.",
     "shots": "Shots of a store, such as 3:20. Default: all finished ones.",
-    "times": "Times of these shots in s: the time between two, or a list 0,1e-9,3e-9. Default: "
-    "shots are numbered.",
+    "times": "Time between two shots of the store in s, or a list for the shots used, such as "
+    "0,1e-9,3e-9. Default: shots are numbered.",
     "csv": "Table of all numbers with their bands.",
     "figure": "Figure of the products: .png, .pdf or .svg.",
     "out": "Copy of the result with the products, .shadowinv.",
@@ -115,7 +116,7 @@ def analyse(
             "should_stop": is_interrupted,
         }
         if content is None:
-            seconds = _times(times, dataset.sizes["shot"])
+            seconds = _times(times, dataset["index"].values.tolist())
             series = analyse_shots(dataset, chosen, seconds, **common)
             results = [each.result for each in series]
         else:
@@ -137,19 +138,20 @@ def _check_series(out: Path | None) -> None:
         )
 
 
-def _times(text: str | None, count: int) -> list[float] | None:
-    """Return the times of shots from the time between two, or from a list of all."""
+def _times(text: str | None, shots: Sequence[int]) -> list[float] | None:
+    """Return the times of numbered shots from the time between two, or from a list of all."""
     if text is None:
         return None
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) == 1 and count > 1:
-        return [number * numbers[0] for number in range(count)]
-    if len(numbers) != count:
+    if len(numbers) == 1 and len(shots) > 1:
+        return [float(shot) * numbers[0] for shot in shots]
+    if len(numbers) != len(shots):
         raise InputError(
-            f"--times is {text!r}, expected the time between two shots in s, or a list of {count}"
+            f"--times is {text!r}, expected the time between two shots in s, or a list for the "
+            f"{len(shots)} finished ones"
         )
     return numbers
 
