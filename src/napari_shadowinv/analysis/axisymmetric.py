@@ -15,6 +15,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 from scipy.constants import mu_0
+from scipy.ndimage import uniform_filter1d
 
 from napari_shadowinv._system.validation import CombinationError
 from napari_shadowinv._typing import FloatArray
@@ -51,6 +52,9 @@ _MIN_RADIUS_PX = 8
 _DEFAULT_SMOOTHING = 1.0
 _MIN_DENSITY_RATIO = 0.02  # below it a temperature is only noise
 _EDGE_SHARE = 0.06  # of the radius, in which the field should have ended
+_NOTABLE_END = 0.15  # of the largest deflection
+_NOTABLE_CHANGE = 0.1  # of the deflection along the axis
+_END_PX, _AT_EDGE_PX = 3, 2.0
 _NOTABLE_EDGE = 0.05  # of the largest deflection
 _NOTABLE_ASYMMETRY = 0.1
 _NOTABLE_LENGTH = 0.02  # of the distance to the source
@@ -229,19 +233,42 @@ class AxisymmetricProfile(Product):
         self, displacement: FloatArray, frame: FieldFrame, shift: float = 0.0
     ) -> tuple[FloatArray, FloatArray]:
         """Return both sides of the object, (slices, radius), averaged over each slice."""
+        right_rows, left_rows = self._rows(displacement, frame, shift)
+        return self._by_slice(right_rows, frame), self._by_slice(left_rows, frame)
+
+    def _by_slice(self, rows: FloatArray, frame: FieldFrame) -> FloatArray:
+        edges = self._slices(frame)
+        widths = np.diff([*edges, len(rows)])
+        return np.asarray(np.add.reduceat(rows, edges, axis=0) / widths[:, None])
+
+    def _rows(
+        self, displacement: FloatArray, frame: FieldFrame, shift: float = 0.0
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return both sides of the object at each place along the axis, (places, radius)."""
         axis = self._axis(frame)
         if shift:
             start, end = (np.array(end) + shift * axis.across for end in (axis.start, axis.end))
             axis = Axis((float(start[0]), float(start[1])), (float(end[0]), float(end[1])))
         component = self._component(displacement, axis, frame)
         is_odd = frame.unit.field != _B
-        sides = sample_sides(component, axis, self._radius_px(frame), is_odd=is_odd)
-        edges = self._slices(frame)
-        widths = np.diff([*edges, len(axis.places())])
-        right_side, left_side = (
-            np.add.reduceat(side, edges, axis=0) / widths[:, None] for side in sides
-        )
-        return right_side, left_side
+        return sample_sides(component, axis, self._radius_px(frame), is_odd=is_odd)
+
+    def _end_share(self, rows: FloatArray, frame: FieldFrame) -> float:
+        """Return the deflection where the axis meets the edge of the image over the largest.
+
+        It is 0 for an object that does not change along its axis.
+        """
+        sizes = np.sqrt((uniform_filter1d(rows, _END_PX, axis=0) ** 2).mean(axis=1))
+        largest = float(sizes.max())
+        if sizes.min() >= (1 - _NOTABLE_CHANGE) * largest:
+            return 0.0
+        axis, last = self._axis(frame), np.array(frame.shape) - 1.0
+        at_edge = [
+            float(size) / largest
+            for point, size in ((axis.start, sizes[0]), (axis.end, sizes[-1]))
+            if min(np.min(point), np.min(last - point)) < _AT_EDGE_PX
+        ]
+        return max(at_edge, default=0.0)
 
     def _slices(self, frame: FieldFrame) -> list[int]:
         """Return the first place of each slice along the axis."""
@@ -288,6 +315,9 @@ class AxisymmetricProfile(Product):
             (), "1", "Difference of the halves of the deflection, relative (r.m.s.)"
         )
         variables["edge"] = Variable((), "1", "Deflection at the edge, relative to the largest")
+        variables["ends"] = Variable(
+            (), "1", "Deflection where the axis meets the edge of the image, relative (r.m.s.)"
+        )
         variables["axis_offset"] = Variable(
             (), PIXEL, "Symmetry axis of the field, offset from the axis"
         )
@@ -336,7 +366,8 @@ class AxisymmetricProfile(Product):
     def measure(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
     ) -> dict[str, FloatArray]:
-        right_side, left_side = self._sides(displacement, frame)
+        right_rows, left_rows = self._rows(displacement, frame)
+        right_side, left_side = (self._by_slice(rows, frame) for rows in (right_rows, left_rows))
         _, inverse = self._operators(frame)
         values = self._profiles((right_side + left_side) / 2 @ inverse.T, frame)
         scale = self._scale(frame)
@@ -348,6 +379,7 @@ class AxisymmetricProfile(Product):
         width = max(round(_EDGE_SHARE * mean.shape[1]), 2)
         edge = np.abs((right_side + left_side)[:, -width:].mean(axis=1) / 2).max()
         values["edge"] = np.asarray(edge / max(mean.max(), 1e-300))
+        values["ends"] = np.asarray(self._end_share((right_rows + left_rows) / 2, frame))
         values["axis_offset"] = np.asarray(_axis_offset(right_side, left_side))
         return values
 
@@ -405,7 +437,7 @@ class AxisymmetricProfile(Product):
 
     def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
         # Noise raises both shares, which say how far the object is from the assumptions.
-        shares = {name: float(quantities[name].value) for name in ("asymmetry", "edge")}
+        shares = {name: float(quantities[name].value) for name in ("asymmetry", "edge", "ends")}
         return [
             replace(fact, text=f"{100 * shares[fact.key]:.2g} %", short="")
             if fact.key in shares
@@ -417,7 +449,16 @@ class AxisymmetricProfile(Product):
         axis, radius = self._axis(frame), self._radius_px(frame)
         points = axis.points(axis.places(), np.arange(-radius + 1.0, radius)).reshape(-1, 2)
         cautions = mask_cautions(points, frame, "the object")
-        edge, halves = (float(quantities[name].value) for name in ("edge", "asymmetry"))
+        edge, halves, ends = (
+            float(quantities[name].value) for name in ("edge", "asymmetry", "ends")
+        )
+        if ends > _NOTABLE_END:
+            text = (
+                f"the object leaves the image along its axis, where its deflection is {ends:.0%} "
+                "of the largest: the closed edge of an inversion distorts the profile near it; use "
+                "a larger image, or a free boundary"
+            )
+            cautions.append(Caution("cut-object", text))
         if edge > _NOTABLE_EDGE:
             text = (
                 f"the deflection at the edge is {edge:.0%} of the largest: the object does not end "
