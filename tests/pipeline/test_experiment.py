@@ -193,11 +193,22 @@ def test_counts_scatter_as_poisson():
     assert image.var() == pytest.approx(50, rel=0.1)
 
 
-def test_the_beam_varies_by_the_stated_share_in_each_draw():
+def test_the_beam_varies_as_its_prior():
+    # A smooth field has an expected r.m.s.; that of a single draw scatters widely about it.
+    instrument = Instrument(beam_rms=0.05, beam_length=0.3)
     blank = PlannedObject(np.zeros((2, 64, 64)), setup=SETUP)
-    chosen = simulator(Instrument(beam_rms=0.05), target=blank)
-    deviations = [chosen.draw(number).images[0].std() / 1e9 for number in range(3)]
-    np.testing.assert_allclose(deviations, 0.05, rtol=0.05)
+    chosen = simulator(instrument, target=blank)
+    beams = np.array([chosen.draw(number).images[0] / 1e9 - 1 for number in range(150)])
+    assert np.abs(beams.mean(axis=(1, 2))).max() < 1e-3
+    assert np.sqrt((beams**2).mean()) == pytest.approx(0.05, rel=0.06)
+    assert beams.std(axis=(1, 2)).max() > 2 * beams.std(axis=(1, 2)).min()
+    # The mean over the image is taken out of a field with Gaussian correlation.
+    apart = np.subtract.outer(np.arange(64), np.arange(64)) / (0.3 * 64)
+    variance = 0.05**2 / (1 - np.exp(-(apart**2) / 2).mean() ** 2)
+    for lag in (6, 12, 24):
+        steps = beams[:, :, lag:] - beams[:, :, :-lag]
+        expected = 2 * variance * (1 - np.exp(-((lag / (0.3 * 64)) ** 2) / 2))
+        assert (steps**2).mean() == pytest.approx(expected, rel=0.12)
 
 
 def test_backgrounds_scatter_by_the_stated_share():
