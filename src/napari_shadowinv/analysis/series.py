@@ -197,18 +197,18 @@ def _facts(series: ProductResult, times: FloatArray, unit: str) -> Iterator[Fact
     for name, quantity in series.quantities.items():
         variable = series.variables[name]
         title = variable.title or name.replace("_", " ")
-        factor, shown = series.scale_of(name)
+        factor, symbol = series.scale_of(name)
         first, last = factor * quantity.value[[0, -1]]
-        text = f"{first:.4g} to {last:.4g} {shown}, first to last shot"
+        text = f"{first:.4g} to {last:.4g} {symbol}, first to last shot"
         yield Fact(name, f"{title[:1].upper()}{title[1:]}", text, short=text)
         is_place = variable.unit in ("m", PIXEL)
         if is_place or not _keeps_sign(quantity) or np.ptp(quantity.value) == 0:
             continue
         rate = _growth_rate(quantity, times)
-        factor, shown = _rate_unit(float(rate.value), unit)
+        factor, symbol = _rate_unit(float(rate.value), unit)
         bands = [rate.band(share) for share in BANDS] if has_bands(rate) else []
         ends = [(factor * float(low), factor * float(high)) for low, high in bands]
-        text = value_text(factor * float(rate.value), ends, shown)
+        text = value_text(factor * float(rate.value), ends, symbol)
         yield Fact(f"growth_{name}", f"Growth of {title}", text, short=text)
     if series.has_bands:
         yield from (fact for fact in series.facts if fact.key == "bands")

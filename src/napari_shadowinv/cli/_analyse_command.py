@@ -17,7 +17,6 @@ from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
     from napari_shadowinv.analysis import Product, ProductResult
-    from napari_shadowinv.results import AnyResult
 
 HELP = {
     "result": "Result of an inversion or a fit, .shadowinv; pradformat, .h5; or a store of shots, "
@@ -91,7 +90,6 @@ def analyse(
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, SITES
     from napari_shadowinv.io.store import is_stack
     from napari_shadowinv.pipeline.files import setup_from
-    from napari_shadowinv.results import result_from_dataset
 
     chosen = _products(product or [], products)
     suffixes = {csv: SITES.suffixes, figure: FIGURE_SUFFIXES, out: RESULT.suffixes}
@@ -101,12 +99,10 @@ def analyse(
     if is_stack(result):
         _check_series(out)
         dataset = open_shots(result, shots)
-        content: AnyResult | None = None
     elif shots is not None or times is not None:
         raise InputError(f"{result} is one result: --shots and --times belong to a store of shots")
     else:
         dataset = read_dataset(result)
-        content = result_from_dataset(dataset)
     with nullcontext() if quiet else progress_bars() as show:
         common: dict[str, Any] = {
             "unit": unit,
@@ -115,13 +111,13 @@ def analyse(
             "on_progress": show,
             "should_stop": is_interrupted,
         }
-        if content is None:
+        if "shot" in dataset.dims:
             seconds = _times(times, dataset["index"].values.tolist())
             series = analyse_shots(dataset, chosen, seconds, **common)
             results = [each.result for each in series]
         else:
             results = measure(dataset, chosen, samples=samples, **common)
-    _write(results, content, dataset, {"csv": csv, "figure": figure, "out": out}, overwrite)
+    _write(results, dataset, {"csv": csv, "figure": figure, "out": out}, overwrite)
     if not quiet:
         for table in _tables(results):
             say(table)
@@ -133,8 +129,8 @@ def _check_series(out: Path | None) -> None:
     """Refuse a copy of a store."""
     if out is not None:
         raise InputError(
-            f"--out {out} is a copy of one result with its products, and the numbers of a store "
-            "have none: use --csv"
+            f"received --out {out}, which copies one result with its products, but a store has "
+            "many results: use --csv"
         )
 
 
@@ -176,7 +172,6 @@ def _products(texts: list[str], file: Path | None) -> list[Product]:
 
 def _write(
     results: list[ProductResult],
-    content: AnyResult | None,
     dataset: Any,
     paths: dict[str, Path | None],
     overwrite: bool,

@@ -190,7 +190,7 @@ class PlannedObject:
         return np.stack(np.meshgrid(*lines, indexing="ij"))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TracedObject(PlannedObject):
     """A 3-D field, through which particles are traced in every setup; it may be thick.
 
@@ -202,7 +202,7 @@ class TracedObject(PlannedObject):
 
     is_thin: ClassVar[bool] = False
 
-    field: FieldGrid = None  # type: ignore[assignment]
+    field: FieldGrid
 
     def displacement(self, setup: Setup | None, grid: Grid) -> FloatArray:
         """Return the displacement in px of a setup at the samples of a grid, (2, h, w).

@@ -248,8 +248,8 @@ class ShotSimulator:
                 correlation = np.exp(-((places[:, None] - places) ** 2) / (2 * length**2))
                 inner = slice(edge, len(places) - edge)
                 variances, vectors = np.linalg.eigh(correlation)
-                kept = variances > _NEGLIGIBLE * variances[-1]
-                root = vectors[:, kept] * np.sqrt(variances[kept])
+                is_notable = variances > _NEGLIGIBLE * variances[-1]
+                root = vectors[:, is_notable] * np.sqrt(variances[is_notable])
                 roots.append((root, float(correlation[inner, inner].mean())))
             self._roots_by_length[length] = roots
         return self._roots_by_length[length]

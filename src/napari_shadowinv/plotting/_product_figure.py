@@ -140,8 +140,8 @@ def draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> None
             if (band := result.band(name, share)) is not None:
                 style: Any = {"color": colour, "alpha": opacity, "linewidth": 0}
                 axes.fill_between(places, scale * band[0], scale * band[1], **style)
-    shown = f"{prefix}{coordinate.unit}" if has_prefix else display_unit(coordinate.unit)
-    axes.set_xlabel(f"{coordinate.long_name} ({shown})" if shown else coordinate.long_name)
+    symbol = f"{prefix}{coordinate.unit}" if has_prefix else display_unit(coordinate.unit)
+    axes.set_xlabel(f"{coordinate.long_name} ({symbol})" if symbol else coordinate.long_name)
     axes.set_ylabel(f"field ({unit})" if unit == result.unit.symbol else unit)
     if result.is_logarithmic:
         make_logarithmic(axes)
