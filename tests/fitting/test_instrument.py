@@ -13,6 +13,7 @@ from napari_shadowinv.fitting import Fit, FitOptions, fit
 from napari_shadowinv.fitting.descent import coarser
 from napari_shadowinv.fitting.instrument import (
     Imperfect,
+    ProductShapes,
     Shapes,
     imperfect_instrument,
     number_text,
@@ -21,6 +22,7 @@ from napari_shadowinv.fitting.instrument import (
 )
 from napari_shadowinv.fitting.measurements import collect_data
 from napari_shadowinv.fitting.posterior import Posterior
+from napari_shadowinv.inversion.imperfections import SmoothField
 from napari_shadowinv.physics.units import shown_fields
 
 SIZE = (48, 56)
@@ -242,7 +244,41 @@ def test_numbers_keep_their_places_in_larger_pixels() -> None:
     assert fine.counts == (5, 1)
     assert coarse.blur == 1.0
     (part,) = coarse.shapes
-    np.testing.assert_allclose(part.values.mean(axis=(1, 2)), shapes.mean(axis=(1, 2)))
+    np.testing.assert_allclose(part.planes.mean(axis=(1, 2)), shapes.mean(axis=(1, 2)))
+
+
+def smooth_shapes() -> tuple[Shapes, np.ndarray]:
+    """Shapes with a plane and products, around images of 24 × 32 px, and the planes of all."""
+    rng = np.random.default_rng(3)
+    field = SmoothField(12.0, rng.uniform(0.5, 1.5, (24, 32)))
+    around, envelope = ((4, 4), (4, 4)), rng.random((24, 32))
+    products = ProductShapes.of_field(field, 0.1, around, envelope)
+    fields = np.stack([field.of(unit) for unit in np.eye(field.count)])
+    beyond = np.pad(fields, ((0, 0), *around), mode="edge") * np.pad(envelope, around)
+    plane = rng.random((1, 32, 40))
+    return Shapes("beam", plane, products), np.concatenate([plane, 0.1 * beyond])
+
+
+def test_products_of_functions_are_the_planes_of_a_smooth_field() -> None:
+    shapes, planes = smooth_shapes()
+    rng = np.random.default_rng(4)
+    numbers, image = rng.normal(size=len(planes)), rng.normal(size=planes.shape[1:])
+    assert len(shapes) == len(planes) > 5
+    np.testing.assert_allclose(shapes.sum(numbers), np.tensordot(numbers, planes, 1), atol=1e-12)
+    np.testing.assert_allclose(shapes.pull(image), np.tensordot(planes, image, 2), atol=1e-12)
+    np.testing.assert_allclose(
+        shapes.squares(image**2), np.tensordot(planes**2, image**2, 2), atol=1e-12
+    )
+    np.testing.assert_allclose(shapes.mean_squares, (planes**2).mean(axis=(1, 2)), atol=1e-12)
+
+
+def test_products_of_functions_have_block_means_in_larger_pixels() -> None:
+    shapes, planes = smooth_shapes()
+    numbers = np.random.default_rng(5).normal(size=len(planes))
+    means = np.tensordot(numbers, planes, 1).reshape(16, 2, 20, 2).mean(axis=(1, 3))
+    coarse = shapes.coarsen(2).sum(numbers)
+    # Fields that hardly change in a pixel, under an envelope that does.
+    assert np.abs(coarse - means).max() < 0.02 * np.abs(means).max()
 
 
 def test_beams_vary_as_far_as_stated() -> None:
@@ -258,7 +294,8 @@ def test_beams_vary_as_far_as_stated() -> None:
         other_strengths=None,
     )
     for shapes, rms in zip(imperfect.shapes, (0.04, 0.02), strict=True):
-        inside = shapes.values[:, 4:-4, 4:-6]
+        planes = np.stack([shapes.sum(unit) for unit in np.eye(len(shapes))])
+        inside = planes[:, 4:-4, 4:-6]
         assert np.sqrt((inside**2).sum(axis=0).mean()) == pytest.approx(rms, rel=0.01)
         np.testing.assert_allclose(inside.mean(axis=(1, 2)), 0, atol=1e-12)
 

@@ -294,14 +294,14 @@ class Scene:
             "other_field": 0.1 * (images - 1),
             "background": np.full(weights.shape, imperfect.background),
         }
-        shapes = {each.key: each.values for each in imperfect.shapes}
+        shapes = {each.key: each for each in imperfect.shapes}
+        sides = zip(self.beams.shape[1:], weights.shape[1:], strict=True)
+        around = [(self.pad, beams - self.pad - image) for beams, image in sides]
         for part in imperfect.parts:
             if part.key in shapes:
-                rows, columns = weights.shape[1:]
-                inner = shapes[part.key][
-                    :, self.pad : self.pad + rows, self.pad : self.pad + columns
-                ]
-                curvature = np.einsum("lyx,kyx->lk", weights, inner**2)
+                curvature = np.stack(
+                    [shapes[part.key].squares(np.pad(each, around)) for each in weights]
+                )
             else:
                 curvature = np.einsum("lyx,lyx->l", weights, changes[part.key] ** 2)[:, None]
             if part.is_common:

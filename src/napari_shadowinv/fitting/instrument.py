@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.fft import dctn, idctn
 
-from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.inversion.imperfections import (
     IMPERFECTIONS,
     BeamExcess,
@@ -38,6 +38,9 @@ _FITTED_VARIANCE = 0.99999
 _DIMMEST = 1e-2  # of a beam's mean, for a relative change
 
 
+Around = tuple[tuple[int, int], tuple[int, int]]
+
+
 class Part(NamedTuple):
     """Numbers of one imperfection: their places among the common ones or those of each image."""
 
@@ -47,15 +50,122 @@ class Part(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes:
-    """Relative changes of a beam by one standard deviation of each number, (n, …).
+class ProductShapes:
+    """Patterns (a_i(y) b_j(x) - c) e(y, x): those of a smooth field, without a plane for each.
 
-    The change of the beams of all images is common, or each has its own.
+    `modes` are the functions a (n, H) and b (m, W), `places` (2, k) their numbers i and j for each
+    pattern, `means` (k,) the constants c, and e the `envelope` (H, W).
+    """
+
+    modes: tuple[FloatArray, FloatArray]
+    places: IntArray
+    means: FloatArray
+    envelope: FloatArray | None = None
+
+    @classmethod
+    def of_field(
+        cls, field: SmoothField, size: float, around: Around, envelope: FloatArray | None = None
+    ) -> ProductShapes:
+        """Return the patterns of a smooth field, which go on beyond the image as at its edge."""
+        along_y, along_x = (
+            np.pad(functions, ((0, 0), beyond), mode="edge")
+            for functions, beyond in zip(field.modes, around, strict=True)
+        )
+        size *= field.size
+        outer = None if envelope is None else np.pad(envelope, around)
+        return cls((size * along_y, along_x), field.places, size * field.means, outer)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def sum(self, numbers: FloatArray) -> FloatArray:
+        """Return the sum of the patterns times numbers, shape (H, W)."""
+        along_y, along_x = self.modes
+        strengths = np.zeros((len(along_y), len(along_x)))
+        strengths[tuple(self.places)] = numbers
+        lines = np.einsum("nm,mx->nx", strengths, along_x)
+        total = np.einsum("ny,nx->yx", along_y, lines) - np.einsum("k,k", self.means, numbers)
+        return np.asarray(total if self.envelope is None else self.envelope * total)
+
+    def products(self, image: FloatArray) -> FloatArray:
+        """Return the scalar product of an image with each pattern."""
+        image = image if self.envelope is None else self.envelope * image
+        return np.asarray(self._along(image, self.modes) - image.sum() * self.means)
+
+    def squares(self, weights: FloatArray) -> FloatArray:
+        """Return the weighted sum of each pattern's square."""
+        if self.envelope is not None:
+            weights = self.envelope**2 * weights
+        along_y, along_x = self.modes
+        squares = self._along(weights, (along_y**2, along_x**2))
+        mixed = self._along(weights, self.modes)
+        return np.asarray(squares - 2 * self.means * mixed + self.means**2 * weights.sum())
+
+    def coarsen(self, factor: int) -> ProductShapes:
+        """Return the patterns in larger pixels."""
+        along_y, along_x = (
+            functions.reshape(len(functions), -1, factor).mean(axis=2) for functions in self.modes
+        )
+        outer = None if self.envelope is None else _block_means(self.envelope[None], factor)[0]
+        return ProductShapes((along_y, along_x), self.places, self.means, outer)
+
+    def _along(self, image: FloatArray, modes: tuple[FloatArray, FloatArray]) -> FloatArray:
+        along_y, along_x = modes
+        lines = np.einsum("ny,yx->nx", along_y, image)
+        table = np.einsum("nx,mx->nm", lines, along_x)
+        return np.asarray(table[tuple(self.places)])
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """Relative changes of a beam by one standard deviation of each number.
+
+    The change of the beams of all images is common, or each has its own. Those of the first numbers
+    are `planes` (n, H, W), those of the others products of functions of y and x.
     """
 
     key: str
-    values: FloatArray
+    planes: FloatArray
+    products: ProductShapes | None = None
     is_common: bool = True
+
+    def __len__(self) -> int:
+        return len(self.planes) + (0 if self.products is None else len(self.products))
+
+    def sum(self, numbers: FloatArray) -> FloatArray:
+        """Return the change by numbers, shape (H, W)."""
+        of_planes, of_products = np.split(numbers, [len(self.planes)])
+        if self.products is None:
+            return np.asarray(np.einsum("k,kyx->yx", of_planes, self.planes))
+        total = self.products.sum(of_products)
+        for number, plane in zip(of_planes, self.planes, strict=True):
+            total += number * plane
+        return total
+
+    def pull(self, image: FloatArray) -> FloatArray:
+        """Return the transpose of `sum` times an image."""
+        of_planes = np.einsum("yx,kyx->k", image, self.planes)
+        if self.products is None:
+            return np.asarray(of_planes)
+        return np.append(of_planes, self.products.products(image))
+
+    def squares(self, weights: FloatArray) -> FloatArray:
+        """Return the weighted sum of the square of each number's change."""
+        of_planes = np.einsum("yx,kyx->k", weights, self.planes**2)
+        if self.products is None:
+            return np.asarray(of_planes)
+        return np.append(of_planes, self.products.squares(weights))
+
+    @property
+    def mean_squares(self) -> FloatArray:
+        """Mean square of the change by each number."""
+        shape = self.planes.shape[1:]
+        return self.squares(np.full(shape, 1 / np.prod(shape)))
+
+    def coarsen(self, factor: int) -> Shapes:
+        """Return the same in larger pixels."""
+        products = None if self.products is None else self.products.coarsen(factor)
+        return replace(self, planes=_block_means(self.planes, factor), products=products)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +203,7 @@ class Imperfect:
             ("blur", True, int(self.blur > 0)),
             ("other_field", True, int(self.other_strengths is not None)),
             ("background", False, int(self.background > 0)),
-            *((each.key, each.is_common, len(each.values)) for each in self.shapes),
+            *((each.key, each.is_common, len(each)) for each in self.shapes),
         ]
         ends = {True: 0, False: 0}
         for key, is_common, size in sizes:
@@ -138,9 +248,7 @@ class Imperfect:
 
     def coarsen(self, factor: int) -> Imperfect:
         """Return the same in larger pixels."""
-        shapes = tuple(
-            replace(each, values=_block_means(each.values, factor)) for each in self.shapes
-        )
+        shapes = tuple(each.coarsen(factor) for each in self.shapes)
         return replace(self, blur=self.blur / factor**2, shapes=shapes)
 
     def number(self, key: str, common: FloatArray, separate: FloatArray) -> float:
@@ -194,17 +302,17 @@ class Imperfect:
 
     def shape_changes(self, common: FloatArray, separate: FloatArray) -> FloatArray:
         """Return the sum of the shapes times their numbers."""
-        total = np.zeros(self.shapes[0].values.shape[1:])
-        for part, each in self._shape_parts():
-            numbers = (common if part.is_common else separate)[part.places]
-            total += np.einsum("k,kyx->yx", numbers, each.values)
-        return total
+        changes = [
+            each.sum((common if part.is_common else separate)[part.places])
+            for part, each in self._shape_parts()
+        ]
+        return np.asarray(sum(changes))
 
     def pull_shapes(self, pull: FloatArray, common: FloatArray, separate: FloatArray) -> None:
         """Add the transpose of `shape_changes` times a pull to derivatives by the numbers."""
         for part, each in self._shape_parts():
             slope = common if part.is_common else separate
-            slope[part.places] += np.einsum("yx,kyx->k", pull, each.values)
+            slope[part.places] += each.pull(pull)
 
     def _shape_parts(self) -> Iterator[tuple[Part, Shapes]]:
         places = {part.key: part for part in self.parts}
@@ -235,7 +343,7 @@ def numbers_in_units(
     variance for the blur, the r.m.s. of the numbers' shapes for beams and transmission.
     """
     units = {"gamma": imperfect.gamma, "blur": imperfect.blur, "background": imperfect.background}
-    shapes = {each.key: each.values for each in imperfect.shapes}
+    shapes = {each.key: each for each in imperfect.shapes}
     report = {}
     for part in imperfect.parts:
         values, *spread = (
@@ -244,7 +352,7 @@ def numbers_in_units(
         )
         deviation = np.sqrt(np.mean(np.square(spread), axis=0)) if spread else values * np.nan
         if part.key in shapes:
-            squares = (shapes[part.key] ** 2).mean(axis=(1, 2))
+            squares = shapes[part.key].mean_squares
             rows = [np.sqrt(each**2 @ squares) for each in (values, deviation)]
         else:
             rows = [units.get(part.key, 1.0) * each[:, 0] for each in (values, deviation)]
@@ -306,7 +414,7 @@ def imperfect_instrument(
     beam: BeamPrior,
     sources: FloatArray,
     used: BoolArray,
-    around: tuple[tuple[int, int], tuple[int, int]],
+    around: Around,
     *,
     is_common: bool,
     is_unknown: bool,
@@ -335,23 +443,20 @@ def imperfect_instrument(
     """
     weights = used.astype(np.float64)
     shapes = []
-
-    def add(key: str, patterns: FloatArray, *, common: bool) -> None:
-        if np.any(patterns):
-            beyond = np.pad(patterns, ((0, 0), *around), mode="edge")
-            shapes.append(Shapes(key, beyond, common))
-
     if beam.rms and not is_unknown:
         excess = BeamExcess(beam, weights, _FITTED_VARIANCE)
-        patterns = beam.rms * np.stack([excess.of(unit) for unit in np.eye(excess.count)])
-        add("beam", patterns, common=is_common)
+        planes = _beyond(beam.rms * excess.shapes, around)
+        rest = ProductShapes.of_field(excess.rest, beam.rms * excess.rest_share, around)
+        shapes.append(Shapes("beam", planes, rest, is_common))
     if beam.between and len(sources) > 1:
         smooth = SmoothField(beam.length * min(weights.shape), weights, _FITTED_VARIANCE)
-        patterns = beam.between * np.stack([smooth.of(unit) for unit in np.eye(smooth.count)])
-        add("beam_between", patterns, common=False)
+        rest = ProductShapes.of_field(smooth, beam.between, around)
+        shapes.append(Shapes("beam_between", _no_planes(rest), rest, is_common=False))
     if instrument.registration and is_common:
         source = np.maximum(sources[0], _DIMMEST)
-        add("registration", instrument.registration * motions(source) / source, common=True)
+        planes = instrument.registration * motions(source) / source
+        if np.any(planes):
+            shapes.append(Shapes("registration", _beyond(planes, around)))
     return Imperfect(
         gamma=instrument.gamma,
         blur=instrument.blur**2,
@@ -369,11 +474,20 @@ def absorption_shapes(
     rms: float,
     displacement: FloatArray,
     used: BoolArray,
-    around: tuple[tuple[int, int], tuple[int, int]],
+    around: Around,
 ) -> Shapes:
     """Return the transmission of an object with a displacement in px, (2, H, W)."""
     scene = Scene(displacement, used.astype(np.float64), used)
     envelope, radius = scene.object_region
     smooth = SmoothField(radius, scene.source, _FITTED_VARIANCE)
-    patterns = np.stack([envelope * smooth.of(unit) for unit in np.eye(smooth.count)])
-    return Shapes("absorption", np.pad(rms * patterns, ((0, 0), *around)))
+    products = ProductShapes.of_field(smooth, rms, around, envelope)
+    return Shapes("absorption", _no_planes(products), products)
+
+
+def _beyond(planes: FloatArray, around: Around) -> FloatArray:
+    """Planes that go on beyond the image as at its edge."""
+    return np.pad(planes, ((0, 0), *around), mode="edge")
+
+
+def _no_planes(products: ProductShapes) -> FloatArray:
+    return np.empty((0, *(functions.shape[1] for functions in products.modes)))

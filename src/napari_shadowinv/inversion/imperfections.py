@@ -112,28 +112,37 @@ class SmoothField:
     ----------
     count : int
         Number of modes.
+    modes : list of ndarray
+        Functions of y (n, H) and of x (m, W), whose products are the modes.
+    places : ndarray of int, shape (2, count)
+        Numbers of both functions of each mode.
+    means : ndarray, shape (count,)
+        Weighted mean of each product, which is subtracted.
+    size : float
+        Factor of all modes.
     """
 
     def __init__(self, length: float, weights: FloatArray, share: float = _VARIANCE) -> None:
-        self._modes = [_line_modes(size, length, share) for size in weights.shape]
+        self.modes = [_line_modes(size, length, share) for size in weights.shape]
         weights = weights / weights.sum()
-        along_y, along_x = self._modes
+        along_y, along_x = self.modes
         means = along_y @ weights @ along_x.T
         squares = along_y**2 @ weights @ (along_x**2).T - means**2
         order = np.argsort(squares, axis=None)[::-1]
         held = np.cumsum(squares.ravel()[order]) / squares.sum()
         self.count = int(np.searchsorted(held, share)) + 1
-        self._chosen = order[: self.count]
-        self._means = means.ravel()[self._chosen]
-        self._size = 1 / np.sqrt(squares.ravel()[self._chosen].sum())
+        chosen = order[: self.count]
+        self.places = np.stack(np.unravel_index(chosen, squares.shape))
+        self.means = means.ravel()[chosen]
+        self.size = float(1 / np.sqrt(squares.ravel()[chosen].sum()))
 
     def of(self, numbers: FloatArray) -> FloatArray:
         """Return the field of `count` numbers, shape (H, W)."""
-        along_y, along_x = self._modes
+        along_y, along_x = self.modes
         strengths = np.zeros((len(along_y), len(along_x)))
-        strengths.ravel()[self._chosen] = numbers
-        field = along_y.T @ strengths @ along_x - self._means @ numbers
-        return np.asarray(self._size * field)
+        strengths[tuple(self.places)] = numbers
+        field = along_y.T @ strengths @ along_x - self.means @ numbers
+        return np.asarray(self.size * field)
 
 
 def _line_modes(size: int, length: float, share: float) -> FloatArray:
@@ -411,28 +420,32 @@ class BeamExcess:
     ----------
     count : int
         Number of independent normal numbers.
+    shapes : ndarray, shape (n, H, W)
+        Shapes of the prior, of the first numbers.
+    rest : SmoothField
+        Of the other numbers, times `rest_share`.
     """
 
     def __init__(self, beam: BeamPrior, source: FloatArray, share: float = _VARIANCE) -> None:
-        self._rest = SmoothField(beam.length * min(source.shape), source, share)
-        self._rest_share, self._shapes = 1.0, np.empty((0, *source.shape))
+        self.rest = SmoothField(beam.length * min(source.shape), source, share)
+        self.rest_share, self.shapes = 1.0, np.empty((0, *source.shape))
         if beam.components is not None:
             block = beam.components.block
             places = (np.indices(source.shape) + 0.5) / block - 0.5
-            self._shapes = np.array(
+            self.shapes = np.array(
                 [
                     map_coordinates(pattern / beam.rms, places, order=1, mode="nearest")
                     for pattern in beam.components.patterns
                 ]
             ).reshape(-1, *source.shape)
-            self._rest_share = beam.components.rest / beam.rms
-        self.count = len(self._shapes) + self._rest.count
+            self.rest_share = beam.components.rest / beam.rms
+        self.count = len(self.shapes) + self.rest.count
 
     def of(self, numbers: FloatArray) -> FloatArray:
         """Return the difference of `count` numbers, (H, W), whose r.m.s. is about 1."""
-        of_shapes, of_rest = np.split(numbers, [len(self._shapes)])
-        excess = self._rest_share * self._rest.of(of_rest)
-        return np.asarray(excess + np.tensordot(of_shapes, self._shapes, 1))
+        of_shapes, of_rest = np.split(numbers, [len(self.shapes)])
+        excess = self.rest_share * self.rest.of(of_rest)
+        return np.asarray(excess + np.tensordot(of_shapes, self.shapes, 1))
 
     def change(self, shot: RecordedShot, rms: float, numbers: FloatArray) -> RecordedShot:
         """Return the shot with a beam of an r.m.s. difference."""
