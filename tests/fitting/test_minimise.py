@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.descent import minimise, product, solve
+from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
+from napari_shadowinv.fitting.descent import minimise
 
 
 def positive_definite(size: int, seed: int) -> FloatArray:
@@ -105,6 +106,59 @@ def test_nothing_on_the_right_gives_nothing() -> None:
     np.testing.assert_array_equal(
         solve(lambda v: v, np.zeros(4), tolerance=0.1, iterations=5), np.zeros(4)
     )
+
+
+def with_soft_directions(size: int, soft: int, seed: int) -> FloatArray:
+    """A matrix with eigenvalues between 0.6 and 2, but for some down to 0.0001."""
+    rng = np.random.default_rng(seed)
+    directions = np.linalg.qr(rng.normal(size=(size, size)))[0]
+    values = np.append(np.geomspace(1e-4, 0.3, soft), rng.uniform(0.6, 2, size - soft))
+    return np.asarray(directions * values @ directions.T)
+
+
+def solve_and_count(
+    matrix: FloatArray, right: FloatArray, modes: SoftModes | None = None
+) -> tuple[FloatArray, int]:
+    steps = [0]
+    solution = solve(
+        lambda v: matrix @ v,
+        right,
+        tolerance=1e-6,
+        iterations=2000,
+        after_step=steps.append,
+        modes=modes,
+    )
+    return solution, steps[-1]
+
+
+def test_soft_modes_of_a_solution_make_the_next_ones_short() -> None:
+    rng = np.random.default_rng(6)
+    matrix, modes = with_soft_directions(600, 25, 7), SoftModes()
+    # A matrix nearby: the energy of no vector changes by more than 2 %.
+    root = np.linalg.cholesky(matrix)
+    noise = rng.normal(size=matrix.shape)
+    noise = (noise + noise.T) / np.linalg.norm(noise + noise.T, 2)
+    nearby = root @ (np.eye(600) + 0.02 * noise) @ root.T
+    for _ in range(2):
+        solve_and_count(matrix, rng.normal(size=600), modes)
+    assert 20 <= len(modes) <= 40
+    right = rng.normal(size=600)
+    solution, steps = solve_and_count(nearby, right, modes)
+    plain, plain_steps = solve_and_count(nearby, right)
+    assert steps < 40 < 150 < plain_steps
+    error = np.linalg.norm(nearby @ solution - right) / np.linalg.norm(right)
+    assert error < 1.1e-6
+    np.testing.assert_allclose(solution, plain, atol=2e-3 * np.abs(plain).max())
+
+
+def test_modes_of_another_matrix_do_no_harm() -> None:
+    rng, modes = np.random.default_rng(8), SoftModes()
+    solve_and_count(with_soft_directions(300, 20, 9), rng.normal(size=300), modes)
+    assert len(modes) > 0
+    for size in (300, 200):
+        matrix, right = with_soft_directions(size, 20, 10), rng.normal(size=size)
+        solution, _ = solve_and_count(matrix, right, modes)
+        assert np.linalg.norm(matrix @ solution - right) < 1.1e-6 * np.linalg.norm(right)
 
 
 def test_product_is_the_scalar_product() -> None:

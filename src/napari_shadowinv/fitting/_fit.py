@@ -228,7 +228,8 @@ def fit(
             unsure = replace(scene, imperfect=imperfect, held=imperfect.keys)
         middle = replace(coarser(unsure, best.bin), spacing=_SPACING_OF_SAMPLES)
         ends = _with_numbers(unsure, best).unknowns
-        posterior = Posterior(middle, ends, rng, lambda: on_step("samples", value))
+        modes = None if data.single else best.modes
+        posterior = Posterior(middle, ends, rng, lambda: on_step("samples", value), modes)
         if pattern.lacks_counts:
             absorbed = posterior.count_determined(np.random.default_rng(options.seed))
             share = pattern.missing_counts - absorbed / np.count_nonzero(scene.weights)

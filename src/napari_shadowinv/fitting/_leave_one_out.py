@@ -18,7 +18,8 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting._fit import collect_starts, reweight_counts
 from napari_shadowinv.fitting.compilation import ensure_compiled
-from napari_shadowinv.fitting.descent import coarser, finer, product, settle
+from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
+from napari_shadowinv.fitting.descent import coarser, finer, settle
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import FitData, collect_data
 from napari_shadowinv.fitting.posterior import Posterior
@@ -319,9 +320,10 @@ class _Work:
         least_gain: float = COARSE_GAIN,
     ) -> Minimum:
         """Fit some of the images; brightness and frames of the others stay."""
-        first = replace(minimum, unknowns=minimum.unknowns.only(members))
+        first = replace(minimum, unknowns=minimum.unknowns.only(members), modes=SoftModes())
         end = settle_minimum(scene.only(members), first, self._on_step, name, least_gain)
-        return replace(end, unknowns=minimum.unknowns.with_images(members, end.unknowns))
+        unknowns = minimum.unknowns.with_images(members, end.unknowns)
+        return replace(end, unknowns=unknowns, modes=SoftModes())
 
     @staticmethod
     def _chi2_in_middle(scene: Scene, minimum: Minimum, members: list[int]) -> FloatArray:

@@ -2,12 +2,11 @@
 
 - by L-BFGS: `descend`; by Gauss and Newton, where it is near: `settle`
 - larger and smaller pixels: `coarser`, `finer`
-- minimisation and linear systems of flat arrays: `minimise`, `solve`
+- minimisation of functions of flat arrays: `minimise`
 
 References
 ----------
-D. C. Liu and J. Nocedal, Math. Prog. 45, 503 (1989); M. R. Hestenes and E. Stiefel, J. Res. Natl.
-Bur. Stand. 49, 409 (1952).
+D. C. Liu and J. Nocedal, Math. Prog. 45, 503 (1989).
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ import numpy as np
 from scipy.fft import dctn, idctn
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import POWERS, Fiducials, Unknowns
@@ -32,10 +32,8 @@ __all__ = [
     "descend",
     "finer",
     "minimise",
-    "product",
     "settle",
     "smoothness_in_pixels",
-    "solve",
 ]
 
 _PAIRS = 20  # of steps and changes of the gradient that are kept
@@ -43,11 +41,6 @@ _DECREASE, _SLOPE = 1e-4, 0.9  # Wolfe's conditions
 _TRIALS = 12  # steps tried along a line
 
 Objective = Callable[[FloatArray], tuple[float, FloatArray]]
-
-
-def product(first: FloatArray, second: FloatArray) -> float:
-    """Scalar product without BLAS, whose idle threads spin and whose sums depend on them."""
-    return float(np.einsum("i,i", first, second))
 
 
 def minimise(
@@ -150,52 +143,14 @@ def _step_along(
     return best
 
 
-def solve(
-    times: Callable[[FloatArray], FloatArray],
-    right: FloatArray,
-    *,
-    tolerance: float,
-    iterations: int,
-    after_step: Callable[[int], None] | None = None,
-) -> FloatArray:
-    """Solve a positive definite system by conjugate gradients, from zero.
-
-    Parameters
-    ----------
-    times : callable
-        The matrix times a vector.
-    right : ndarray, shape (n,)
-        The right side.
-    tolerance : float
-        Length of the residual relative to the right side.
-    iterations : int
-        Most steps.
-    after_step : callable, optional
-        Receives the number of steps.
-    """
-    solution = np.zeros_like(right)
-    residual, direction = right.copy(), right.copy()
-    square = first = product(residual, residual)
-    for k in range(iterations):
-        if square <= tolerance**2 * first:
-            break
-        image = times(direction)
-        share = square / product(direction, image)
-        solution += share * direction
-        residual -= share * image
-        square, before = product(residual, residual), square
-        direction = residual + square / before * direction
-        if after_step is not None:
-            after_step(k + 1)
-    return solution
-
-
 _DESCENTS = 3  # with fixed numbers of rays each
 _FEW = 10  # steps, after which the numbers of rays still fit
 _MOST_NEWTON, _MOST_SHORTENED, _SHARES_OF_STEP = 8, 2, (1.0, 0.5, 0.25)  # of Gauss and Newton
 _NEWTON, _MOST_SOLVING = 0.02, 200  # how exactly each is found, and in how many steps
 # Fields and numbers of an instrument that explain an image alike lie along a flat valley.
 _NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 2e-3, 400, 0.1
+# Numbers of rays are renewed after steps that gain more; other numbers change the objective by 1.
+_RENEWING_GAIN = 5.0
 _MOST_PIXELS = 2_000_000  # of all images
 
 
@@ -296,7 +251,7 @@ def descend(
     steps : int
     """
     scales = Preconditioner(scene)
-    unknowns, steps, value = scales.damp(start), 0, np.inf
+    unknowns, steps, value = start, 0, np.inf
     for _ in range(_DESCENTS):
         counts, base = scene.ray_counts(unknowns), unknowns
 
@@ -326,6 +281,7 @@ def settle(
     steps: int,
     least_gain: float,
     after_step: Callable[[float], None] | None = None,
+    modes: SoftModes | None = None,
 ) -> tuple[Unknowns, float, int, bool]:
     """Minimise a scene's objective from nearby: Gauss-Newton steps, and a descent if they fail.
 
@@ -341,6 +297,8 @@ def settle(
         Ends where one step, or five of a descent, lower the objective by less.
     after_step : callable, optional
         Receives the objective often.
+    modes : SoftModes, optional
+        Of the Hessians of this scene, from scenes of the same pixels and priors.
 
     Returns
     -------
@@ -355,8 +313,9 @@ def settle(
     if scene.has_free_numbers:
         tolerance, solving = _NEWTON_IN_VALLEY, _MOST_IN_VALLEY
         least_gain *= _GAIN_IN_VALLEY
+    modes = SoftModes() if modes is None else modes
     scales = Preconditioner(scene)
-    now = scales.damp(start)
+    now = start
     counts = scene.ray_counts(now)
     value, slope = scene.value_and_gradient(now, counts)
     # Jacobians of many pixels would fill the memory.
@@ -372,21 +331,23 @@ def settle(
             return scales.transpose_times(linear.hessian_times(change)).flat()  # noqa: B023
 
         down = -scales.transpose_times(slope).flat()
-        step = solve(times, down, tolerance=tolerance, iterations=solving)
+        step = solve(times, down, tolerance=tolerance, iterations=solving, modes=modes)
         change = scales.times(now.like(step))
         for share in _SHARES_OF_STEP:
             trial = now.plus(now.like(share * change.flat()))
-            trial_counts = scene.ray_counts(trial)
-            trial_value, trial_slope = scene.value_and_gradient(trial, trial_counts)
+            trial_value, trial_slope = scene.value_and_gradient(trial, counts)
             if trial_value < value:
                 break
         else:
             break
         taken, shortened = taken + 1, shortened + (share < 1)
         gain = value - trial_value
-        now, counts, value, slope = trial, trial_counts, trial_value, trial_slope
+        now, value, slope = trial, trial_value, trial_slope
         if gain < least_gain:
-            return now, value, taken, True
+            return now, _value_afresh(scene, now), taken, True
+        if gain > _RENEWING_GAIN:
+            counts = scene.ray_counts(now)
+            value, slope = scene.value_and_gradient(now, counts)
     remaining_steps = steps - taken
     if remaining_steps > 0:
         now, value, more = descend(
@@ -394,6 +355,11 @@ def settle(
         )
         taken += more
     return now, value, taken, taken < steps
+
+
+def _value_afresh(scene: Scene, unknowns: Unknowns) -> float:
+    """The objective with the numbers of rays that the unknowns need."""
+    return scene.value_and_gradient(unknowns, scene.ray_counts(unknowns))[0]
 
 
 def binned(planes: FloatArray, factor: int) -> FloatArray:

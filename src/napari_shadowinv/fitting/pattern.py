@@ -21,6 +21,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, laplace
 
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.fitting.conjugate_gradients import SoftModes
 from napari_shadowinv.fitting.descent import coarser
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import strengths_of
@@ -346,7 +347,7 @@ def name_cause(
     excess = float((misfit * (pixels.weights > 0).sum(axis=(1, 2))).sum())
     gains = []
     for rival in _rivals(scene, best, names, setups):
-        start = replace(best, unknowns=rival.unknowns)
+        start = replace(best, unknowns=rival.unknowns, modes=SoftModes())
         end = settle_minimum(rival.scene, start, on_step, "rivals", steps=_STEPS)
         gains.append((2 * (best.value - end.value) - rival.free_numbers, rival.cause))
     gains.sort(reverse=True)

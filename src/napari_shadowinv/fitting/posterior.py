@@ -24,7 +24,8 @@ from scipy.linalg import eigh_tridiagonal
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.descent import Preconditioner, finer, product, solve
+from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
+from napari_shadowinv.fitting.descent import Preconditioner, finer
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import FitData
 from napari_shadowinv.fitting.unknowns import Unknowns
@@ -96,6 +97,8 @@ class Posterior:
         For all random choices.
     after_step : callable, optional
         Called after each step, to report progress and to stop.
+    modes : SoftModes, optional
+        Of the Hessians of this scene, from scenes of the same pixels and priors.
     """
 
     def __init__(
@@ -104,12 +107,14 @@ class Posterior:
         unknowns: Unknowns,
         rng: np.random.Generator,
         after_step: Callable[[], None] | None = None,
+        modes: SoftModes | None = None,
     ) -> None:
         self._scene, self._unknowns, self._rng = scene, unknowns, rng
         self._counts = scene.ray_counts(unknowns)
         self._linear = scene.linear(unknowns, self._counts)
         self._scales = Preconditioner(scene)
         self._after_step = after_step or (lambda: None)
+        self._modes = SoftModes() if modes is None else modes
 
     @property
     def scene(self) -> Scene:
@@ -267,7 +272,7 @@ class Posterior:
     def _held(self) -> Posterior:
         """The same for an instrument that is known."""
         posterior = copy(self)
-        posterior._scales = self._scales.held()
+        posterior._scales, posterior._modes = self._scales.held(), SoftModes()
         return posterior
 
     def count_determined(self, rng: np.random.Generator) -> float:
@@ -374,7 +379,9 @@ class Posterior:
     def _change(self, slope: Unknowns, tolerance: float) -> Unknowns:
         """The change of the unknowns that undoes a slope."""
         right = self._scales.transpose_times(slope).flat()
-        scaled = solve(self._times, right, tolerance=tolerance, iterations=_MOST_STEPS)
+        scaled = solve(
+            self._times, right, tolerance=tolerance, iterations=_MOST_STEPS, modes=self._modes
+        )
         return self._scales.times(self._unknowns.like(scaled))
 
     def _prior_times(self, flat: FloatArray) -> FloatArray:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
 from napari_shadowinv.fitting.descent import (
+    Preconditioner,
     coarser,
     descend,
     finer,
-    product,
     settle,
     smoothness_in_pixels,
 )
@@ -91,6 +92,7 @@ class Minimum:
     value: float
     displacement: FloatArray  # of all fields in the first image, px of the recorded image
     bin: int = 2
+    modes: SoftModes = field(default_factory=SoftModes)  # of Hessians nearby in these pixels
 
     def in_pixels(self, bin: int) -> Unknowns:
         """Return the unknowns in pixels `bin` wide, which is no wider than they are."""
@@ -167,7 +169,7 @@ def _descend_stage(
     now = replace(coarser(scene, factor), blur=blur)
     unknowns, value, _ = descend(
         now,
-        minimum.in_pixels(factor),
+        Preconditioner(now).damp(minimum.in_pixels(factor)),
         iterations=_COARSE_STEPS,
         least_gain=COARSE_GAIN,
         after_step=lambda now: on_step(minimum.start, now),
@@ -182,8 +184,16 @@ def _displacement(scene: Scene, unknowns: Unknowns) -> FloatArray:
 
 def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
     """Return a minimum of a scene in the pixels of the recorded images."""
-    unknowns = minimum.in_pixels(1)
+    if minimum.bin == 1:
+        return minimum
+    unknowns = _in_smaller_pixels(scene, minimum)
     return Minimum(minimum.start, unknowns, minimum.value, _displacement(scene, unknowns), 1)
+
+
+def _in_smaller_pixels(scene: Scene, minimum: Minimum) -> Unknowns:
+    """Return the unknowns in the pixels of a scene, without waves that larger ones left behind."""
+    unknowns = minimum.in_pixels(scene.bin)
+    return unknowns if minimum.bin == scene.bin else Preconditioner(scene).damp(unknowns)
 
 
 def estimate_smoothness(
@@ -256,13 +266,16 @@ def _settle_response(
     least_gain: float,
 ) -> tuple[Scene, Minimum]:
     """Find the numbers that change the response to fields, and how uncertain they are."""
+    turns, before = 1, None
     for _ in range(rounds):
         response = _posterior(scene, end, rng, on_step).response(_PAIRS)
         mean, precision = _mean_of_numbers(response)
-        step = np.maximum(mean, scene.least_numbers()) - response.numbers
+        remaining = np.maximum(mean, scene.least_numbers()) - response.numbers
+        # Steps that turn back hover about their end: their mean is nearer to it.
+        turns += before is not None and bool(remaining @ precision @ before < 0)
+        step = remaining / max(turns, float(np.abs(remaining).max()))
         is_settled = step @ precision @ step < _NUMBERS_SETTLED
-        remaining = step
-        step = step / max(1.0, float(np.abs(step).max()))
+        before = remaining
         unknowns = end.unknowns
         for each, share in zip(response.changes, step, strict=True):
             unknowns = unknowns.plus(unknowns.like(share * each.flat()))
@@ -288,7 +301,11 @@ def _mean_of_numbers(response: Response) -> tuple[FloatArray, FloatArray]:
 
 def _posterior(scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep) -> Posterior:
     middle = replace(coarser(scene, end.bin), spacing=MIDDLE_SPACING)
-    return Posterior(middle, end.unknowns, rng, lambda: on_step("smoothness", end.value))
+
+    def after_step() -> None:
+        on_step("smoothness", end.value)
+
+    return Posterior(middle, end.unknowns, rng, after_step, end.modes)
 
 
 def settle_minimum(
@@ -307,8 +324,11 @@ def settle_minimum(
         steps=steps,
         least_gain=least_gain,
         after_step=lambda now: on_step(name, now),
+        modes=minimum.modes,
     )
-    return Minimum(minimum.start, unknowns, value, _displacement(middle, unknowns), minimum.bin)
+    return replace(
+        minimum, unknowns=unknowns, value=value, displacement=_displacement(middle, unknowns)
+    )
 
 
 def refine_minimum(
@@ -323,7 +343,8 @@ def refine_minimum(
 
     Also returns the number of steps, and whether it converged within the allowed number.
     """
-    unknowns, steps = minimum.in_pixels(scene.bin), 0
+    unknowns, steps = _in_smaller_pixels(scene, minimum), 0
+    modes = minimum.modes if minimum.bin == scene.bin else SoftModes()
     has_dense_rays = bool(scene.imperfect.parts) and not is_near
     usual = [_SPACING_WITH_NUMBERS] if has_dense_rays else list(_SPACINGS)
     denser = usual if options.spacing is None else [options.spacing]
@@ -336,6 +357,7 @@ def refine_minimum(
             steps=min(most, options.max_iterations - steps),
             least_gain=_FINE_GAIN,
             after_step=lambda now: on_step("full size", now),
+            modes=modes,
         )
         steps += taken
         chi2 = scene.chi2(unknowns, scene.ray_counts(unknowns))

@@ -1,0 +1,172 @@
+"""Linear systems with a positive definite matrix: `solve`, and what one teaches the next.
+
+Where fields and the numbers of an instrument explain images alike, some dozens of the eigenvalues
+of a scaled Hessian are a thousand times smaller than all others. Conjugate gradients find these
+directions slowly, but a solution yields them (`SoftModes`), and further systems with nearly the
+same matrix are solved in few steps once they are treated apart.
+
+References
+----------
+M. R. Hestenes and E. Stiefel, J. Res. Natl. Bur. Stand. 49, 409 (1952); S. Gratton, A. Sartenaer
+and J. Tshimanga, SIAM J. Optim. 21, 912 (2011).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.linalg import eigh_tridiagonal
+
+from napari_shadowinv._typing import FloatArray
+
+__all__ = ["SoftModes", "product", "solve"]
+
+_SOFT = 0.5  # eigenvalues below, where most are about 1
+_MOST_MODES = 120
+_OUTDATED_STEPS = 100  # of a solution with so many modes: they belong to another matrix
+_WORTH_STEPS = 30  # of a solution from which modes are taken
+_MOST_NUMBERS = 8_000_000  # in each list of vectors that is kept of a solution
+_FOUND = 0.5  # residual of an eigenvector over its eigenvalue
+_INDEPENDENT = 1e-6  # least eigenvalue of the vectors' products; rounding makes copies of some
+
+
+def product(first: FloatArray, second: FloatArray) -> float:
+    """Scalar product without BLAS, whose idle threads spin and whose sums depend on them."""
+    return float(np.einsum("i,i", first, second))
+
+
+class SoftModes:
+    """Directions in which a matrix is small, for systems with nearly the same matrix.
+
+    `solve` uses them, and adds those that have cost it many steps. What they are changes the number
+    of steps, not the solution beyond its tolerance.
+    """
+
+    def __init__(self) -> None:
+        self._vectors = np.empty((0, 0))
+        self._weights = np.empty(0)
+
+    def __len__(self) -> int:
+        return len(self._weights)
+
+    def precondition(self, residual: FloatArray) -> FloatArray:
+        """Return a residual with larger parts along the modes: 1 over their eigenvalues."""
+        if self._vectors.shape[1] != residual.size:
+            return residual
+        along = np.einsum("kn,n->k", self._vectors, residual)
+        along *= self._weights
+        return np.asarray(residual + np.einsum("k,kn->n", along, self._vectors))
+
+    def learn(self, history: _History) -> None:
+        """Add the modes that a solution has met; begin anew if others are of no use."""
+        if len(history) < _WORTH_STEPS:
+            return
+        residuals, turned, matrix = history.lanczos()
+        values, mixing = eigh_tridiagonal(np.diag(matrix)[:-1], np.diag(matrix, -1)[:-1])
+        errors = np.abs(matrix[-1, -2] * mixing[-1])
+        chosen = np.flatnonzero((values < _SOFT) & (errors < _FOUND * values))
+        size, is_outdated = residuals.shape[1], len(history) > _OUTDATED_STEPS
+        if self._vectors.shape[1] != size or (is_outdated and len(self) == _MOST_MODES):
+            self._vectors, self._weights = np.empty((0, size)), np.empty(0)
+        chosen = chosen[: _MOST_MODES - len(self)]
+        if not chosen.size:
+            return
+        mixing = mixing[:, chosen]
+        vectors = np.einsum("mk,mn->kn", mixing, turned[:-1])
+        untouched = np.einsum("mk,mn->kn", mixing, residuals[:-1])
+        images = np.einsum("mk,mn->kn", matrix[:, :-1] @ mixing, residuals)
+        # Eigenvectors in the space of these vectors, of which rounding makes some twice.
+        overlaps = np.einsum("in,jn->ij", vectors, untouched)
+        energies = np.einsum("in,jn->ij", vectors, images)
+        sizes, turn = np.linalg.eigh(overlaps + overlaps.T)
+        turn = turn[:, sizes > _INDEPENDENT] / np.sqrt(sizes[sizes > _INDEPENDENT] / 2)
+        values, inner = np.linalg.eigh(turn.T @ (energies + energies.T) @ turn / 2)
+        inner, values = inner[:, values > 0], values[values > 0]
+        new = np.einsum("jk,jn->kn", turn @ inner, vectors)
+        self._vectors = np.concatenate([self._vectors, new])
+        self._weights = np.append(self._weights, np.maximum(1 / values - 1, 0))
+
+
+class _History:
+    """Steps of conjugate gradients: vectors in whose space the matrix is simple."""
+
+    def __init__(self, size: int) -> None:
+        self._most = _MOST_NUMBERS // size
+        self._pairs: list[tuple[FloatArray, FloatArray]] = []
+        self._shares: list[float] = []
+        self._ratios: list[float] = []
+
+    def __len__(self) -> int:
+        return len(self._shares)
+
+    def add(
+        self, residual: FloatArray, turned: FloatArray, square: float, share: float, ratio: float
+    ) -> None:
+        """Add a step: a residual, the same preconditioned, their product, and coefficients."""
+        if len(self) < self._most:
+            scale = (-1.0) ** len(self) / np.sqrt(square)
+            pair = (scale * residual).astype(np.float32), (scale * turned).astype(np.float32)
+            self._pairs.append(pair)
+            self._shares.append(share)
+            self._ratios.append(ratio)
+
+    def lanczos(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return m vectors, the same preconditioned, and the tridiagonal matrix between them."""
+        shares, ratios = np.array(self._shares), np.array(self._ratios)
+        diagonal = 1 / shares
+        diagonal[1:] += ratios[:-1] / shares[:-1]
+        beside = np.sqrt(ratios[:-1]) / shares[:-1]
+        matrix = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
+        residuals, turned = np.array(self._pairs, dtype=np.float64).swapaxes(0, 1)
+        return residuals, turned, matrix
+
+
+def solve(
+    times: Callable[[FloatArray], FloatArray],
+    right: FloatArray,
+    *,
+    tolerance: float,
+    iterations: int,
+    after_step: Callable[[int], None] | None = None,
+    modes: SoftModes | None = None,
+) -> FloatArray:
+    """Solve a positive definite system by conjugate gradients, from zero.
+
+    Parameters
+    ----------
+    times : callable
+        The matrix times a vector.
+    right : ndarray, shape (n,)
+        The right side.
+    tolerance : float
+        Length of the residual relative to the right side.
+    iterations : int
+        Most steps.
+    after_step : callable, optional
+        Receives the number of steps.
+    modes : SoftModes, optional
+        Of nearly the same matrix; those of this solution are added.
+    """
+    modes = SoftModes() if modes is None else modes
+    history = _History(right.size)
+    solution, residual = np.zeros_like(right), right
+    goal = tolerance**2 * product(residual, residual)
+    turned = modes.precondition(residual)
+    direction, square, steps = turned, product(residual, turned), 0
+    while steps < iterations and product(residual, residual) > goal:
+        image = times(direction)
+        share = square / product(direction, image)
+        solution += share * direction
+        before = residual, turned, square
+        residual = residual - share * image
+        turned = modes.precondition(residual)
+        square = product(residual, turned)
+        ratio = square / before[2]
+        direction = turned + ratio * direction
+        history.add(*before, share, ratio)
+        steps += 1
+        if after_step is not None:
+            after_step(steps)
+    modes.learn(history)
+    return solution
