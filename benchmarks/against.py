@@ -8,7 +8,8 @@ median seconds of both, how many times as fast this version is (median of the ra
 neighbouring runs, and their range), and the displacement's L2 error in both, in per cent: against
 the truth, or for real frames against this version's with one site a pixel.
 
-Images are those of the reference toroid, and of the burner's frames where they are present.
+Images are those of the reference toroid, and of the burner's frames where they are present; those
+of fits (`--only fit`) are counted rays, as in fit.py: their times are of whole fits by default.
 """
 
 from __future__ import annotations
@@ -19,10 +20,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from fit import Case, blobs, cases, pixels
 
 FRAMES = 6  # of the stream
 Work = dict[str, Any]
@@ -43,6 +47,13 @@ def works(folder: Path) -> dict[str, Work]:
         found[name] = {"image": name, "truth": f"{name} truth"}
         if noise:
             found[f"{name}, 40,000 sites"] = {**found[name], "n_sites": 40_000}
+    for title, case, noise in fits():
+        name = f"fit, {title}"
+        images = case.images()
+        images += noise * np.random.default_rng(0).normal(size=images.shape)
+        np.savez(folder / name, images=images, strengths=case.strengths())
+        np.save(folder / f"{name} truth.npy", [field(*pixels()) for field in case.fields])
+        found[name] = {"fit": name, "noise": noise, "keywords": case.keywords}
     files = sorted((DATA / "burner").rglob("*.bmp"))
     if not files:
         return found
@@ -62,9 +73,18 @@ def works(folder: Path) -> dict[str, Work]:
     return found
 
 
+def fits() -> Iterator[tuple[str, Case, float]]:
+    """Images of fits, with their noise."""
+    folded = [(700, 14, 24, 0.35, 80, 70), (650, 22, 13, 0.2, 125, 130)]
+    yield "three energies", Case("", [blobs(folded)], (14.7, 30.0, 60.0)), 0.1
+    by_name = {case.name: case for case in cases()}
+    yield "unknown beam", by_name["toroid 97, beam unknown, 2 energies"], 0.03
+    yield "B and E", by_name["B and E × 1, four energies"], 0.03
+
+
 def worker() -> None:
     """Do what is asked for line by line, and tell the seconds, and the error where there is one."""
-    from napari_shadowinv import InversionOptions, invert, plan_sites
+    from napari_shadowinv import FitOptions, InversionOptions, fit, invert, plan_sites
 
     def inverted(work: Work, folder: Path) -> tuple[float, float]:
         known = {
@@ -93,9 +113,27 @@ def worker() -> None:
             last = invert(frame, plan=plan, options=options, start=last)
         return (time.perf_counter() - begun) / (len(frames) - 1), float("nan")
 
+    def fitted(work: Work, folder: Path) -> tuple[float, float]:
+        shots = np.load(folder / f"{work['fit']}.npz")
+        truth = np.load(folder / f"{work['fit']} truth.npy")
+        keywords = {"source": np.ones(truth.shape[-2:]), **work["keywords"]}
+        options = FitOptions(threads=work.get("threads"))
+        begun = time.perf_counter()
+        result = fit(
+            shots["images"],
+            strengths=shots["strengths"],
+            noise=work["noise"],
+            options=options,
+            **keywords,
+        )
+        seconds = time.perf_counter() - begun
+        pairs = zip(result.fields, truth, strict=True)
+        shares = [np.linalg.norm(f.displacement - t) / np.linalg.norm(t) for f, t in pairs]
+        return seconds, float(max(shares))
+
     for line in sys.stdin:
         work = json.loads(line)
-        done = streamed if "stream" in work else inverted
+        done = streamed if "stream" in work else fitted if "fit" in work else inverted
         print(json.dumps(done(work, Path(work["folder"]))), flush=True)
 
 
