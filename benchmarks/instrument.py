@@ -13,8 +13,8 @@ and two totals, and the median error. A total is right if the ratio is about 1; 
 number 68 and 95 % are within.
 Bands: the share of pixels whose true displacement lies within the bands of `uncertainty`, for
 imperfections as large as stated, half and twice as large.
-Ranks: for random objects, the rank of the truth among the samples of quantities, mirrored at the
-inversion's, and TARP, the rank of its distance from random points. The columns are the share of
+Ranks: for random objects, the rank of the truth among the samples of quantities, mirrored as in
+their bands, and TARP, the rank of its distance from random points. The columns are the share of
 truths within 68 and 95 %, and the probability of ranks as uneven if all were equally likely
 (Kolmogorov and Smirnov).
 Cost: samples a minute, and time and memory of the budget.
@@ -44,6 +44,7 @@ from napari_shadowinv import (
     FitOptions,
     Instrument,
     InversionOptions,
+    Maximum,
     fit,
     invert,
     plan_sites,
@@ -311,7 +312,7 @@ def quantities(side: int) -> dict[str, Callable[[FloatArray, FloatArray], FloatA
         return np.asarray(ends.sum())
 
     return {
-        "peak": lambda potential, displacement: np.hypot(*displacement).max(),
+        "peak": Maximum(lambda potential, displacement: np.hypot(*displacement).max()),
         "r.m.s.": lambda potential, displacement: np.asarray(length(displacement)),
         "flux through a line": lambda potential, displacement: displacement[
             1, start:stop, side // 3
@@ -341,8 +342,7 @@ def table_of_ranks(side: int, shots: int, first_seed: int, method: str) -> None:
             method=method,
             options=InversionOptions(seed=number),
         )
-        mirrored = [2 * q.value - q.samples for q in result.quantities.values()]
-        samples.append(np.array(mirrored).T)
+        samples.append(np.array([q.mirrored() for q in result.quantities.values()]).T)
         exact = strength * truth(side, names[number % len(names)])
         truths.append([float(measure(exact[0], exact)) for measure in measures.values()])
     drawn, exact = np.array(samples), np.array(truths)

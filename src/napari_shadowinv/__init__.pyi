@@ -5,7 +5,7 @@ from .cautions import Caution
 from .errors import FileFormatError, InputError, InversionCancelled
 from .fitting import Fit, FitOptions, FitShot, fit
 from .inversion import Inversion, Report, invert, plan_sites
-from .inversion.error_bars import Uncertainty, uncertainty
+from .inversion.error_bars import Maximum, Uncertainty, uncertainty
 from .io import Radiograph, read, write
 from .options import BeamPrior, Instrument, InversionOptions
 from .physics.field_grid import FieldGrid
@@ -35,6 +35,7 @@ __all__ = [
     "Inversion",
     "InversionCancelled",
     "InversionOptions",
+    "Maximum",
     "OpticalSetup",
     "Progress",
     "ProtonSetup",

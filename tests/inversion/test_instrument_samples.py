@@ -9,6 +9,7 @@ from napari_shadowinv import (
     InputError,
     Instrument,
     InversionOptions,
+    Maximum,
     invert,
     plan_sites,
     synthetic_image,
@@ -265,6 +266,29 @@ def test_the_band_of_a_quantity_mirrors_its_samples():
     assert (low, high) == (pytest.approx(3 - 1.96, abs=0.03), pytest.approx(3 + 1.96, abs=0.03))
     assert quantity.bias == pytest.approx(2, abs=0.02)
     assert quantity.std == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize("count", [20, 200])
+@pytest.mark.parametrize("top", ["flat", "two", "sharp"])
+def test_bands_of_a_maximum_hold_the_truth(top, count):
+    """The noise of the estimate, and that of samples about it, is normal, as large everywhere."""
+    rng, held, biases = np.random.default_rng(7), [], []
+    truth = {"flat": np.ones(60), "two": np.repeat([1.0, -9.0], [2, 58])}.get(
+        top, -(np.linspace(-3, 3, 61) ** 2)
+    )
+    for _ in range(600):
+        estimate = truth + 0.1 * rng.normal(size=truth.size)
+        samples = (estimate + 0.1 * rng.normal(size=(count, truth.size))).max(axis=1)
+        quantity = Quantity(np.asarray(estimate.max()), samples, is_maximum=True)
+        ends = [quantity.band(share) for share in (0.68, 0.95)]
+        held.append([low < truth.max() < high for low, high in ends])
+        biases.append((quantity.value - quantity.bias - truth.max()) / 0.1)
+    shares = np.mean(held, axis=0)
+    assert 0.54 < shares[0] < 0.9
+    assert 0.9 < shares[1] < 0.98
+    # A maximum of 60 equal values is 2.3 deviations too high, that of two 0.6.
+    assert abs(np.mean(biases)) < 0.45
+    assert Maximum(np.hypot)(3.0, 4.0) == 5
 
 
 @pytest.mark.parametrize("count", [4, 12])

@@ -208,7 +208,9 @@ class _Task:
             if self.products[place].subtracts_noise and len(scatter):
                 scatter = scatter + (value - scatter.mean(axis=0))
             quantities[place][name] = Quantity(
-                value.reshape(shape), scatter.reshape(len(samples), *shape)
+                value.reshape(shape),
+                scatter.reshape(len(samples), *shape),
+                name in self.products[place].maxima,
             )
         frame = self.field.frame
         doubts = caution_facts(evaluation.cautions)

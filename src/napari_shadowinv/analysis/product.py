@@ -107,6 +107,8 @@ class Product(Choice):
     reference: ClassVar[str] = ""  # literature and equation
     # Variables that are recorded and not retrieved, such as the image's intensity.
     recorded: ClassVar[tuple[str, ...]] = ()
+    # Variables that are a maximum over places.
+    maxima: ClassVar[tuple[str, ...]] = ()
     # Whether `measure` already corrects the mean effect of noise, so that bands need not.
     subtracts_noise: ClassVar[bool] = False
     # Of several variables along an axis, those that figures show; empty for all.

@@ -28,6 +28,7 @@ class Region(Outlined):
     title = "region"
     place = 20
     recorded = ("intensity",)
+    maxima = ("peak",)
     product: Literal["region"] = "region"
 
     def check(self, frame: FieldFrame) -> None:

@@ -181,7 +181,7 @@ def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> Ti
         shots = [each.quantities[name] for each in results]
         samples = [shot.samples[:count][order] for shot, order in zip(shots, orders, strict=True)]
         values = np.array([float(shot.value) for shot in shots])
-        quantities[name] = Quantity(values, np.stack(samples, axis=1))
+        quantities[name] = Quantity(values, np.stack(samples, axis=1), shots[0].is_maximum)
     result = replace(
         first,
         quantities=quantities,

@@ -65,7 +65,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["Quantity", "Uncertainty", "uncertainty"]
+__all__ = ["Maximum", "Quantity", "Uncertainty", "uncertainty"]
 
 
 Result = TypeVar("Result")
@@ -84,6 +84,27 @@ QuantityOf = Callable[[FloatArray, FloatArray], ArrayLike]
 Quantities = Mapping[str, QuantityOf] | Callable[[FloatArray], Mapping[str, QuantityOf]]
 
 
+# Of a maximum of many equal values: its mean grows as the deviation of the noise, which samples,
+# with the noise of the inversion and their own, have √2 times.
+_BIAS_OF_MAXIMUM = 1 / (np.sqrt(2) - 1)
+# The share of it that is uncertain; bands of one, two and many equal values hold 59 to 87 and 92 to
+# 96 % of the truths.
+_UNSURE_BIAS = 0.5
+
+
+@dataclass(frozen=True)
+class Maximum:
+    """A function of potential and displacement that returns a maximum over places, such as a peak.
+
+    Its bands take a stronger bias by noise into account (`Quantity.bias`).
+    """
+
+    measure: QuantityOf
+
+    def __call__(self, potential: FloatArray, displacement: FloatArray) -> ArrayLike:
+        return self.measure(potential, displacement)
+
+
 @dataclass(frozen=True)
 class Quantity:
     """A number, or an array of them, that is derived from the field.
@@ -94,20 +115,29 @@ class Quantity:
         Of the inversion.
     samples : ndarray, shape (n, ...)
         Of each sample.
+    is_maximum : bool
+        Whether it is a maximum over places.
     """
 
     value: FloatArray
     samples: FloatArray
+    is_maximum: bool = False
 
     @property
     def std(self) -> FloatArray:
-        """Standard deviation of the samples."""
-        return np.asarray(self.samples.std(axis=0, ddof=1))
+        """Standard deviation of the samples, of a maximum with half of its bias."""
+        deviation = self.samples.std(axis=0, ddof=1)
+        return np.asarray(np.hypot(deviation, _UNSURE_BIAS * self.bias * self.is_maximum))
 
     @property
     def bias(self) -> FloatArray:
-        """Mean of the samples less the value: what noise and instrument add on average."""
-        return np.asarray(self.samples.mean(axis=0) - self.value)
+        """What noise and instrument add on average: mean of the samples less the value.
+
+        Of a maximum 2.4 times as much: noise picks the largest of many nearly equal values, as
+        around a ring, but the inversion, from which samples start, has one maximum by its noise.
+        """
+        added = np.asarray(self.samples.mean(axis=0) - self.value)
+        return _BIAS_OF_MAXIMUM * added if self.is_maximum else added
 
     def band(self, share: float = 0.68) -> tuple[FloatArray, FloatArray]:
         """Return the lower and the upper end of the interval with a share of probability.
@@ -128,8 +158,20 @@ class Quantity:
             middle = self.value - self.bias
             width = stdtrit(count - 1, tails[0]) * np.sqrt(1 + 1 / count) * self.std
             return np.asarray(middle - width), np.asarray(middle + width)
-        high, low = np.quantile(self.samples, tails, axis=0)
-        return np.asarray(2 * self.value - high), np.asarray(2 * self.value - low)
+        mirrored = self.mirrored()
+        low, high = np.quantile(mirrored, tails[::-1], axis=0)
+        return np.asarray(low), np.asarray(high)
+
+    def mirrored(self) -> FloatArray:
+        """Return values that are as likely as the true one, shape (n, ...).
+
+        Samples mirrored at the value; of a maximum about the value less its bias.
+        """
+        if not self.is_maximum:
+            return np.asarray(2 * self.value - self.samples)
+        about_mean = self.samples - self.samples.mean(axis=0)
+        spread = np.maximum(self.samples.std(axis=0, ddof=1), np.finfo(np.float64).tiny)
+        return np.asarray(self.value - self.bias - self.std / spread * about_mean)
 
 
 def _checked_share(share: float) -> float:
@@ -324,7 +366,7 @@ def uncertainty(
         (2, H, W), that return a number or an array: a line profile, the mean of a region, an
         integral, a peak. Several threads may call them at once. A function that returns the
         dictionary is called with the changes of the potential in a few samples, (k, H, W), from
-        which it may choose a smoothing.
+        which it may choose a smoothing. Of a maximum give a `Maximum`.
 
     Returns
     -------
@@ -344,7 +386,7 @@ def uncertainty(
     >>> result = uncertainty(counts, n=4)
     >>> result.potential_std.shape, result.n, result.converged
     ((24, 24), 4, (True, True, True))
-    >>> peak = {"peak": lambda potential, displacement: np.hypot(*displacement).max()}
+    >>> peak = {"peak": Maximum(lambda potential, displacement: np.hypot(*displacement).max())}
     >>> result = uncertainty(counts, n=20, instrument={"blur": 1.0}, quantities=peak)
     >>> result.imperfections
     ('beam, 5 %', 'blur, 1 px')
@@ -466,7 +508,11 @@ def uncertainty(
         mean_shift=check.mean_shift,
         imperfections=names,
         quantities={
-            name: Quantity(value, np.array([sample[name] for sample in scatter.quantities]))
+            name: Quantity(
+                value,
+                np.array([sample[name] for sample in scatter.quantities]),
+                isinstance(functions[name], Maximum),
+            )
             for name, value in values.items()
         },
         tolerance=resampling.options.tolerance,
