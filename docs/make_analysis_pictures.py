@@ -31,6 +31,7 @@ from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.plotting import make_logarithmic
 
 BINNED = 8
+RESAMPLES = 200
 # Assumed: the distances of the burner were not published.
 PIXEL_M, DISTANCE_M = 0.1e-3, 1.0
 AIR = {"gladstone_dale": 2.26e-4, "ambient_density": 1.20, "ambient_temperature": 293.0}
@@ -46,11 +47,20 @@ def burner_profile(folder: Path) -> None:
     frames = [read(file).bin_pixels(BINNED).image for file in sorted(folder.glob("Image_2*.bmp"))]
     fields = [invert(frame, plan=plan, options=InversionOptions(n_sites=reference.size))
               for frame in frames]  # fmt: skip
-    displacement = np.mean([field.displacement for field in fields], axis=0)
-    potential = np.mean([field.potential for field in fields], axis=0)
-    mean = RetrievedField(dataset_from_field(displacement, potential, setup))
+    displacements = np.stack([field.displacement for field in fields])
+    potentials = np.stack([field.potential for field in fields])
+
+    def mean_of(chosen: np.ndarray | slice) -> RetrievedField:
+        means = (planes[chosen].mean(axis=0) for planes in (displacements, potentials))
+        return RetrievedField(dataset_from_field(*means, setup))
+
     product = {"product": "axisymmetric", "slice_width": 15, **AIR}
-    (profile,) = analyse(mean, product, setup=setup)
+    (profile,) = analyse(mean_of(slice(None)), product, setup=setup)
+    # The plume flickers: means of as many frames, drawn with replacement, about the same axis.
+    rng = np.random.default_rng(0)
+    means = [mean_of(rng.integers(0, len(fields), len(fields))) for _ in range(RESAMPLES)]
+    resampled = [analyse(mean, profile.product, setup=setup)[0] for mean in means]
+    displacement = displacements.mean(axis=0)
     for fact in profile.facts:
         print(f"{fact.title}: {fact.text}")
     figure = Figure(figsize=(11, 4), layout="constrained")
@@ -74,12 +84,20 @@ def burner_profile(folder: Path) -> None:
         (right, "temperature", "temperature (K)"),
     ):
         values = profile[name].value
+        others = np.stack([each[name].value for each in resampled])
         for number, colour in ((1, BLUE), (len(along) // 2, ORANGE), (len(along) - 2, DARK)):
             axes.plot(radius, values[number], color=colour, label=f"{along[number]:.0f} mm")
-            print(f"{name} at {along[number]:.0f} mm: {values[number, 0]:.3g} on the axis")
+            for tail in (0.025, 0.16):
+                low, high = np.quantile(others[:, number], [tail, 1 - tail], axis=0)
+                axes.fill_between(radius, low, high, color=colour, alpha=0.15, lw=0)
+            print(
+                f"{name} at {along[number]:.0f} mm: {values[number, 0]:.3g} "
+                f"({low[0]:.3g} to {high[0]:.3g}) on the axis"
+            )
         tidy(axes, name.capitalize(), "distance from the axis (mm)", label, 0.9)
     right.legend(title="from the top", frameon=False)
-    save(figure, "pictures/burner-profile.png", "0.1 mm a pixel and 1 m to the camera are assumed.")
+    note = "Bands of 68 and 95 % by the scatter of the frames. 0.1 mm a pixel and 1 m are assumed."
+    save(figure, "pictures/burner-profile.png", note)
 
 
 def turbulence(side: int = 200, slope: float = -5 / 3, contrast: float = 0.6) -> None:
