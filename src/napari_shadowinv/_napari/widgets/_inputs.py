@@ -47,7 +47,12 @@ from napari_shadowinv.physics.setup import (
     geometry_text,
     setup_warnings,
 )
+from napari_shadowinv.physics.trace_options import GridView
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
+
+GRID = "grid"
+GRID_KIND = {GRID: ("a 3-D field from a file", GridView)}
+"""The kind of object of a `ModelPicker`."""
 
 _NONE = "none"
 _INSTRUMENT_KINDS = ("detector", "beam_source")
@@ -69,6 +74,33 @@ _SOURCE_TITLES = {
     SUPPLIED: "supplied with the shot",
     UNKNOWN: "unknown (fit it)",
 }
+
+
+@dataclass(frozen=True)
+class GridFile:
+    """A 3-D field in a file, and the direction from which it is seen."""
+
+    path: str
+    view: GridView
+
+    @classmethod
+    def chosen(cls, file: forms.PathEdit, view: Any) -> GridFile:
+        """Return the file of an entry; raise an `InputError` if it is empty."""
+        if not file.path:
+            raise InputError("there is no file with a 3-D field: choose one")
+        return cls(file.path, view)
+
+
+def grid_file_edit() -> forms.PathEdit:
+    """Return an entry for a file with a 3-D field."""
+    entry = forms.PathEdit(
+        "Choose a 3-D field", "openPMD or NetCDF file", "3-D fields (*.h5 *.hdf5 *.nc)"
+    )
+    entry.setToolTip(
+        "<qt>openPMD file (HDF5), or NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez; particles "
+        "are traced through it.</qt>"
+    )
+    return entry
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,13 +17,21 @@ from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
-from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
+from napari_shadowinv._napari.widgets._inputs import (
+    GRID,
+    GRID_KIND,
+    GridFile,
+    InstrumentForm,
+    SetupPicker,
+    grid_file_edit,
+)
 from napari_shadowinv._napari.widgets._layers import LayerPicker
 from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io import read_field_grid
 from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
 from napari_shadowinv.physics.setup import SETUPS, Setup
@@ -31,6 +40,7 @@ from napari_shadowinv.pipeline.experiment import SWEPT, plan_experiment, sweep_e
 from napari_shadowinv.pipeline.experiment_object import (
     PlannedObject,
     object_of_displacement,
+    object_of_field,
     shape_of_text,
 )
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
@@ -49,7 +59,7 @@ _LOG_RANGE = 8.0
 class PlanJob(Job):
     """A plan of an experiment, or a sweep of one of its quantities."""
 
-    object: PhantomRecipe | PlannedObject
+    object: PhantomRecipe | PlannedObject | GridFile
     setups: tuple[Setup, ...]
     shape: tuple[int, int] | None
     instrument: Instrument
@@ -68,10 +78,18 @@ class PlanJob(Job):
             "should_stop": should_stop,
         }
         setups = self.setups or None
+        planned = self._traced() if isinstance(self.object, GridFile) else self.object
         if self.quantity:
             choices |= {"quantity": self.quantity, "values": self.values}
-            return sweep_experiment(self.object, setups, **choices)
-        return plan_experiment(self.object, setups, **choices)
+            return sweep_experiment(planned, setups, **choices)
+        return plan_experiment(planned, setups, **choices)
+
+    def _traced(self) -> PlannedObject:
+        """Read a 3-D field, through which particles are traced."""
+        file: Any = self.object
+        grid = file.view.apply(read_field_grid(Path(file.path)))
+        setup = self.setups[0] if self.setups else None
+        return object_of_field(grid, setup, title=Path(file.path).name)
 
     def layers(self, content: ExperimentPlan | ExperimentSweep) -> list[FullLayerData]:
         """Describe the image of the first draw."""
@@ -144,13 +162,20 @@ class PlanExperiment(panels.ToolPanel):
         )
         super().__init__(viewer, "plan-experiment", panel)
         self.object = forms.ModelPicker(
-            "Object", {**forms.kinds_of(PHANTOMS), _LAYER: ("the field of a result", None)}
+            "Object",
+            {
+                **forms.kinds_of(PHANTOMS),
+                **GRID_KIND,
+                _LAYER: ("the field of a result", None),
+            },
         )
         self.object.choice.setToolTip("Object that deflects the beam.")
         self.field = LayerPicker(
             viewer, ("image",), "A layer of a result, whose field is the object.", suits=_has_field
         )
         self._field_row = forms.labelled("Result", self.field)
+        self.file = grid_file_edit()
+        self._file_row = forms.labelled("File", self.file)
         self.setup = SetupPicker()
         self.energies = _line(
             "14.7, 30",
@@ -178,6 +203,7 @@ class PlanExperiment(panels.ToolPanel):
         self.results: ResultLayers | None = None
         self.add(
             self.object,
+            self._file_row,
             self._field_row,
             forms.labelled("Size (px)", self.side),
             self.setup,
@@ -196,6 +222,7 @@ class PlanExperiment(panels.ToolPanel):
         self.quantity.currentIndexChanged.connect(lambda _: self._on_change())
         for part in (self.object, self.setup, self.instrument, self.options):
             part.changed.connect(self._on_change)
+        self.file.changed.connect(self.keep)
         for line in (self.energies, self.side, self.values):
             line.textChanged.connect(lambda _: self.keep())
         self.restore_last()
@@ -205,6 +232,7 @@ class PlanExperiment(panels.ToolPanel):
     def state(self) -> dict[str, Any]:
         return {
             "object": self.object.state(),
+            "file": self.file.path,
             "setup": {**self.setup.state(), "kind": self.setup.picker.kind},
             "energies": self.energies.text(),
             "size": self.side.text(),
@@ -215,6 +243,7 @@ class PlanExperiment(panels.ToolPanel):
 
     def restore(self, state: Any) -> None:
         self.object.restore(state.get("object", {}))
+        self.file.edit.setText(str(state.get("file", "")))
         self.setup.restore(state.get("setup", {}))
         if kind := state.get("setup", {}).get("kind"):
             self.setup.picker.set_kind(str(kind))
@@ -257,7 +286,9 @@ class PlanExperiment(panels.ToolPanel):
         self.report.show_rows(rows, details)
         self.reveal(self.report)
 
-    def _object(self) -> PhantomRecipe | PlannedObject:
+    def _object(self) -> PhantomRecipe | PlannedObject | GridFile:
+        if self.object.kind == GRID:
+            return GridFile.chosen(self.file, self.object.model())
         if self.object.kind != _LAYER:
             recipe: Any = self.object.model()
             return recipe
@@ -284,17 +315,19 @@ class PlanExperiment(panels.ToolPanel):
         )
 
     def _on_object(self) -> None:
-        """Show the kind of setup that a phantom requires."""
+        """Show the kind of setup that an object requires."""
         recipe = PHANTOMS.get(self.object.kind)
-        if self._ready and recipe is not None and recipe.probe:
-            self.setup.picker.set_kind(recipe.probe)
+        probe = "proton" if self.object.kind == GRID else recipe.probe if recipe else ""
+        if self._ready and probe:
+            self.setup.picker.set_kind(probe)
             form = self.setup.picker.form
             if form is not None and form.is_empty:
-                self.setup.suggest(SETUPS[recipe.probe].example(), "example from the paper")
+                self.setup.suggest(SETUPS[probe].example(), "example from the paper")
         self._on_change()
 
     def _on_change(self) -> None:
         self._field_row.setVisible(self.object.kind == _LAYER)
+        self._file_row.setVisible(self.object.kind == GRID)
         self._values_row.setVisible(bool(self.quantity.currentData()))
         self.keep()
 
