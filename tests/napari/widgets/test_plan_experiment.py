@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from napari_shadowinv._napari.layer_metadata import role_of
 from napari_shadowinv.physics.phantoms import paper_setup
@@ -50,6 +52,34 @@ def test_a_sweep_draws_the_error_at_each_value(tool: Any, qtbot: Any) -> None:
     np.testing.assert_array_equal(line.get_xdata(), [100, 1600])
     few, many = line.get_ydata()
     assert few > 2 * many
+
+
+def test_particles_are_traced_through_a_field_in_a_file(
+    tool: Any, tmp_path: Path, qtbot: Any
+) -> None:
+    """A bundle of field lines around the beam, which runs along x of the grid."""
+    places = np.linspace(-6e-5, 6e-5, 33)
+    z, y, x = np.meshgrid(places, places, places, indexing="ij")
+    bell = 8e6 * np.exp(-(x**2 + y**2 + z**2) / (2 * 1.2e-5**2))
+    values = {"Bx": bell * 0, "By": -z * bell, "Bz": y * bell}
+    magnetic = {name: (("z", "y", "x"), value, {"units": "T"}) for name, value in values.items()}
+    axes = {name: (name, places, {"units": "m"}) for name in "zyx"}
+    xr.Dataset(magnetic, axes).to_netcdf(tmp_path / "cube.nc", engine="h5netcdf")
+    tool.object.set_kind("grid")
+    tool.panel.button.click()
+    assert "There is no file with a 3-D field: choose one" in tool.panel.status.text()
+    tool.object.form.set_values({"beam": "x", "right": "y"})
+    tool.file.edit.setText(str(tmp_path / "cube.nc"))
+    tool.options.set_values({"draws": 2, "counts": 100_000.0})
+    tool.side.setText("")  # all of the grid
+    finished(tool, qtbot)
+    assert "would be determined: 2 of 2" in tool.verdict.text()
+    restored = tool.state()
+    assert restored["file"] == str(tmp_path / "cube.nc")
+    assert restored["object"]["kind"] == "grid"
+    tool.file.edit.setText(str(tmp_path / "missing.nc"))
+    finished(tool, qtbot)
+    assert "missing.nc" in tool.panel.status.text()
 
 
 @pytest.mark.parametrize(
