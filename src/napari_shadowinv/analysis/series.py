@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["TimeSeries", "analyse_shots", "time_series"]
+__all__ = ["TimeSeries", "analyse_shots", "shot_times", "time_series"]
 
 _MIN_SHOTS = 2
 _LEAST = 1e-300
@@ -223,6 +223,50 @@ def _rate_unit(rate: float, unit: str) -> tuple[float, str]:
         return 1.0, "per shot"
     factor, prefix = prefix_for(1 / max(abs(rate), _LEAST))
     return 1 / factor, f"1/{prefix}{unit}"
+
+
+def shot_times(text: str | None, shots: ArrayLike, name: str = "times") -> FloatArray | None:
+    """Return the times of numbered shots in s that a text states.
+
+    Parameters
+    ----------
+    text : str or None
+        The time between two successive shots, or a list with the time of each shot used.
+    shots : array_like of int, shape (n,)
+        Numbers of the shots used.
+    name : str
+        Of the text in errors.
+
+    Returns
+    -------
+    ndarray, shape (n,), or None
+        None if there is no text: shots are numbered.
+
+    Raises
+    ------
+    InputError
+        If it is neither one number nor one for each shot.
+
+    Examples
+    --------
+    >>> shot_times("1e-9", [0, 2, 3])
+    array([0.e+00, 2.e-09, 3.e-09])
+    """
+    if not text:
+        return None
+    numbers = np.asarray(shots, dtype=np.float64)
+    try:
+        times = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        times = np.empty(0)
+    if len(times) == 1 and len(numbers) > 1:
+        return np.asarray(numbers * times[0])
+    if len(times) != len(numbers):
+        raise InputError(
+            f"{name} is {text!r}, expected the time between two shots in s, or a list for "
+            f"the {len(numbers)} finished ones"
+        )
+    return times
 
 
 def analyse_shots(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -84,7 +83,7 @@ def analyse(
     Bands hold the noise of the image, the discretisation and what was stated of the instrument.
     """
     from napari_shadowinv.analysis import analyse as measure
-    from napari_shadowinv.analysis import analyse_shots
+    from napari_shadowinv.analysis import analyse_shots, shot_times
     from napari_shadowinv.cli._export import open_shots
     from napari_shadowinv.io import read_dataset
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, SITES
@@ -112,7 +111,7 @@ def analyse(
             "should_stop": is_interrupted,
         }
         if "shot" in dataset.dims:
-            seconds = _times(times, dataset["index"].values.tolist())
+            seconds = shot_times(times, dataset["index"].values, "--times")
             series = analyse_shots(dataset, chosen, seconds, **common)
             results = [each.result for each in series]
         else:
@@ -132,24 +131,6 @@ def _check_series(out: Path | None) -> None:
             f"received --out {out}, which copies one result with its products, but a store has "
             "many results: use --csv"
         )
-
-
-def _times(text: str | None, shots: Sequence[int]) -> list[float] | None:
-    """Return the times of numbered shots from the time between two, or from a list of all."""
-    if text is None:
-        return None
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) == 1 and len(shots) > 1:
-        return [float(shot) * numbers[0] for shot in shots]
-    if len(numbers) != len(shots):
-        raise InputError(
-            f"--times is {text!r}, expected the time between two shots in s, or a list for the "
-            f"{len(shots)} finished ones"
-        )
-    return numbers
 
 
 def _products(texts: list[str], file: Path | None) -> list[Product]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,9 @@ from napari_shadowinv._napari.layer_metadata import (
     frame_of,
     layer_name,
     metadata_for,
+    metadata_of,
     result_of,
+    setup_of,
 )
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.widgets import _forms as forms
@@ -33,12 +36,15 @@ from napari_shadowinv.analysis import (
     ProductResult,
     add_products,
     analyse,
+    analyse_shots,
     product_from_dict,
     products_table,
+    shot_times,
 )
 from napari_shadowinv.analysis.outlines import Outlined
 from napari_shadowinv.analysis.product import BANDS
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.store import DONE, read_stack
 from napari_shadowinv.physics.units import display_unit, prefix_for
 from napari_shadowinv.plotting import make_logarithmic
 
@@ -52,6 +58,7 @@ _ELLIPSE_CORNERS = 90
 _ROUND = 0.02  # largest difference of the axes of a circle
 _OPACITIES = (0.35, 0.18)  # of the bands
 _BY_SETUP = "unit of the setup"
+_FEW_PLACES = 50  # such as shots, which are marked
 _OPEN_SHAPES = ("line", "path")
 
 
@@ -65,6 +72,11 @@ class _Request:
     unit: str | None
     samples: int
 
+    @property
+    def subject(self) -> Any:
+        """What is measured."""
+        return self.result
+
     def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
         return analyse(
             self.result.content,
@@ -75,6 +87,30 @@ class _Request:
             on_progress=on_progress,
             should_stop=should_stop,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _SeriesRequest:
+    """A product to be measured in all finished shots of a store, and the layer of the store."""
+
+    subject: str  # path of the store
+    layer: Any
+    product: Product
+    unit: str | None
+    times: str
+
+    def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
+        stack = read_stack(Path(self.subject))
+        finished = np.flatnonzero(stack["status"].values == DONE)
+        series = analyse_shots(
+            stack.isel(shot=finished),
+            self.product,
+            shot_times(self.times, finished, "Times"),
+            unit=self.unit,
+            on_progress=on_progress,
+            should_stop=should_stop,
+        )
+        return [each.result for each in series]
 
 
 class ProductPlot(Plot):
@@ -96,7 +132,8 @@ class ProductPlot(Plot):
         for number, name in enumerate(names):
             scale, field_unit = result.scale_of(name)
             colour, places = COLOURS[number % len(COLOURS)], factor * coordinate.values
-            axes.plot(places, scale * result[name].value, color=colour, label=name)
+            style = "o-" if len(places) <= _FEW_PLACES else "-"
+            axes.plot(places, scale * result[name].value, style, ms=3, color=colour, label=name)
             for share, opacity in zip(BANDS, _OPACITIES, strict=True):
                 if (band := result.band(name, share)) is not None:
                     low, high = (scale * end for end in band)
@@ -117,10 +154,19 @@ class ProductForm(QtWidgets.QWidget):
         super().__init__()
         self.viewer = viewer
         self.results: list[ProductResult] = []
-        self._measured: _Request | None = None
-        tip = "<qt>Layer of the result of an inversion or a fit.</qt>"
+        self._measured: _Request | _SeriesRequest | None = None
+        tip = "<qt>Layer of the result of an inversion or a fit, or of a store of shots.</qt>"
         self.result = LayerPicker(
-            viewer, ("image",), tip, suits=lambda layer: bool(result_of(layer))
+            viewer,
+            ("image",),
+            tip,
+            suits=lambda layer: bool(result_of(layer) or _store_of(layer)),
+        )
+        self.times = QtWidgets.QLineEdit()
+        self.times.setPlaceholderText("shots are numbered")
+        self.times.setToolTip(
+            "<qt>Time between two shots of the store in s, or a list of the times of all finished "
+            "shots, such as 0, 1e-9, 3e-9.</qt>"
         )
         self.product = SteadyComboBox()
         for name, kind in PRODUCTS.items():
@@ -147,12 +193,14 @@ class ProductForm(QtWidgets.QWidget):
         self.clear = qt.push_button("Clear", "Forget all measured products.", self._clear)
         shapes = qt.with_button(self.shapes, "✎", "Draw a new shape for the product.", self._draw)
         numbers = qt.side_by_side((self.width_edit, 1), (self.samples, 1))
+        self._times_row = forms.labelled("Times (s)", self.times)
         rows = (
             forms.labelled("Result", self.result),
             forms.labelled("Product", self.product),
             forms.labelled("Shape", shapes),
             forms.labelled("Unit", self.unit),
             forms.labelled("Width, samples", numbers),
+            self._times_row,
             self.panel,
         )
         content = QtWidgets.QWidget()
@@ -182,8 +230,8 @@ class ProductForm(QtWidgets.QWidget):
     def _offer_units(self) -> None:
         """Offer the units of the fields of the result's setup."""
         layer = self.result.layer
-        result = None if layer is None else result_of(layer)
-        setup = None if result is None else result.setup
+        self._times_row.setVisible(_store_of(layer) is not None)
+        setup = None if layer is None else setup_of(layer)
         fields = {"displacement"} if setup is None else {each.name for each in setup.si_fields}
         symbols = [s for s, unit in FIELD_UNITS.items() if unit.field in fields | {"displacement"}]
         before = self.unit.currentText()
@@ -191,14 +239,14 @@ class ProductForm(QtWidgets.QWidget):
         self.unit.addItems([_BY_SETUP, *symbols])
         self.unit.setCurrentText(before if before in symbols else _BY_SETUP)
 
-    def request(self) -> _Request:
+    def request(self) -> _Request | _SeriesRequest:
         """Return what is to be measured, or raise an `InputError`."""
         layer = self.result.layer
-        result = None if layer is None else result_of(layer)
-        if result is None:
+        result, store = None if layer is None else result_of(layer), _store_of(layer)
+        if result is None and store is None:
             raise InputError(
                 "there is no result to measure: run 'Invert shot' or 'Fit several images', or "
-                "open a .shadowinv file"
+                "open a .shadowinv file or a store"
             )
         values: dict[str, Any] = {"product": self.kind.name()}
         if "width" in self.kind.model_fields:
@@ -206,13 +254,10 @@ class ProductForm(QtWidgets.QWidget):
         if "path" in self.kind.model_fields:
             values |= self._outline(layer)
         symbol = self.unit.currentText()
-        return _Request(
-            result,
-            layer,
-            product_from_dict(values),
-            None if symbol == _BY_SETUP else symbol,
-            self.samples.value(),
-        )
+        unit, product = None if symbol == _BY_SETUP else symbol, product_from_dict(values)
+        if result is None:
+            return _SeriesRequest(str(store), layer, product, unit, self.times.text().strip())
+        return _Request(result, layer, product, unit, self.samples.value())
 
     def _outline(self, layer: Any) -> dict[str, Any]:
         """Return the fields of a product that the selected shape stands for, in px."""
@@ -249,8 +294,8 @@ class ProductForm(QtWidgets.QWidget):
     def _on_end(self, outcome: Outcome) -> None:
         if outcome.value is None:
             return
-        request: _Request = outcome.tag
-        if self._measured is not None and self._measured.result is not request.result:
+        request: _Request | _SeriesRequest = outcome.tag
+        if self._measured is not None and self._measured.subject != request.subject:
             self.results = []
         self._measured = request
         for measured in outcome.value:
@@ -260,7 +305,7 @@ class ProductForm(QtWidgets.QWidget):
             self.results.append(replace(measured, name=name))
             self._show(self.results[-1], request)
 
-    def _show(self, measured: ProductResult, request: _Request) -> None:
+    def _show(self, measured: ProductResult, request: _Request | _SeriesRequest) -> None:
         rows = [(fact.title, fact.text) for fact in measured.facts]
         rows += [("Note", sentence) for sentence in measured.limits]
         self.report.show_rows(rows)
@@ -268,6 +313,8 @@ class ProductForm(QtWidgets.QWidget):
         self.plot.setVisible(self.plot.show_curves(measured))
         for widget in (self.export, self.save, self.clear):
             widget.setEnabled(True)
+        # A store has many results, and none that a product could be saved with.
+        self.save.setEnabled(isinstance(request, _Request))
         for name, variable in measured.variables.items():
             if variable.dims == PLANE:
                 add_layers(self.viewer, [map_layer(measured, name, request.layer)])
@@ -310,7 +357,7 @@ class ProductForm(QtWidgets.QWidget):
         from napari_shadowinv.io import write
         from napari_shadowinv.io.formats import RESULT
 
-        assert self._measured is not None
+        assert isinstance(self._measured, _Request)
         name, _ = QtWidgets.QFileDialog.getSaveFileName(
             self, "Save with result", f"products{RESULT.suffix}", f"Result (*{RESULT.suffix})"
         )
@@ -321,6 +368,11 @@ class ProductForm(QtWidgets.QWidget):
         has_setup = result.setup is not None and content.setup is None
         dataset = content.to_dataset(result.setup) if has_setup else content.to_dataset()
         show_info(f"Wrote {write(name, add_products(dataset, self.results), overwrite=True)}")
+
+
+def _store_of(layer: Any) -> str | None:
+    """Return the path of the store that a layer shows; None if it shows none."""
+    return None if layer is None else metadata_of(layer).get("store")
 
 
 def shape_fields(shape_type: str, corners: FloatArray) -> dict[str, Any]:
