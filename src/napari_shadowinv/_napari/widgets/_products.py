@@ -127,7 +127,7 @@ class ProductPlot(Plot):
         (axes,) = self.fresh_axes()
         coordinate = result.coordinates[result.variables[names[0]].dims[0]]
         factor, prefix, unit = 1.0, "", display_unit(coordinate.unit)
-        if unit == "m":
+        if unit in ("m", "s"):
             factor, prefix = prefix_for(float(np.abs(coordinate.values).max()))
         for number, name in enumerate(names):
             scale, field_unit = result.scale_of(name)
