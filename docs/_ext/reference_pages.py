@@ -39,7 +39,13 @@ TASKS: dict[str, tuple[str, ...]] = {
     "Apply a recipe to a file": ("read", "Radiograph", "Recipe", "run", "write"),
     "Repeat a result from its provenance": ("rerun", "Rerun"),
     "Describe the experiment, for SI units": ("ProtonSetup", "OpticalSetup"),
-    "Estimate the error of a field": ("Instrument", "BeamPrior", "uncertainty", "Uncertainty"),
+    "Estimate the error of a field": (
+        "Instrument",
+        "BeamPrior",
+        "uncertainty",
+        "Uncertainty",
+        "Maximum",
+    ),
     "Measure currents, profiles and maps of a result": ("analyse",),
     "Fit one or several images, also where rays cross": ("fit", "FitShot", "FitOptions", "Fit"),
     "Invert many shots": (

@@ -131,7 +131,7 @@ class Quantity:
 
     @property
     def bias(self) -> FloatArray:
-        """What noise and instrument add on average: mean of the samples less the value.
+        """Mean of the samples less the value, which noise and instrument add on average.
 
         Of a maximum 2.4 times as much: noise picks the largest of many nearly equal values, as
         around a ring, but the inversion, from which samples start, has one maximum by its noise.

@@ -74,7 +74,7 @@ class _Request:
 
     @property
     def subject(self) -> Any:
-        """What is measured."""
+        """The result that is measured."""
         return self.result
 
     def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
