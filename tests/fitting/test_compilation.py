@@ -61,7 +61,7 @@ folder.mkdir(parents=True, exist_ok=True)
 version = "py{0.major}{0.minor}".format(__import__("sys").version_info)
 answers = [is_compiled()]
 for when in (0.0, time.time()):
-    for name in ("deposit", "gather", "boxes", "collect"):
+    for name in ("deposit", "gather", "boxes", "collect", "rows_times", "transpose_times"):
         path = folder / f"_ray_kernels.{name}-1.{version}.nbi"
         path.touch()
         os.utime(path, (when, when))
@@ -107,7 +107,14 @@ def test_parts_of_kernels_are_compiled_into_them_only() -> None:
     assert len(parts) > 4
     assert all(part.targetoptions.get("inline") == "always" for part in parts.values())
     kernels = compiled.keys() - parts.keys()
-    assert kernels == {"boxes", "collect", "deposit", "gather"}
+    assert kernels == {
+        "boxes",
+        "collect",
+        "deposit",
+        "gather",
+        "rows_times",
+        "transpose_times",
+    }
     # None of them calls another.
     called = {name for kernel in kernels for name in compiled[kernel].py_func.__code__.co_names}
     assert not called & kernels

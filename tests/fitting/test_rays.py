@@ -267,12 +267,17 @@ def test_threads_do_not_change_a_bit() -> None:
     image = alone.image(potential, counts, beam, turned())
     pulls = alone.gradient(potential, counts, beam, pull, turned())
     jacobian = alone.jacobian(potential, counts, beam, turned())
+    change = np.random.default_rng(5).normal(size=jacobian.shape[1])
+    pushed, pulled = alone.push(jacobian, change), alone.pull(jacobian, pull)
+    np.testing.assert_array_equal(pushed.ravel(), jacobian @ change)
+    np.testing.assert_array_equal(pulled, jacobian.T @ pull.ravel())
     for threads in (2, 3):
         several = model_of((80, 96), threads=threads)
         np.testing.assert_array_equal(several.image(potential, counts, beam, turned()), image)
         again = several.gradient(potential, counts, beam, pull, turned())
         for first, repeated in zip(pulls, again, strict=True):
             np.testing.assert_array_equal(first, repeated)
+        np.testing.assert_array_equal(several.push(jacobian, change), pushed)
         repeated = several.jacobian(potential, counts, beam, turned())
         np.testing.assert_array_equal(repeated.indices, jacobian.indices)
         np.testing.assert_array_equal(repeated.data, jacobian.data)

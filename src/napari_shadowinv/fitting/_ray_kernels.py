@@ -13,7 +13,17 @@ import numpy as np
 from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.geometry.compiler import njit
 
-__all__ = ["KNOT", "MOST_RAYS", "boxes", "collect", "deposit", "gather", "spline_tables"]
+__all__ = [
+    "KNOT",
+    "MOST_RAYS",
+    "boxes",
+    "collect",
+    "deposit",
+    "gather",
+    "rows_times",
+    "spline_tables",
+    "transpose_times",
+]
 
 KNOT = 2  # px between knots
 MOST_RAYS = 64  # along a cell's side
@@ -408,3 +418,35 @@ def collect(
                         places[0, entry], places[1, entry] = pixel, last + s
                         values[entry] = block[p, 20 + s]
                         entry += 1
+
+
+@njit(nogil=True, error_model="numpy")
+def rows_times(
+    start: int,
+    stop: int,
+    begins: IntArray,
+    columns: IntArray,
+    values: FloatArray,
+    vector: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Rows of a sparse matrix times a vector, while other threads run."""
+    for row in range(start, stop):
+        total = 0.0
+        for entry in range(begins[row], begins[row + 1]):
+            total += values[entry] * vector[columns[entry]]
+        out[row] = total
+
+
+@njit(nogil=True, error_model="numpy")
+def transpose_times(
+    begins: IntArray,
+    columns: IntArray,
+    values: FloatArray,
+    vector: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Add the transpose of a sparse matrix times a vector, while other threads run."""
+    for row in range(len(begins) - 1):
+        for entry in range(begins[row], begins[row + 1]):
+            out[columns[entry]] += values[entry] * vector[row]

@@ -27,6 +27,8 @@ _KERNELS: tuple[Any, ...] = (
     _ray_kernels.gather,
     _ray_kernels.boxes,
     _ray_kernels.collect,
+    _ray_kernels.rows_times,
+    _ray_kernels.transpose_times,
 )
 _SIZE = (8, 8)
 
@@ -61,10 +63,15 @@ def _compile_rays(report: Reporter) -> None:
     potential, beam = np.zeros(rays.shape), rays.around(np.ones(_SIZE))
     counts = rays.ray_counts(potential)
     weights = np.ones(rays.seen)
+
+    def use_jacobian() -> None:
+        jacobian = rays.jacobian(potential, counts, beam)
+        rays.pull(jacobian, rays.push(jacobian, np.zeros(jacobian.shape[1])))
+
     works: tuple[Callable[[], object], ...] = (
         lambda: rays.image(potential, counts, beam),
         lambda: rays.gradient(potential, counts, beam, weights),
-        lambda: rays.jacobian(potential, counts, beam),
+        use_jacobian,
     )
     for step, work in enumerate(works):
         report("compile", step, None, "rays, " + compilation_frequency())

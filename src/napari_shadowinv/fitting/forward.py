@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import gaussian_filter, laplace
 from scipy.signal import oaconvolve
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csr_array
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.fitting.instrument import DARKEST, EXACT, Imperfect, Part, widen, widening
@@ -553,7 +553,7 @@ class Linear:
                     self._beam_shape * self._beam_change(change, k)
                 )
                 columns = np.concatenate([columns, of_beam.ravel(), change.frames[k]])
-            landed = (jacobian @ columns).reshape(scene.rays.seen)
+            landed = scene.rays.push(jacobian, columns)
             spread = scene._inner(scene._spread(k, landed, self.unknowns))
             image = seen.slope * spread + change.brightness[k] * seen.image
             image = image + seen.push(change.common, change.separate[k])
@@ -566,13 +566,13 @@ class Linear:
         scene = self.scene
         slope = self.unknowns.zeros()
         of_shape = np.zeros(scene.beams.shape[1:])
-        for k, (transposed, seen) in enumerate(zip(self._transposed, self.seen, strict=True)):
+        for k, (jacobian, seen) in enumerate(zip(self.jacobians, self.seen, strict=True)):
             pull = self._roots[k] * residuals[k]
             slope.brightness[k] = np.einsum("yx,yx", pull, seen.image)
             scene._add_light_pulls(slope, k, pull)
             seen.add_pulls(slope, k, pull)
             back = scene._spread_back(k, seen.slope * pull, self.unknowns)
-            columns = transposed @ back.ravel()
+            columns = scene.rays.pull(jacobian, back)
             of_potential, of_instrument = np.split(columns, [math.prod(scene.rays.shape)])
             psi = of_potential.reshape(scene.rays.shape)
             scene._add_potential_pulls(slope, self.unknowns, k, psi)
@@ -608,10 +608,6 @@ class Linear:
     def _has_others(self) -> bool:
         """Whether the Jacobians have columns for the beam and the frame."""
         return bool(self.jacobians[0].shape[1] > math.prod(self.scene.rays.shape))
-
-    @cached_property
-    def _transposed(self) -> list[csc_array]:
-        return [jacobian.T for jacobian in self.jacobians]
 
     @cached_property
     def _beam_shape(self) -> FloatArray:

@@ -227,6 +227,19 @@ class RayModel:
         inner = np.arange(shape[0]).reshape(size)[_GUARD:-_GUARD, _GUARD:-_GUARD].ravel()
         return csr_array(coo_array((values, tuple(places)), shape=shape))[inner]
 
+    def push(self, jacobian: csr_array, change: FloatArray) -> FloatArray:
+        """Return a Jacobian times a change of its columns, (n,), with the shape `seen`."""
+        out = np.empty(jacobian.shape[0])
+        threads = available_threads(self.threads)
+        in_ranges(kernels.rows_times, len(out), threads, *_entries(jacobian), change, out)
+        return out.reshape(self.seen)
+
+    def pull(self, jacobian: csr_array, image: FloatArray) -> FloatArray:
+        """Return the transpose of `push` times an image, (n,)."""
+        out = np.zeros(jacobian.shape[1])
+        kernels.transpose_times(*_entries(jacobian), image.ravel(), out)
+        return out
+
     def displacement(self, potential: FloatArray) -> FloatArray:
         """Return -∇ψ in px at the pixels' centres, shape (2, H, W), in axis order (y, x)."""
         height, width = self.size
@@ -306,6 +319,12 @@ class RayModel:
             about_middle[k + 1] -= y * pulls[k]
             about_middle[k + 2] -= x * pulls[k]
         return about_middle
+
+
+def _entries(matrix: csr_array) -> tuple[IntArray, IntArray, FloatArray]:
+    """Begins of rows, columns and values; unsigned, for which no index counts from the end."""
+    unsigned = np.dtype(f"u{matrix.indices.itemsize}")
+    return matrix.indptr.view(unsigned), matrix.indices.view(unsigned), matrix.data
 
 
 def at_rest() -> FloatArray:
