@@ -310,8 +310,9 @@ def settle(
         Whether steps were left.
     """
     tolerance, solving = _NEWTON, _MOST_SOLVING
-    if scene.has_free_numbers:
+    if scene.has_free_numbers or scene.beam_modes:
         tolerance, solving = _NEWTON_IN_VALLEY, _MOST_IN_VALLEY
+    if scene.has_free_numbers:
         least_gain *= _GAIN_IN_VALLEY
     modes = SoftModes() if modes is None else modes
     scales = Preconditioner(scene)
