@@ -17,7 +17,7 @@ from napari_shadowinv.analysis import (
     analyse_shots,
     time_series,
 )
-from napari_shadowinv.analysis.series import TimeSeries
+from napari_shadowinv.analysis.series import TimeSeries, shot_times
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.error_bars import Quantity
@@ -85,6 +85,24 @@ def test_wrong_stacks_and_times_are_refused():
             analyse_shots(wrong, REGION, times)
     with pytest.raises(InputError, match="no single number to follow"):
         analyse_shots(stack, LineProfile(path=[(2, 2), (9, 9)]))
+
+
+def test_product_without_a_number_is_refused_after_one_shot():
+    measured = []
+    with pytest.raises(InputError, match="the profile along a line has no single number"):
+        analyse_shots(
+            stack_of(TIMES),
+            LineProfile(path=[(2, 2), (9, 9)]),
+            on_progress=lambda progress: measured.append(progress.step),
+        )
+    assert measured == [0]
+
+
+def test_times_follow_from_the_time_between_two_shots():
+    assert shot_times([2.0], [0, 2, 5], "--times") == [0, 4, 10]
+    assert shot_times([1.0, 3.0], [0, 2], "--times") == [1, 3]
+    with pytest.raises(InputError, match="--times, expected the time between two shots in s"):
+        shot_times([1.0, 3.0], [0, 1, 2], "--times")
 
 
 def test_interval_of_a_growth_rate_holds_it():

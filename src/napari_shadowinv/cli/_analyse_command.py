@@ -85,10 +85,10 @@ def analyse(
     """
     from napari_shadowinv.analysis import analyse as measure
     from napari_shadowinv.analysis import analyse_shots
-    from napari_shadowinv.cli._export import open_shots
     from napari_shadowinv.io import read_dataset
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, SITES
     from napari_shadowinv.io.store import is_stack
+    from napari_shadowinv.io.store_shots import open_shots
     from napari_shadowinv.pipeline.files import setup_from
 
     chosen = _products(product or [], products)
@@ -136,20 +136,15 @@ def _check_series(out: Path | None) -> None:
 
 def _times(text: str | None, shots: Sequence[int]) -> list[float] | None:
     """Return the times of numbered shots from the time between two, or from a list of all."""
+    from napari_shadowinv.analysis.series import shot_times
+
     if text is None:
         return None
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) == 1 and len(shots) > 1:
-        return [float(shot) * numbers[0] for shot in shots]
-    if len(numbers) != len(shots):
-        raise InputError(
-            f"--times is {text!r}, expected the time between two shots in s, or a list for the "
-            f"{len(shots)} finished ones"
-        )
-    return numbers
+    return shot_times(numbers, shots, f"--times is {text!r}")
 
 
 def _products(texts: list[str], file: Path | None) -> list[Product]:
