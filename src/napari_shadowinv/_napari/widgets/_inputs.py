@@ -152,6 +152,13 @@ class SetupPicker(QWidget):
         self._show(setup.kind, _Entry(setup.model_dump(), origin))
         self.changed.emit()
 
+    def choose_kind(self, kind: str) -> None:
+        """Show the user's setup of a kind, or else the paper's."""
+        self.picker.set_kind(kind)
+        form = self.picker.form
+        if form is not None and form.is_empty:
+            self.suggest(SETUPS[kind].example(), "example from the paper")
+
     def show_setup(self, values: Mapping[str, Any], origin: str = "") -> None:
         """Show a setup from the user: loaded from `origin`, or typed if that is empty."""
         kind = str(values["kind"])

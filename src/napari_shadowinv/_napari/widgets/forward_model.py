@@ -18,6 +18,7 @@ from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
 from napari_shadowinv._napari.widgets._files import IMAGE_FORMATS, Savable, SaveButton
+from napari_shadowinv._napari.widgets._grid_files import GRID, GRID_KIND, GridFile, GridFileEdit
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, shown_plane
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
@@ -29,22 +30,13 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
-from napari_shadowinv.physics.setup import SETUPS, deflector_titles
-from napari_shadowinv.physics.trace_options import GridView
+from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.inversion_run import plane_of
 
 if TYPE_CHECKING:
     import napari
     from napari_shadowinv.physics.setup import Setup
-
-
-@dataclass(frozen=True)
-class GridFile:
-    """A 3-D field in a file, and the direction from which it is seen."""
-
-    path: str
-    view: GridView
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +193,6 @@ class ForwardJob(Job):
 
 _FIELDS = ("field", "field y", "field x")
 _LAYER = "layer"
-_GRID = "grid"
 _MAX_SIDE_PX = 20_000
 
 
@@ -276,18 +267,12 @@ class ForwardModel(ToolPanel):
             "Object",
             {
                 **forms.kinds_of(PHANTOMS),
-                _GRID: ("a 3-D field from a file", GridView),
+                **GRID_KIND,
                 _LAYER: ("a result or potential", None),
             },
         )
         self.object.choice.setToolTip("Object that deflects the beam.")
-        self.file = forms.PathEdit(
-            "Choose a 3-D field", "openPMD or NetCDF file", "3-D fields (*.h5 *.hdf5 *.nc)"
-        )
-        self.file.setToolTip(
-            "<qt>openPMD file (HDF5), or NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez; particles "
-            "are traced through it.</qt>"
-        )
+        self.file = GridFileEdit()
         self.potential = LayerPicker(
             viewer,
             ("image",),
@@ -351,7 +336,7 @@ class ForwardModel(ToolPanel):
         self.object.restore(state.get("object", {}))
         self.file.edit.setText(str(state.get("file", "")))
         if self.object.kind != _LAYER:
-            self._choose_setup(str(state.get("setup", {}).get("kind", "proton")))
+            self.setup.choose_kind(str(state.get("setup", {}).get("kind", "proton")))
         size = state.get("size", [200, 200])
         self.height_px.setValue(int(size[0]))
         self.width_px.setValue(int(size[1]))
@@ -376,12 +361,10 @@ class ForwardModel(ToolPanel):
                 **common,
             )
         recipe: Any = self.object.model()
-        title = "" if self.object.kind == _GRID else type(recipe).title
-        if self.object.kind == _GRID:
-            if not self.file.path:
-                raise InputError("there is no file with a 3-D field: choose one")
-            recipe = GridFile(self.file.path, recipe)
-            title = Path(self.file.path).stem
+        title = "" if self.object.kind == GRID else type(recipe).title
+        if self.object.kind == GRID:
+            recipe = self.file.grid_file(recipe)
+            title = recipe.title
         shape = (self.height_px.value(), self.width_px.value())
         if source is not None:
             shape = source.shape
@@ -410,20 +393,12 @@ class ForwardModel(ToolPanel):
         if self.object.kind == _LAYER and self._ready:
             self._select_field()
         self._follow_potential()
-        if self.object.kind == _GRID and self._ready:
-            self._choose_setup("proton")
+        if self.object.kind == GRID and self._ready:
+            self.setup.choose_kind("proton")
         recipe = PHANTOMS.get(self.object.kind)
         if recipe is None or not recipe.probe or not self._ready:
             return
-        self._choose_setup(recipe.probe)
-
-    def _choose_setup(self, kind: str) -> None:
-        """Show the user's setup of a kind, or else the paper's."""
-        self.setup.picker.set_kind(kind)
-        form = self.setup.picker.form
-        if form is not None and form.is_empty:
-            example = SETUPS[kind].example()
-            self.setup.suggest(example, "example from the paper")
+        self.setup.choose_kind(recipe.probe)
 
     def _follow_potential(self) -> None:
         """Show the setup of a potential's result, or the user's setup for an object."""
@@ -445,7 +420,7 @@ class ForwardModel(ToolPanel):
         for row in self._potential_rows:
             row.setVisible(is_layer)
         self._size_row.setVisible(not is_layer)
-        self._file_row.setVisible(self.object.kind == _GRID)
+        self._file_row.setVisible(self.object.kind == GRID)
         if is_layer:
             self._show_interpretation()
         self.keep()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,16 +17,17 @@ from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
+from napari_shadowinv._napari.widgets._grid_files import GRID, GRID_KIND, GridFile, GridFileEdit
 from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
 from napari_shadowinv._napari.widgets._layers import LayerPicker
 from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
-from napari_shadowinv._system.progress import OnProgress, ShouldStop
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
-from napari_shadowinv.physics.setup import SETUPS, Setup
+from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.experiment import SWEPT, plan_experiment, sweep_experiment
 from napari_shadowinv.pipeline.experiment_object import (
@@ -35,6 +37,7 @@ from napari_shadowinv.pipeline.experiment_object import (
 )
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep
+from napari_shadowinv.pipeline.traced_file import object_of_file
 
 if TYPE_CHECKING:
     import napari
@@ -49,7 +52,7 @@ _LOG_RANGE = 8.0
 class PlanJob(Job):
     """A plan of an experiment, or a sweep of one of its quantities."""
 
-    object: PhantomRecipe | PlannedObject
+    object: PhantomRecipe | PlannedObject | GridFile
     setups: tuple[Setup, ...]
     shape: tuple[int, int] | None
     instrument: Instrument
@@ -67,11 +70,14 @@ class PlanJob(Job):
             "on_progress": on_progress,
             "should_stop": should_stop,
         }
-        setups = self.setups or None
+        setups, target = self.setups or None, self.object
+        if isinstance(target, GridFile):
+            Reporter(on_progress, should_stop)("field", 0, None)
+            target = object_of_file(Path(target.path), next(iter(self.setups), None), target.view)
         if self.quantity:
             choices |= {"quantity": self.quantity, "values": self.values}
-            return sweep_experiment(self.object, setups, **choices)
-        return plan_experiment(self.object, setups, **choices)
+            return sweep_experiment(target, setups, **choices)
+        return plan_experiment(target, setups, **choices)
 
     def layers(self, content: ExperimentPlan | ExperimentSweep) -> list[FullLayerData]:
         """Describe the image of the first draw."""
@@ -144,12 +150,19 @@ class PlanExperiment(panels.ToolPanel):
         )
         super().__init__(viewer, "plan-experiment", panel)
         self.object = forms.ModelPicker(
-            "Object", {**forms.kinds_of(PHANTOMS), _LAYER: ("the field of a result", None)}
+            "Object",
+            {
+                **forms.kinds_of(PHANTOMS),
+                **GRID_KIND,
+                _LAYER: ("the field of a result", None),
+            },
         )
         self.object.choice.setToolTip("Object that deflects the beam.")
         self.field = LayerPicker(
             viewer, ("image",), "A layer of a result, whose field is the object.", suits=_has_field
         )
+        self.file = GridFileEdit()
+        self._file_row = forms.labelled("File", self.file)
         self._field_row = forms.labelled("Result", self.field)
         self.setup = SetupPicker()
         self.energies = _line(
@@ -178,6 +191,7 @@ class PlanExperiment(panels.ToolPanel):
         self.results: ResultLayers | None = None
         self.add(
             self.object,
+            self._file_row,
             self._field_row,
             forms.labelled("Size (px)", self.side),
             self.setup,
@@ -193,6 +207,7 @@ class PlanExperiment(panels.ToolPanel):
             self.report,
         )
         self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
+        self.file.changed.connect(self.keep)
         self.quantity.currentIndexChanged.connect(lambda _: self._on_change())
         for part in (self.object, self.setup, self.instrument, self.options):
             part.changed.connect(self._on_change)
@@ -205,6 +220,7 @@ class PlanExperiment(panels.ToolPanel):
     def state(self) -> dict[str, Any]:
         return {
             "object": self.object.state(),
+            "file": self.file.path,
             "setup": {**self.setup.state(), "kind": self.setup.picker.kind},
             "energies": self.energies.text(),
             "size": self.side.text(),
@@ -215,6 +231,7 @@ class PlanExperiment(panels.ToolPanel):
 
     def restore(self, state: Any) -> None:
         self.object.restore(state.get("object", {}))
+        self.file.edit.setText(str(state.get("file", "")))
         self.setup.restore(state.get("setup", {}))
         if kind := state.get("setup", {}).get("kind"):
             self.setup.picker.set_kind(str(kind))
@@ -257,10 +274,10 @@ class PlanExperiment(panels.ToolPanel):
         self.report.show_rows(rows, details)
         self.reveal(self.report)
 
-    def _object(self) -> PhantomRecipe | PlannedObject:
+    def _object(self) -> PhantomRecipe | PlannedObject | GridFile:
         if self.object.kind != _LAYER:
             recipe: Any = self.object.model()
-            return recipe
+            return self.file.grid_file(recipe) if self.object.kind == GRID else recipe
         layer = self.field.layer
         if layer is None:
             raise InputError(
@@ -284,16 +301,19 @@ class PlanExperiment(panels.ToolPanel):
         )
 
     def _on_object(self) -> None:
-        """Show the kind of setup that a phantom requires."""
+        """Show the kind of setup that an object requires."""
         recipe = PHANTOMS.get(self.object.kind)
-        if self._ready and recipe is not None and recipe.probe:
-            self.setup.picker.set_kind(recipe.probe)
-            form = self.setup.picker.form
-            if form is not None and form.is_empty:
-                self.setup.suggest(SETUPS[recipe.probe].example(), "example from the paper")
+        probe = recipe.probe if recipe is not None else None
+        if self.object.kind == GRID:
+            probe = "proton"
+        if self._ready and probe:
+            self.setup.choose_kind(probe)
         self._on_change()
 
     def _on_change(self) -> None:
+        is_phantom = self.object.kind in PHANTOMS
+        self.side.setPlaceholderText("200 x 200" if is_phantom else "that of the field")
+        self._file_row.setVisible(self.object.kind == GRID)
         self._field_row.setVisible(self.object.kind == _LAYER)
         self._values_row.setVisible(bool(self.quantity.currentData()))
         self.keep()
