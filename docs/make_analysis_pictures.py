@@ -9,10 +9,11 @@ picture is left out without it. The numbers of the tutorial on the flame are pri
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from _drawing import BLUE, DARK, ORANGE, save, show, tidy
+from _drawing import BLUE, DARK, ORANGE, FloatArray, save, show, tidy
 from matplotlib.figure import Figure
 
 from napari_shadowinv import (
@@ -26,18 +27,40 @@ from napari_shadowinv import (
     synthetic_image,
 )
 from napari_shadowinv.analysis.power_spectra import random_displacement, ring_spectrum
+from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.plotting import make_logarithmic
 
 BINNED = 8
+T_DRAWS = 50  # of Student's t, for each sample by the images
 # Assumed: the distances of the burner were not published.
 PIXEL_M, DISTANCE_M = 0.1e-3, 1.0
 AIR = {"gladstone_dale": 2.26e-4, "ambient_density": 1.20, "ambient_temperature": 293.0}
 
 
+def mean_of_frames(frames: Sequence[FloatArray], errors: Sequence[FloatArray]) -> Quantity:
+    """Return the mean of frames, with samples of its error.
+
+    The frames scatter about their mean, which is uncertain by Student's t. Errors by the images
+    count as shared by all frames, as the reference's are.
+
+    Parameters
+    ----------
+    frames : sequence of ndarray
+        A profile for each frame.
+    errors : sequence of ndarray, shape (samples, ...)
+        Samples of the profile of each frame by errors of the images.
+    """
+    count, rng = len(frames), np.random.default_rng(0)
+    mean, scatter = np.mean(frames, axis=0), np.std(frames, axis=0, ddof=1)
+    by_images = np.repeat(np.mean(errors, axis=0), T_DRAWS, axis=0)
+    draws = rng.standard_t(count - 1, (len(by_images), *np.ones(mean.ndim, int)))
+    return Quantity(mean, by_images + draws * scatter / np.sqrt(count))
+
+
 def burner_profile(folder: Path) -> None:
-    """Average the displacements of all frames, and draw the profiles of their mean."""
+    """Draw the profiles of the mean of all frames, with their bands."""
     setup = OpticalSetup(
         wavelength=532e-9, object_image_distance=DISTANCE_M, pixel_size=BINNED * PIXEL_M
     )
@@ -53,7 +76,12 @@ def burner_profile(folder: Path) -> None:
     (profile,) = analyse(mean, product, setup=setup)
     for fact in profile.facts:
         print(f"{fact.title}: {fact.text}")
-    figure = Figure(figsize=(11, 4), layout="constrained")
+    # The axis and the smoothing of the mean, so that the mean of the profiles is its profile.
+    of_frames = [analyse(field, profile.product, setup=setup)[0]["density"] for field in fields]
+    density = mean_of_frames(
+        [each.value for each in of_frames], [each.samples for each in of_frames]
+    )
+    figure = Figure(figsize=(11, 3.7), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     strength = BINNED * np.hypot(*displacement)
     top = float(np.percentile(strength, 99.8))
@@ -69,17 +97,29 @@ def burner_profile(folder: Path) -> None:
     left.plot([x0, x1], [y0, y1], color="white", lw=1)
     radius = 1e3 * profile.coordinates["radius"].values
     along = 1e3 * profile.coordinates["along"].values
+    heated = AIR["ambient_density"] * AIR["ambient_temperature"]  # of an ideal gas: T ρ
     for axes, name, label in (
         (middle, "density", "density (kg/m³)"),
         (right, "temperature", "temperature (K)"),
     ):
-        values = profile[name].value
         for number, colour in ((1, BLUE), (len(along) // 2, ORANGE), (len(along) - 2, DARK)):
-            axes.plot(radius, values[number], color=colour, label=f"{along[number]:.0f} mm")
-            print(f"{name} at {along[number]:.0f} mm: {values[number, 0]:.3g} on the axis")
+            curve = profile[name].value[number]
+            axes.plot(radius, curve, color=colour, label=f"{along[number]:.0f} mm")
+            print(f"{name} at {along[number]:.0f} mm: {curve[0]:.3g} on the axis", end="")
+            for share, opacity in ((0.68, 0.3), (0.95, 0.13)):
+                ends = [end[number] for end in density.band(share)]
+                if name == "temperature":
+                    ends = [heated / end for end in ends[::-1]]
+                axes.fill_between(radius, *ends, color=colour, alpha=opacity, lw=0)
+                print(f", {share:.0%}: {ends[0][0]:.3g} to {ends[1][0]:.3g}", end="")
+            print()
         tidy(axes, name.capitalize(), "distance from the axis (mm)", label, 0.9)
     right.legend(title="from the top", frameon=False)
-    save(figure, "pictures/burner-profile.png", "0.1 mm a pixel and 1 m to the camera are assumed.")
+    footer = (
+        "Bands of 68 and 95 % by the scatter of the frames and the errors of the images. "
+        "0.1 mm a pixel and 1 m to the camera are assumed."
+    )
+    save(figure, "pictures/burner-profile.png", footer)
 
 
 def turbulence(side: int = 200, slope: float = -5 / 3, contrast: float = 0.6) -> None:
