@@ -28,6 +28,7 @@ class Region(Outlined):
     title = "region"
     place = 20
     recorded = ("intensity",)
+    lengths = ("centroid_y", "centroid_x")
     product: Literal["region"] = "region"
 
     def check(self, frame: FieldFrame) -> None:

@@ -119,12 +119,16 @@ class ProductResult:
 
     @property
     def curve_groups(self) -> tuple[tuple[str, ...], ...]:
-        """Variables that figures draw, those of one panel together; of a series all variables."""
+        """Variables that figures draw, those of one panel together.
+
+        Of a series these are all variables; lengths are apart from a displacement in pixels.
+        """
         if not self.is_series:
             return (self.curve_names,) if self.curve_names else ()
-        groups: dict[str, list[str]] = {}
+        groups: dict[tuple[str, bool], list[str]] = {}
         for name, variable in self.variables.items():
-            groups.setdefault(variable.unit, []).append(name)
+            key = variable.unit, name in self.product.lengths
+            groups.setdefault(key, []).append(name)
         return tuple(map(tuple, groups.values()))
 
     @property

@@ -28,7 +28,7 @@ from napari_shadowinv.analysis.result import SERIES_AXES, ProductResult
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.inversion.error_bars import Quantity
-from napari_shadowinv.physics.units import PIXEL, prefix_for
+from napari_shadowinv.physics.units import prefix_for
 
 if TYPE_CHECKING:
     import xarray
@@ -215,10 +215,11 @@ def _facts(series: ProductResult, times: FloatArray, unit: str) -> Iterator[Fact
         title = variable.title or name.replace("_", " ")
         factor, symbol = series.shown_scale([name])
         first, last = factor * quantity.value[[0, -1]]
-        text = f"{first:.4g} to {last:.4g} {symbol}, first to last shot"
+        of_unit = "" if symbol == "1" else f" {symbol}"
+        text = f"{first:.4g} to {last:.4g}{of_unit}, first to last shot"
         yield Fact(name, f"{title[:1].upper()}{title[1:]}", text, short=text)
-        is_place = variable.unit in ("m", PIXEL)
-        if is_place or not _keeps_sign(quantity) or np.ptp(quantity.value) == 0:
+        is_length = name in series.product.lengths
+        if is_length or not _keeps_sign(quantity) or np.ptp(quantity.value) == 0:
             continue
         rate = _growth_rate(quantity, times)
         factor, symbol = _rate_unit(float(rate.value), unit)

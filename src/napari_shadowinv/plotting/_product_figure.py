@@ -131,6 +131,8 @@ def draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> None
     names : sequence of str
         Variables with one common axis.
     """
+    from matplotlib.ticker import MaxNLocator
+
     places, words = result.shown_places(names[0])
     scale, unit = result.shown_scale(names)
     for number, name in enumerate(names):
@@ -143,6 +145,8 @@ def draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> None
                 style: Any = {"color": colour, "alpha": opacity, "linewidth": 0}
                 axes.fill_between(places, scale * band[0], scale * band[1], **style)
     axes.set_xlabel(words)
+    if "shot" in result.coordinates:
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     shown_unit = "" if unit == "1" else unit
     axes.set_ylabel(f"field ({unit})" if unit == result.unit.symbol else shown_unit)
     if result.is_logarithmic:
