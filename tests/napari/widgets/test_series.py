@@ -96,6 +96,8 @@ def test_shots_are_chosen_and_numbered_without_times(form: Any, qtbot: Any) -> N
     press(form, qtbot)
     np.testing.assert_array_equal(form.results[0].coordinates["shot"].values, [1, 3])
     assert "per shot" in form.report.texts()["Growth of rms"]
+    ticks = form.plot.figure.axes[-1].get_xticks()
+    np.testing.assert_array_equal(ticks, np.round(ticks))
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ _BY_SETUP = "unit of the setup"
 _TIMES, _SHOTS = "Times", "Shots"  # labels of the rows of a store
 _OPEN_SHAPES = ("line", "path")
 _PANEL_HEIGHT_PX = 180
-_MAX_COLUMN = 3  # entries of a legend in one column
+_MAX_COLUMN = 3  # entries of a legend inside the axes; longer ones are above
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +150,8 @@ class ProductPlot(Plot):
             self._draw_group(axis, result, names)
         _, words = result.shown_places(groups[0][0])
         axes[-1].set_xlabel(f"{words[:1].lower()}{words[1:]}", color=self.ink)
+        if "shot" in result.coordinates:
+            axes[-1].xaxis.get_major_locator().set_params(integer=True)
         if result.is_logarithmic:
             make_logarithmic(axes[-1])
         self.draw()
@@ -168,7 +170,9 @@ class ProductPlot(Plot):
                     axis.fill_between(places, low, high, color=colour, alpha=opacity, linewidth=0)
         axis.set_ylabel("" if unit == "1" else unit, color=self.ink)
         if len(names) > _MAX_COLUMN:
-            self.add_legend(axis, size=7, ncols=2)
+            above = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
+            compact = {"ncols": len(names), "handlelength": 1.0, "columnspacing": 0.8}
+            self.add_legend(axis, size=7, frameon=False, **above, **compact)
         else:
             self.add_legend(axis)
 
@@ -292,8 +296,8 @@ class ProductForm(QtWidgets.QWidget):
         layer = self.result.layer
         if layer is None:
             raise InputError(
-                "there is no result to measure: run 'Invert shot' or 'Fit several images', or "
-                "open a .shadowinv file"
+                "there is no result to measure: run 'Invert shot', 'Fit several images' or "
+                "'Invert stack', or open a .shadowinv file or a store of shots"
             )
         values: dict[str, Any] = {"product": self.kind.name()}
         if "width" in self.kind.model_fields:
