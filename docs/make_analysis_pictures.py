@@ -9,10 +9,11 @@ picture is left out without it. The numbers of the tutorial on the flame are pri
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from _drawing import BLUE, DARK, ORANGE, save, show, tidy
+from _drawing import BLUE, DARK, ORANGE, FloatArray, save, show, tidy
 from matplotlib.figure import Figure
 
 from napari_shadowinv import (
@@ -26,19 +27,40 @@ from napari_shadowinv import (
     synthetic_image,
 )
 from napari_shadowinv.analysis.power_spectra import random_displacement, ring_spectrum
+from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.plotting import make_logarithmic
 
 BINNED = 8
-RESAMPLES = 200
+T_DRAWS = 50  # of Student's t, for each sample by the images
 # Assumed: the distances of the burner were not published.
 PIXEL_M, DISTANCE_M = 0.1e-3, 1.0
 AIR = {"gladstone_dale": 2.26e-4, "ambient_density": 1.20, "ambient_temperature": 293.0}
 
 
+def mean_of_frames(frames: Sequence[FloatArray], errors: Sequence[FloatArray]) -> Quantity:
+    """Return the mean of frames, with samples of its error.
+
+    The frames scatter about their mean, which is uncertain by Student's t. Errors by the images
+    count as shared by all frames, as the reference's are.
+
+    Parameters
+    ----------
+    frames : sequence of ndarray
+        A profile for each frame.
+    errors : sequence of ndarray, shape (samples, ...)
+        Samples of the profile of each frame by errors of the images.
+    """
+    count, rng = len(frames), np.random.default_rng(0)
+    mean, scatter = np.mean(frames, axis=0), np.std(frames, axis=0, ddof=1)
+    by_images = np.repeat(np.mean(errors, axis=0), T_DRAWS, axis=0)
+    draws = rng.standard_t(count - 1, (len(by_images), *np.ones(mean.ndim, int)))
+    return Quantity(mean, by_images + draws * scatter / np.sqrt(count))
+
+
 def burner_profile(folder: Path) -> None:
-    """Average the displacements of all frames, and draw the profiles of their mean."""
+    """Draw the profiles of the mean of all frames, with their bands."""
     setup = OpticalSetup(
         wavelength=532e-9, object_image_distance=DISTANCE_M, pixel_size=BINNED * PIXEL_M
     )
@@ -47,23 +69,19 @@ def burner_profile(folder: Path) -> None:
     frames = [read(file).bin_pixels(BINNED).image for file in sorted(folder.glob("Image_2*.bmp"))]
     fields = [invert(frame, plan=plan, options=InversionOptions(n_sites=reference.size))
               for frame in frames]  # fmt: skip
-    displacements = np.stack([field.displacement for field in fields])
-    potentials = np.stack([field.potential for field in fields])
-
-    def mean_of(chosen: np.ndarray | slice) -> RetrievedField:
-        means = (planes[chosen].mean(axis=0) for planes in (displacements, potentials))
-        return RetrievedField(dataset_from_field(*means, setup))
-
+    displacement = np.mean([field.displacement for field in fields], axis=0)
+    potential = np.mean([field.potential for field in fields], axis=0)
+    mean = RetrievedField(dataset_from_field(displacement, potential, setup))
     product = {"product": "axisymmetric", "slice_width": 15, **AIR}
-    (profile,) = analyse(mean_of(slice(None)), product, setup=setup)
-    # The plume flickers: means of as many frames, drawn with replacement, about the same axis.
-    rng = np.random.default_rng(0)
-    means = [mean_of(rng.integers(0, len(fields), len(fields))) for _ in range(RESAMPLES)]
-    resampled = [analyse(mean, profile.product, setup=setup)[0] for mean in means]
-    displacement = displacements.mean(axis=0)
+    (profile,) = analyse(mean, product, setup=setup)
     for fact in profile.facts:
         print(f"{fact.title}: {fact.text}")
-    figure = Figure(figsize=(11, 4), layout="constrained")
+    # The axis and the smoothing of the mean, so that the mean of the profiles is its profile.
+    of_frames = [analyse(field, profile.product, setup=setup)[0]["density"] for field in fields]
+    density = mean_of_frames(
+        [each.value for each in of_frames], [each.samples for each in of_frames]
+    )
+    figure = Figure(figsize=(11, 3.7), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     strength = BINNED * np.hypot(*displacement)
     top = float(np.percentile(strength, 99.8))
@@ -79,25 +97,29 @@ def burner_profile(folder: Path) -> None:
     left.plot([x0, x1], [y0, y1], color="white", lw=1)
     radius = 1e3 * profile.coordinates["radius"].values
     along = 1e3 * profile.coordinates["along"].values
+    heated = AIR["ambient_density"] * AIR["ambient_temperature"]  # of an ideal gas: T ρ
     for axes, name, label in (
         (middle, "density", "density (kg/m³)"),
         (right, "temperature", "temperature (K)"),
     ):
-        values = profile[name].value
-        others = np.stack([each[name].value for each in resampled])
         for number, colour in ((1, BLUE), (len(along) // 2, ORANGE), (len(along) - 2, DARK)):
-            axes.plot(radius, values[number], color=colour, label=f"{along[number]:.0f} mm")
-            for tail in (0.025, 0.16):
-                low, high = np.quantile(others[:, number], [tail, 1 - tail], axis=0)
-                axes.fill_between(radius, low, high, color=colour, alpha=0.15, lw=0)
-            print(
-                f"{name} at {along[number]:.0f} mm: {values[number, 0]:.3g} "
-                f"({low[0]:.3g} to {high[0]:.3g}) on the axis"
-            )
+            curve = profile[name].value[number]
+            axes.plot(radius, curve, color=colour, label=f"{along[number]:.0f} mm")
+            print(f"{name} at {along[number]:.0f} mm: {curve[0]:.3g} on the axis", end="")
+            for share, opacity in ((0.68, 0.3), (0.95, 0.13)):
+                ends = [end[number] for end in density.band(share)]
+                if name == "temperature":
+                    ends = [heated / end for end in ends[::-1]]
+                axes.fill_between(radius, *ends, color=colour, alpha=opacity, lw=0)
+                print(f", {share:.0%}: {ends[0][0]:.3g} to {ends[1][0]:.3g}", end="")
+            print()
         tidy(axes, name.capitalize(), "distance from the axis (mm)", label, 0.9)
     right.legend(title="from the top", frameon=False)
-    note = "Bands of 68 and 95 % by the scatter of the frames. 0.1 mm a pixel and 1 m are assumed."
-    save(figure, "pictures/burner-profile.png", note)
+    footer = (
+        "Bands of 68 and 95 % by the scatter of the frames and the errors of the images. "
+        "0.1 mm a pixel and 1 m to the camera are assumed."
+    )
+    save(figure, "pictures/burner-profile.png", footer)
 
 
 def turbulence(side: int = 200, slope: float = -5 / 3, contrast: float = 0.6) -> None:

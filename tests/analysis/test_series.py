@@ -10,6 +10,7 @@ import xarray as xr
 
 from helpers.exact_fields import SETUP, field_of
 from napari_shadowinv.analysis import (
+    Contrast,
     Flux,
     LineProfile,
     Region,
@@ -17,10 +18,12 @@ from napari_shadowinv.analysis import (
     analyse_shots,
     time_series,
 )
-from napari_shadowinv.analysis.series import TimeSeries
+from napari_shadowinv.analysis.series import TimeSeries, shot_times
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.inversion.result import RetrievedField
+from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import toroid
 
@@ -85,6 +88,44 @@ def test_wrong_stacks_and_times_are_refused():
             analyse_shots(wrong, REGION, times)
     with pytest.raises(InputError, match="no single number to follow"):
         analyse_shots(stack, LineProfile(path=[(2, 2), (9, 9)]))
+
+
+def test_product_without_a_number_is_refused_after_one_shot():
+    measured = []
+    with pytest.raises(InputError, match="the profile along a line has no single number"):
+        analyse_shots(
+            stack_of(TIMES),
+            LineProfile(path=[(2, 2), (9, 9)]),
+            on_progress=lambda progress: measured.append(progress.step),
+        )
+    assert measured == [0]
+
+
+def test_series_states_numbers_in_their_units():
+    contrast, region = (analyse_shots(stack_of(TIMES), each)[0] for each in (Contrast(), REGION))
+    first, last = contrast["mu"].value[[0, -1]]
+    assert contrast.result.facts[0].text == f"{first:.4g} to {last:.4g}, first to last shot"
+    texts = {fact.key: fact.text for fact in region.result.facts}
+    first, last = 1e6 * region["centroid_y"].value[[0, -1]]
+    assert texts["centroid_y"] == f"{first:.4g} to {last:.4g} µm, first to last shot"
+
+
+def test_growth_in_pixels_is_that_of_the_field_and_not_of_places():
+    fields = [field_at(time) for time in TIMES]
+    data = [dataset_from_field(each.displacement, each.potential, None) for each in fields]
+    series = time_series([analyse(RetrievedField(each), REGION)[0] for each in data], TIMES)
+    keys = {fact.key for fact in series.result.facts}
+    assert {"growth_mean", "growth_peak", "growth_rms"} <= keys
+    assert not {"growth_centroid_y", "growth_centroid_x"} & keys
+    assert series.variables["rms"].unit == series.variables["centroid_y"].unit == "pixel"
+    assert ("centroid_y", "centroid_x") in series.result.curve_groups
+
+
+def test_times_follow_from_the_time_between_two_shots():
+    assert shot_times([2.0], [0, 2, 5], "--times") == [0, 4, 10]
+    assert shot_times([1.0, 3.0], [0, 2], "--times") == [1, 3]
+    with pytest.raises(InputError, match="--times, expected the time between two shots in s"):
+        shot_times([1.0, 3.0], [0, 1, 2], "--times")
 
 
 def test_interval_of_a_growth_rate_holds_it():

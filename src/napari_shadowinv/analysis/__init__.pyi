@@ -10,7 +10,7 @@ from .maps import ChargeDensity, CurrentDensity
 from .product import Product
 from .regions import Region
 from .result import ProductResult, add_products, products_in, products_table
-from .series import TimeSeries, analyse_shots, shot_times, time_series
+from .series import TimeSeries, analyse_shots, time_series
 from .spectra import TurbulenceSpectrum
 
 __all__ = [
@@ -39,6 +39,5 @@ __all__ = [
     "product_from_text",
     "products_in",
     "products_table",
-    "shot_times",
     "time_series",
 ]

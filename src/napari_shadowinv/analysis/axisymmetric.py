@@ -79,6 +79,7 @@ class AxisymmetricProfile(Product):
 
     title = "axisymmetric profile"
     place = 60
+    lengths: ClassVar = ("axis_offset",)
     fields: ClassVar = (*_LENGTHS, _N, _E, _B)
     reference: ClassVar = "Daun et al., Appl. Opt. 45, 4638 (2006)"
     product: Literal["axisymmetric"] = "axisymmetric"

@@ -48,6 +48,7 @@ class Contrast(Smoothed):
 
     title = "contrast"
     place = 80
+    lengths = ("scale",)
     reference = "A. F. A. Bott et al., J. Plasma Phys. 83, 905830614 (2017)"
     product: Literal["contrast"] = "contrast"
     object_length: float | None = Field(

@@ -87,6 +87,7 @@ class Filaments(Product):
     place = 75
     reference: ClassVar = "J. Levesque et al., arXiv:1910.04070"
     curves: ClassVar = ("autocorrelation", "along")
+    lengths: ClassVar = ("radius", "width", "spacing")
     product: Literal["filaments"] = "filaments"
     angle: float | None = Field(
         default=None,

@@ -114,6 +114,8 @@ class Product(Choice):
     # Of several variables along an axis, those that figures show; empty for all.
     curves: ClassVar[tuple[str, ...]] = ()
     is_logarithmic: ClassVar[bool] = False  # whether their axes are
+    # Variables that are places or lengths in the object plane and do not grow with the field.
+    lengths: ClassVar[tuple[str, ...]] = ()
 
     label: str = Field(
         default="",

@@ -29,6 +29,7 @@ class Region(Outlined):
     place = 20
     recorded = ("intensity",)
     maxima = ("peak",)
+    lengths = ("centroid_y", "centroid_x")
     product: Literal["region"] = "region"
 
     def check(self, frame: FieldFrame) -> None:

@@ -31,7 +31,7 @@ from napari_shadowinv.analysis.product import (
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.inversion.error_bars import Quantity
-from napari_shadowinv.physics.units import display_unit, label, numbers_of
+from napari_shadowinv.physics.units import display_unit, label, numbers_of, prefix_for
 
 if TYPE_CHECKING:
     import xarray
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 __all__ = ["ProductResult", "add_products", "products_in", "products_table"]
 
 _ATTRIBUTE = "products"
+SERIES_AXES: tuple[str, str] = ("time", "shot")
 _COLUMNS = ("product", "quantity", "place", "place_unit", "value", "unit", "bias", "std")
 
 Band = tuple[FloatArray, FloatArray]
@@ -112,6 +113,25 @@ class ProductResult:
         return tuple(name for name in names if self.variables[name].unit in units)
 
     @property
+    def is_series(self) -> bool:
+        """Whether its axis is that of successive shots."""
+        return not self.coordinates.keys().isdisjoint(SERIES_AXES)
+
+    @property
+    def curve_groups(self) -> tuple[tuple[str, ...], ...]:
+        """Variables that figures draw, those of one panel together.
+
+        Of a series these are all variables; lengths are apart from a displacement in pixels.
+        """
+        if not self.is_series:
+            return (self.curve_names,) if self.curve_names else ()
+        groups: dict[tuple[str, bool], list[str]] = {}
+        for name, variable in self.variables.items():
+            key = variable.unit, name in self.product.lengths
+            groups.setdefault(key, []).append(name)
+        return tuple(map(tuple, groups.values()))
+
+    @property
     def is_logarithmic(self) -> bool:
         """Whether the axes of its curves are logarithmic."""
         return self.product.is_logarithmic and "k" in self.coordinates
@@ -159,6 +179,25 @@ class ProductResult:
         if unit == si_unit_of(self.field):
             return 1 / self.unit.size, self.unit.symbol
         return 1.0, display_unit(unit)
+
+    def shown_scale(self, names: Sequence[str]) -> tuple[float, str]:
+        """Return `scale_of` variables of one unit, with a prefix if they are lengths."""
+        factor, unit = self.scale_of(names[0])
+        if unit != "m":
+            return factor, unit
+        largest = max(float(np.max(np.abs(self.quantities[name].value))) for name in names)
+        larger, prefix = prefix_for(largest)
+        return larger * factor, f"{prefix}{unit}"
+
+    def shown_places(self, name: str) -> tuple[FloatArray, str]:
+        """Return the places along a variable's axis in a handy unit, and the axis in words."""
+        coordinate = self.coordinates[self.variables[name].dims[0]]
+        places = np.asarray(coordinate.values)
+        unit = display_unit(coordinate.unit)
+        if unit in ("m", "s"):
+            factor, prefix = prefix_for(float(np.max(np.abs(places), initial=0.0)))
+            places, unit = factor * places, f"{prefix}{unit}"
+        return places, f"{coordinate.long_name} ({unit})" if unit else coordinate.long_name
 
 
 def _band_names(share: float) -> tuple[str, str]:

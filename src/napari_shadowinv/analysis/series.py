@@ -1,4 +1,7 @@
-"""A product over the shots of a stack: `time_series`, `analyse_shots`; `TimeSeries`."""
+"""A product over the shots of a stack: `time_series`, `analyse_shots`; `TimeSeries`.
+
+- the time of each shot from the time between two: `shot_times`
+"""
 
 from __future__ import annotations
 
@@ -21,11 +24,11 @@ from napari_shadowinv.analysis.product import (
     has_bands,
     value_text,
 )
-from napari_shadowinv.analysis.result import ProductResult
+from napari_shadowinv.analysis.result import SERIES_AXES, ProductResult
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.inversion.error_bars import Quantity
-from napari_shadowinv.physics.units import PIXEL, prefix_for
+from napari_shadowinv.physics.units import prefix_for
 
 if TYPE_CHECKING:
     import xarray
@@ -37,7 +40,8 @@ __all__ = ["TimeSeries", "analyse_shots", "shot_times", "time_series"]
 _MIN_SHOTS = 2
 _LEAST = 1e-300
 _SAMPLES = 1000  # of a growth rate by the scatter of the shots
-_AXES = {"s": ("time", "time"), "": ("shot", "number of the shot")}
+_TIME, _SHOT = SERIES_AXES
+_AXES = {"s": (_TIME, "time"), "": (_SHOT, "number of the shot")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +162,11 @@ def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> Ti
             "each of at least two shots"
         )
     if not (np.isfinite(places).all() and (np.diff(places) > 0).all()):
-        raise InputError("the times do not increase: expected those of successive shots, in s")
+        places_in_words = "times" if unit else "numbers of the shots"
+        raise InputError(
+            f"the {places_in_words} do not increase: expected those of successive shots"
+            f"{', in s' if unit else ''}"
+        )
     first = results[0]
     kinds = {(type(each.product), each.field) for each in results}
     if len(kinds) > 1:
@@ -167,15 +175,8 @@ def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> Ti
     orders = [np.random.default_rng(shot).permutation(count) for shot in range(len(results))]
     axis, long_name = _AXES[unit]
     variables = {
-        name: replace(variable, dims=(axis,))
-        for name, variable in first.variables.items()
-        if not variable.dims and name not in first.product.recorded
+        name: replace(variable, dims=(axis,)) for name, variable in _single_numbers(first).items()
     }
-    if not variables:
-        raise InputError(
-            f"{first.title} has no single number to follow over the shots: expected a product with "
-            "one, such as a region or a flux"
-        )
     quantities = {}
     for name in variables:
         shots = [each.quantities[name] for each in results]
@@ -192,17 +193,33 @@ def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> Ti
     return TimeSeries(replace(result, facts=tuple(_facts(result, places, unit))))
 
 
+def _single_numbers(result: ProductResult) -> dict[str, Variable]:
+    """Return the variables that can be followed over the shots, or raise an `InputError`."""
+    variables = {
+        name: variable
+        for name, variable in result.variables.items()
+        if not variable.dims and name not in result.product.recorded
+    }
+    if not variables:
+        raise InputError(
+            f"the {result.product.title} has no single number to follow over the shots: expected "
+            "a product with one, such as a region or a flux"
+        )
+    return variables
+
+
 def _facts(series: ProductResult, times: FloatArray, unit: str) -> Iterator[Fact]:
     """Yield each number in the first and last shot, its growth, and what the band holds."""
     for name, quantity in series.quantities.items():
         variable = series.variables[name]
         title = variable.title or name.replace("_", " ")
-        factor, symbol = series.scale_of(name)
+        factor, symbol = series.shown_scale([name])
         first, last = factor * quantity.value[[0, -1]]
-        text = f"{first:.4g} to {last:.4g} {symbol}, first to last shot"
+        of_unit = "" if symbol == "1" else f" {symbol}"
+        text = f"{first:.4g} to {last:.4g}{of_unit}, first to last shot"
         yield Fact(name, f"{title[:1].upper()}{title[1:]}", text, short=text)
-        is_place = variable.unit in ("m", PIXEL)
-        if is_place or not _keeps_sign(quantity) or np.ptp(quantity.value) == 0:
+        is_length = name in series.product.lengths
+        if is_length or not _keeps_sign(quantity) or np.ptp(quantity.value) == 0:
             continue
         rate = _growth_rate(quantity, times)
         factor, symbol = _rate_unit(float(rate.value), unit)
@@ -225,48 +242,31 @@ def _rate_unit(rate: float, unit: str) -> tuple[float, str]:
     return 1 / factor, f"1/{prefix}{unit}"
 
 
-def shot_times(text: str | None, shots: ArrayLike, name: str = "times") -> FloatArray | None:
-    """Return the times of numbered shots in s that a text states.
+def shot_times(numbers: Sequence[float], shots: Sequence[int], received: str) -> list[float]:
+    """Return the times of numbered shots from the time between two, or from a list of all.
 
     Parameters
     ----------
-    text : str or None
-        The time between two successive shots, or a list with the time of each shot used.
-    shots : array_like of int, shape (n,)
-        Numbers of the shots used.
-    name : str
-        Of the text in errors.
-
-    Returns
-    -------
-    ndarray, shape (n,), or None
-        None if there is no text: shots are numbered.
+    numbers : sequence of float
+        One time, in s, between two successive shots of a store; or one for each of `shots`.
+    shots : sequence of int
+        Numbers of the shots in their store.
+    received : str
+        Start of an error, such as ``"--times is '1,2'"``.
 
     Raises
     ------
     InputError
-        If it is neither one number nor one for each shot.
-
-    Examples
-    --------
-    >>> shot_times("1e-9", [0, 2, 3])
-    array([0.e+00, 2.e-09, 3.e-09])
+        If there are neither one nor as many numbers as shots.
     """
-    if not text:
-        return None
-    numbers = np.asarray(shots, dtype=np.float64)
-    try:
-        times = np.array([float(part) for part in text.split(",")])
-    except ValueError:
-        times = np.empty(0)
-    if len(times) == 1 and len(numbers) > 1:
-        return np.asarray(numbers * times[0])
-    if len(times) != len(numbers):
+    if len(numbers) == 1 and len(shots) > 1:
+        return [float(shot) * numbers[0] for shot in shots]
+    if len(numbers) != len(shots):
         raise InputError(
-            f"{name} is {text!r}, expected the time between two shots in s, or a list for "
-            f"the {len(numbers)} finished ones"
+            f"{received}, expected the time between two shots in s, or a list for the "
+            f"{len(shots)} finished ones"
         )
-    return times
+    return list(numbers)
 
 
 def analyse_shots(
@@ -329,6 +329,9 @@ def analyse_shots(
             continue
         used.append(index)
         shots.append(analyse(shot, products, unit=unit, deflector=deflector, setup=setup))
+        if len(shots) == 1:
+            for result in shots[0]:
+                _single_numbers(result)  # the other shots would be measured in vain
     if len(shots) < _MIN_SHOTS:
         raise InputError(f"{len(shots)} of {count} shots have a field, expected at least two")
     unit_of_places = "" if times is None else "s"

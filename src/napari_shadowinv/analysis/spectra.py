@@ -84,6 +84,7 @@ class TurbulenceSpectrum(Product):
     reference: ClassVar = "A. F. A. Bott et al., J. Plasma Phys. 83, 905830614 (2017)"
     subtracts_noise: ClassVar = True
     curves: ClassVar = ("power", "noise")
+    lengths: ClassVar = ("correlation_length",)
     is_logarithmic: ClassVar = True
     product: Literal["spectrum"] = "spectrum"
     path_length: float | None = Field(

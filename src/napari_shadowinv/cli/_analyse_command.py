@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -83,11 +84,11 @@ def analyse(
     Bands hold the noise of the image, the discretisation and what was stated of the instrument.
     """
     from napari_shadowinv.analysis import analyse as measure
-    from napari_shadowinv.analysis import analyse_shots, shot_times
-    from napari_shadowinv.cli._export import open_shots
+    from napari_shadowinv.analysis import analyse_shots
     from napari_shadowinv.io import read_dataset
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, SITES
     from napari_shadowinv.io.store import is_stack
+    from napari_shadowinv.io.store_shots import open_shots
     from napari_shadowinv.pipeline.files import setup_from
 
     chosen = _products(product or [], products)
@@ -111,7 +112,7 @@ def analyse(
             "should_stop": is_interrupted,
         }
         if "shot" in dataset.dims:
-            seconds = shot_times(times, dataset["index"].values, "--times")
+            seconds = _times(times, dataset["index"].values.tolist())
             series = analyse_shots(dataset, chosen, seconds, **common)
             results = [each.result for each in series]
         else:
@@ -131,6 +132,19 @@ def _check_series(out: Path | None) -> None:
             f"received --out {out}, which copies one result with its products, but a store has "
             "many results: use --csv"
         )
+
+
+def _times(text: str | None, shots: Sequence[int]) -> list[float] | None:
+    """Return the times of numbered shots from the time between two, or from a list of all."""
+    from napari_shadowinv.analysis.series import shot_times
+
+    if text is None:
+        return None
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    return shot_times(numbers, shots, f"--times is {text!r}")
 
 
 def _products(texts: list[str], file: Path | None) -> list[Product]:

@@ -19,7 +19,8 @@ from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.files import make_folder
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
 from napari_shadowinv.io.pradformat import check_pradformat_setup
-from napari_shadowinv.io.store import DAMAGED, DONE, STATUS_NAMES, StackStore, read_stack
+from napari_shadowinv.io.store import STATUS_NAMES, StackStore, read_stack
+from napari_shadowinv.io.store_shots import open_shots, parse_shots
 from napari_shadowinv.physics.units import display_unit
 from napari_shadowinv.pipeline.rerun import provenance_of
 
@@ -28,47 +29,6 @@ if TYPE_CHECKING:
 
 _FORMULA_SIGNS = ("=", "+", "-", "@")
 FORMATS = ("tiff", "pradformat", "csv")
-
-
-def open_shots(path: Path, shots: str | None) -> xarray.Dataset:
-    """Open a store and select shots from it; only finished ones."""
-    dataset = read_stack(path)
-    count = dataset.sizes["shot"]
-    selection = dataset.assign_coords(index=("shot", np.arange(count)))
-    if shots is not None:
-        selection = selection.isel(shot=_parse_shots(shots, count))
-    for index in np.flatnonzero(selection["status"].values == DAMAGED)[:1]:
-        number = int(selection["index"].values[index])
-        store = StackStore(path)
-        raise FileFormatError(
-            f"{path} is damaged: shot {number} ({store.names[number]}): "
-            f"{store.report(number)['reason']}; "
-            "repeat the run with --resume to invert it again, or choose other shots with --shots"
-        )
-    done = selection.isel(shot=np.flatnonzero(selection["status"].values == DONE))
-    if not done.sizes["shot"]:
-        raise InputError(f"{path} has no finished shots in this selection: see shadowinv status")
-    return done
-
-
-def _parse_shots(text: str, count: int) -> list[int]:
-    """Convert 3, 3:20, :10, ::5 or a list of these to shot numbers."""
-    selection: list[int] = []
-    for part in text.split(","):
-        try:
-            numbers = [int(piece) if piece.strip() else None for piece in part.split(":")]
-            if len(numbers) == 1 and numbers[0] is not None:
-                selection.append(range(count)[numbers[0]])
-            elif 2 <= len(numbers) <= 3:
-                selection.extend(range(count)[slice(*numbers)])
-            else:
-                raise ValueError(part)
-        except (ValueError, IndexError):
-            raise InputError(
-                f"shots are {text!r}: expected numbers from 0 to {count - 1} such as 3, 3:20, or "
-                "3,5,10:20"
-            ) from None
-    return selection
 
 
 def export_shots(
@@ -153,7 +113,7 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
     columns = {name: np.asarray(peaks[name].values) for name in names}
     headings = [f"{name} ({display_unit(peaks[name].attrs['units'])})" for name in names]
     count = len(content.names)
-    indices = range(count) if shots is None else _parse_shots(shots, count)
+    indices = range(count) if shots is None else parse_shots(shots, count)
     statuses, reports = content.statuses(), content.reports()
     with (
         replacing(out, overwrite) as temporary,

@@ -148,12 +148,9 @@ def _object(
     view: dict[str, Any],
 ) -> PlannedObject | Any:
     """Return the phantom of a text, or the object of a file."""
-    from napari_shadowinv.io import is_field_grid, read_field_grid
-    from napari_shadowinv.pipeline.experiment_object import (
-        object_of_displacement,
-        object_of_field,
-        phantom_of_text,
-    )
+    from napari_shadowinv.io import is_field_grid
+    from napari_shadowinv.pipeline.experiment_object import object_of_displacement, phantom_of_text
+    from napari_shadowinv.pipeline.traced_file import object_of_file
 
     is_file = _file_of(text.partition(":")[0]) is not None
     is_grid = is_file and is_field_grid(Path(text))
@@ -168,8 +165,7 @@ def _object(
             )
         if setups is None:
             raise InputError(f"{text} is a 3-D field: particles through it need --setup")
-        grid = GridView(**view).apply(read_field_grid(Path(text)))
-        return object_of_field(grid, setups[0], title=Path(text).name)
+        return object_of_file(Path(text), setups[0], GridView(**view))
     if not is_file:
         if recorded_with is not None or deflector is not None:
             flag = "--deflector" if recorded_with is None else "--recorded-with"

@@ -1,4 +1,4 @@
-"""The image of a 3-D field in a file: `trace_file`."""
+"""A 3-D field in a file: its image, `trace_file`; an object to plan with, `object_of_file`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from napari_shadowinv.io.field_grids import read_field_grid
 from napari_shadowinv.physics.particle_flight import check_particles
 from napari_shadowinv.physics.trace_options import GridView, TraceOptions
 from napari_shadowinv.physics.tracing import trace
+from napari_shadowinv.pipeline.experiment_object import TracedObject, object_of_field
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
@@ -74,3 +75,25 @@ def trace_file(
         on_progress=on_progress,
         should_stop=should_stop,
     )
+
+
+def object_of_file(path: Path, setup: Setup | None, view: GridView | None = None) -> TracedObject:
+    """Return the field in a file as the object of a planned experiment.
+
+    Parameters
+    ----------
+    path : Path
+        As for `trace_file`.
+    setup : Setup or None
+        The experiment of the first image, of particles.
+    view : GridView, optional
+        Direction of the beam. Default: along z, with x to the right.
+
+    Raises
+    ------
+    InputError, FileFormatError
+        As `read_field_grid` and `object_of_field`.
+    """
+    checked = check_particles(setup)
+    grid = (view or GridView()).apply(read_field_grid(path))
+    return object_of_field(grid, checked, title=path.name)

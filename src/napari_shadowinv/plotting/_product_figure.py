@@ -46,18 +46,18 @@ def products_figure(results: Sequence[ProductResult], *, title: str | None = Non
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    drawn = [each for each in results if any(v.dims for v in each.variables.values())]
+    panels = [(each, names) for each in results for names in _panels_of(each)]
     lines = _footer(results)
     foot = 0.25 + _LINE_IN * len(lines)
     head = 0.35 if title else 0.1
-    height = head + _HEIGHT_IN * len(drawn) + foot
+    height = head + _HEIGHT_IN * len(panels) + foot
     with mpl.rc_context(_panels.STYLE):
         figure = Figure(figsize=(_WIDTH_IN, height))
         FigureCanvasAgg(figure)
-        for number, each in enumerate(drawn):
+        for number, (each, names) in enumerate(panels):
             bottom = height - head - _HEIGHT_IN * (number + 1)
             box = (0.1, (bottom + 0.6) / height, 0.78, (_HEIGHT_IN - 1.0) / height)
-            _draw(figure.add_axes(box), each)
+            _draw(figure.add_axes(box), each, names)
         if title:
             figure.text(0.02, 1 - 0.1 / height, title, va="top", weight="bold")
         for number, (text, colour) in enumerate(lines):
@@ -84,20 +84,23 @@ def _colour(level: Level) -> str:
     return QUIET_COLOUR if level is Level.SOUND else ALARM_COLOUR
 
 
-def _draw(axes: Axes, result: ProductResult) -> None:
-    axes.set_title(result.title)
+def _panels_of(result: ProductResult) -> tuple[tuple[str, ...], ...]:
+    """Return the variables of each panel: a map, or curves in one unit."""
     maps = [name for name, variable in result.variables.items() if len(variable.dims) == 2]
-    if maps:
-        _draw_map(axes, result, maps[0])
+    return ((maps[0],),) if maps else result.curve_groups
+
+
+def _draw(axes: Axes, result: ProductResult, names: Sequence[str]) -> None:
+    axes.set_title(result.title)
+    if len(result.variables[names[0]].dims) == 2:
+        _draw_map(axes, result, names[0])
         return
-    curves = [name for name, variable in result.variables.items() if len(variable.dims) == 1]
-    draw_curves(axes, result, result.curve_names)
-    if "intensity" in curves:
+    draw_curves(axes, result, names)
+    if "intensity" in result.variables:
         beside = axes.twinx()
-        coordinate = result.coordinates[result.variables["intensity"].dims[0]]
-        factor, _ = prefix_for(float(np.max(np.abs(coordinate.values), initial=0.0)))
+        places, _ = result.shown_places("intensity")
         values = result.quantities["intensity"].value
-        beside.plot(factor * coordinate.values, values, color="0.6", linewidth=0.8)
+        beside.plot(places, values, color="0.6", linewidth=0.8)
         beside.set_ylabel("image", color="0.5")
         beside.margins(x=0)
 
@@ -128,21 +131,24 @@ def draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> None
     names : sequence of str
         Variables with one common axis.
     """
-    coordinate = result.coordinates[result.variables[names[0]].dims[0]]
-    factor, prefix = prefix_for(float(np.max(np.abs(coordinate.values), initial=0.0)))
-    has_prefix = coordinate.unit in ("m", "s")
-    places = coordinate.values * (factor if has_prefix else 1.0)
+    from matplotlib.ticker import MaxNLocator
+
+    places, words = result.shown_places(names[0])
+    scale, unit = result.shown_scale(names)
     for number, name in enumerate(names):
-        scale, unit = result.scale_of(name)
         colour = _COLOURS[number % len(_COLOURS)]
-        axes.plot(places, scale * result[name].value, color=colour, linewidth=1.3, label=name)
+        marker = "." if result.is_series else ""
+        values = scale * result[name].value
+        axes.plot(places, values, color=colour, linewidth=1.3, marker=marker, label=name)
         for share, opacity in zip(BANDS, _OPACITIES, strict=True):
             if (band := result.band(name, share)) is not None:
                 style: Any = {"color": colour, "alpha": opacity, "linewidth": 0}
                 axes.fill_between(places, scale * band[0], scale * band[1], **style)
-    symbol = f"{prefix}{coordinate.unit}" if has_prefix else display_unit(coordinate.unit)
-    axes.set_xlabel(f"{coordinate.long_name} ({symbol})" if symbol else coordinate.long_name)
-    axes.set_ylabel(f"field ({unit})" if unit == result.unit.symbol else unit)
+    axes.set_xlabel(words)
+    if "shot" in result.coordinates:
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    shown_unit = "" if unit == "1" else unit
+    axes.set_ylabel(f"field ({unit})" if unit == result.unit.symbol else shown_unit)
     if result.is_logarithmic:
         make_logarithmic(axes)
     axes.grid(alpha=0.25, linewidth=0.6)

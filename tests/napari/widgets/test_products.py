@@ -17,8 +17,6 @@ from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.io import read_dataset
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
-from napari_shadowinv.preprocessing import Recipe
-from napari_shadowinv.stack import run_stack
 
 PATIENCE = 60_000  # ms
 
@@ -133,40 +131,3 @@ def test_problems_are_said_in_a_sentence(form: Any, window: Any, messages: list[
         window.layers.remove(layer)
     form.panel.button.click()
     assert "There is no result to measure" in messages[-1]
-
-
-def test_numbers_are_followed_through_the_shots_of_a_store(
-    window: Any, open_widget: Any, messages: list[str], tmp_path: Path, qtbot: Any
-) -> None:
-    """A field that grows by exp(0.2) from shot to shot, of which the third cannot be inverted."""
-    setup = paper_setup()
-    peaks = [20 * np.exp(0.2 * number) for number in range(4)]
-    shots = [
-        300 * synthetic_image(toroid((32, 32), setup, peak, 6e-6).displacement) for peak in peaks
-    ]
-    shots[2][:] = np.nan
-    store = tmp_path / "night.shadowinv.zarr"
-    run_stack(np.stack(shots), store, Recipe(setup=setup))
-    window.open(str(store), plugin="napari-shadowinv")
-    form = open_widget("Analyse").products
-    assert form.times.isVisibleTo(form)
-    choose(form, "region")
-    form._draw()
-    pixel = form.result.layer.scale[-1]
-    assert pixel != 1
-    form.shapes.layer.add_ellipses(np.array([[15.5, 15.5], [10.0, 10.0]]))
-    form.times.setText("2e-9")
-    measured = measure(form, qtbot)
-    np.testing.assert_allclose(measured.coordinates["time"].values, [0, 2e-9, 6e-9])
-    rates = {fact.title: fact.text for fact in measured.facts}
-    growth = np.polyfit([0, 2, 6], np.log(measured["rms"].value), 1)[0]
-    assert growth == pytest.approx(0.1, rel=0.05)
-    assert f"{growth:.3f}" in " ".join(rates.values())
-    assert rates.items() <= dict(form.report.texts()).items()
-    assert len(form.plot.figure.axes[0].lines[0].get_xdata()) == 3
-    assert form.export.isEnabled()
-    assert not form.save.isEnabled()
-    form.times.setText("1, 2")
-    form.panel.button.click()
-    qtbot.waitUntil(lambda: not form.panel.runner.running, timeout=PATIENCE)
-    assert "Times is '1, 2', expected the time between two shots in s" in " ".join(messages)

@@ -47,12 +47,7 @@ from napari_shadowinv.physics.setup import (
     geometry_text,
     setup_warnings,
 )
-from napari_shadowinv.physics.trace_options import GridView
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
-
-GRID = "grid"
-GRID_KIND = {GRID: ("a 3-D field from a file", GridView)}
-"""The kind of object of a `ModelPicker`."""
 
 _NONE = "none"
 _INSTRUMENT_KINDS = ("detector", "beam_source")
@@ -74,33 +69,6 @@ _SOURCE_TITLES = {
     SUPPLIED: "supplied with the shot",
     UNKNOWN: "unknown (fit it)",
 }
-
-
-@dataclass(frozen=True)
-class GridFile:
-    """A 3-D field in a file, and the direction from which it is seen."""
-
-    path: str
-    view: GridView
-
-    @classmethod
-    def chosen(cls, file: forms.PathEdit, view: Any) -> GridFile:
-        """Return the file of an entry; raise an `InputError` if it is empty."""
-        if not file.path:
-            raise InputError("there is no file with a 3-D field: choose one")
-        return cls(file.path, view)
-
-
-def grid_file_edit() -> forms.PathEdit:
-    """Return an entry for a file with a 3-D field."""
-    entry = forms.PathEdit(
-        "Choose a 3-D field", "openPMD or NetCDF file", "3-D fields (*.h5 *.hdf5 *.nc)"
-    )
-    entry.setToolTip(
-        "<qt>openPMD file (HDF5), or NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez; particles "
-        "are traced through it.</qt>"
-    )
-    return entry
 
 
 @dataclass(frozen=True)
@@ -183,6 +151,13 @@ class SetupPicker(QWidget):
         """Show a setup that the user did not enter; editing it makes it the user's."""
         self._show(setup.kind, _Entry(setup.model_dump(), origin))
         self.changed.emit()
+
+    def choose_kind(self, kind: str) -> None:
+        """Show the user's setup of a kind, or else the paper's."""
+        self.picker.set_kind(kind)
+        form = self.picker.form
+        if form is not None and form.is_empty:
+            self.suggest(SETUPS[kind].example(), "example from the paper")
 
     def show_setup(self, values: Mapping[str, Any], origin: str = "") -> None:
         """Show a setup from the user: loaded from `origin`, or typed if that is empty."""

@@ -1,8 +1,8 @@
-"""The form that measures products of a result, drawn as shapes: `ProductForm`."""
+"""The form that measures products of a result or of all shots of a store: `ProductForm`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from napari_shadowinv._napari.layer_metadata import (
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._editors import SteadyComboBox
+from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
 from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes
 from napari_shadowinv._napari.widgets._panels import Outcome, ReportTable, RunPanel
 from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
@@ -39,14 +39,14 @@ from napari_shadowinv.analysis import (
     analyse_shots,
     product_from_dict,
     products_table,
-    shot_times,
 )
 from napari_shadowinv.analysis.outlines import Outlined
 from napari_shadowinv.analysis.product import BANDS
+from napari_shadowinv.analysis.series import shot_times
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io.store import DONE, read_stack
-from napari_shadowinv.physics.units import display_unit, prefix_for
-from napari_shadowinv.plotting import make_logarithmic
+from napari_shadowinv.io.store_shots import open_shots
+from napari_shadowinv.physics.units import prefix_for
+from napari_shadowinv.plotting import make_logarithmic, products_figure, save_figure
 
 if TYPE_CHECKING:
     import napari
@@ -58,8 +58,10 @@ _ELLIPSE_CORNERS = 90
 _ROUND = 0.02  # largest difference of the axes of a circle
 _OPACITIES = (0.35, 0.18)  # of the bands
 _BY_SETUP = "unit of the setup"
-_FEW_PLACES = 50  # such as shots, which are marked
+_TIMES, _SHOTS = "Times", "Shots"  # labels of the rows of a store
 _OPEN_SHAPES = ("line", "path")
+_PANEL_HEIGHT_PX = 180
+_MAX_COLUMN = 3  # entries of a legend inside the axes; longer ones are above
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +75,8 @@ class _Request:
     samples: int
 
     @property
-    def subject(self) -> Any:
-        """The result that is measured."""
+    def origin(self) -> Any:
+        """The result, by which requests are compared."""
         return self.result
 
     def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
@@ -91,64 +93,95 @@ class _Request:
 
 @dataclass(frozen=True, eq=False)
 class _SeriesRequest:
-    """A product to be measured in all finished shots of a store, and the layer of the store."""
+    """A product to be followed through the shots of a store, and a layer of the store."""
 
-    subject: str  # path of the store
+    store: Path
     layer: Any
     product: Product
     unit: str | None
+    shots: str | None
     times: str
 
+    @property
+    def origin(self) -> Any:
+        """The store, by which requests are compared."""
+        return self.store
+
     def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
-        stack = read_stack(Path(self.subject))
-        finished = np.flatnonzero(stack["status"].values == DONE)
+        stack = open_shots(self.store, self.shots)
         series = analyse_shots(
-            stack.isel(shot=finished),
+            stack,
             self.product,
-            shot_times(self.times, finished, "Times"),
+            self._seconds(stack["index"].values.tolist()),
             unit=self.unit,
             on_progress=on_progress,
             should_stop=should_stop,
         )
         return [each.result for each in series]
 
+    def _seconds(self, shots: list[int]) -> list[float] | None:
+        """Return the time of each shot in s; None if shots are numbered."""
+        if not self.times:
+            return None
+        received = f"{_TIMES} is '{self.times}'"
+        try:
+            numbers = [parse_number(part, "s") for part in self.times.split(",")]
+        except InputError:
+            raise InputError(
+                f"{received}, expected times separated by commas, such as 1 ns or 0, 1 ns, 3 ns"
+            ) from None
+        return shot_times(numbers, shots, received)
+
 
 class ProductPlot(Plot):
-    """The curves of a product with their bands of 68 and 95 %."""
+    """The curves of a product with their bands of 68 and 95 %, or its series over shots."""
 
     def __init__(self) -> None:
-        super().__init__(height=180)
+        super().__init__(height=_PANEL_HEIGHT_PX)
 
     def show_curves(self, result: ProductResult) -> bool:
         """Draw all curves but the image's intensity; return whether there is any."""
-        names = list(result.curve_names)
-        if not names:
+        groups = result.curve_groups
+        if not groups:
             return False
-        (axes,) = self.fresh_axes()
-        coordinate = result.coordinates[result.variables[names[0]].dims[0]]
-        factor, prefix, unit = 1.0, "", display_unit(coordinate.unit)
-        if unit in ("m", "s"):
-            factor, prefix = prefix_for(float(np.abs(coordinate.values).max()))
-        for number, name in enumerate(names):
-            scale, field_unit = result.scale_of(name)
-            colour, places = COLOURS[number % len(COLOURS)], factor * coordinate.values
-            style = "o-" if len(places) <= _FEW_PLACES else "-"
-            axes.plot(places, scale * result[name].value, style, ms=3, color=colour, label=name)
-            for share, opacity in zip(BANDS, _OPACITIES, strict=True):
-                if (band := result.band(name, share)) is not None:
-                    low, high = (scale * end for end in band)
-                    axes.fill_between(places, low, high, color=colour, alpha=opacity, linewidth=0)
-        axes.set_xlabel(f"{coordinate.long_name.lower()} ({prefix}{unit})", color=self.ink)
-        axes.set_ylabel(field_unit, color=self.ink)
+        self.setMinimumHeight(_PANEL_HEIGHT_PX * len(groups))
+        axes = self.fresh_axes(len(groups))
+        for axis, names in zip(axes, groups, strict=True):
+            self._draw_group(axis, result, names)
+        _, words = result.shown_places(groups[0][0])
+        axes[-1].set_xlabel(f"{words[:1].lower()}{words[1:]}", color=self.ink)
+        if "shot" in result.coordinates:
+            axes[-1].xaxis.get_major_locator().set_params(integer=True)
         if result.is_logarithmic:
-            make_logarithmic(axes)
-        self.add_legend(axes)
+            make_logarithmic(axes[-1])
         self.draw()
         return True
 
+    def _draw_group(self, axis: Any, result: ProductResult, names: Sequence[str]) -> None:
+        places, _ = result.shown_places(names[0])
+        scale, unit = result.shown_scale(names)
+        marker = "." if result.is_series else ""
+        for number, name in enumerate(names):
+            colour = COLOURS[number % len(COLOURS)]
+            axis.plot(places, scale * result[name].value, color=colour, marker=marker, label=name)
+            for share, opacity in zip(BANDS, _OPACITIES, strict=True):
+                if (band := result.band(name, share)) is not None:
+                    low, high = (scale * end for end in band)
+                    axis.fill_between(places, low, high, color=colour, alpha=opacity, linewidth=0)
+        axis.set_ylabel("" if unit == "1" else unit, color=self.ink)
+        if len(names) > _MAX_COLUMN:
+            above = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
+            compact = {"ncols": len(names), "handlelength": 1.0, "columnspacing": 0.8}
+            self.add_legend(axis, size=7, frameon=False, **above, **compact)
+        else:
+            self.add_legend(axis)
+
 
 class ProductForm(QtWidgets.QWidget):
-    """Choose a result, a product and a shape, and measure it with its bands."""
+    """Choose a result, a product and a shape, and measure it with its bands.
+
+    Of a store, the product is followed through its shots.
+    """
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         super().__init__()
@@ -157,16 +190,7 @@ class ProductForm(QtWidgets.QWidget):
         self._measured: _Request | _SeriesRequest | None = None
         tip = "<qt>Layer of the result of an inversion or a fit, or of a store of shots.</qt>"
         self.result = LayerPicker(
-            viewer,
-            ("image",),
-            tip,
-            suits=lambda layer: bool(result_of(layer) or _store_of(layer)),
-        )
-        self.times = QtWidgets.QLineEdit()
-        self.times.setPlaceholderText("shots are numbered")
-        self.times.setToolTip(
-            "<qt>Time between two shots of the store in s, or a list of the times of all finished "
-            "shots, such as 0, 1e-9, 3e-9.</qt>"
+            viewer, ("image",), tip, suits=lambda layer: bool(result_of(layer) or _store_of(layer))
         )
         self.product = SteadyComboBox()
         for name, kind in PRODUCTS.items():
@@ -182,6 +206,22 @@ class ProductForm(QtWidgets.QWidget):
         self.samples.setRange(_MIN_SAMPLES, _MAX_SAMPLES)
         self.samples.setValue(_SAMPLES)
         self.samples.setToolTip("<qt>Number of samples of the field for the bands.</qt>")
+        self.times = QtWidgets.QLineEdit()
+        self.times.setPlaceholderText("shots are numbered")
+        self.times.setToolTip(
+            "<qt>Time between two shots of the store, such as 1 ns, or the times of all shots "
+            "used, such as 0, 1 ns, 3 ns; a number without a unit is in s. Empty: shots are "
+            "numbered, and rates are per shot.</qt>"
+        )
+        self.shots = QtWidgets.QLineEdit()
+        self.shots.setPlaceholderText("all finished ones")
+        self.shots.setToolTip(
+            "<qt>Shots of the store, such as 3:20 or 0,2,5. Empty: all finished ones.</qt>"
+        )
+        self._store_rows = (
+            forms.labelled(_SHOTS, self.shots),
+            forms.labelled(_TIMES, self.times),
+        )
         self.panel = RunPanel("analysis", "Measure", "Measure the product with its bands.")
         self.panel.button.clicked.connect(lambda: self._run_or_cancel())
         self.panel.runner.ended.connect(self._on_end)
@@ -190,30 +230,34 @@ class ProductForm(QtWidgets.QWidget):
         self.save = qt.push_button(
             "Save with result…", "Save the result with all measured products.", self._save
         )
+        self.picture = qt.push_button(
+            "Save figure…", "Save a figure of all measured products.", self._save_figure
+        )
         self.clear = qt.push_button("Clear", "Forget all measured products.", self._clear)
         shapes = qt.with_button(self.shapes, "✎", "Draw a new shape for the product.", self._draw)
         numbers = qt.side_by_side((self.width_edit, 1), (self.samples, 1))
-        self._times_row = forms.labelled("Times (s)", self.times)
         rows = (
             forms.labelled("Result", self.result),
+            *self._store_rows,
             forms.labelled("Product", self.product),
             forms.labelled("Shape", shapes),
             forms.labelled("Unit", self.unit),
             forms.labelled("Width, samples", numbers),
-            self._times_row,
             self.panel,
         )
         content = QtWidgets.QWidget()
-        buttons = qt.side_by_side((self.export, 1), (self.save, 1), (self.clear, 0))
-        qt.column(content, *rows, self.plot, self.report, buttons, margin=6).addStretch(1)
+        files = qt.side_by_side((self.export, 1), (self.picture, 1))
+        buttons = qt.side_by_side((self.save, 1), (self.clear, 0))
+        outputs = (self.plot, self.report, files, buttons)
+        qt.column(content, *rows, *outputs, margin=6).addStretch(1)
         area = QtWidgets.QScrollArea()
         area.setWidgetResizable(True)
         area.setFrameShape(QtWidgets.QFrame.Shape.NoFrame)
         area.setWidget(content)
         qt.column(self, area)
-        self.result.picked.connect(self._offer_units)
+        self.result.picked.connect(self._on_result)
         self.product.currentIndexChanged.connect(lambda _: self._enable())
-        self._offer_units()
+        self._on_result()
         self._enable()
         self._empty()
 
@@ -227,11 +271,19 @@ class ProductForm(QtWidgets.QWidget):
         self.shapes.parent().setEnabled(is_drawn)
         self.width_edit.setEnabled("width" in self.kind.model_fields)
 
-    def _offer_units(self) -> None:
-        """Offer the units of the fields of the result's setup."""
+    def _on_result(self) -> None:
+        """Show the rows of a store or of a single result, and offer the units of its fields."""
         layer = self.result.layer
-        self._times_row.setVisible(_store_of(layer) is not None)
-        setup = None if layer is None else setup_of(layer)
+        is_store = layer is not None and _store_of(layer) is not None
+        for row in self._store_rows:
+            row.setVisible(is_store)
+        self.samples.setEnabled(not is_store)
+        tip = "Save the result with all measured products."
+        if is_store:
+            tip = "Only for a single result; of a store, export a table or save a figure."
+        self.save.setToolTip(f"<qt>{tip}</qt>")
+        result = None if layer is None else result_of(layer)
+        setup = setup_of(layer) if is_store else None if result is None else result.setup
         fields = {"displacement"} if setup is None else {each.name for each in setup.si_fields}
         symbols = [s for s, unit in FIELD_UNITS.items() if unit.field in fields | {"displacement"}]
         before = self.unit.currentText()
@@ -242,11 +294,10 @@ class ProductForm(QtWidgets.QWidget):
     def request(self) -> _Request | _SeriesRequest:
         """Return what is to be measured, or raise an `InputError`."""
         layer = self.result.layer
-        result, store = None if layer is None else result_of(layer), _store_of(layer)
-        if result is None and store is None:
+        if layer is None:
             raise InputError(
-                "there is no result to measure: run 'Invert shot' or 'Fit several images', or "
-                "open a .shadowinv file or a store"
+                "there is no result to measure: run 'Invert shot', 'Fit several images' or "
+                "'Invert stack', or open a .shadowinv file or a store of shots"
             )
         values: dict[str, Any] = {"product": self.kind.name()}
         if "width" in self.kind.model_fields:
@@ -254,9 +305,12 @@ class ProductForm(QtWidgets.QWidget):
         if "path" in self.kind.model_fields:
             values |= self._outline(layer)
         symbol = self.unit.currentText()
-        unit, product = None if symbol == _BY_SETUP else symbol, product_from_dict(values)
-        if result is None:
-            return _SeriesRequest(str(store), layer, product, unit, self.times.text().strip())
+        product, unit = product_from_dict(values), None if symbol == _BY_SETUP else symbol
+        store, result = _store_of(layer), result_of(layer)
+        if store is not None:
+            shots, times = self.shots.text().strip(), self.times.text().strip()
+            return _SeriesRequest(store, layer, product, unit, shots or None, times)
+        assert result is not None
         return _Request(result, layer, product, unit, self.samples.value())
 
     def _outline(self, layer: Any) -> dict[str, Any]:
@@ -295,7 +349,7 @@ class ProductForm(QtWidgets.QWidget):
         if outcome.value is None:
             return
         request: _Request | _SeriesRequest = outcome.tag
-        if self._measured is not None and self._measured.subject != request.subject:
+        if self._measured is not None and self._measured.origin != request.origin:
             self.results = []
         self._measured = request
         for measured in outcome.value:
@@ -311,9 +365,8 @@ class ProductForm(QtWidgets.QWidget):
         self.report.show_rows(rows)
         self.report.setVisible(True)
         self.plot.setVisible(self.plot.show_curves(measured))
-        for widget in (self.export, self.save, self.clear):
+        for widget in (self.export, self.picture, self.clear):
             widget.setEnabled(True)
-        # A store has many results, and none that a product could be saved with.
         self.save.setEnabled(isinstance(request, _Request))
         for name, variable in measured.variables.items():
             if variable.dims == PLANE:
@@ -322,7 +375,7 @@ class ProductForm(QtWidgets.QWidget):
     def _empty(self) -> None:
         self.report.setVisible(False)
         self.plot.setVisible(False)
-        for widget in (self.export, self.save, self.clear):
+        for widget in (self.export, self.picture, self.save, self.clear):
             widget.setEnabled(False)
 
     def _clear(self) -> None:
@@ -353,6 +406,23 @@ class ProductForm(QtWidgets.QWidget):
             show_info(f"Wrote {forms.save_text(text, name, SITES.suffix)}")
 
     @qt.notify_errors
+    def _save_figure(self) -> None:
+        from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG
+
+        filters = ";;".join(f"{suffix[1:].upper()} (*{suffix})" for suffix in FIGURE_SUFFIXES)
+        name, selected = QtWidgets.QFileDialog.getSaveFileName(
+            self, "Save figure", f"products{PNG.suffix}", filters
+        )
+        if not name:
+            return
+        path = Path(name)
+        if path.suffix.lower() not in FIGURE_SUFFIXES:
+            suffixes = [suffix for suffix in FIGURE_SUFFIXES if f"*{suffix}" in selected]
+            path = path.with_name(path.name + (suffixes or [PNG.suffix])[0])
+        figure = products_figure(self.results)
+        show_info(f"Wrote {save_figure(path, figure, overwrite=path == Path(name))}")
+
+    @qt.notify_errors
     def _save(self) -> None:
         from napari_shadowinv.io import write
         from napari_shadowinv.io.formats import RESULT
@@ -370,9 +440,10 @@ class ProductForm(QtWidgets.QWidget):
         show_info(f"Wrote {write(name, add_products(dataset, self.results), overwrite=True)}")
 
 
-def _store_of(layer: Any) -> str | None:
-    """Return the path of the store that a layer shows; None if it shows none."""
-    return None if layer is None else metadata_of(layer).get("store")
+def _store_of(layer: Any) -> Path | None:
+    """Return the store of shots that a layer shows, or None."""
+    store = metadata_of(layer).get("store")
+    return None if store is None else Path(store)
 
 
 def shape_fields(shape_type: str, corners: FloatArray) -> dict[str, Any]:

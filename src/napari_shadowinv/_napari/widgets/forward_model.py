@@ -18,13 +18,8 @@ from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
 from napari_shadowinv._napari.widgets._files import IMAGE_FORMATS, Savable, SaveButton
-from napari_shadowinv._napari.widgets._inputs import (
-    GRID,
-    GRID_KIND,
-    GridFile,
-    SetupPicker,
-    grid_file_edit,
-)
+from napari_shadowinv._napari.widgets._grid_files import GRID, GRID_KIND, GridFile, GridFileEdit
+from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, shown_plane
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._qt import side_by_side
@@ -35,7 +30,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
-from napari_shadowinv.physics.setup import SETUPS, deflector_titles
+from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.inversion_run import plane_of
 
@@ -277,7 +272,7 @@ class ForwardModel(ToolPanel):
             },
         )
         self.object.choice.setToolTip("Object that deflects the beam.")
-        self.file = grid_file_edit()
+        self.file = GridFileEdit()
         self.potential = LayerPicker(
             viewer,
             ("image",),
@@ -341,7 +336,7 @@ class ForwardModel(ToolPanel):
         self.object.restore(state.get("object", {}))
         self.file.edit.setText(str(state.get("file", "")))
         if self.object.kind != _LAYER:
-            self._choose_setup(str(state.get("setup", {}).get("kind", "proton")))
+            self.setup.choose_kind(str(state.get("setup", {}).get("kind", "proton")))
         size = state.get("size", [200, 200])
         self.height_px.setValue(int(size[0]))
         self.width_px.setValue(int(size[1]))
@@ -368,8 +363,8 @@ class ForwardModel(ToolPanel):
         recipe: Any = self.object.model()
         title = "" if self.object.kind == GRID else type(recipe).title
         if self.object.kind == GRID:
-            recipe = GridFile.chosen(self.file, recipe)
-            title = Path(recipe.path).stem
+            recipe = self.file.grid_file(recipe)
+            title = recipe.title
         shape = (self.height_px.value(), self.width_px.value())
         if source is not None:
             shape = source.shape
@@ -399,19 +394,11 @@ class ForwardModel(ToolPanel):
             self._select_field()
         self._follow_potential()
         if self.object.kind == GRID and self._ready:
-            self._choose_setup("proton")
+            self.setup.choose_kind("proton")
         recipe = PHANTOMS.get(self.object.kind)
         if recipe is None or not recipe.probe or not self._ready:
             return
-        self._choose_setup(recipe.probe)
-
-    def _choose_setup(self, kind: str) -> None:
-        """Show the user's setup of a kind, or else the paper's."""
-        self.setup.picker.set_kind(kind)
-        form = self.setup.picker.form
-        if form is not None and form.is_empty:
-            example = SETUPS[kind].example()
-            self.setup.suggest(example, "example from the paper")
+        self.setup.choose_kind(recipe.probe)
 
     def _follow_potential(self) -> None:
         """Show the setup of a potential's result, or the user's setup for an object."""

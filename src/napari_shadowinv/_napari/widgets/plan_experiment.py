@@ -17,34 +17,27 @@ from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
-from napari_shadowinv._napari.widgets._inputs import (
-    GRID,
-    GRID_KIND,
-    GridFile,
-    InstrumentForm,
-    SetupPicker,
-    grid_file_edit,
-)
+from napari_shadowinv._napari.widgets._grid_files import GRID, GRID_KIND, GridFile, GridFileEdit
+from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
 from napari_shadowinv._napari.widgets._layers import LayerPicker
 from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
-from napari_shadowinv._system.progress import OnProgress, ShouldStop
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io import read_field_grid
 from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
-from napari_shadowinv.physics.setup import SETUPS, Setup
+from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.experiment import SWEPT, plan_experiment, sweep_experiment
 from napari_shadowinv.pipeline.experiment_object import (
     PlannedObject,
     object_of_displacement,
-    object_of_field,
     shape_of_text,
 )
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep
+from napari_shadowinv.pipeline.traced_file import object_of_file
 
 if TYPE_CHECKING:
     import napari
@@ -77,19 +70,14 @@ class PlanJob(Job):
             "on_progress": on_progress,
             "should_stop": should_stop,
         }
-        setups = self.setups or None
-        planned = self._traced() if isinstance(self.object, GridFile) else self.object
+        setups, target = self.setups or None, self.object
+        if isinstance(target, GridFile):
+            Reporter(on_progress, should_stop)("field", 0, None)
+            target = object_of_file(Path(target.path), next(iter(self.setups), None), target.view)
         if self.quantity:
             choices |= {"quantity": self.quantity, "values": self.values}
-            return sweep_experiment(planned, setups, **choices)
-        return plan_experiment(planned, setups, **choices)
-
-    def _traced(self) -> PlannedObject:
-        """Read a 3-D field, through which particles are traced."""
-        file: Any = self.object
-        grid = file.view.apply(read_field_grid(Path(file.path)))
-        setup = self.setups[0] if self.setups else None
-        return object_of_field(grid, setup, title=Path(file.path).name)
+            return sweep_experiment(target, setups, **choices)
+        return plan_experiment(target, setups, **choices)
 
     def layers(self, content: ExperimentPlan | ExperimentSweep) -> list[FullLayerData]:
         """Describe the image of the first draw."""
@@ -173,9 +161,9 @@ class PlanExperiment(panels.ToolPanel):
         self.field = LayerPicker(
             viewer, ("image",), "A layer of a result, whose field is the object.", suits=_has_field
         )
-        self._field_row = forms.labelled("Result", self.field)
-        self.file = grid_file_edit()
+        self.file = GridFileEdit()
         self._file_row = forms.labelled("File", self.file)
+        self._field_row = forms.labelled("Result", self.field)
         self.setup = SetupPicker()
         self.energies = _line(
             "14.7, 30",
@@ -219,10 +207,10 @@ class PlanExperiment(panels.ToolPanel):
             self.report,
         )
         self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
+        self.file.changed.connect(self.keep)
         self.quantity.currentIndexChanged.connect(lambda _: self._on_change())
         for part in (self.object, self.setup, self.instrument, self.options):
             part.changed.connect(self._on_change)
-        self.file.changed.connect(self.keep)
         for line in (self.energies, self.side, self.values):
             line.textChanged.connect(lambda _: self.keep())
         self.restore_last()
@@ -287,11 +275,9 @@ class PlanExperiment(panels.ToolPanel):
         self.reveal(self.report)
 
     def _object(self) -> PhantomRecipe | PlannedObject | GridFile:
-        if self.object.kind == GRID:
-            return GridFile.chosen(self.file, self.object.model())
         if self.object.kind != _LAYER:
             recipe: Any = self.object.model()
-            return recipe
+            return self.file.grid_file(recipe) if self.object.kind == GRID else recipe
         layer = self.field.layer
         if layer is None:
             raise InputError(
@@ -317,17 +303,18 @@ class PlanExperiment(panels.ToolPanel):
     def _on_object(self) -> None:
         """Show the kind of setup that an object requires."""
         recipe = PHANTOMS.get(self.object.kind)
-        probe = "proton" if self.object.kind == GRID else recipe.probe if recipe else ""
+        probe = recipe.probe if recipe is not None else None
+        if self.object.kind == GRID:
+            probe = "proton"
         if self._ready and probe:
-            self.setup.picker.set_kind(probe)
-            form = self.setup.picker.form
-            if form is not None and form.is_empty:
-                self.setup.suggest(SETUPS[probe].example(), "example from the paper")
+            self.setup.choose_kind(probe)
         self._on_change()
 
     def _on_change(self) -> None:
-        self._field_row.setVisible(self.object.kind == _LAYER)
+        is_phantom = self.object.kind in PHANTOMS
+        self.side.setPlaceholderText("200 x 200" if is_phantom else "that of the field")
         self._file_row.setVisible(self.object.kind == GRID)
+        self._field_row.setVisible(self.object.kind == _LAYER)
         self._values_row.setVisible(bool(self.quantity.currentData()))
         self.keep()
 

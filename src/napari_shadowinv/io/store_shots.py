@@ -1,0 +1,87 @@
+"""Shots of a store, chosen by a text such as ``3:20``.
+
+- the finished ones among them, opened lazily: `open_shots`
+- the numbers that a text stands for: `parse_shots`
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.store import DAMAGED, DONE, StackStore, read_stack
+
+if TYPE_CHECKING:
+    import xarray
+
+
+def open_shots(path: Path, shots: str | None = None) -> xarray.Dataset:
+    """Open a store and select shots from it; only finished ones.
+
+    Parameters
+    ----------
+    path : Path
+        ``name.shadowinv.zarr``.
+    shots : str, optional
+        As of `parse_shots`. Default: all.
+
+    Returns
+    -------
+    xarray.Dataset
+        As of `read_stack`, with the number of each shot as the coordinate ``index``.
+
+    Raises
+    ------
+    InputError
+        If the text is wrong, or no shot of the selection is finished.
+    FileFormatError
+        If it is no store, or a shot of the selection is damaged.
+    """
+    dataset = read_stack(path)
+    count = dataset.sizes["shot"]
+    selection = dataset.assign_coords(index=("shot", np.arange(count)))
+    if shots is not None:
+        selection = selection.isel(shot=parse_shots(shots, count))
+    for index in np.flatnonzero(selection["status"].values == DAMAGED)[:1]:
+        number = int(selection["index"].values[index])
+        store = StackStore(path)
+        raise FileFormatError(
+            f"{path} is damaged: shot {number} ({store.names[number]}): "
+            f"{store.report(number)['reason']}; "
+            "resume its run to invert it again, or choose other shots"
+        )
+    done = selection.isel(shot=np.flatnonzero(selection["status"].values == DONE))
+    if not done.sizes["shot"]:
+        raise InputError(
+            f"{path} has no finished shots in this selection: wait for them, or choose other shots"
+        )
+    return done
+
+
+def parse_shots(text: str, count: int) -> list[int]:
+    """Convert 3, 3:20, :10, ::5 or a list of these to numbers of `count` shots.
+
+    Raises
+    ------
+    InputError
+        If the text is none of these, or a number is too large.
+    """
+    selection: list[int] = []
+    for part in text.split(","):
+        try:
+            numbers = [int(piece) if piece.strip() else None for piece in part.split(":")]
+            if len(numbers) == 1 and numbers[0] is not None:
+                selection.append(range(count)[numbers[0]])
+            elif 2 <= len(numbers) <= 3:
+                selection.extend(range(count)[slice(*numbers)])
+            else:
+                raise ValueError(part)
+        except (ValueError, IndexError):
+            raise InputError(
+                f"shots are {text!r}: expected numbers from 0 to {count - 1} such as 3, 3:20, or "
+                "3,5,10:20"
+            ) from None
+    return selection

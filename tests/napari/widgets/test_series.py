@@ -1,0 +1,179 @@
+"""The tab *Products of a result* of *Analyse*, for a store of shots."""
+
+from __future__ import annotations
+
+import csv
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from qtpy.QtWidgets import QFileDialog
+
+from napari_shadowinv import run_stack
+from napari_shadowinv._napari.layers import add_inversion
+from napari_shadowinv._napari.widgets import _products
+from napari_shadowinv.analysis import Region, analyse_shots
+from napari_shadowinv.inversion import invert
+from napari_shadowinv.io import read_stack
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.preprocessing import Recipe
+
+PATIENCE = 60_000  # ms
+RATE = 0.2  # 1/ns
+SHOTS = 4
+
+
+def image_at(time: float) -> Any:
+    """A toroid that grows, as the camera would see it after a time in ns."""
+    phantom = toroid((32, 32), paper_setup(), 20 * np.exp(RATE * time), 6e-6)
+    return 300 * synthetic_image(phantom.displacement)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("series") / "night.shadowinv.zarr"
+    images = np.stack([image_at(time) for time in range(SHOTS)])
+    run_stack(images, out, Recipe(setup=paper_setup()))
+    return out
+
+
+@pytest.fixture
+def form(window: Any, open_widget: Any, store: Path) -> Any:
+    """The form with the store, a region and a circle."""
+    window.open(str(store), plugin="napari-shadowinv")
+    tool = open_widget("Analyse")
+    tool.tabs.setCurrentWidget(tool.products)
+    form = tool.products
+    form.product.setCurrentIndex(form.product.findData("region"))
+    form._draw()
+    form.shapes.layer.add_ellipses(np.array([[15.5, 15.5], [10.0, 10.0]]))
+    return form
+
+
+def press(form: Any, qtbot: Any) -> str:
+    """Press the button, wait for the end, and return the line below the button."""
+    form.panel.button.click()
+    qtbot.waitUntil(lambda: not form.panel.runner.running, timeout=PATIENCE)
+    return str(form.panel.status.text())
+
+
+def test_series_of_a_store_is_that_of_python(form: Any, qtbot: Any, store: Path) -> None:
+    assert form.times.isVisibleTo(form)
+    form.times.setText("1 ns")
+    assert press(form, qtbot) == ""
+    (measured,) = form.results
+    region = Region(center=(15.5, 15.5), radius=10)
+    times = 1e-9 * np.arange(SHOTS)
+    (expected,) = analyse_shots(read_stack(store), region, times)
+    for name, quantity in expected.quantities.items():
+        np.testing.assert_allclose(measured[name].value, quantity.value, rtol=1e-12)
+    rows = form.report.texts()
+    for fact in expected.result.facts:
+        assert rows[fact.title] == fact.text
+    assert float(rows["Growth of rms"].split()[0]) == pytest.approx(RATE, rel=0.05)
+    assert "95 %" in rows["Growth of rms"]
+
+
+def test_numbers_and_centroid_are_drawn_over_time(form: Any, qtbot: Any) -> None:
+    form.times.setText("0, 1 ns, 2 ns, 4 ns")
+    press(form, qtbot)
+    numbers, places = form.plot.figure.axes
+    assert places.get_xlabel() == "time (ns)"
+    assert places.get_ylabel() == "µm"
+    lines = {line.get_label(): line for axes in (numbers, places) for line in axes.lines}
+    assert {"peak", "rms", "centroid_y", "centroid_x"} <= lines.keys()
+    np.testing.assert_allclose(lines["rms"].get_xdata(), [0, 1, 2, 4])
+    np.testing.assert_allclose(lines["rms"].get_ydata(), form.results[0]["rms"].value)
+    middle = 1e6 * 15.5 * paper_setup().object_pixel_size
+    np.testing.assert_allclose(lines["centroid_y"].get_ydata(), middle, rtol=0.02)
+
+
+def test_shots_are_chosen_and_numbered_without_times(form: Any, qtbot: Any) -> None:
+    form.shots.setText("1:4:2")
+    press(form, qtbot)
+    np.testing.assert_array_equal(form.results[0].coordinates["shot"].values, [1, 3])
+    assert "per shot" in form.report.texts()["Growth of rms"]
+    ticks = form.plot.figure.axes[-1].get_xticks()
+    np.testing.assert_array_equal(ticks, np.round(ticks))
+
+
+@pytest.mark.parametrize(
+    ("kind", "shots", "times", "message"),
+    [
+        ("region", "", "1,2", "Times is '1,2', expected the time between two shots in s, or a"),
+        ("region", "", "soon", "Times is 'soon', expected times separated by commas"),
+        ("region", "", "-1 ns", "The times do not increase"),
+        ("region", "2,1", "", "The numbers of the shots do not increase"),
+        ("region", "9", "", "Shots are '9': expected numbers from 0 to 3"),
+        ("region", "2", "", "1 of 1 shots have a field, expected at least two"),
+        ("current-density", "", "", "The current density has no single number to follow"),
+    ],
+)
+def test_mistake_with_a_store_is_a_sentence(
+    form: Any, qtbot: Any, messages: list[str], kind: str, shots: str, times: str, message: str
+) -> None:
+    form.product.setCurrentIndex(form.product.findData(kind))
+    form.shots.setText(shots)
+    form.times.setText(times)
+    assert message in press(form, qtbot)
+    assert message in messages[-1]
+    assert form.results == []
+
+
+def test_series_is_saved_as_a_table_and_a_figure(
+    form: Any, qtbot: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    form.times.setText("2 ns")
+    press(form, qtbot)
+    names = iter([(tmp_path / "growth.csv", ""), (tmp_path / "growth", "PDF (*.pdf)")])
+    monkeypatch.setattr(
+        QFileDialog, "getSaveFileName", lambda *_, **__: tuple(map(str, next(names)))
+    )
+    form.export.click()
+    rows = list(csv.DictReader((tmp_path / "growth.csv").open(encoding="utf-8")))
+    places = [float(row["place"]) for row in rows if row["quantity"] == "rms"]
+    np.testing.assert_allclose(places, 2e-9 * np.arange(SHOTS))
+    form.picture.click()
+    assert (tmp_path / "growth.pdf").read_bytes().startswith(b"%PDF")
+    assert not form.save.isEnabled()
+
+
+def test_cancelled_series_leaves_no_result(
+    form: Any, qtbot: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entered = threading.Event()
+    original = _products.analyse_shots
+
+    def held(*args: Any, should_stop: Any, **choices: Any) -> Any:
+        entered.set()
+        while not should_stop():
+            threading.Event().wait(0.01)
+        return original(*args, should_stop=should_stop, **choices)
+
+    monkeypatch.setattr(_products, "analyse_shots", held)
+    form.panel.button.click()
+    qtbot.waitUntil(entered.is_set, timeout=PATIENCE)
+    form.panel.button.click()
+    qtbot.waitUntil(lambda: not form.panel.runner.running, timeout=PATIENCE)
+    assert form.panel.status.text() == "Cancelled."
+    assert form.results == []
+    monkeypatch.undo()
+    assert press(form, qtbot) == ""
+    assert len(form.results) == 1
+
+
+def test_single_result_has_no_times(form: Any, window: Any, qtbot: Any) -> None:
+    form.times.setText("1 ns")
+    press(form, qtbot)
+    inversion = invert(image_at(0.0), source=np.full((32, 32), 300.0))
+    added = add_inversion(window, inversion, paper_setup(), name="single")
+    form.result.layer = next(layer for layer in added if layer in form.result.offered)
+    assert not form.times.isVisibleTo(form)
+    form.samples.setValue(20)
+    press(form, qtbot)
+    (measured,) = form.results  # those of the store are forgotten
+    assert not measured.is_series
+    assert form.save.isEnabled()
