@@ -83,8 +83,8 @@ class SoftModes:
         turn = turn[:, sizes > _INDEPENDENT] / np.sqrt(sizes[sizes > _INDEPENDENT] / 2)
         values, inner = np.linalg.eigh(turn.T @ (energies + energies.T) @ turn / 2)
         inner, values = inner[:, values > 0], values[values > 0]
-        new = np.einsum("jk,jn->kn", turn @ inner, vectors)
-        self._vectors = np.concatenate([self._vectors, new])
+        directions = np.einsum("jk,jn->kn", turn @ inner, vectors)
+        self._vectors = np.concatenate([self._vectors, directions])
         self._weights = np.append(self._weights, np.maximum(1 / values - 1, 0))
 
 
