@@ -8,8 +8,8 @@ median seconds of both, how many times as fast this version is (median of the ra
 neighbouring runs, and their range), and the displacement's L2 error in both, in per cent: against
 the truth, or for real frames against this version's with one site a pixel.
 
-Images are those of the reference toroid, and of the burner's frames where they are present; those
-of fits (`--only fit`) are counted rays, as in fit.py: their times are of whole fits by default.
+Images are those of the reference toroid, and of the burner's frames where they are present. Those
+of fits are rays counted as in fit.py, for minutes; `--only "fit, three"` counts those of one fit.
 """
 
 from __future__ import annotations
@@ -32,8 +32,11 @@ FRAMES = 6  # of the stream
 Work = dict[str, Any]
 
 
-def works(folder: Path) -> dict[str, Work]:
-    """What is to be done, by name; images are written into a folder."""
+def works(folder: Path, only: str) -> dict[str, Work]:
+    """What is to be done, by name; images are written into a folder.
+
+    Those of fits are made for names that contain `only`.
+    """
     from PIL import Image
 
     from reference import DATA, toroid_case
@@ -49,6 +52,8 @@ def works(folder: Path) -> dict[str, Work]:
             found[f"{name}, 40,000 sites"] = {**found[name], "n_sites": 40_000}
     for title, case, noise in fits():
         name = f"fit, {title}"
+        if only not in name:
+            continue
         images = case.images()
         images += noise * np.random.default_rng(0).normal(size=images.shape)
         np.savez(folder / name, images=images, strengths=case.strengths())
@@ -185,7 +190,8 @@ def main() -> None:
     if given.old is None:
         parser.error("give the interpreter of the other version's environment")
     with tempfile.TemporaryDirectory() as folder:
-        chosen = {name: work for name, work in works(Path(folder)).items() if given.only in name}
+        all_works = works(Path(folder), given.only)
+        chosen = {name: work for name, work in all_works.items() if given.only in name}
         old, new = Version(given.old), Version(sys.executable)
         common = {"folder": folder, "threads": given.threads}
         if any(work.get("truth") == "finest" for work in chosen.values()):
