@@ -20,6 +20,9 @@ CORE_TESTS := tests/geometry tests/transport tests/fitting tests/physics tests/i
 	tests/cli/test_shot_commands.py tests/plotting tests/stack/test_lazy.py tests/stack/test_run.py \
 	tests/stack/test_statistics.py
 
+# Keep byte code, though a container may say otherwise: the tests start hundreds of processes.
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: demo test test-pyside kernels coverage test-oldest docs gallery lint dist check-wheel format clean
 
 demo: $(VENV)/installed

@@ -33,6 +33,9 @@ from napari_shadowinv.physics.setup import SETUPS, BeamSetup, OpticalSetup, Prot
 settings.register_profile("same each time", derandomize=True)
 settings.load_profile("same each time")
 
+# A shell that starts the tests in the background makes them ignore Ctrl-C, for which some wait.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
@@ -78,6 +81,16 @@ def dots_per_inch() -> int:
     usual = figures.DOTS_PER_INCH
     figures.DOTS_PER_INCH = 40
     return usual
+
+
+@pytest.fixture
+def blank_pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compose figures, but leave their files blank: to draw takes longer than most commands.
+
+    Tests marked `draws_figures` draw them.
+    """
+    if request.node.get_closest_marker("draws_figures") is None:
+        monkeypatch.setattr("matplotlib.figure.Figure.draw", lambda figure, renderer: None)
 
 
 def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:

@@ -10,6 +10,7 @@ import ast
 import importlib
 from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -140,23 +141,21 @@ def test_no_module_is_too_long_to_be_read_at_once():
     assert not {path.name: lines for path, lines in lengths.items() if lines > MOST_LINES}
 
 
-def fields_of(wanted: str) -> dict[str, list[str]]:
-    """Classes that declare a field of a name, by file."""
-    by_file: dict[str, list[str]] = {}
-    for path, tree in TREES.items():
+@cache
+def classes_by_field() -> dict[str, list[str]]:
+    """Classes that declare a field, by its name."""
+    classes: dict[str, list[str]] = {}
+    for tree in TREES.values():
         for node in ast.walk(tree):
-            if isinstance(node, ast.ClassDef):
-                names = [
-                    part.target.id
-                    for part in node.body
-                    if isinstance(part, ast.AnnAssign)
+            for part in node.body if isinstance(node, ast.ClassDef) else ():
+                if (
+                    isinstance(part, ast.AnnAssign)
                     and isinstance(part.target, ast.Name)
                     and isinstance(part.value, ast.Call)
                     and ast.unparse(part.value.func) == "Field"
-                ]
-                if wanted in names:
-                    by_file.setdefault(path.name, []).append(node.name)
-    return by_file
+                ):
+                    classes.setdefault(part.target.id, []).append(node.name)
+    return classes
 
 
 # Names for the same thing in a fit, where values and defaults differ.
@@ -173,10 +172,9 @@ def test_an_option_is_declared_once(option):
     }
     assert option not in step_parameters  # its flag would be that of a step
     of_fits = ["FitOptions"] if option in OPTIONS_OF_FITS else []
-    classes = [name for names in fields_of(option).values() for name in names]
     of_plans = ["ExperimentOptions"] if option in OPTIONS_OF_PLANS else []
     expected = [] if option in SHARED_OPTIONS else [*of_fits, *of_plans, "InversionOptions"]
-    assert sorted(classes) == sorted(expected)
+    assert sorted(classes_by_field().get(option, [])) == sorted(expected)
 
 
 def names_declared() -> Counter[tuple[str, str]]:

@@ -8,11 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import tifffile
 import xarray as xr
-from matplotlib.figure import Figure
 
 from helpers.command_line import content, flat, interrupted, shadowinv
 from helpers.fit_images import of_each
@@ -38,6 +38,8 @@ RATIO = 1.72  # of a 5 MeV proton's displacement to one's of 14.7 MeV
 LENGTHS = {"source_object_distance": 0.01, "object_image_distance": 0.3, "pixel_size": 1e-5}
 FIRST, SECOND = (ProtonSetup(energy=energy, **LENGTHS) for energy in (14.7, 5.0))
 
+pytestmark = pytest.mark.usefixtures("blank_pages")
+
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -56,15 +58,7 @@ PAIR = ("fit", "a.tif", "b.tif", "--energies", "14.7,5", "--setup", "setup.toml"
 
 
 @pytest.fixture
-def empty_figure(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write figures without drawing them, which would take longer than the fit."""
-    monkeypatch.setattr("napari_shadowinv.plotting.fit_figure", lambda *_, **__: Figure())
-
-
-@pytest.fixture
-def fit_arguments(
-    monkeypatch: pytest.MonkeyPatch, make_fit: Callable[..., Fit], empty_figure: None
-) -> dict[str, Any]:
+def fit_arguments(monkeypatch: pytest.MonkeyPatch, make_fit: Callable[..., Fit]) -> dict[str, Any]:
     """Record the arguments that the command passes to `fit`, which then does no work."""
     recorded: dict[str, Any] = {}
 
@@ -108,11 +102,13 @@ def provenance_in(path: str) -> Provenance:
 # Results
 
 
+@pytest.mark.draws_figures
 def test_the_field_of_two_energies_is_found_and_written(folder: Path) -> None:
     result = shadowinv(*PAIR, "--samples", 2, "--noise", 20, "--beam-rms", 0)
     assert result.exit_code == 0, result.output
     names = {"a.tif", "b.tif", "setup.toml", "a_fit.shadowinv", "a_fit.png"}
     assert set(content(folder)) == names
+    assert len(np.unique(iio.imread("a_fit.png"))) > 100
     fit, dataset = fit_in("a_fit.shadowinv")
     assert fit.verdict is Verdict.DETERMINED
     assert np.abs(fit.fields[0].displacement - TRUTH).max() < 0.2
@@ -421,7 +417,7 @@ def test_info_shows_a_doubtful_verdict(make_fit: Callable[..., Fit]) -> None:
 
 
 def test_rerun_takes_moved_images_in_their_order(
-    folder: Path, refused: Callable[..., None], empty_figure: None
+    folder: Path, refused: Callable[..., None]
 ) -> None:
     tifffile.imwrite("beam.tif", np.full(SHAPE, 1000, np.float32))
     quick = ("--samples", 0, "--max-iterations", 1, "--spacing", 0.5, "--smoothness", 10)
@@ -442,7 +438,7 @@ def test_rerun_takes_moved_images_in_their_order(
     assert "nothing" not in output
 
 
-def test_rerun_reports_an_older_version(empty_figure: None) -> None:
+def test_rerun_reports_an_older_version() -> None:
     quick = ("--samples", 0, "--max-iterations", 1, "--spacing", 0.5, "--smoothness", 10)
     assert shadowinv("fit", "a.tif", "--bin", 1, *quick).exit_code in (0, 3)
     fit, _ = fit_in("a_fit.shadowinv")
@@ -454,7 +450,7 @@ def test_rerun_reports_an_older_version(empty_figure: None) -> None:
     assert "the same result, bit for bit" in output
 
 
-def test_rerun_uses_the_fiducials_and_masks(empty_figure: None) -> None:
+def test_rerun_uses_the_fiducials_and_masks() -> None:
     rng = np.random.default_rng(3)
     for name in ("one", "two"):  # too complex to be kept with the result
         tifffile.imwrite(f"{name}.tif", (rng.random((480, 640)) > 0.15).astype(np.uint8))
@@ -584,7 +580,7 @@ def test_the_recipe_on_the_page_works(fit_arguments: dict[str, Any]) -> None:
 # Comparison of fields
 
 
-def test_fields_are_compared_and_the_likeliest_is_written(empty_figure: None) -> None:
+def test_fields_are_compared_and_the_likeliest_is_written() -> None:
     quick = (
         "--noise",
         20,

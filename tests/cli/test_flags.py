@@ -1,5 +1,6 @@
 """Flags of the commands, and the sentences about their values."""
 
+from functools import cache
 from typing import Any
 
 import pytest
@@ -28,6 +29,7 @@ CANDIDATES: dict[str, tuple[Any, ...]] = {
 }
 
 
+@cache
 def kinds_of_flags(command: str) -> dict[str, str]:
     """Return the type of the value of each flag of a command."""
     parameters = get_command(app).commands[command].params  # type: ignore[attr-defined]

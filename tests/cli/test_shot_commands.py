@@ -65,6 +65,8 @@ object_image_distance = 0.3
 pixel_size = 1e-5
 """
 
+pytestmark = pytest.mark.usefixtures("blank_pages")
+
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -169,6 +171,7 @@ def test_help_needs_no_heavy_import() -> None:
     assert result.stdout.strip() == "[]", result.stderr
 
 
+@pytest.mark.draws_figures
 def test_invert_writes_the_result_of_the_library(folder: Path, shot: Path) -> None:
     result = shadowinv("invert", shot, "--n-sites", 300, "--seed", 4)
     assert result.exit_code == 0, result.output
@@ -182,7 +185,7 @@ def test_invert_writes_the_result_of_the_library(folder: Path, shot: Path) -> No
     assert provenance is not None
     assert provenance.image == ImageOrigin(file="shot.npy", sha256=sha256(shot), shape=(24, 32))
     assert provenance.recipe == Recipe(source=UniformEstimate(), options=options)
-    assert iio.imread("shot.png").ndim == 3
+    assert len(np.unique(iio.imread("shot.png"))) > 100
     for word in ("300", "converged", "peak |d|", "shot.shadowinv", "shot.png"):
         assert word in result.stdout
 

@@ -66,6 +66,8 @@ def cross(a: Array, b: Array) -> Array:
 def clipped(polygon: Array, normal: Array, offset: float) -> Array:
     """Part of a convex polygon where normal · x <= offset."""
     side = polygon @ normal - offset
+    if side.max() <= 0:
+        return polygon
     following, side_following = np.roll(polygon, -1, axis=0), np.roll(side, -1)
     corners = []
     for p, q, s, t in zip(polygon, following, side, side_following, strict=True):

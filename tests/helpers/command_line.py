@@ -7,11 +7,17 @@ import signal
 import subprocess
 import sys
 import textwrap
+from functools import cache
 from pathlib import Path
 
+import typer.testing
+from typer.main import get_command
 from typer.testing import CliRunner, Result
 
 from napari_shadowinv.cli import app
+
+# Built once: its flags take longer than many a command.
+typer.testing._get_command = cache(get_command)  # type: ignore[attr-defined]
 
 
 def shadowinv(*arguments: object) -> Result:

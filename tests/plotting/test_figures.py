@@ -201,8 +201,7 @@ def setups_of(proton_setup: ProtonSetup, count: int) -> tuple[ProtonSetup, ...]:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("count", [1, 2, 5])
-@pytest.mark.parametrize("names", [("B",), ("B", "E")])
+@pytest.mark.parametrize(("count", "names"), [(1, ("B",)), (5, ("B",)), (2, ("B", "E"))])
 def test_no_panel_of_a_fit_touches_another(
     make_fit: MakeFit,
     proton_setup: ProtonSetup,

@@ -1,8 +1,10 @@
 """Beams predicted from around an object, against beams that are drawn here."""
 
+from functools import cache
+
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
 from helpers.fit_images import bump, counted
 from napari_shadowinv import InputError, Instrument, InversionOptions, Recipe, invert
@@ -17,7 +19,7 @@ from napari_shadowinv.preprocessing import (
 )
 from napari_shadowinv.preprocessing.kriging import kriged_beam
 
-SIDE = 128
+SIDE, MARGIN = 128, 17
 Y, X = np.indices((SIDE, SIDE)) / SIDE - 0.5
 BARE = np.hypot(Y, X) > 0.25
 
@@ -91,21 +93,24 @@ def random_waves(rng, length, rms):
     """Return a beam of 48 plane waves with a correlation of exp(-r²/2 length²)."""
     numbers = rng.normal(size=(48, 2)) / (length * SIDE)
     phases = rng.uniform(0, 2 * np.pi, 48)
+    # Between pixels by cubic splines: the waves are tens of pixels long.
+    pixels = np.arange(-MARGIN, SIDE + MARGIN)
+    of_y, of_x = (np.exp(1j * np.outer(pixels, along)) for along in numbers.T)
+    waves = ((of_y * np.exp(1j * phases)) @ of_x.T).real / np.sqrt(24)
+    coefficients = spline_filter(waves)
 
     def brightness(y, x):
-        terms = zip(numbers, phases, strict=True)
-        waves = sum(
-            np.cos(along_y * y + along_x * x + phase) for (along_y, along_x), phase in terms
-        )
-        return 1 + rms * waves / np.sqrt(24)
+        places = np.stack([y, x]) + MARGIN
+        return 1 + rms * map_coordinates(coefficients, places, prefilter=False, mode="nearest")
 
     return brightness
 
 
-def traced_shot(seed, width=0.06, length=0.25, rms=0.03):
+@cache
+def traced_shot(seed, width=0.06, rms=0.03):
     """Return counts of traced rays around an object, and its beam."""
     rng = np.random.default_rng(seed)
-    brightness = random_waves(rng, length, rms)
+    brightness = random_waves(rng, 0.25, rms)
     middle = (SIDE / 2, SIDE / 2)
     flux = counted(bump(0.6, width * SIDE, middle), (SIDE, SIDE), beam=brightness, rays=4)
     return rng.poisson(1000 * flux).astype(float), brightness(*np.indices((SIDE, SIDE)))

@@ -55,7 +55,8 @@ def _step(image: FloatArray, dual_y: FloatArray, dual_x: FloatArray, weight: flo
         if row + 1 < height:
             _smooth_row(image, dual_y, dual_x, row + 1, lower)
         else:
-            lower[:] = upper
+            for column in range(width):  # a slice would take 8 s to compile
+                lower[column] = upper[column]
         energy += _step_row(image[row], dual_y[row], dual_x[row], upper, lower, weight)
         upper, lower = lower, upper
     return energy
