@@ -38,7 +38,7 @@ docs: $(VENV)/installed-dev
 test: $(VENV)/installed-dev
 	@sh .ci/need-display
 	@$(MAKE) --no-print-directory -j3 lint docs kernels
-	QT_API=pyqt6 $(ON_SCREEN) $(BIN)/python -m pytest $(ON_BOTH_CORES)
+	QT_API=pyqt6 $(ON_SCREEN) $(BIN)/python -m pytest $(ON_BOTH_CORES) --durations=40
 	@$(MAKE) --no-print-directory -j2 check-wheel test-pyside
 
 test-pyside: $(VENV)/installed-dev

@@ -1311,6 +1311,7 @@ def test_ctrl_c_while_writing_keeps_the_old_result(folder: Path, shot: Path) -> 
     assert content(folder) == before
 
 
+@pytest.mark.draws_figures
 def test_neither_result_nor_figure_is_left_on_a_full_disk(
     small_disk: tuple[Path, Callable[[str], bool]], shot: Path
 ) -> None:

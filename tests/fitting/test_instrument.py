@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -33,17 +35,33 @@ FEW = FitOptions(samples=4, max_iterations=20, spacing=0.25, threads=1)
 EXACT_BEAM = {"beam_rms": 0.0}
 
 
+@cache
+def clean_images(blur: float = 0.0) -> FloatArray:
+    return np.stack(
+        [counted(lambda y, x, a=a: a * RING(y, x), SIZE, blur=blur, margin=12) for a in STRENGTHS]
+    )
+
+
 def shots(background: float = 0.0, gamma: float = 0.0, blur: float = 0.0) -> FloatArray:
-    images = [
-        counted(lambda y, x, a=a: a * RING(y, x), SIZE, blur=blur, margin=12) for a in STRENGTHS
-    ]
-    recorded = np.stack(images) ** (1 + gamma)
+    recorded = clean_images(blur) ** (1 + gamma)
     return noisy(list((1 - background) * recorded + background), NOISE)
 
 
 def fitted(images: FloatArray, instrument: Instrument | None, **keywords: object) -> Fit:
     choices = {"strengths": STRENGTHS, "noise": NOISE, "options": FEW} | keywords
     return fit(images, instrument=instrument, **choices)
+
+
+@pytest.fixture(scope="module")
+def plain() -> Fit:
+    """Fit of images of a perfect instrument, which is taken for perfect."""
+    return fitted(shots(), Instrument(**EXACT_BEAM))
+
+
+@pytest.fixture(scope="module")
+def assumed() -> Fit:
+    """Fit of the same images with the usual assumption of a beam."""
+    return fitted(shots(), Instrument())
 
 
 def error(result: Fit) -> float:
@@ -79,14 +97,11 @@ def test_a_point_spread_wider_than_stated_is_found() -> None:
     assert error(aware) < 0.05 < error(fitted(images, Instrument(**EXACT_BEAM), psf=1.0))
 
 
-def test_an_instrument_without_numbers_changes_no_bit() -> None:
-    images = shots()
-    plain, exact, energy = (
-        fitted(images, instrument) for instrument in (None, Instrument(), Instrument(energy=0.05))
-    )
-    for other in (exact, energy):
-        np.testing.assert_array_equal(other.fields[0].displacement, plain.fields[0].displacement)
-        assert (other.verdict, other.report.total) == (plain.verdict, plain.report.total)
+def test_an_instrument_without_numbers_changes_no_bit(assumed: Fit) -> None:
+    for instrument in (None, Instrument(energy=0.05)):
+        other = fitted(shots(), instrument)
+        np.testing.assert_array_equal(other.fields[0].displacement, assumed.fields[0].displacement)
+        assert (other.verdict, other.report.total) == (assumed.verdict, assumed.report.total)
 
 
 def test_one_image_keeps_its_field_and_gets_larger_errors() -> None:
@@ -134,12 +149,10 @@ def test_errors_have_a_part_for_all_that_is_stated() -> None:
     assert restored.report.numbers == result.report.numbers
 
 
-def test_the_largest_allowed_error_decides_what_is_determined() -> None:
-    images = shots()
-    total = fitted(images, Instrument()).report.total
+def test_the_largest_allowed_error_decides_what_is_determined(assumed: Fit) -> None:
     for factor, is_determined in ((1.1, True), (0.9, False)):
-        options = FEW.model_copy(update={"max_error": factor * total})
-        result = fitted(images, Instrument(), options=options)
+        options = FEW.model_copy(update={"max_error": factor * assumed.report.total})
+        result = fitted(shots(), Instrument(), options=options)
         assert (result.verdict is Verdict.DETERMINED) == is_determined
 
 
@@ -166,19 +179,15 @@ def test_energy_adds_to_the_errors_of_fields_in_si_units_alone() -> None:
     assert Fit.from_dataset(result.to_dataset()).instrument == result.instrument
 
 
-def test_stated_correlation_of_noise_widens_the_errors() -> None:
-    images = shots()
-    white, correlated = (
-        fitted(images, Instrument(noise_correlation=width)) for width in (0.0, 1.0)
-    )
+def test_stated_correlation_of_noise_widens_the_errors(assumed: Fit) -> None:
+    correlated = fitted(shots(), Instrument(noise_correlation=1.0))
     assert correlated.report.uncertainty == pytest.approx(
-        np.sqrt(4 * np.pi) * white.report.uncertainty
+        np.sqrt(4 * np.pi) * assumed.report.uncertainty
     )
 
 
-def test_each_fit_states_its_sensitivities() -> None:
+def test_each_fit_states_its_sensitivities(plain: Fit) -> None:
     """By as much as fits of changed images move."""
-    plain = fitted(shots(), Instrument(**EXACT_BEAM))
     assert plain.report.sensitivities.keys() == {"gamma", "blur", "background", "absorption"}
     with_background = fitted(shots(background=0.05), Instrument(**EXACT_BEAM))
     moved = with_background.fields[0].displacement - plain.fields[0].displacement
