@@ -233,6 +233,22 @@ def test_band_of_a_cylinder_holds_it():
     assert np.mean(shares) > 0.7
 
 
+def test_band_holds_what_a_closed_edge_takes_from_an_object():
+    """Its deflection is 3 % of the largest there; the error is long compared with the object."""
+    x, sigma = np.arange(100.0) - 49.5, 16.0
+    moves = 3.0 * (x / sigma) * np.exp(0.5 - x**2 / (2 * sigma**2))
+    displacement = np.stack([np.zeros((60, 100)), np.tile(moves, (60, 1))])
+    product = AxisymmetricProfile(axis=((0.0, 49.5), (59.0, 49.5)), slice_width=0, smoothing=1.0)
+    result = invert(1000 * synthetic_image(displacement), instrument={"beam_rms": 0.0})
+    (profile,) = analyse(result, product)
+    radius = np.arange(50.0)
+    exact = 3.0 * np.exp(0.5 - radius**2 / (2 * sigma**2)) / np.sqrt(2 * np.pi)
+    error = (profile["profile"].value - exact)[5:35]
+    deviation = profile["profile"].std[5:35]
+    assert (error < 0).all()
+    assert ((0.5 * deviation < -error) & (-error < 1.3 * deviation)).all()
+
+
 def codes(result) -> set[str]:
     return {fact.key for fact in result.facts}
 

@@ -15,10 +15,11 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 from scipy.constants import mu_0
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
 from napari_shadowinv._system.validation import CombinationError
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.analysis._derivatives import finer_displacement, finer_potential
 from napari_shadowinv.analysis.abel import choose_smoothing, operators
 from napari_shadowinv.analysis.axis import (
     Axis,
@@ -52,6 +53,8 @@ _MIN_RADIUS_PX = 8
 _DEFAULT_SMOOTHING = 1.0
 _MIN_DENSITY_RATIO = 0.02  # below it a temperature is only noise
 _EDGE_SHARE = 0.06  # of the radius, in which the field should have ended
+_EDGE_PX = 6
+_EDGE_REACH = 0.25  # of the radius
 _NOTABLE_END = 0.15  # of the largest deflection
 _NOTABLE_CHANGE = 0.1  # of the deflection along the axis
 _END_PX, _AT_EDGE_PX = 3, 2.0
@@ -367,6 +370,7 @@ class AxisymmetricProfile(Product):
     def measure(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
     ) -> dict[str, FloatArray]:
+        displacement = finer_displacement(finer_potential(potential), displacement)
         right_rows, left_rows = self._rows(displacement, frame)
         right_side, left_side = (self._by_slice(rows, frame) for rows in (right_rows, left_rows))
         _, inverse = self._operators(frame)
@@ -377,12 +381,27 @@ class AxisymmetricProfile(Product):
             values = {name: profiles[0] for name, profiles in values.items()}
         values["asymmetry"] = np.asarray(asymmetry(right_side, left_side))
         mean = np.abs((right_side + left_side) / 2)
-        width = max(round(_EDGE_SHARE * mean.shape[1]), 2)
+        width = _end_width(mean.shape[1])
         edge = np.abs((right_side + left_side)[:, -width:].mean(axis=1) / 2).max()
         values["edge"] = np.asarray(edge / max(mean.max(), 1e-300))
         values["ends"] = np.asarray(self._end_share((right_rows + left_rows) / 2, frame))
         values["axis_offset"] = np.asarray(_axis_offset(right_side, left_side))
         return values
+
+    def _deflection_of_edge(self, sides: FloatArray, frame: FieldFrame) -> FloatArray:
+        """Return what a closed edge takes from deflections that have not ended there.
+
+        It lets no light through, so that the image is compressed as a whole, or shifted if both
+        sides are displaced alike.
+        """
+        count, radius = sides.shape
+        # Nearer than this the edge has taken most of it.
+        width = max(_end_width(radius), min(_EDGE_PX, radius // 4))
+        ends = sides[:, -width:].mean(axis=1)
+        if count > 1:  # what changes along the edge is felt as far inside as it is long
+            ends = gaussian_filter1d(ends, _EDGE_REACH * radius / self.slice_width)
+        is_odd = frame.unit.field != _B
+        return np.asarray(ends[:, None] * (np.arange(1.0, radius + 1) / radius) ** is_odd)
 
     def _scale(self, frame: FieldFrame) -> float:
         """Return the first of the profiles for a profile of 1 px."""
@@ -419,16 +438,20 @@ class AxisymmetricProfile(Product):
     def systematic(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
     ) -> dict[str, FloatArray]:
-        """Return the change of the profile by one more smoothing, and by the error of the axis."""
+        """Return the changes by one more smoothing, by the image's edge and by the axis' error."""
         matrix, inverse = self._operators(frame)
         right_side, left_side = self._sides(displacement, frame)
-        profile = (right_side + left_side) / 2 @ inverse.T
+        sides = (right_side + left_side) / 2
+        profile = sides @ inverse.T
         values = self._profiles(profile, frame)
         again = self._profiles(profile @ matrix.T @ inverse.T, frame)
-        errors = {name: np.abs(again[name] - values[name]) for name in values}
+        cut = self._profiles((sides + self._deflection_of_edge(sides, frame)) @ inverse.T, frame)
+        errors = {
+            name: np.hypot(again[name] - value, cut[name] - value) for name, value in values.items()
+        }
         if self.axis_error:
-            sides = (self._sides(displacement, frame, sign * self.axis_error) for sign in (1, -1))
-            moved = [self._profiles((a + b) / 2 @ inverse.T, frame) for a, b in sides]
+            pairs = (self._sides(displacement, frame, sign * self.axis_error) for sign in (1, -1))
+            moved = [self._profiles((a + b) / 2 @ inverse.T, frame) for a, b in pairs]
             for name, error in errors.items():
                 change = np.abs(moved[0][name] + moved[1][name] - 2 * values[name]) / 2
                 errors[name] = np.hypot(error, change)
@@ -605,6 +628,11 @@ def _found_axis(
     if find_tilt and tilt < _TILT_ERRORS * float(np.std(end - start, ddof=1)):
         return _found_axis(displacement, noise, direction, find_tilt=False)
     return axis, float(np.sqrt((np.var(start, ddof=1) + np.var(end, ddof=1)) / 2))
+
+
+def _end_width(radius: int) -> int:
+    """Return over how many px from the edge the deflection is averaged there."""
+    return max(round(_EDGE_SHARE * radius), 2)
 
 
 def _axis_offset(right_side: FloatArray, left_side: FloatArray) -> float:
