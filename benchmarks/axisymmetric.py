@@ -36,7 +36,7 @@ OBJECTS: dict[str, Callable[[Array, Array], Array]] = {
 
 
 def potential_of(profile: Callable[[Array, Array], Array]) -> Array:
-    """Return ∫f dz with minus its gradient, px."""
+    """Return ∫f dz in px² and minus its gradient in px, (3, H, W)."""
     depth = (np.arange(0.0, DEPTH_PX, STEP_PX) + STEP_PX / 2)[:, None]
     places = np.arange(SIDE) - MIDDLE
 
@@ -84,8 +84,8 @@ def main() -> None:
           "worst) | exact displacement, % | band of 68 % holds, % |")  # fmt: skip
     print("|---|---|---|---|---|---|")
     for name, profile in OBJECTS.items():
-        potential, *gradient = potential_of(profile)
-        displacement = np.stack(gradient)
+        planes = potential_of(profile)
+        potential, displacement = planes[0], planes[1:]
         limit = caustic_strength(displacement)
         for share in (0.5, 0.8):
             strength = share * limit

@@ -33,7 +33,7 @@ from napari_shadowinv.physics.setup import SETUPS, BeamSetup, OpticalSetup, Prot
 settings.register_profile("same each time", derandomize=True)
 settings.load_profile("same each time")
 
-# A shell that starts the tests in the background makes them ignore Ctrl-C, for which some wait.
+# A shell that runs the tests in the background makes them ignore Ctrl-C, and some wait for it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 
 from napari_shadowinv.cli import app
 
-# Built once: its flags take longer than many a command.
+# Built once: to build all flags takes longer than most of the commands.
 typer.testing._get_command = cache(get_command)  # type: ignore[attr-defined]
 
 

@@ -53,7 +53,7 @@ _MIN_RADIUS_PX = 8
 _DEFAULT_SMOOTHING = 1.0
 _MIN_DENSITY_RATIO = 0.02  # below it a temperature is only noise
 _EDGE_SHARE = 0.06  # of the radius, in which the field should have ended
-_EDGE_PX = 6
+_EDGE_PX = 6  # at least: nearer to it, a closed edge suppresses most of the deflection
 _EDGE_REACH = 0.25  # of the radius
 _NOTABLE_END = 0.15  # of the largest deflection
 _NOTABLE_CHANGE = 0.1  # of the deflection along the axis
@@ -389,13 +389,12 @@ class AxisymmetricProfile(Product):
         return values
 
     def _deflection_of_edge(self, sides: FloatArray, frame: FieldFrame) -> FloatArray:
-        """Return what a closed edge takes from deflections that have not ended there.
+        """Return the deflections that a closed edge suppresses if the object does not end there.
 
-        It lets no light through, so that the image is compressed as a whole, or shifted if both
-        sides are displaced alike.
+        No light crosses that edge, so the whole image is compressed, or shifted if both sides are
+        displaced alike.
         """
         count, radius = sides.shape
-        # Nearer than this the edge has taken most of it.
         width = max(_end_width(radius), min(_EDGE_PX, radius // 4))
         ends = sides[:, -width:].mean(axis=1)
         if count > 1:  # what changes along the edge is felt as far inside as it is long
