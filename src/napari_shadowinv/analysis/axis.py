@@ -22,6 +22,7 @@ _MAX_TILT = math.radians(20)
 _START_RADIUS = 0.3  # of the side across, while the axis is only sought
 _FITTED_RADIUS = 0.9  # of the largest, so that a shifted axis stays inside
 _TOLERANCE_PX = 1e-3
+_MIN_PLACES = 200  # along a long axis while it is sought: neighbours share their noise
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class Axis:
 
 
 def sample_sides(
-    component: FloatArray, axis: Axis, radius: int, *, is_odd: bool = True
+    component: FloatArray, axis: Axis, radius: int, *, is_odd: bool = True, every: int = 1
 ) -> tuple[FloatArray, FloatArray]:
     """Return a component of the field on both sides of an axis.
 
@@ -87,6 +88,8 @@ def sample_sides(
     is_odd : bool
         Whether the component changes its sign across the axis of a symmetric object; the second
         side is then turned round.
+    every : int
+        Distance of places along the axis in px.
 
     Returns
     -------
@@ -95,7 +98,7 @@ def sample_sides(
         They are equal if the field is symmetric.
     """
     first = FIRST_OFFSET if is_odd else 0.0
-    offsets, places = first + np.arange(float(radius)), axis.places()
+    offsets, places = first + np.arange(float(radius)), axis.places()[::every]
     right_side = interpolate_cubic(component, axis.points(places, offsets))
     left_side = interpolate_cubic(component, axis.points(places, -offsets))
     return right_side, -left_side if is_odd else left_side
@@ -144,6 +147,7 @@ def find_axis(
     radius = max(int(_FITTED_RADIUS * start.max_radius(shape)), 4)
     middle = (np.array(start.start) + np.array(start.end)) / 2
     half = start.length / 2
+    every = max(int(start.length) // _MIN_PLACES, 1)
 
     def axis_at(shift: float, tilt: float) -> Axis:
         along = math.cos(tilt) * start.direction + math.sin(tilt) * start.across
@@ -156,7 +160,8 @@ def find_axis(
         if abs(tilt) > _MAX_TILT:
             return math.inf
         axis = axis_at(shift, tilt)
-        return asymmetry(*sample_sides(component_across(displacement, axis), axis, radius))
+        component = component_across(displacement, axis)
+        return asymmetry(*sample_sides(component, axis, radius, every=every))
 
     # Both numbers are px: the shift of the middle, and that of the ends against it.
     size = 2 if find_tilt else 1

@@ -14,13 +14,15 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._typing import FloatArray, IntArray
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.geometry.compiler import njit
 
 __all__ = [
     "PeakMeasures",
@@ -219,24 +221,35 @@ def interpolate_cubic(plane: FloatArray, points: FloatArray) -> FloatArray:
 
     Points in the outermost half pixel are extrapolated.
     """
-    value: FloatArray = np.zeros(points.shape[:-1])
-    axes = [_cubic_weights(points[..., axis], plane.shape[axis]) for axis in (0, 1)]
-    (rows, row_weights), (columns, column_weights) = axes
-    for i in range(rows.shape[-1]):
-        for k in range(columns.shape[-1]):
-            weight = row_weights[..., i] * column_weights[..., k]
-            value += weight * plane[rows[..., i], columns[..., k]]
-    return value
+    values = np.empty(points[..., 0].size)
+    _interpolate_points(plane, points.reshape(-1, 2), values)
+    return values.reshape(points.shape[:-1])
 
 
-def _cubic_weights(places: FloatArray, count: int) -> tuple[IntArray, FloatArray]:
-    """Return the pixels (..., n) around places, and the weights of Lagrange's polynomial."""
-    n = min(4, count)
-    first = np.clip(np.floor(places).astype(np.int64) - 1, 0, count - n)
-    nodes = np.arange(n)
-    offset = places[..., None] - first[..., None]
-    weights = np.ones((*places.shape, n))
-    for node in nodes:
-        for other_node in nodes[nodes != node]:
-            weights[..., node] *= (offset[..., 0] - other_node) / (node - other_node)
-    return first[..., None] + nodes, weights
+@njit(nogil=True, cache=True, error_model="numpy")
+def _interpolate_points(plane: FloatArray, points: FloatArray, values: FloatArray) -> None:
+    """Write the values of a plane at points (n, 2)."""
+    height, width = plane.shape
+    row_weights, column_weights = np.empty(min(4, height)), np.empty(min(4, width))
+    for point in range(len(points)):
+        first_row = _weigh_pixels(points[point, 0], height, row_weights)
+        first_column = _weigh_pixels(points[point, 1], width, column_weights)
+        value = 0.0
+        for i in range(len(row_weights)):
+            for k in range(len(column_weights)):
+                weight = row_weights[i] * column_weights[k]
+                value += weight * plane[first_row + i, first_column + k]
+        values[point] = value
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _weigh_pixels(place: float, count: int, weights: FloatArray) -> int:
+    """Return the first of the pixels around a place; write the weights of Lagrange's polynomial."""
+    n = len(weights)
+    first = min(max(math.floor(place) - 1, 0), count - n)
+    for node in range(n):
+        weights[node] = 1.0
+        for other_node in range(n):
+            if other_node != node:
+                weights[node] *= (place - first - other_node) / (node - other_node)
+    return first
