@@ -255,24 +255,28 @@ def filament_bands(arguments: argparse.Namespace) -> None:
     inside: dict[str, list[float]] = {}
     for seed in range(arguments.seeds):
         rng = np.random.default_rng([seed, 29])
-        potential = np.zeros((side, side))
+        potential, moved = np.zeros((side, side)), np.zeros((2, side, side))
         for place in np.arange(-0.36, 0.37, 0.12) * side:  # regular, but each a little bent
-            bend = place + 2 * np.sin(2 * np.pi * (rows / side + rng.random()))
-            part = 4 * np.exp(-((columns - bend) ** 2) / 2 / radius**2 - (rows / side) ** 2 * 18)
+            phase = 2 * np.pi * (rows / side + rng.random())
+            across = (columns - place - 2 * np.sin(phase)) / radius
+            part = 4 * np.exp(-(across**2) / 2 - (rows / side) ** 2 * 18)
+            slope = across / radius * 4 * np.pi / side * np.cos(phase) - 36 * rows / side**2
             potential += part
-        moved = -np.stack(np.gradient(potential))
+            moved -= part * np.stack([slope, -across / radius])
         image = rng.poisson(arguments.counts * synthetic_image(moved)).astype(float)
-        inversion = invert(image, source=np.full(image.shape, arguments.counts))
+        source, options = np.full(image.shape, arguments.counts), {"seed": seed}
+        inversion = invert(image, source=source, options=options)
         exact = RetrievedField(dataset_from_field(moved, potential, SETUP))
         (truth,) = analyse(exact, Filaments())
         (result,) = analyse(inversion, Filaments(), setup=SETUP)
         for name in ("radius", "spacing", "rms", "peak"):
             low, high = result.band(name, SHARE)
-            inside.setdefault(name, []).append(float(low <= truth[name].value <= high))
+            if np.isfinite(low) and np.isfinite(truth[name].value):  # a spacing may not be stated
+                inside.setdefault(name, []).append(float(low <= truth[name].value <= high))
     print(f"{arguments.seeds} seeds, {side}² px, {arguments.counts:g} counts a pixel\n")
-    print("| filaments | number of the exact field in the band of 68 % |\n|-|-|")
+    print("| filaments | stated | number of the exact field in the band of 68 % |\n|-|-|-|")
     for name, shares in inside.items():
-        print(f"| {name} | {np.mean(shares):.0%} |")
+        print(f"| {name} | {len(shares)} | {np.mean(shares):.0%} |")
 
 
 PARTS: dict[str, Callable[[argparse.Namespace], None]] = {

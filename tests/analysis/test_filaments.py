@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 
 from helpers.exact_fields import SETUP
-from napari_shadowinv import synthetic_image
+from napari_shadowinv import invert, synthetic_image
 from napari_shadowinv.analysis import Filaments, analyse
-from napari_shadowinv.analysis.filaments import field_autocorrelation
+from napari_shadowinv.analysis.filaments import _next_maximum, field_autocorrelation
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.inversion.variables import dataset_from_field
 
 SIDE = 160
 PIXEL = SETUP.object_pixel_size
+NUMBERS = ("radius", "spacing", "rms", "peak")
 
 
 def filaments(places, angle, radius, length, strength=3.0):
@@ -96,6 +98,55 @@ def test_strength_is_that_of_the_field():
     assert float(product["rms"].value) == pytest.approx(np.sqrt((field**2).mean()))
     assert float(product["peak"].value) == pytest.approx(np.percentile(field, 99))
     assert product.variables["rms"].unit == "T m"
+
+
+def test_thin_filaments_are_measured_without_the_errors_of_pixels_and_of_noise():
+    # Radius 3 px: central differences and means over pixels take 5 % of the strength.
+    potential, displacement = filaments([(y, 0.0) for y in range(-60, 61, 12)], 0.0, 3.0, 40.0)
+    exact = np.array([measured(potential, displacement)[name].value for name in NUMBERS])
+    image = synthetic_image(displacement)
+    source = np.full(image.shape, 100.0)
+    (clean,) = analyse(invert(100 * image, source=source), Filaments(), setup=SETUP)
+    np.testing.assert_allclose([clean[name].value for name in NUMBERS], exact, rtol=0.015)
+    noisy_image = np.random.default_rng(1).poisson(100 * image).astype(float)
+    (noisy,) = analyse(invert(noisy_image, source=source), Filaments(), setup=SETUP)
+    for name, value in zip(NUMBERS, exact, strict=True):
+        quantity = noisy[name]
+        assert abs(float(quantity.value) - value) < 2.5 * float(quantity.std)
+        assert quantity.bias == pytest.approx(0, abs=1e-9 * value)
+        low, high = quantity.band()
+        assert low < quantity.value < high
+
+
+def test_spacing_is_exact_for_a_smooth_maximum():
+    lags = np.arange(0.0, 40.0, 0.25)
+    correlation = np.cos(2 * np.pi * lags / 11.1) * np.exp(-lags / 200)
+    spacing, order = _next_maximum(correlation, lags, 0.5)
+    assert spacing == pytest.approx(11.1, rel=2e-3)
+    assert order == pytest.approx(np.exp(-11.1 / 200), rel=2e-3)
+
+
+def test_a_higher_second_maximum_is_twice_the_spacing():
+    lags = np.arange(0.0, 40.0, 0.25)
+    envelope = np.exp(-0.5 * ((lags - 24) / 4) ** 2) + 0.2 + (lags < 1)
+    correlation = np.cos(2 * np.pi * lags / 12) * envelope
+    spacing, order = _next_maximum(correlation, lags, 0.5)
+    assert spacing == pytest.approx(12, rel=0.05)
+    assert order < 0.5
+
+
+def test_a_spacing_that_samples_do_not_confirm_is_not_stated():
+    quantities = {
+        name: Quantity(np.asarray(1.0), np.ones(100)) for name in ("spacing", "order", "radius")
+    }
+    samples = np.where(np.arange(100) < 15, 2.0, 1.0)
+    refined = Filaments().refine(quantities | {"spacing": Quantity(np.asarray(1.0), samples)})
+    assert np.isnan(refined["spacing"].value)
+    assert np.isnan(refined["order"].value)
+    assert refined["radius"].value == 1
+    few = np.where(np.arange(100) < 5, np.nan, 1.01)
+    refined = Filaments().refine(quantities | {"spacing": Quantity(np.asarray(1.0), few)})
+    assert refined["spacing"].value == pytest.approx(0.99)
 
 
 def test_autocorrelation_ignores_masked_pixels():

@@ -335,7 +335,8 @@ def _of_inversion(
         source=np.where(inversion.mask, inversion.source * inversion.report.flux_scale, np.nan),
     )  # fmt: skip
     is_folded = any(caution.code == "folds" for caution in inversion.cautions)
-    yield ResampledInversion(replace(frame, has_crossed_rays=is_folded), inversion)
+    frame = replace(frame, has_crossed_rays=is_folded, is_pixel_mean=True)
+    yield ResampledInversion(frame, inversion)
 
 
 def _of_fit(

@@ -19,7 +19,6 @@ from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
 from napari_shadowinv._system.validation import CombinationError
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.analysis._derivatives import finer_displacement, finer_potential
 from napari_shadowinv.analysis.abel import choose_smoothing, operators
 from napari_shadowinv.analysis.axis import (
     Axis,
@@ -370,7 +369,7 @@ class AxisymmetricProfile(Product):
     def measure(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
     ) -> dict[str, FloatArray]:
-        displacement = finer_displacement(finer_potential(potential), displacement)
+        _, displacement = frame.at_points(potential, displacement)
         right_rows, left_rows = self._rows(displacement, frame)
         right_side, left_side = (self._by_slice(rows, frame) for rows in (right_rows, left_rows))
         _, inverse = self._operators(frame)

@@ -44,6 +44,8 @@ _PEAK_ERRORS = 3.0
 _PEAK_PERCENTILE = 99.0
 _ROUND_RATIO = 1.88  # of the reaches of the autocorrelation of a round Gaussian
 _NEIGHBOURS = 3
+_MULTIPLE_ERROR = 0.1  # of the spacing, up to which a maximum belongs to a multiple of it
+_CONFIRMED, _CONFIRMED_SHARE = 0.2, 0.9  # of the spacing, and of the samples
 _WAVE_ZERO, _WAVE_MARGIN = 0.25, 0.003  # first zero over spacing of a sine wave
 _MERGED = 3.6  # spacing over radius at which filaments merge
 _FWHM = 2 * math.sqrt(2 * math.log(2))
@@ -145,6 +147,7 @@ class Filaments(Product):
     def measure(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
     ) -> dict[str, FloatArray]:
+        potential, displacement = frame.at_points(potential, displacement)
         weights = window_weights(frame.mask, _TAPER)
         across = self._across(displacement, frame)
         component = np.tensordot(across, displacement, axes=1)
@@ -170,6 +173,23 @@ class Filaments(Product):
             "elongation": np.asarray(length / half / _ROUND_RATIO),
             "rms": np.asarray(math.sqrt(float((used**2).mean()))),
             "peak": np.asarray(np.percentile(used, _PEAK_PERCENTILE)),
+        }
+
+    def refine(self, quantities: dict[str, Quantity]) -> dict[str, Quantity]:
+        """Subtract what noise adds; state a spacing only if nearly all samples confirm it."""
+        spacing = quantities["spacing"]
+        samples = spacing.samples
+        if len(samples):
+            is_confirmed = np.abs(samples / spacing.value - 1) < _CONFIRMED
+            if is_confirmed.mean() < _CONFIRMED_SHARE:
+                nothing = Quantity(np.asarray(math.nan), np.full_like(samples, math.nan))
+                quantities = quantities | {"spacing": nothing, "order": nothing}
+            else:
+                confirmed = np.where(is_confirmed, samples, samples[is_confirmed].mean())
+                quantities = quantities | {"spacing": Quantity(spacing.value, confirmed)}
+        return {
+            name: _without_bias(quantity) if quantity.value.ndim == 0 else quantity
+            for name, quantity in quantities.items()
         }
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
@@ -205,6 +225,14 @@ class Filaments(Product):
             "the scatter of structures at random places."
         )
         return tuple(remarks)
+
+
+def _without_bias(quantity: Quantity) -> Quantity:
+    """Return the value less what noise adds on average; its bands are the same."""
+    if not len(quantity.samples):
+        return quantity
+    bias = quantity.bias
+    return Quantity(quantity.value - bias, quantity.samples - 2 * bias)
 
 
 def _direction(displacement: FloatArray, weights: FloatArray) -> tuple[float, float]:
@@ -281,12 +309,25 @@ def _radius(zero: float, spacing: float) -> float:
 
 
 def _next_maximum(values: FloatArray, lags: FloatArray, least: float) -> tuple[float, float]:
-    """Return lag and height of the first maximum above `least` beyond the first zero."""
-    zero = np.flatnonzero(values < 0)
-    if len(zero):
-        inner = values[1:-1]
-        peaks = 1 + np.flatnonzero((inner >= values[:-2]) & (inner > values[2:]) & (inner > least))
-        peaks = peaks[peaks > zero[0]]
-        if len(peaks):
-            return float(lags[peaks[0]]), float(values[peaks[0]])
-    return math.nan, math.nan
+    """Return lag and height of the first maximum beyond the first zero.
+
+    It is above `least`, or its multiple is: the second neighbours of bent filaments may by chance
+    be aligned better than the first.
+    """
+    inner = values[1:-1]
+    peaks = 1 + np.flatnonzero((inner >= values[:-2]) & (inner > values[2:]) & (inner > 0))
+    peaks = peaks[np.cumsum(values < 0)[peaks] > 0]
+    high = peaks[values[peaks] > least]
+    if not len(high):
+        return math.nan, math.nan
+    multiple = lags[high[0]] / lags[peaks]
+    is_spacing = np.abs(multiple - np.round(multiple)) < _MULTIPLE_ERROR * np.round(multiple)
+    peak = peaks[np.flatnonzero(is_spacing)[0]]
+    return _vertex(values[peak - 1 : peak + 2], lags[peak - 1 : peak + 2])
+
+
+def _vertex(values: FloatArray, lags: FloatArray) -> tuple[float, float]:
+    """Return lag and height of the top of the parabola through three values at equal steps."""
+    low, middle, high = (float(each) for each in values)
+    shift = (high - low) / (2 * (2 * middle - low - high))
+    return float(lags[1]) + shift * float(lags[1] - lags[0]), middle + shift * (high - low) / 4

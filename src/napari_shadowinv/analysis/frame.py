@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.analysis._derivatives import finer_displacement, finer_potential
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.units import PIXEL
@@ -105,6 +106,9 @@ class FieldFrame:
         The recorded image and the undisturbed beam in its unit; NaN where masked.
     has_crossed_rays : bool
         Whether the result says that rays cross.
+    is_pixel_mean : bool
+        Whether the potential is a mean over pixels and the displacement its central differences,
+        as inversions read them out.
     """
 
     shape: tuple[int, int]
@@ -115,6 +119,7 @@ class FieldFrame:
     image: AnyArray | None = None
     source: AnyArray | None = None
     has_crossed_rays: bool = False
+    is_pixel_mean: bool = False
 
     @cached_property
     def contrast(self) -> FloatArray | None:
@@ -177,6 +182,15 @@ class FieldFrame:
         return self.setup.field_in_si(
             self.unit.field, displacement if self.is_vector else potential
         )
+
+    def at_points(
+        self, potential: FloatArray, displacement: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return potential and displacement at the middles of pixels, rather than means."""
+        if not self.is_pixel_mean:
+            return potential, displacement
+        finer = finer_potential(potential)
+        return finer, finer_displacement(finer, displacement)
 
     def require_field(self, product: str, *fields: str) -> None:
         """Refuse a product of other fields than this one, with an `InputError`."""
