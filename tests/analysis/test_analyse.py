@@ -235,6 +235,21 @@ def test_a_wrong_choice_is_refused(
         analyse(exact, LINE, **keywords)
 
 
+def test_texts_and_tables_describe_the_same_products(exact: RetrievedField):
+    text = "profile 10,20 60,20"
+    table = {"product": "profile", "path": [(10, 20), (60, 20)]}
+    (alone,) = analyse(exact, text)
+    for result in analyse(exact, [text, table]):
+        assert result.product == alone.product
+        np.testing.assert_array_equal(result["magnitude"].value, alone["magnitude"].value)
+
+
+@pytest.mark.parametrize("products", [7, [7], [["profile"]], None])
+def test_what_is_no_product_is_refused(products: object, exact: RetrievedField):
+    with pytest.raises(InputError, match=r"product 1 is a \w+, expected a product, a table"):
+        analyse(exact, products)
+
+
 def test_pixels_without_a_setup_have_one_unit(exact: RetrievedField):
     bare = RetrievedField(exact.dataset.drop_attrs())
     (result,) = analyse(bare, LINE)

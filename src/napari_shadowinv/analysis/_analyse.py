@@ -19,7 +19,7 @@ from napari_shadowinv.analysis._field_samples import (
     sampled_fields,
 )
 from napari_shadowinv.analysis.frame import FieldFrame, field_unit
-from napari_shadowinv.analysis.kinds import product_from_dict
+from napari_shadowinv.analysis.kinds import product_from_dict, product_from_text
 from napari_shadowinv.analysis.product import FieldNoise, Product, Variable
 from napari_shadowinv.analysis.result import ProductResult
 from napari_shadowinv.errors import InputError
@@ -35,7 +35,7 @@ _MIN_SAMPLES = 20
 
 def analyse(
     result: Any,
-    products: Product | Mapping[str, Any] | Sequence[Product | Mapping[str, Any]],
+    products: Product | Mapping[str, Any] | str | Sequence[Product | Mapping[str, Any] | str],
     *,
     samples: int = 100,
     unit: str | None = None,
@@ -56,8 +56,9 @@ def analyse(
     ----------
     result : Inversion, Fit, RetrievedField or Dataset
         Of one shot; a dataset as `read` returns it.
-    products : Product, mapping, or sequence of these
-        Products, or tables of their fields, such as ``{"product": "flux", "path": …}``.
+    products : Product, mapping, str, or sequence of these
+        Products, tables of their fields, such as ``{"product": "flux", "path": …}``, or texts, such
+        as "flux 100,20 100,180", which `product_syntax` describes.
     samples : int
         Number of samples, at least 20. A band of 95 % needs about 100. For a fit at most the
         number that it has stored.
@@ -122,14 +123,24 @@ def analyse(
 
 
 def _checked_products(products: Any) -> list[Product]:
-    single = isinstance(products, Product | Mapping)
-    listed = [products] if single else list(products)
+    is_list = isinstance(products, Sequence) and not isinstance(products, str)
+    listed = list(products) if is_list else [products]
     if not listed:
         raise InputError("got no product, expected at least one")
-    return [
-        each if isinstance(each, Product) else product_from_dict(each, f"product {number}")
-        for number, each in enumerate(listed, 1)
-    ]
+    return [_checked_product(each, number) for number, each in enumerate(listed, 1)]
+
+
+def _checked_product(product: Any, number: int) -> Product:
+    if isinstance(product, Product):
+        return product
+    if isinstance(product, str):
+        return product_from_text(product)
+    if isinstance(product, Mapping):
+        return product_from_dict(product, f"product {number}")
+    raise InputError(
+        f"product {number} is a {type(product).__name__}, expected a product, a table of its "
+        "fields, or a text such as 'profile 100,20 100,180 width=5'"
+    )
 
 
 def _products_for(products: list[Product], frame: FieldFrame, n_fields: int) -> list[Product]:

@@ -176,21 +176,16 @@ class Filaments(Product):
         }
 
     def refine(self, quantities: dict[str, Quantity]) -> dict[str, Quantity]:
-        """Subtract what noise adds; state a spacing only if nearly all samples confirm it."""
-        spacing = quantities["spacing"]
-        samples = spacing.samples
-        if len(samples):
-            is_confirmed = np.abs(samples / spacing.value - 1) < _CONFIRMED
-            if is_confirmed.mean() < _CONFIRMED_SHARE:
-                nothing = Quantity(np.asarray(math.nan), np.full_like(samples, math.nan))
-                quantities = quantities | {"spacing": nothing, "order": nothing}
-            else:
-                confirmed = np.where(is_confirmed, samples, samples[is_confirmed].mean())
-                quantities = quantities | {"spacing": Quantity(spacing.value, confirmed)}
-        return {
-            name: _without_bias(quantity) if quantity.value.ndim == 0 else quantity
-            for name, quantity in quantities.items()
-        }
+        """Keep the spacing only if nearly all samples confirm it."""
+        value, samples = quantities["spacing"].value, quantities["spacing"].samples
+        if not len(samples):
+            return quantities
+        is_confirmed = np.abs(samples / value - 1) < _CONFIRMED
+        if is_confirmed.mean() < _CONFIRMED_SHARE:
+            nothing = Quantity(np.asarray(math.nan), np.full_like(samples, math.nan))
+            return quantities | {"spacing": nothing, "order": nothing}
+        confirmed = np.where(is_confirmed, samples, samples[is_confirmed].mean())
+        return quantities | {"spacing": Quantity(value, confirmed)}
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
         cautions = []
@@ -225,14 +220,6 @@ class Filaments(Product):
             "the scatter of structures at random places."
         )
         return tuple(remarks)
-
-
-def _without_bias(quantity: Quantity) -> Quantity:
-    """Return the value less what noise adds on average; its bands are the same."""
-    if not len(quantity.samples):
-        return quantity
-    bias = quantity.bias
-    return Quantity(quantity.value - bias, quantity.samples - 2 * bias)
 
 
 def _direction(displacement: FloatArray, weights: FloatArray) -> tuple[float, float]:
