@@ -8,7 +8,14 @@ from scipy import constants
 from scipy.ndimage import gaussian_filter
 
 from helpers.exact_fields import SETUP, field_of
-from napari_shadowinv.analysis import ChargeDensity, Contrast, CurrentDensity, Region, analyse
+from napari_shadowinv.analysis import (
+    ChargeDensity,
+    Contrast,
+    CurrentDensity,
+    PhaseCurvature,
+    Region,
+    analyse,
+)
 from napari_shadowinv.analysis._derivatives import laplacian
 from napari_shadowinv.analysis.maps import chosen_width, smooth
 from napari_shadowinv.errors import InputError
@@ -23,6 +30,7 @@ from napari_shadowinv.physics.phantoms import (
     wakefield,
     wakefield_setup,
 )
+from napari_shadowinv.physics.setup import OpticalSetup
 
 PIXEL = SETUP.object_pixel_size
 
@@ -53,6 +61,30 @@ def test_charge_density_of_a_gaussian_is_that_of_its_formula():
     volts = SETUP.path_integrated_e([0.0, 1.0])[1]
     exact = constants.epsilon_0 * volts * divergence / PIXEL
     np.testing.assert_allclose(density["density"].value, exact, atol=1e-3 * abs(exact).max())
+
+
+def test_curvature_of_a_phase_is_that_of_its_formula():
+    radians, sigma, distance = -40.0, 13.0, 0.4
+    light = OpticalSetup(wavelength=532e-9, object_image_distance=distance, pixel_size=8e-6)
+    wave_number = 2 * np.pi / light.wavelength
+    # A ray turns by the gradient of the phase over the wave number.
+    per_px = distance / wave_number / light.pixel_size**2
+    y, x = offsets(128)
+    square = (y**2 + x**2) / sigma**2
+    phase = radians * np.exp(-square / 2)
+    displacement = -per_px * phase * np.stack([y, x]) / sigma**2
+    field = RetrievedField(dataset_from_field(displacement, -per_px * phase, light))
+    exact = phase * (square - 2) / (sigma * light.pixel_size) ** 2
+    for unit in (None, "m", "m⁻²"):
+        (curvature,) = analyse(field, PhaseCurvature(smoothing=0), unit=unit)
+        np.testing.assert_allclose(
+            curvature["curvature"].value, exact, atol=1e-3 * abs(exact).max()
+        )
+        assert curvature.variables["curvature"].unit == "rad/m²"
+    protons = field_of(gaussian_blob((64, 64), 60.0, 9.0))
+    for unit in (None, "rad"):
+        with pytest.raises(InputError, match="phase curvature"):
+            analyse(protons, PhaseCurvature(), unit=unit)
 
 
 def test_laplacian_is_exact_for_polynomials_of_fifth_order():

@@ -3,7 +3,7 @@
 - measure products of a result: `analyse`; each becomes a `ProductResult`
 - values along a line or path: `LineProfile`; in a drawn region: `Region`
 - line integrals: `Flux`, `EnclosedCurrent`, `EnclosedCharge`
-- maps: `CurrentDensity`, `ChargeDensity`
+- maps: `CurrentDensity`, `ChargeDensity`, `PhaseCurvature`
 - how strongly the field structures the image: `Contrast`
 - objects with an axis: `AxisymmetricProfile` from the side, `AzimuthalProfile` face-on
 - turbulence and filaments: `TurbulenceSpectrum`, `Filaments`

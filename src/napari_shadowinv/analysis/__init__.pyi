@@ -6,7 +6,7 @@ from .filaments import Filaments
 from .frame import FIELD_UNITS, FieldFrame
 from .kinds import PRODUCTS, product_from_dict, product_from_text
 from .lines import LineProfile
-from .maps import ChargeDensity, CurrentDensity
+from .maps import ChargeDensity, CurrentDensity, PhaseCurvature
 from .product import Product
 from .regions import Region
 from .result import ProductResult, add_products, products_in, products_table
@@ -27,6 +27,7 @@ __all__ = [
     "Filaments",
     "Flux",
     "LineProfile",
+    "PhaseCurvature",
     "Product",
     "ProductResult",
     "Region",

@@ -1,6 +1,6 @@
-"""Maps of the sources of a field: `CurrentDensity`, `ChargeDensity`; their smoothing.
+"""Maps of the sources of a field: `CurrentDensity`, `ChargeDensity`, `PhaseCurvature`.
 
-The sources are the Laplacian of the potential, which amplifies noise. It is smoothed by a kernel
+They are the Laplacian of the potential, which amplifies noise. It is smoothed by a kernel
 that leaves large structures as they are: with the Gaussian G of a standard deviation w, the gain
 1 - (1 - G)³ falls short of 1 only by the sixth power of the wave number. Its width minimises the
 expected error of the map, which follows from the map and from samples of its noise (Stein's
@@ -37,8 +37,16 @@ from napari_shadowinv.analysis.product import (
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact
 from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.physics.setup import OpticalSetup
 
-__all__ = ["ChargeDensity", "CurrentDensity", "Smoothed", "chosen_width", "smooth"]
+__all__ = [
+    "ChargeDensity",
+    "CurrentDensity",
+    "PhaseCurvature",
+    "Smoothed",
+    "chosen_width",
+    "smooth",
+]
 
 ORDER = 3
 MIN_SPACINGS = 1.5  # of the sites, in widths: finer structures are those of the cells
@@ -151,9 +159,10 @@ class _SourceMap(Smoothed):
 
     unit: ClassVar[str]
     long_name: ClassVar[str]
+    variable: ClassVar[str] = "density"
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
-        return {"density": Variable(("y", "x"), self.unit, self.long_name)}
+        return {self.variable: Variable(("y", "x"), self.unit, self.long_name)}
 
     def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
         return {
@@ -166,27 +175,28 @@ class _SourceMap(Smoothed):
         }
 
     def _per_curvature(self, frame: FieldFrame) -> float:
-        """Return the density by a Laplacian of the potential of 1."""
+        """Return the density or curvature by a Laplacian of the potential of 1."""
         raise NotImplementedError
 
     def measure(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
     ) -> dict[str, FloatArray]:
-        return {"density": self._per_curvature(frame) * self.sources(potential)}
+        return {self.variable: self._per_curvature(frame) * self.sources(potential)}
 
     def systematic(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
     ) -> dict[str, FloatArray]:
         # The next order of the kernel shows what this one takes away.
         lost = self.sources(potential, ORDER + 1) - self.sources(potential)
-        return {"density": self._per_curvature(frame) * lost}
+        return {self.variable: self._per_curvature(frame) * lost}
 
     def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
-        text = quantity_text(at_peak(inside(quantities["density"], frame)), self.unit, frame)
+        name = self.variable
+        text = quantity_text(at_peak(inside(quantities[name], frame)), self.unit, frame)
         return [
-            Fact("density", "Largest density", text, short=text),
+            Fact(name, f"Largest {name}", text, short=text),
             Fact("smoothing", "Smoothing", self.smoothing_text(frame)),
-            *self._linear_facts(quantities["density"], frame),
+            *self._linear_facts(quantities[name], frame),
         ]
 
     def _linear_facts(self, density: Quantity, frame: FieldFrame) -> list[Fact]:
@@ -243,3 +253,28 @@ class ChargeDensity(_SourceMap):
 
     def _per_curvature(self, frame: FieldFrame) -> float:
         return -charge_factor(frame) / frame.pixel
+
+
+class PhaseCurvature(_SourceMap):
+    """Map of the curvature of light's phase: ∇²Φ with Φ = (2π/λ) ∫ln η dz.
+
+    Negative where the object focuses.
+    """
+
+    title = "phase curvature"
+    place = 72
+    fields = ("line_integrated_log_index", "line_integrated_density", "deflection_angle")
+    unit = "rad/m²"
+    long_name = "Curvature of the phase"
+    variable = "curvature"
+    product: Literal["phase-curvature"] = "phase-curvature"
+
+    def check(self, frame: FieldFrame) -> None:
+        super().check(frame)
+        if not isinstance(frame.setup, OpticalSetup):
+            raise InputError("phase curvature is that of light: expected a setup with a wavelength")
+
+    def _per_curvature(self, frame: FieldFrame) -> float:
+        assert isinstance(frame.setup, OpticalSetup)
+        wave_number = 2 * math.pi / frame.setup.wavelength
+        return -wave_number * float(frame.setup.deflection_angle(1.0)) / frame.pixel
