@@ -37,6 +37,7 @@ from napari_shadowinv.analysis.product import (
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact
 from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.physics.beam import length_text
 from napari_shadowinv.physics.setup import OpticalSetup
 
 __all__ = [
@@ -149,9 +150,10 @@ class Smoothed(Product):
             return "none"
         wavelength = 2 * math.pi * width / _HALF_GAIN
         text = f"width {width:.3g} px: structures of a wavelength of {wavelength:.3g} px"
+        text = f"{wavelength:.3g} px"
         if frame.setup is not None:
-            text += f" ({frame.length(wavelength) * 1e6:.3g} µm)"
-        return f"{text} keep half of their amplitude"
+            text += f" ({length_text(frame.length(wavelength))})"
+        return f"width {width:.3g} px: structures of a wavelength of {text} keep half of their amplitude"
 
 
 class _SourceMap(Smoothed):
