@@ -211,6 +211,43 @@ def test_settling_reaches_where_a_long_descent_ends(scene: Scene) -> None:
     )
 
 
+def test_a_nearly_quadratic_objective_takes_one_step(scene: Scene) -> None:
+    truth = bump(scene, 0.3)
+    images = scene.model(truth, scene.ray_counts(truth))
+    noisy = images + np.random.default_rng(6).normal(0, 0.05, images.shape)
+    target = replace(scene, images=noisy)
+    near = truth._replace(potentials=0.95 * truth.potentials)
+    end, value, steps, ended = settle(target, near, steps=8, least_gain=1.0)
+    assert (steps, ended) == (1, True)
+    _, least, *_ = settle(target, end, steps=8, least_gain=1e-6)
+    assert value - least < 1.0
+
+
+def test_a_known_jacobian_leads_to_the_same_end(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = bump(scene, 1.0)
+    images = scene.model(truth, scene.ray_counts(truth))
+    noisy = images + np.random.default_rng(6).normal(0, 0.05, images.shape)
+    target = replace(scene, images=noisy)
+    near = truth._replace(potentials=0.98 * truth.potentials)
+    _, expected, *_ = settle(target, near, steps=8, least_gain=0.1)
+    linear = target.linear(truth, target.ray_counts(truth))
+    built: list[Scene] = []
+    original = Scene.linear
+    monkeypatch.setattr(Scene, "linear", lambda *given: built.append(given[0]) or original(*given))
+    _, value, _, ended = settle(target, near, steps=8, least_gain=0.1, linear=linear)
+    assert ended
+    assert not built
+    assert value == pytest.approx(expected, abs=0.5)
+    # That of another field fails, and is left.
+    far = truth._replace(potentials=-8 * truth.potentials)
+    wrong = target.linear(far, target.ray_counts(far))
+    _, value, *_ = settle(target, near, steps=8, least_gain=0.1, linear=wrong)
+    assert built
+    assert value == pytest.approx(expected, abs=0.5)
+
+
 def test_settling_goes_on_by_descent_where_its_own_steps_fail(scene: Scene) -> None:
     """From a fold on the wrong side, steps of a linear model overshoot."""
     truth = bump(scene, 2.0)

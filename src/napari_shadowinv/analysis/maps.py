@@ -149,11 +149,13 @@ class Smoothed(Product):
         if not width:
             return "none"
         wavelength = 2 * math.pi * width / _HALF_GAIN
-        text = f"width {width:.3g} px: structures of a wavelength of {wavelength:.3g} px"
-        text = f"{wavelength:.3g} px"
+        length = f"{wavelength:.3g} px"
         if frame.setup is not None:
-            text += f" ({length_text(frame.length(wavelength))})"
-        return f"width {width:.3g} px: structures of a wavelength of {text} keep half of their amplitude"
+            length += f" ({length_text(frame.length(wavelength))})"
+        return (
+            f"width {width:.3g} px: structures of a wavelength of {length} keep half of their "
+            "amplitude"
+        )
 
 
 class _SourceMap(Smoothed):

@@ -20,7 +20,7 @@ from napari_shadowinv.fitting._fit import collect_starts, reweight_counts
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
 from napari_shadowinv.fitting.descent import coarser, finer, settle
-from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.measurements import FitData, collect_data
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.rays import at_rest
@@ -137,15 +137,29 @@ class _SampledFit:
     unknowns: Unknowns
     changes: list[Unknowns]
 
-    def variance_in(self, scene: Scene, unknowns: Unknowns) -> float:
+    def variance_in(self, linear: Linear) -> float:
         """Return the mean square of the changes in one image, in units of its noise."""
-        linear = scene.linear(unknowns, scene.ray_counts(unknowns))
-        no_change = unknowns.zeros()
+        no_change = linear.unknowns.zeros()
         residuals = [
             linear.push(no_change._replace(potentials=change.potentials, beam=change.beam))
             for change in self.changes
         ]
-        return float(np.mean(np.square(residuals)[:, scene.weights > 0]))
+        return float(np.mean(np.square(residuals)[:, linear.scene.weights > 0]))
+
+
+@dataclass(frozen=True)
+class _JointFit:
+    """Dense rays through all images that agree, in their order `members`, to first order."""
+
+    members: list[int]
+    linear: Linear
+    unknowns: Unknowns  # of all images
+
+    def only(self, members: list[int]) -> Linear | None:
+        """Return some images to first order; None if there is no such joint fit of them."""
+        if not set(members) <= set(self.members):
+            return None
+        return self.linear.only([self.members.index(k) for k in members])
 
 
 @dataclass(frozen=True)
@@ -226,52 +240,92 @@ class _Work:
 
         Larger pixels may set aside too many: images that the others predict are added again.
         """
-        own_fits = [self._fit_alone(scene, k, common) for k in self._all]
+        joint = self._fit_jointly(scene, common, agreeing)
+        own_fits = [self._fit_alone(scene, k, common, joint) for k in self._all]
         predictions: dict[int, _Prediction] = {}
         while outside := [k for k in self._all if k not in agreeing]:
-            fit = self._sample_fit(scene, common, agreeing)
+            fit = self._sample_fit(scene, common, agreeing, joint)
             for k in outside:
-                predictions[k] = self._predict(k, agreeing, scene, fit, own_fits[k])
+                predictions[k] = self._predict(k, agreeing, scene, fit, own_fits[k], None)
             back = [k for k in outside if predictions[k].chi2 <= predictions[k].limit]
             if not back:
                 break
             agreeing = sorted([*agreeing, *back])
+            joint = self._fit_jointly(scene, common, agreeing)
         for k in agreeing:
             members = [image for image in agreeing if image != k]
-            fit = self._sample_fit(scene, common, members)
-            predictions[k] = self._predict(k, members, scene, fit, own_fits[k])
+            fit = self._sample_fit(scene, common, members, joint)
+            predictions[k] = self._predict(k, members, scene, fit, own_fits[k], joint)
         return [predictions[k] for k in self._all]
 
-    def _sample_fit(self, scene: Scene, common: Minimum, members: list[int]) -> _SampledFit:
-        name = f"images {', '.join(str(k + 1) for k in members)}"
-        coarse = self._settle_members(scene, common, members, name, _LAST_GAIN)
-        part = scene.only(members)
+    def _fit_jointly(self, scene: Scene, common: Minimum, members: list[int]) -> _JointFit | None:
+        """Fit images with dense rays; None if they are too many for Jacobians."""
+        if scene.only(members).images.size > _MAX_SAMPLED_PIXELS:
+            return None
+        _, fine, unknowns, _ = self._fit_densely(scene, common, members)
+        linear = fine.linear(unknowns, fine.ray_counts(unknowns))
+        return _JointFit(members, linear, finer(common.unknowns).with_images(members, unknowns))
+
+    def _fit_densely(
+        self, scene: Scene, common: Minimum, members: list[int]
+    ) -> tuple[Minimum, Scene, Unknowns, float]:
+        """Fit some images; return where that ends in pixels of two, and with dense rays."""
+        coarse = self._settle_members(scene, common, members, _name(members), _LAST_GAIN)
         first = replace(coarse, unknowns=coarse.unknowns.only(members))
-        fine, unknowns, *_ = refine_minimum(part, first, self._options, self._on_step)
+        fine, unknowns, *_ = refine_minimum(
+            scene.only(members), first, self._options, self._on_step
+        )
         # Folds are deeper in the image that is left out if it is displaced most.
         fine = replace(fine, spacing=_RAY_SPACING_RATIO * fine.spacing)
+        return coarse, fine, *self._settle_densely(fine, unknowns, members)
+
+    def _settle_densely(
+        self, fine: Scene, unknowns: Unknowns, members: list[int], linear: Linear | None = None
+    ) -> tuple[Unknowns, float]:
         unknowns, value, *_ = settle(
             fine,
             unknowns,
             steps=_DENSE_STEPS,
             least_gain=_LAST_GAIN,
-            after_step=lambda now: self._on_step(name, now),
+            after_step=lambda now: self._on_step(_name(members), now),
+            linear=linear,
         )
+        return unknowns, value
+
+    def _sample_fit(
+        self, scene: Scene, common: Minimum, members: list[int], joint: _JointFit | None
+    ) -> _SampledFit:
+        """Fit some images, from a joint fit of these and others if there is one."""
+        linear = None if joint is None else joint.only(members)
+        large = False
+        if linear is not None and joint is not None:
+            fine, start = linear.scene, joint.unknowns
+            unknowns, value = self._settle_densely(fine, start.only(members), members, linear)
+            sampled = fine, unknowns
+        else:
+            coarse, fine, unknowns, value = self._fit_densely(scene, common, members)
+            start, sampled = finer(coarse.unknowns), (fine, unknowns)
+            large = fine.images.size > _MAX_SAMPLED_PIXELS
+            if large:
+                middle = replace(coarser(scene.only(members), MIDDLE), spacing=MIDDLE_SPACING)
+                sampled = middle, coarse.unknowns.only(members)
         rng = np.random.default_rng(self._options.seed)
-        large = fine.images.size > _MAX_SAMPLED_PIXELS
         posterior = Posterior(
-            replace(coarser(part, MIDDLE), spacing=MIDDLE_SPACING) if large else fine,
-            first.unknowns if large else unknowns,
-            rng,
-            lambda: self._on_step(name, value),
+            *sampled, rng, lambda: self._on_step(_name(members), value), linear=linear
         )
         changes = [posterior.draw_sample(_SAMPLE_TOLERANCE).change for _ in range(_SAMPLES)]
         if large:
             changes = [finer(change) for change in changes]
-        return _SampledFit(fine, finer(coarse.unknowns).with_images(members, unknowns), changes)
+        return _SampledFit(fine, start.with_images(members, unknowns), changes)
 
     def _predict(
-        self, k: int, others: list[int], scene: Scene, fit: _SampledFit, own_fit: _OwnFit
+        self,
+        k: int,
+        others: list[int],
+        scene: Scene,
+        fit: _SampledFit,
+        own_fit: _OwnFit,
+        joint: _JointFit | None,
     ) -> _Prediction:
         """One image, as others predict it."""
         scene = replace(scene, spacing=fit.scene.spacing)
@@ -285,19 +339,20 @@ class _Work:
         (image,) = scene.model(unknowns, scene.ray_counts(unknowns))
         brightness, weights = self._match_brightness(k, image, scene)
         chi2 = _chi2(brightness * image, scene.images[0], weights)
-        variance = fit.variance_in(scene, unknowns)
+        variance = fit.variance_in(_linear_of(k, scene, unknowns, joint))
         variance += _RAY_VARIANCE_RATIO * _chi2(brightness * image, brightness * rough, weights)
         limit = _MAX_NOISE_RATIO + _MAX_VARIANCE_RATIO * variance
         return _Prediction(
             brightness * image, weights, brightness, chi2, own_fit.chi2, limit * own_fit.noise_chi2
         )
 
-    def _fit_alone(self, scene: Scene, k: int, common: Minimum) -> _OwnFit:
-        fit = self._sample_fit(scene, common, [k])
+    def _fit_alone(self, scene: Scene, k: int, common: Minimum, joint: _JointFit | None) -> _OwnFit:
+        fit = self._sample_fit(scene, common, [k], joint)
         unknowns = fit.unknowns.only([k])
         chi2 = float(fit.scene.chi2(unknowns, fit.scene.ray_counts(unknowns))[0])
         # A field of an image's own follows the noise by as much as it is left open.
-        share = min(fit.variance_in(fit.scene, unknowns), _MAX_FITTED_SHARE)
+        variance = fit.variance_in(_linear_of(k, fit.scene, unknowns, joint))
+        share = min(variance, _MAX_FITTED_SHARE)
         return _OwnFit(chi2, chi2 / (1 - share))
 
     def _match_brightness(self, k: int, made: FloatArray, one: Scene) -> tuple[float, FloatArray]:
@@ -330,6 +385,16 @@ class _Work:
         middle = replace(coarser(scene.only(members), MIDDLE), spacing=MIDDLE_SPACING)
         unknowns = minimum.unknowns.only(members)
         return middle.chi2(unknowns, middle.ray_counts(unknowns))
+
+
+def _linear_of(k: int, scene: Scene, unknowns: Unknowns, joint: _JointFit | None) -> Linear:
+    """One image to first order, by a joint fit if it takes part in it."""
+    linear = None if joint is None else joint.only([k])
+    return linear or scene.linear(unknowns, scene.ray_counts(unknowns))
+
+
+def _name(members: list[int]) -> str:
+    return f"images {', '.join(str(k + 1) for k in members)}"
 
 
 def _align_image(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknowns:

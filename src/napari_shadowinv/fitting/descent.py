@@ -21,7 +21,7 @@ from scipy.fft import dctn, idctn
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
-from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import POWERS, Fiducials, Unknowns
 
@@ -147,6 +147,7 @@ _DESCENTS = 3  # with fixed numbers of rays each
 _FEW = 10  # steps, after which the numbers of rays still fit
 _MOST_NEWTON, _MOST_SHORTENED, _SHARES_OF_STEP = 8, 2, (1.0, 0.5, 0.25)  # of Gauss and Newton
 _NEWTON, _MOST_SOLVING = 0.02, 200  # how exactly each is found, and in how many steps
+_NEXT_GAIN = 0.3  # of the least gain; outside valleys a step gains up to twice what is expected
 # Fields and numbers of an instrument that explain an image alike lie along a flat valley.
 _NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 2e-3, 400, 0.1
 # Numbers of rays are renewed after steps that gain more; other numbers change the objective by 1.
@@ -282,6 +283,7 @@ def settle(
     least_gain: float,
     after_step: Callable[[float], None] | None = None,
     modes: SoftModes | None = None,
+    linear: Linear | None = None,
 ) -> tuple[Unknowns, float, int, bool]:
     """Minimise a scene's objective from nearby: Gauss-Newton steps, and a descent if they fail.
 
@@ -294,11 +296,13 @@ def settle(
     steps : int
         Most steps.
     least_gain : float
-        Ends where one step, or five of a descent, lower the objective by less.
+        Ends where one step, or five of a descent, lower the objective by less, or the next would.
     after_step : callable, optional
         Receives the objective often.
     modes : SoftModes, optional
         Of the Hessians of this scene, from scenes of the same pixels and priors.
+    linear : Linear, optional
+        The scene to first order near the start: used for all steps while these succeed.
 
     Returns
     -------
@@ -310,7 +314,8 @@ def settle(
         Whether steps were left.
     """
     tolerance, solving = _NEWTON, _MOST_SOLVING
-    if scene.has_free_numbers or scene.beam_modes:
+    has_valley = scene.has_free_numbers or scene.beam_modes > 0
+    if has_valley:
         tolerance, solving = _NEWTON_IN_VALLEY, _MOST_IN_VALLEY
     if scene.has_free_numbers:
         least_gain *= _GAIN_IN_VALLEY
@@ -323,13 +328,13 @@ def settle(
     newton = min(_MOST_NEWTON, steps) if scene.images.size <= _MOST_PIXELS else 0
     taken = shortened = 0
     while taken < newton and shortened < _MOST_SHORTENED:
-        linear = scene.linear(now, counts)
+        here = linear or scene.linear(now, counts)
 
         def times(flat: FloatArray) -> FloatArray:
             if after_step is not None:
                 after_step(value)  # noqa: B023
             change = scales.times(now.like(flat))  # noqa: B023
-            return scales.transpose_times(linear.hessian_times(change)).flat()  # noqa: B023
+            return scales.transpose_times(here.hessian_times(change)).flat()  # noqa: B023
 
         down = -scales.transpose_times(slope).flat()
         step = solve(times, down, tolerance=tolerance, iterations=solving, modes=modes)
@@ -340,11 +345,19 @@ def settle(
             if trial_value < value:
                 break
         else:
-            break
+            if linear is None:
+                break
+            linear = None
+            continue
+        if share < 1:
+            linear = None
         taken, shortened = taken + 1, shortened + (share < 1)
         gain = value - trial_value
         now, value, slope = trial, trial_value, trial_slope
-        if gain < least_gain:
+        # What the next step would gain is about the preconditioned square of the slope.
+        after = scales.transpose_times(slope).flat()
+        next_gain = product(after, modes.precondition(after)) / 2
+        if gain < least_gain or (next_gain < _NEXT_GAIN * least_gain and not has_valley):
             return now, _value_afresh(scene, now), taken, True
         if gain > _RENEWING_GAIN:
             counts = scene.ray_counts(now)
@@ -360,7 +373,7 @@ def settle(
 
 def _value_afresh(scene: Scene, unknowns: Unknowns) -> float:
     """The objective with the numbers of rays that the unknowns need."""
-    return scene.value_and_gradient(unknowns, scene.ray_counts(unknowns))[0]
+    return scene.value(unknowns, scene.ray_counts(unknowns))
 
 
 def binned(planes: FloatArray, factor: int) -> FloatArray:

@@ -178,6 +178,21 @@ class Scene:
         misfit = (self.model(unknowns, counts) - self.images) ** 2 * self.weights
         return np.asarray(misfit.sum(axis=(1, 2)) / (self.weights > 0).sum(axis=(1, 2)))
 
+    def value(self, unknowns: Unknowns, counts: list[IntArray]) -> float:
+        """Return the objective at fixed numbers of rays."""
+        value, _ = self.prior.value_and_slope(unknowns)
+        for shot in self._shots(unknowns, counts):
+            *_, residual = self._misfit(unknowns, shot)
+            value += float(np.einsum("yx,yx", residual, residual)) / 2
+        return value
+
+    def _misfit(self, unknowns: Unknowns, shot: _Shot) -> tuple[_Seen, FloatArray, FloatArray]:
+        """An image as it is seen, its model, and its residual in units of the noise."""
+        seen = self._seen(unknowns, shot)
+        model = np.exp(unknowns.brightness[shot.number]) * seen.image
+        residual = np.sqrt(self.weights[shot.number]) * (model - self.images[shot.number])
+        return seen, model, blurred(residual, self.blur)
+
     def value_and_gradient(
         self, unknowns: Unknowns, counts: list[IntArray]
     ) -> tuple[float, Unknowns]:
@@ -185,12 +200,10 @@ class Scene:
         value, slope = self.prior.value_and_slope(unknowns)
         of_shape = np.zeros(self.beams.shape[1:])
         for shot in self._shots(unknowns, counts):
-            k, root = shot.number, np.sqrt(self.weights[shot.number])
-            seen = self._seen(unknowns, shot)
-            model = np.exp(unknowns.brightness[k]) * seen.image
-            residual = blurred(root * (model - self.images[k]), self.blur)
+            k = shot.number
+            seen, model, residual = self._misfit(unknowns, shot)
             value += float(np.einsum("yx,yx", residual, residual)) / 2
-            pull = root * blurred(residual, self.blur)
+            pull = np.sqrt(self.weights[k]) * blurred(residual, self.blur)
             slope.brightness[k] += np.einsum("yx,yx", pull, model)
             scaled = np.exp(unknowns.brightness[k]) * pull
             self._add_light_pulls(slope, k, scaled)
@@ -534,6 +547,14 @@ class Linear:
     unknowns: Unknowns
     jacobians: list[csr_array]
     seen: list[_Seen]
+
+    def only(self, numbers: Sequence[int]) -> Linear | None:
+        """Return some of the images; None if another point spread reaches further than theirs."""
+        scene = self.scene.only(numbers)
+        if scene.rays.seen != self.scene.rays.seen:
+            return None
+        jacobians, seen = ([each[k] for k in numbers] for each in (self.jacobians, self.seen))
+        return Linear(scene, self.unknowns.only(numbers), jacobians, seen)
 
     def hessian_times(self, change: Unknowns) -> Unknowns:
         """Return the Gauss-Newton Hessian times a change of the unknowns."""

@@ -26,7 +26,7 @@ from scipy.ndimage import gaussian_filter
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
 from napari_shadowinv.fitting.descent import Preconditioner, finer
-from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.measurements import FitData
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions
@@ -99,6 +99,8 @@ class Posterior:
         Called after each step, to report progress and to stop.
     modes : SoftModes, optional
         Of the Hessians of this scene, from scenes of the same pixels and priors.
+    linear : Linear, optional
+        The scene to first order near these unknowns. Default: at these.
     """
 
     def __init__(
@@ -108,10 +110,11 @@ class Posterior:
         rng: np.random.Generator,
         after_step: Callable[[], None] | None = None,
         modes: SoftModes | None = None,
+        linear: Linear | None = None,
     ) -> None:
         self._scene, self._unknowns, self._rng = scene, unknowns, rng
         self._counts = scene.ray_counts(unknowns)
-        self._linear = scene.linear(unknowns, self._counts)
+        self._linear = linear or scene.linear(unknowns, self._counts)
         self._scales = Preconditioner(scene)
         self._after_step = after_step or (lambda: None)
         self._modes = SoftModes() if modes is None else modes
@@ -367,7 +370,7 @@ class Posterior:
 
         `chances` are the random generators of the fields.
         """
-        value, _ = self._scene.value_and_gradient(self._unknowns, self._counts)
+        value = self._scene.value(self._unknowns, self._counts)
         return -value - self.log_volume(chances)
 
     def _times(self, flat: FloatArray) -> FloatArray:
