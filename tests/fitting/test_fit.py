@@ -227,10 +227,10 @@ def test_a_start_at_the_truth_is_taken() -> None:
 
 
 def test_a_fit_that_runs_out_of_steps_says_so() -> None:
-    image = noisy([counted(WEAK, SIZE)], 0.02)[0]
+    image = noisy([counted(bump(1.2, 8, (22, 29)), SIZE)], 0.004)[0]
     for steps in (1, 100):
         options = FitOptions(samples=0, max_iterations=steps, threads=1)
-        result = fit(image, noise=0.02, options=options)
+        result = fit(image, noise=0.004, options=options)
         assert result.report.converged == (steps == 100)
         assert result.report.converged or result.report.iterations == steps
 

@@ -147,7 +147,7 @@ _DESCENTS = 3  # with fixed numbers of rays each
 _FEW = 10  # steps, after which the numbers of rays still fit
 _MOST_NEWTON, _MOST_SHORTENED, _SHARES_OF_STEP = 8, 2, (1.0, 0.5, 0.25)  # of Gauss and Newton
 _NEWTON, _MOST_SOLVING = 0.02, 200  # how exactly each is found, and in how many steps
-_NEXT_GAIN = 0.3  # of the least gain; outside valleys a step gains up to twice what is expected
+_NEXT_GAIN = 0.3  # of the least gain; a step gains up to twice what is expected
 # Fields and numbers of an instrument that explain an image alike lie along a flat valley.
 _NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 2e-3, 400, 0.1
 # Numbers of rays are renewed after steps that gain more; other numbers change the objective by 1.
@@ -315,6 +315,8 @@ def settle(
     """
     tolerance, solving = _NEWTON, _MOST_SOLVING
     has_valley = scene.has_free_numbers or scene.beam_modes > 0
+    # Scales of frames and of added light are rough.
+    is_scaled = not (has_valley or scene.added or scene.free_frames.any())
     if has_valley:
         tolerance, solving = _NEWTON_IN_VALLEY, _MOST_IN_VALLEY
     if scene.has_free_numbers:
@@ -357,7 +359,7 @@ def settle(
         # What the next step would gain is about the preconditioned square of the slope.
         after = scales.transpose_times(slope).flat()
         next_gain = product(after, modes.precondition(after)) / 2
-        if gain < least_gain or (next_gain < _NEXT_GAIN * least_gain and not has_valley):
+        if gain < least_gain or (next_gain < _NEXT_GAIN * least_gain and is_scaled):
             return now, _value_afresh(scene, now), taken, True
         if gain > _RENEWING_GAIN:
             counts = scene.ray_counts(now)
