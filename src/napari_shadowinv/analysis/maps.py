@@ -38,7 +38,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import length_text
-from napari_shadowinv.physics.setup import OpticalSetup
 
 __all__ = [
     "ChargeDensity",
@@ -275,10 +274,10 @@ class PhaseCurvature(_SourceMap):
 
     def check(self, frame: FieldFrame) -> None:
         super().check(frame)
-        if not isinstance(frame.setup, OpticalSetup):
+        if frame.setup is None or frame.setup.beam_field != "wavelength":
             raise InputError("phase curvature is that of light: expected a setup with a wavelength")
 
     def _per_curvature(self, frame: FieldFrame) -> float:
-        assert isinstance(frame.setup, OpticalSetup)
-        wave_number = 2 * math.pi / frame.setup.wavelength
+        assert frame.setup is not None
+        wave_number = 2 * math.pi / frame.setup.beam_value
         return -wave_number * float(frame.setup.deflection_angle(1.0)) / frame.pixel
