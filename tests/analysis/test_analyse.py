@@ -21,11 +21,13 @@ from napari_shadowinv.analysis import (
     products_in,
     products_table,
 )
+from napari_shadowinv.analysis._field_samples import sampled_fields
+from napari_shadowinv.analysis.product import quantity_text
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
 from napari_shadowinv.fitting import Fit, FitOptions, fit
 from napari_shadowinv.inversion import Inversion, invert
-from napari_shadowinv.inversion.error_bars import uncertainty
+from napari_shadowinv.inversion.error_bars import Quantity, uncertainty
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import Phantom
@@ -242,6 +244,14 @@ def test_texts_and_tables_describe_the_same_products(exact: RetrievedField):
     for result in analyse(exact, [text, table]):
         assert result.product == alone.product
         np.testing.assert_array_equal(result["magnitude"].value, alone["magnitude"].value)
+
+
+def test_small_numbers_have_a_power_of_ten(exact: RetrievedField):
+    (frame,) = (each.frame for each in sampled_fields(exact, None, None, None))
+    samples = -9.94e-5 + 4e-6 * np.linspace(-1, 1, 101)
+    text = quantity_text(Quantity(np.asarray(-9.94e-5), samples), "1", frame)
+    assert text == "-9.94 × 10⁻⁵ (-10.21 to -9.67; 95 %: -10.32 to -9.56)"
+    assert quantity_text(Quantity(np.asarray(0.3), np.zeros((0,))), "1", frame) == "0.3"
 
 
 @pytest.mark.parametrize("products", [7, [7], [["profile"]], None])

@@ -54,6 +54,9 @@ def test_random_filaments_have_their_size_and_direction_but_no_spacing(radius, a
         assert product.product.angle == pytest.approx(angle, abs=4)
         assert float(product["elongation"].value) > 2
         assert np.isnan(product["spacing"].value)
+        texts = {fact.key: fact.text for fact in product.facts}
+        assert (texts["spacing"], texts["order"]) == ("none", "none")
+        assert "autocorrelation" not in texts
     assert np.mean(radii) == pytest.approx(radius, rel=0.1)
 
 

@@ -31,6 +31,7 @@ from napari_shadowinv.analysis.power_spectra import window_weights
 from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Product, Variable
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Fact
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import displacement_from_potential
 
@@ -186,6 +187,9 @@ class Filaments(Product):
             return quantities | {"spacing": nothing, "order": nothing}
         confirmed = np.where(is_confirmed, samples, samples[is_confirmed].mean())
         return quantities | {"spacing": Quantity(value, confirmed)}
+
+    def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
+        return [fact for fact in super().facts(quantities, frame) if fact.key not in self.curves]
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
         cautions = []

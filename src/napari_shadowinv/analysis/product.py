@@ -39,8 +39,8 @@ BANDS = 0.68, 0.95
 _NO_PREFIX = ("", "1", PIXEL, "m⁻²", "m⁻³")
 _MIN_SAMPLES = 2
 _NOTABLE_MASK = 0.02
-_MAX_PLAIN = 1e5  # larger numbers have a power of ten
-_RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+_MIN_PLAIN, _MAX_PLAIN = 1e-3, 1e5  # other numbers have a power of ten
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _NOTABLE_BIAS = 0.3  # of the standard deviation
 
 
@@ -246,9 +246,11 @@ def shown_unit(unit: str, frame: FieldFrame, largest: float) -> tuple[float, str
     """Return the factor from a unit of a dataset to a handy one, and the unit's name."""
     if unit == frame.si_unit and frame.unit.size != 1:
         return 1 / frame.unit.size, frame.unit.symbol
-    if unit not in ("", "1", PIXEL) and not unit.isascii() and largest >= _MAX_PLAIN:
+    is_large = unit not in ("", "1", PIXEL) and not unit.isascii() and largest >= _MAX_PLAIN
+    if is_large or (unit == "1" and 0 < largest < _MIN_PLAIN):
         power = math.floor(math.log10(largest))
-        return 10.0**-power, f"× 10{str(power).translate(_RAISED)} {unit}"
+        symbol = "" if unit == "1" else f" {unit}"
+        return 10.0**-power, f"× 10{str(power).translate(_RAISED)}{symbol}"
     if unit in _NO_PREFIX or not unit.isascii() or PIXEL in unit:
         return 1.0, display_unit(unit).replace("1", "") if unit == "1" else display_unit(unit)
     factor, prefix = prefix_for(largest)
@@ -264,7 +266,7 @@ def corrected(quantity: Quantity) -> FloatArray:
 
 
 def quantity_text(quantity: Quantity, unit: str, frame: FieldFrame) -> str:
-    """Return a number, corrected for a bias by noise, with its bands in words.
+    """Return a number, corrected for a bias by noise, with its bands in words; "none" for NaN.
 
     Parameters
     ----------
@@ -276,6 +278,8 @@ def quantity_text(quantity: Quantity, unit: str, frame: FieldFrame) -> str:
         Has the unit that a field is shown in.
     """
     value = float(corrected(quantity))
+    if np.isnan(value):
+        return "none"
     factor, name = shown_unit(unit, frame, abs(value))
     ends: Sequence[tuple[float, ...]] = ()
     if has_bands(quantity):
