@@ -50,6 +50,12 @@ def bump(scene: Scene, slope: float, width: float = 8.0) -> Unknowns:
     return unknowns
 
 
+def with_noisy_images(scene: Scene, truth: Unknowns) -> Scene:
+    images = scene.model(truth, scene.ray_counts(truth))
+    noise = np.random.default_rng(6).normal(0, 0.05, images.shape)
+    return replace(scene, images=images + noise)
+
+
 def test_finer_pixels_change_no_potential(scene: Scene) -> None:
     """Coefficients twice as dense hold the same spline: at all points, to rounding."""
     coarse = coarser(scene, 2)
@@ -192,9 +198,7 @@ def test_descending_takes_no_more_steps_than_allowed(scene: Scene) -> None:
 
 def test_settling_reaches_where_a_long_descent_ends(scene: Scene) -> None:
     truth = bump(scene, 1.5)
-    images = scene.model(truth, scene.ray_counts(truth))
-    noisy = images + np.random.default_rng(6).normal(0, 0.05, images.shape)
-    target = replace(scene, images=noisy)
+    target = with_noisy_images(scene, truth)
     near = truth._replace(potentials=0.99 * truth.potentials)
     before, _ = target.value_and_gradient(near, target.ray_counts(near))
     end, value, steps, ended = settle(target, near, steps=8, least_gain=0.1)
@@ -213,9 +217,7 @@ def test_settling_reaches_where_a_long_descent_ends(scene: Scene) -> None:
 
 def test_a_nearly_quadratic_objective_takes_one_step(scene: Scene) -> None:
     truth = bump(scene, 0.3)
-    images = scene.model(truth, scene.ray_counts(truth))
-    noisy = images + np.random.default_rng(6).normal(0, 0.05, images.shape)
-    target = replace(scene, images=noisy)
+    target = with_noisy_images(scene, truth)
     near = truth._replace(potentials=0.95 * truth.potentials)
     end, value, steps, ended = settle(target, near, steps=8, least_gain=1.0)
     assert (steps, ended) == (1, True)
@@ -227,9 +229,7 @@ def test_a_known_jacobian_leads_to_the_same_end(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truth = bump(scene, 1.0)
-    images = scene.model(truth, scene.ray_counts(truth))
-    noisy = images + np.random.default_rng(6).normal(0, 0.05, images.shape)
-    target = replace(scene, images=noisy)
+    target = with_noisy_images(scene, truth)
     near = truth._replace(potentials=0.98 * truth.potentials)
     _, expected, *_ = settle(target, near, steps=8, least_gain=0.1)
     linear = target.linear(truth, target.ray_counts(truth))

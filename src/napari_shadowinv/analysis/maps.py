@@ -1,6 +1,6 @@
 """Maps of the sources of a field: `CurrentDensity`, `ChargeDensity`, `PhaseCurvature`.
 
-They are the Laplacian of the potential, which amplifies noise. It is smoothed by a kernel
+Each is the Laplacian of the potential, which amplifies noise. It is smoothed by a kernel
 that leaves large structures as they are: with the Gaussian G of a standard deviation w, the gain
 1 - (1 - G)³ falls short of 1 only by the sixth power of the wave number. Its width minimises the
 expected error of the map, which follows from the map and from samples of its noise (Stein's

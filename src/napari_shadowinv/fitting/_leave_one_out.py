@@ -149,7 +149,7 @@ class _SampledFit:
 
 @dataclass(frozen=True)
 class _JointFit:
-    """Dense rays through all images that agree, in their order `members`, to first order."""
+    """Fit of all images that agree, with dense rays, and the images to first order around it."""
 
     members: list[int]
     linear: Linear
