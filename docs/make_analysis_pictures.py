@@ -1,4 +1,4 @@
-"""Make the pictures of products: the burner's profile, the spectrum of turbulence, filaments.
+"""Make the pictures of products: the burner's profile, turbulence, filaments, a toroid's integrals.
 
     python docs/make_analysis_pictures.py [BURNER]
 
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from _drawing import BLUE, DARK, ORANGE, FloatArray, save, show, tidy
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
 
 from napari_shadowinv import (
     InversionOptions,
@@ -30,6 +31,7 @@ from napari_shadowinv.analysis.power_spectra import random_displacement, ring_sp
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.inversion.variables import dataset_from_field
+from napari_shadowinv.physics.phantoms import paper_setup, toroid
 from napari_shadowinv.plotting import make_logarithmic
 
 BINNED = 8
@@ -206,9 +208,57 @@ def filaments(side: int = 160, radius: float = 5.0, spacing: float = 29.0) -> No
     save(figure, "pictures/filaments.png")
 
 
+def integrals(side: int = 160, sigma: float = 24e-6) -> None:
+    """Draw a flux, a current and a region of a toroid, its azimuthal field, and the contrast."""
+    setup, middle = paper_setup(), (side - 1) / 2
+    figure = Figure(figsize=(11, 3.5), layout="constrained")
+    left, centre, right = figure.subplots(1, 3)
+    for peak, colour in ((60, BLUE), (6, ORANGE)):
+        phantom = toroid((side, side), setup, peak=peak, sigma=sigma)
+        image = np.random.default_rng(0).poisson(1000 * synthetic_image(phantom.displacement))
+        inversion = invert(image, source=np.full(image.shape, 1000.0))
+        *numbers, azimuthal, current, contrast = analyse(
+            inversion,
+            [
+                f"flux {middle},{middle} {middle},{middle + 50}",
+                f"current center={middle},{middle} radius=30",
+                "region rectangle=20,20 60,60",
+                f"azimuthal center={middle},{middle} radius=60",
+                "current-density",
+                "contrast",
+            ],
+            setup=setup,
+            unit="MG µm",
+        )
+        mu = float(contrast["mu"].value)
+        row = slice(int(middle) - 1, int(middle) + 3)
+        map_of_image = -current["density"].value[row].mean(axis=0)
+        right.plot(
+            map_of_image / np.abs(map_of_image).max(), color=colour, label=f"field, µ = {mu:.2g}"
+        )
+        seen = 1 - image[row].mean(axis=0) / 1000
+        right.plot(seen / np.abs(seen).max(), color=colour, lw=0.8, alpha=0.6, label="image")
+        if peak < 60:
+            continue
+        strength = 1e4 * np.hypot(*setup.path_integrated_b(inversion.displacement))
+        show(left, strength, "Field", "MG µm", (0, float(strength.max())), "inferno")
+        left.plot([middle, middle + 50], [middle, middle], color="white", lw=1.2)
+        left.add_patch(Circle((middle, middle), 30, fill=False, color="cyan", lw=1.2))
+        left.add_patch(Rectangle((20, 20), 40, 40, fill=False, color="lime", lw=1.2))
+        for result in numbers:
+            print(f"{result.name}: {result.facts[0].text}")
+        radius = 1e6 * azimuthal.coordinates["radius"].values
+        centre.plot(radius, 1e4 * azimuthal["azimuthal_field"].value, color=BLUE)
+        tidy(centre, "Azimuthal field", "radius (µm)", "∫B dz (MG µm)", 0.9)
+    right.legend(frameon=False, fontsize=7, loc="upper left")
+    tidy(right, "Contrast of field and image", "x (px)", "over its largest", 0.9)
+    save(figure, "pictures/integrals.png")
+
+
 def main() -> None:
     turbulence()
     filaments()
+    integrals()
     if len(sys.argv) > 1:
         burner_profile(Path(sys.argv[1]))
 
