@@ -116,8 +116,11 @@ def only(part: str, change: Unknowns) -> Unknowns:
 @pytest.mark.parametrize(
     "part", ["potentials", "beam", "brightness", "frames", "common", "separate", "added", "all"]
 )
-def test_the_gradient_is_that_of_the_value(scene: Scene, part: str) -> None:
+@pytest.mark.parametrize("force", [False, True], ids=["plain", "forced"])
+def test_the_gradient_is_that_of_the_value(scene: Scene, part: str, force: bool) -> None:
     unknowns = some(scene)
+    if force:
+        scene = replace(scene, force=random_like(unknowns, 2))
     counts = scene.ray_counts(unknowns)
     _, slope = scene.value_and_gradient(unknowns, counts)
     change = random_like(unknowns, 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -147,6 +148,31 @@ def test_errors_have_a_part_for_all_that_is_stated() -> None:
     restored = Fit.from_dataset(result.to_dataset())
     assert restored.report.parts == parts
     assert restored.report.numbers == result.report.numbers
+
+
+def test_fitted_samples_are_compared_with_those_to_first_order() -> None:
+    """A background of 5 % acts almost linearly; what does not is reported with its remedy."""
+    instrument = Instrument(**EXACT_BEAM, background=0.05)
+    fits = [
+        fitted(shots(), instrument, options=FEW.model_copy(update={"sampling": sampling}))
+        for sampling in ("linear", "resolve")
+    ]
+    linear, solved = (each.report for each in fits)
+    assert (linear.sampling, solved.sampling) == ("linear", "resolve")
+    assert solved.uncertainty == pytest.approx(linear.uncertainty, rel=0.15)
+    assert solved.uncertainty != linear.uncertainty
+    assert 0 < solved.nonlinearity < 0.3
+    assert solved.spread_ratio == pytest.approx(1, abs=0.15)
+    assert not any(caution.code == "samples" for each in fits for caution in each.warnings)
+    np.testing.assert_array_equal(fits[0].fields[0].potential, fits[1].fields[0].potential)
+    restored = Fit.from_dataset(fits[1].to_dataset()).report
+    assert (restored.sampling, restored.nonlinearity) == ("resolve", solved.nonlinearity)
+
+    skewed = replace(linear, nonlinearity=0.6)
+    (caution,) = (c for c in replace(fits[0], report=skewed).cautions if c.code == "samples")
+    assert "differ from fitted ones by 60% of their change" in caution.text
+    assert "use the sampling 'resolve'" in caution.text
+    assert not replace(fits[1], report=replace(skewed, sampling="resolve")).warnings
 
 
 def test_the_largest_allowed_error_decides_what_is_determined(assumed: Fit) -> None:

@@ -12,7 +12,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.descent import descend, settle
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import Imperfect
-from napari_shadowinv.fitting.posterior import Posterior, draw_variations
+from napari_shadowinv.fitting.posterior import Posterior, Sample, compare_samples, draw_variations
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.search import Minimum, estimate_smoothness
 from napari_shadowinv.fitting.unknowns import Unknowns
@@ -159,6 +159,33 @@ def test_samples_have_the_inverse_hessian_as_covariance(
         expected = way[free] @ covariance @ way[free]
         variance = ((samples @ way) ** 2).mean()
         assert variance == pytest.approx(expected, rel=tolerance)
+
+
+def test_a_solved_sample_explains_its_noise_and_its_force_in_full() -> None:
+    """The objective of its own images has no slope there; to first order it has."""
+    scene, unknowns = imperfect_scene()
+    scene = replace(scene, images=scene.model(unknowns, scene.ray_counts(unknowns)))
+    unknowns, *_ = settle(scene, unknowns, steps=40, least_gain=1e-6)
+    posterior = Posterior(scene, unknowns, np.random.default_rng(3))
+    linear = [posterior.draw_sample() for _ in range(4)]
+    solved = posterior.solve(linear)
+    pairs = compare_samples(scene, linear, solved)
+    assert 0.01 < pairs.nonlinearity < 0.5
+    assert pairs.spread_ratio == pytest.approx(1, abs=0.2)
+
+    def gain_left(sample: Sample, change: Unknowns) -> float:
+        """What a Newton step from a sample would still gain."""
+        images = scene.images + sample.noise / np.sqrt(scene.weights)
+        noisy = replace(scene, images=images, force=sample.force)
+        there = unknowns.plus(change)
+        before = noisy.value(there, noisy.ray_counts(there))
+        return before - settle(noisy, there, steps=3, least_gain=1e-9)[1]
+
+    for first, full in zip(linear, solved, strict=True):
+        # Held numbers are those that were drawn.
+        np.testing.assert_allclose(full.change.common, first.change.common, atol=1e-12)
+        assert abs(gain_left(full, full.change)) < 0.1
+        assert gain_left(full, full.change) < 0.2 * gain_left(first, first.change)
 
 
 def test_what_is_known_does_not_vary(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import add
+
 import numpy as np
 import pytest
 
@@ -16,6 +19,7 @@ from napari_shadowinv.inversion.readout import read_dual
 from napari_shadowinv.inversion.samples import (
     FullResampling,
     LinearResampling,
+    Pairs,
     Scatter,
     noise_of,
 )
@@ -114,3 +118,49 @@ def test_the_scatter_of_samples_is_that_of_all_at_once():
         scatter = scatter + Scatter.of(value)
     np.testing.assert_allclose(scatter.mean, values.mean(axis=0), rtol=1e-13)
     np.testing.assert_allclose(scatter.std, values.std(axis=0, ddof=1), rtol=1e-12)
+
+
+def pairs_of(linear, solved):
+    return reduce(add, map(Pairs.of, linear, solved))
+
+
+def test_samples_that_are_related_by_a_line_are_corrected_to_it():
+    """Whatever the few that are solved: shift, factor, and the corrected samples are exact."""
+    linear = np.random.default_rng(0).normal(size=(100, 5))
+    slope, level = np.array([0.5, 1.0, 2.0, 0.9, 1.2]), np.array([3.0, 0.0, -1.0, 2.0, 0.5])
+    pairs = pairs_of(linear[:12], (slope * linear + level)[:12])
+    np.testing.assert_allclose(pairs.factor, slope)
+    np.testing.assert_allclose(pairs.correct(linear), slope * linear + level)
+    assert pairs_of(linear[:5], (slope * linear)[:5]).factor == pytest.approx(1)
+
+
+def test_chance_does_not_correct_a_deviation():
+    """Unrelated samples of one distribution: the ratio of 24 scatters by 20 %, the factor not."""
+    rng = np.random.default_rng(1)
+    linear, solved = rng.normal(size=(2, 24, 4000))
+    pairs = pairs_of(linear, solved)
+    ratios = np.log(solved.std(axis=0) / linear.std(axis=0))
+    assert ratios.std() == pytest.approx(0.2, rel=0.1)
+    assert np.log(pairs.factor).std() < 0.5 * ratios.std()
+    np.testing.assert_allclose(pairs.shift, (solved - linear).mean(axis=0), atol=1e-12)
+
+
+def test_values_that_are_no_numbers_stay_as_they_are():
+    linear = np.random.default_rng(2).normal(size=(30, 2))
+    linear[3, 0] = np.nan
+    corrected = pairs_of(linear[:10], 2 * linear[:10]).correct(linear)
+    np.testing.assert_array_equal(corrected[:, 0], linear[:, 0])
+    np.testing.assert_allclose(corrected[:, 1], 2 * linear[:, 1])
+
+
+def test_the_comparison_of_pairs_is_that_of_all_their_samples():
+    rng = np.random.default_rng(3)
+    linear = rng.normal(size=(9, 3, 4))
+    solved = 1.1 * linear + 0.2 + 0.1 * rng.normal(size=(9, 3, 4))
+    pairs, length = pairs_of(linear, solved), np.linalg.norm
+    assert pairs.nonlinearity == pytest.approx(length(linear - solved) / length(solved))
+    assert pairs.spread_ratio == pytest.approx(length(solved) / length(linear))
+    spread = length(solved - solved.mean(axis=0)) / np.sqrt(8)
+    assert pairs.mean_shift == pytest.approx(length((linear - solved).mean(axis=0)) / spread)
+    assert pairs.part(np.s_[1:]).count == 9
+    np.testing.assert_array_equal(pairs.part(np.s_[1:]).shift, pairs.shift[1:])

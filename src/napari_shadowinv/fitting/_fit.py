@@ -40,6 +40,7 @@ from napari_shadowinv.fitting.posterior import (
     BeamShifts,
     Posterior,
     Sample,
+    compare_samples,
     errors_by_noise,
     errors_by_part,
     largest_share,
@@ -81,6 +82,7 @@ _MIN_BLUR_SCORE = 4.0  # standard deviations
 _DARKEST = 1e-3  # of a beam's mean
 _MAX_RIVAL_CHI2 = 3.0  # a fit that ended further away is no start for a rival
 _SPACING_OF_SAMPLES = 1 / 3  # px
+_CHECKED = 2  # samples of an instrument that are solved, too
 # Before a field has been found, they would take its place.
 _HELD_IN_SEARCH = frozenset({"gamma", "blur", "other_field"})
 
@@ -243,6 +245,11 @@ def fit(
     with _timed("samples", seconds):
         count = options.samples if options.samples > 1 else 0
         samples = [posterior.draw_sample() for _ in range(count)]
+        is_solved = options.sampling == "resolve"
+        checked = samples if is_solved else samples[: _CHECKED if unsure.imperfect.parts else 0]
+        solved = posterior.solve(checked)
+        pairs = compare_samples(middle, checked, solved) if solved else None
+        samples = solved if is_solved else samples
         errors = errors_by_noise(scene, samples, data.size)
         by_part = errors_by_part(unsure, posterior, samples, data.size)
         by_beam = shifts_by_beam(data, unsure, posterior, samples, options)
@@ -282,6 +289,9 @@ def fit(
             [sample.change for sample in samples],
         ),
         sensitivities=sensitivities,
+        sampling=options.sampling,
+        nonlinearity=float("nan") if pairs is None else pairs.nonlinearity,
+        spread_ratio=float("nan") if pairs is None else pairs.spread_ratio,
     )
     return _result(
         data,

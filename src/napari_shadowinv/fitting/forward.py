@@ -68,6 +68,9 @@ class Scene:
         Imperfections whose numbers do not change.
     spread : ndarray, shape (n, n), or None
         Root of the covariance of those of `response_units`. Default: as before the images.
+    force : Unknowns or None
+        Derivatives that are subtracted from those of the objective: a random one makes its least
+        a sample of the prior.
     """
 
     images: FloatArray
@@ -93,6 +96,7 @@ class Scene:
     imperfect: Imperfect = EXACT
     held: frozenset[str] = frozenset()
     spread: FloatArray | None = None
+    force: Unknowns | None = None
 
     def only(self, numbers: Sequence[int]) -> Scene:
         """Return some of the images, in this order; fields stay in the same unit."""
@@ -180,11 +184,20 @@ class Scene:
 
     def value(self, unknowns: Unknowns, counts: list[IntArray]) -> float:
         """Return the objective at fixed numbers of rays."""
-        value, _ = self.prior.value_and_slope(unknowns)
+        value, _ = self._priors(unknowns)
         for shot in self._shots(unknowns, counts):
             *_, residual = self._misfit(unknowns, shot)
             value += float(np.einsum("yx,yx", residual, residual)) / 2
         return value
+
+    def _priors(self, unknowns: Unknowns) -> tuple[float, Unknowns]:
+        """The prior's part of the objective, less that of the force, and its derivatives."""
+        value, slope = self.prior.value_and_slope(unknowns)
+        if self.force is None:
+            return value, slope
+        pairs = zip(self.force.blocks, unknowns.blocks, strict=True)
+        value -= sum(float(np.sum(a * b)) for a, b in pairs)
+        return value, slope.plus(slope.like(-self.force.flat()))
 
     def _misfit(self, unknowns: Unknowns, shot: _Shot) -> tuple[_Seen, FloatArray, FloatArray]:
         """An image as it is seen, its model, and its residual in units of the noise."""
@@ -197,7 +210,7 @@ class Scene:
         self, unknowns: Unknowns, counts: list[IntArray]
     ) -> tuple[float, Unknowns]:
         """Return the objective at fixed numbers of rays, and its derivatives."""
-        value, slope = self.prior.value_and_slope(unknowns)
+        value, slope = self._priors(unknowns)
         of_shape = np.zeros(self.beams.shape[1:])
         for shot in self._shots(unknowns, counts):
             k = shot.number

@@ -89,6 +89,7 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
         "Displacement where a start has led, at every other pixel",
     ),
 }
+_LINEAR_ENOUGH, _SPREAD_ENOUGH = 0.5, 0.3
 _ATTRIBUTES = ("options", "report", "verdict", "explanation", "folded", "setups")
 
 
@@ -206,6 +207,11 @@ class FitReport:
     sensitivities : dict of str to float
         R.m.s. change of the displacement, as a share of it, by imperfections of the instrument of
         the tested sizes in `IMPERFECTIONS`.
+    sampling : {"linear", "resolve"}
+        Whether the samples of the error bars respond to first order, or were fitted.
+    nonlinearity, spread_ratio : float
+        Of those that were fitted: deviation of their displacements to first order, as a share of
+        them, and their size relative to these (r.m.s.); NaN if none was.
     """
 
     objective: float
@@ -221,6 +227,25 @@ class FitReport:
     parts: dict[str, float] = dataclasses.field(default_factory=dict)
     numbers: dict[str, list[list[float]]] = dataclasses.field(default_factory=dict)
     sensitivities: dict[str, float] = dataclasses.field(default_factory=dict)
+    sampling: str = "linear"
+    nonlinearity: float = float("nan")
+    spread_ratio: float = float("nan")
+
+    @property
+    def sampling_text(self) -> str:
+        """How far samples to first order are from those that were fitted; "" if none was."""
+        if np.isnan(self.nonlinearity):
+            return ""
+        return (
+            f"to first order, samples differ from fitted ones by {self.nonlinearity:.0%} of their "
+            f"change, and fitted ones scatter {self.spread_ratio:.2g} times as far"
+        )
+
+    @property
+    def is_linear_enough(self) -> bool:
+        """Whether the samples hold the response to noise and instrument."""
+        is_spread = abs(self.spread_ratio - 1) > _SPREAD_ENOUGH
+        return self.sampling == "resolve" or not (is_spread or self.nonlinearity > _LINEAR_ENOUGH)
 
     @property
     def total(self) -> float:
@@ -373,12 +398,19 @@ class Fit:
 
     @property
     def warnings(self) -> tuple[Caution, ...]:
-        """Reasons to doubt the images, each with the name of its image."""
-        return tuple(
+        """Reasons to doubt the images, each with the name of its image, and the error bars."""
+        of_images = tuple(
             caution.about(each.file or f"image {number}")
             for number, each in enumerate(self._origins, 1)
             for caution in each.warnings
         )
+        if self.report.is_linear_enough:
+            return of_images
+        text = (
+            f"the response to noise and instrument is not linear: {self.report.sampling_text}; "
+            "use the sampling 'resolve'"
+        )
+        return (*of_images, Caution("samples", text))
 
     @property
     def setup(self) -> Setup | None:

@@ -8,23 +8,25 @@ imperfections drawn and added to image and source; it is inverted on the same si
 scatter of the samples is the scatter of repeated shots of the same object (the parametric
 bootstrap). The linear response of the solved transport to a small change of the image costs one
 linear system with a matrix that all samples share; to solve the transport again costs a few, each
-with its own.
+with its own. An instrument's imperfections are larger than noise, so with them the first 24 linear
+samples are solved as well, and correct the mean and the deviation of all (control variates).
 
 References
 ----------
 B. Efron and R. J. Tibshirani, *An Introduction to the Bootstrap* (Chapman & Hall, 1993),
-chapter 6.
+chapter 6; C. Lemieux, *Monte Carlo and Quasi-Monte Carlo Sampling* (Springer, 2009), chapter 4, for
+the correction of cheap samples by a few that are solved.
 """
 
 from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from functools import partial, reduce
-from itertools import chain
+from itertools import chain, islice
 from operator import add
 from statistics import NormalDist
 from threading import Event
@@ -50,6 +52,7 @@ from napari_shadowinv.inversion.result import Inversion
 from napari_shadowinv.inversion.samples import (
     FullResampling,
     LinearResampling,
+    Pairs,
     Scatter,
     Seed,
     noise_of,
@@ -70,7 +73,7 @@ __all__ = ["Maximum", "Quantity", "Uncertainty", "uncertainty"]
 
 Result = TypeVar("Result")
 
-_CHECKED = 3  # linear samples that are solved, too
+_CHECKED, _SOLVED = 3, 3 * WIDTH  # linear samples that are solved, too; with an instrument
 _LINEAR_ENOUGH = 0.3  # of their change
 _SPREAD_ENOUGH = 0.15  # of the size of the changes
 _MEAN_ENOUGH = 0.3  # of the standard deviation
@@ -200,14 +203,14 @@ class Uncertainty:
     method : {"linear", "resolve"}
         How samples were inverted.
     nonlinearity : float
-        Deviation of linear samples from solved ones, as a share of the change by noise (r.m.s. over
-        the image); 0 where all were solved.
+        Deviation of linear samples from solved ones, as a share of the change (r.m.s. over the
+        image); 0 where all were solved.
     spread_ratio : float
         Size of the changes in those solved samples relative to the linear ones (r.m.s.); 1 where
-        all were solved.
+        all were solved. With an instrument, means and deviations are corrected by it.
     mean_shift : float
         Difference of their means, relative to the r.m.s. standard deviation; 0 where all were
-        solved.
+        solved. With an instrument, means are corrected by it.
     imperfections : tuple of str
         What the samples draw of the instrument besides the noise, such as "background, 5 %".
     quantities : dict of str to Quantity
@@ -355,9 +358,9 @@ def uncertainty(
         value v then scatters by √(units_per_quantum · v). Default: 1 for an image of
         whole numbers, which are taken as counts; any other image needs it.
     method : {"linear", "resolve"}
-        ``"linear"``: by the linear response of the transport, which a few samples that are solved
-        as well check. ``"resolve"``: solve the transport of each sample, which takes many times as
-        long; for caustics and strong noise.
+        ``"linear"``: by the linear response of the transport. Three samples that are solved as well
+        check it; with an instrument, 24 correct the mean and the deviation. ``"resolve"``: solve
+        the transport of each sample, which takes many times as long; for caustics and strong noise.
     instrument : Instrument, optional
         How well beam, detector and alignment are known. If it states no beam, a source that was not
         recorded is taken to be off as in the error budget. Default: samples draw noise alone.
@@ -461,7 +464,7 @@ def uncertainty(
             outcomes.append((solution.iterations, solution.residual, solution.converged))
             yield sample.field - image_fields
 
-    check = _LinearCheck(0.0, 1.0, 0.0)
+    pairs, of_solved = None, []
     if method == "resolve":
         head = list(solve_samples(seeds[:_CHECKED], report))
         functions.update(_functions(quantities, np.array([change[0] for change in head])))
@@ -469,19 +472,30 @@ def uncertainty(
         scatter = reduce(add, (Scatter.of(change, asked) for change in changes))
     else:
         quietly = Reporter(None, should_stop)
-        few = seeds[: _CHECKED if draws is None else WIDTH]
-        checked = np.array(list(solve_samples(few, quietly)))
         clean = prepare(image, plan.source, clipping, plan.mask).floored_image
         response = _in_thread(
             lambda: LinearResampling(resampling, clean, options.threads, asked), quietly
         )
-        linear = _in_thread(lambda: response.changes(few), quietly)
-        check = _LinearCheck.of(linear[:, 1:], checked[:, 1:])
-        functions.update(_functions(quantities, linear[:, 0]))
-        del checked, linear
-        blocks = [seeds[start : start + WIDTH] for start in range(0, len(seeds), WIDTH)]
-        scatter = reduce(add, _in_order(response.scatter, blocks, workers, report))
-    mean, std = image_fields + scatter.mean, scatter.std
+        checked = seeds[: _CHECKED if draws is None else _SOLVED]
+        solved = solve_samples(checked, quietly if draws is None else report)
+        for block in _blocks(checked):
+            linear = _in_thread(partial(response.changes, block), quietly)
+            if not functions:
+                functions.update(_functions(quantities, linear[:, 0]))
+            for pair in map(Pairs.of, linear, islice(solved, len(block))):
+                pairs = pair if pairs is None else pairs + pair
+                if asked is not None and draws is not None:
+                    of_solved.append(asked(pair.solved))
+        scatter = reduce(add, _in_order(response.scatter, _blocks(seeds), workers, report))
+    mean, std, of_samples = scatter.mean, scatter.std, _joined(scatter.quantities)
+    check = _LinearCheck() if pairs is None else _LinearCheck.of(pairs.part(np.s_[1:]))
+    if draws is not None and pairs is not None:
+        mean, std = mean + pairs.shift, std * pairs.factor
+        for name, exact in _joined(of_solved).items():
+            few = of_samples[name][: len(exact)].astype(np.float64)
+            both = reduce(add, map(Pairs.of, few, exact.astype(np.float64)))
+            of_samples[name] = both.correct(of_samples[name])
+    mean = image_fields + mean
     warnings = inversion.report.warnings
     if (caution := check.caution(with_instrument=draws is not None)) is not None:
         warnings = (caution, *warnings)
@@ -508,11 +522,7 @@ def uncertainty(
         mean_shift=check.mean_shift,
         imperfections=names,
         quantities={
-            name: Quantity(
-                value,
-                np.array([sample[name] for sample in scatter.quantities]),
-                isinstance(functions[name], Maximum),
-            )
+            name: Quantity(value, of_samples[name], isinstance(functions[name], Maximum))
             for name, value in values.items()
         },
         tolerance=resampling.options.tolerance,
@@ -573,20 +583,13 @@ def _draws(
 class _LinearCheck:
     """Linear samples against the same ones solved."""
 
-    nonlinearity: float
-    spread_ratio: float
-    mean_shift: float
+    nonlinearity: float = 0.0
+    spread_ratio: float = 1.0
+    mean_shift: float = 0.0
 
     @classmethod
-    def of(cls, linear: FloatArray, solved: FloatArray) -> _LinearCheck:
-        count = len(solved)
-        spread = float(np.linalg.norm(solved - solved.mean(axis=0))) / (count - 1) ** 0.5
-        shift = float(np.linalg.norm((linear - solved).mean(axis=0)))
-        return cls(
-            _relative_length(linear - solved, solved),
-            _relative_length(solved, linear),
-            shift / spread if spread > 0 else 0.0,
-        )
+    def of(cls, pairs: Pairs) -> _LinearCheck:
+        return cls(pairs.nonlinearity, pairs.spread_ratio, pairs.mean_shift)
 
     def caution(self, *, with_instrument: bool) -> Caution | None:
         """Warn if the linear answer is not enough."""
@@ -600,17 +603,22 @@ class _LinearCheck:
         if not is_spread and self.mean_shift < _MEAN_ENOUGH:
             return None
         text = (
-            f"the response to noise and instrument is not linear: samples that were solved scatter "
+            "the response to noise and instrument is not linear: samples that were solved scatter "
             f"{self.spread_ratio:.2g} times as far, and their mean differs by "
-            f"{self.mean_shift:.2g} of an error bar; use the method 'resolve'"
+            f"{self.mean_shift:.2g} of an error bar; the bands are corrected for both, but not "
+            "for a skewed distribution: use the method 'resolve'"
         )
         return Caution("samples", text)
 
 
-def _relative_length(part: FloatArray, reference: FloatArray) -> float:
-    """Return the length of one vector relative to another."""
-    length = float(np.linalg.norm(reference))
-    return float(np.linalg.norm(part)) / length if length > 0 else 0.0
+def _joined(samples: Sequence[dict[str, FloatArray]]) -> dict[str, FloatArray]:
+    """Return each quantity of all samples, (n, ...)."""
+    names = samples[0] if samples else {}
+    return {name: np.array([sample[name] for sample in samples]) for name in names}
+
+
+def _blocks(seeds: list[Seed]) -> list[list[Seed]]:
+    return [seeds[start : start + WIDTH] for start in range(0, len(seeds), WIDTH)]
 
 
 def _workers(options: InversionOptions, n_sites: int, n_pixels: int) -> int:

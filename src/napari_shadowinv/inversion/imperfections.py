@@ -332,9 +332,13 @@ def _object_region(
 
 
 def _add_background(shot: RecordedShot, share: float, numbers: FloatArray) -> RecordedShot:
+    means = shot.mean(shot.image), shot.mean(shot.source)
     image, source = (
-        values + share * numbers[0] * shot.mean(values) for values in (shot.image, shot.source)
+        values + share * numbers[0] * mean
+        for values, mean in zip((shot.image, shot.source), means, strict=True)
     )
+    # A level below the darkest pixels leaves them dark; those of the image are floored with noise.
+    source = np.where(shot.scene.mask, np.maximum(source, _LEAST_BRIGHTNESS * means[1]), source)
     return replace(shot, image=image, source=source)
 
 

@@ -287,6 +287,97 @@ class Scatter:
         return np.sqrt(np.maximum(variance, 0))
 
 
+_LEAST_PAIRS = 8  # below, their deviations are too uncertain to correct any
+_CHANCE = 2.0  # a correction counts as far as its square exceeds so many times its variance
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Sums over samples that are known twice: by linear response, and solved.
+
+    Both of a pair have the same noise and instrument, so few of them show how the distributions
+    differ: the correction of means has the error of the differences alone.
+    """
+
+    count: int
+    linear: FloatArray
+    solved: FloatArray
+    products: FloatArray  # linear², solved², and of both: (3, ...)
+
+    @classmethod
+    def of(cls, linear: FloatArray, solved: FloatArray) -> Pairs:
+        """Return one pair of samples, of any shape."""
+        return cls(1, linear, solved, np.stack([linear**2, solved**2, linear * solved]))
+
+    def __add__(self, other: Pairs) -> Pairs:
+        return Pairs(
+            self.count + other.count,
+            self.linear + other.linear,
+            self.solved + other.solved,
+            self.products + other.products,
+        )
+
+    @property
+    def shift(self) -> FloatArray:
+        """What the mean of linear samples lacks."""
+        return (self.solved - self.linear) / self.count
+
+    @property
+    def factor(self) -> FloatArray:
+        """What the deviation of linear samples is to be multiplied by; 1 where chance explains it.
+
+        The logarithm of the ratio of two deviations with a correlation ρ scatters by
+        √((1 - ρ²) / (n - 1)); it is shrunk as by James and Stein.
+        """
+        if self.count < _LEAST_PAIRS:
+            return np.ones_like(self.linear)
+        outer = self.linear**2, self.solved**2, self.linear * self.solved
+        of_linear, of_solved, of_both = self.products - np.stack(outer) / self.count
+        usable = (of_linear > 0) & (of_solved > 0)
+        squares = np.where(usable, of_linear * of_solved, 1.0)
+        logarithm = np.log(np.where(usable, of_solved / np.where(usable, of_linear, 1.0), 1.0)) / 2
+        unexplained = np.clip(1 - of_both**2 / squares, 0, 1)
+        chance = _CHANCE * unexplained / (self.count - 1)
+        kept = 1 - np.minimum(1.0, chance / np.maximum(logarithm**2, 1e-300))
+        return np.asarray(np.exp(logarithm * np.where(usable, kept, 0.0)))
+
+    def correct(self, samples: FloatArray) -> FloatArray:
+        """Return linear samples, (n, ...), with the mean and the deviation that solved ones have.
+
+        Values that are not numbers in a pair stay as they are.
+        """
+        shift, factor = self.shift, self.factor
+        known = np.isfinite(shift) & np.isfinite(factor)
+        middle = np.where(known, self.linear / self.count, 0.0)
+        factor = np.where(known, factor, 1.0)
+        moved = middle + np.where(known, shift, 0.0) + factor * (samples - middle)
+        return np.asarray(moved, dtype=samples.dtype)
+
+    def part(self, numbers: slice) -> Pairs:
+        """Return the pairs of some of the values along the first axis."""
+        linear, solved = self.linear[numbers], self.solved[numbers]
+        return Pairs(self.count, linear, solved, self.products[:, numbers])
+
+    @property
+    def nonlinearity(self) -> float:
+        """Length of the differences relative to the solved samples."""
+        linear, solved, both = (float(each.sum()) for each in self.products)
+        return float(np.sqrt(max(linear + solved - 2 * both, 0.0) / solved)) if solved > 0 else 0.0
+
+    @property
+    def spread_ratio(self) -> float:
+        """Length of the solved samples relative to the linear ones."""
+        linear, solved, _ = (float(each.sum()) for each in self.products)
+        return float(np.sqrt(solved / linear)) if linear > 0 else 0.0
+
+    @property
+    def mean_shift(self) -> float:
+        """Length of the shift relative to the deviation of the solved samples."""
+        squares = float(self.products[1].sum() - (self.solved**2).sum() / self.count)
+        spread = float(np.sqrt(max(squares, 0.0) / max(self.count - 1, 1)))
+        return float(np.linalg.norm(self.shift)) / spread if spread > 0 else 0.0
+
+
 @njit(nogil=True, cache=True)
 def _subtract_product(factors: FloatArray, strengths: FloatArray, values: FloatArray) -> None:
     """Subtract the product of (n, k) and (`WIDTH`, k) from values (n, `WIDTH`) in this thread."""
