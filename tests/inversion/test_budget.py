@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from napari_shadowinv import (
     BeamPrior,
@@ -23,6 +23,7 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.budget import Budget, ErrorEstimate, discretisation_share
+from napari_shadowinv.inversion.imperfections import motions
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.options import ASSUMED_BEAM
@@ -281,6 +282,35 @@ def test_the_difference_outside_an_object_is_that_of_the_beams(side, variation):
         prepared = prepare(shot, reference, InversionOptions()).in_units()
         differences.append(beam_difference(prepared, ImageNoise(prepared)))
     assert np.mean(differences) == pytest.approx(variation, rel=0.25, abs=2e-3)
+
+
+@pytest.mark.parametrize("variation", [0.0, 0.03])
+def test_what_a_stated_registration_explains_is_no_difference_of_beams(variation):
+    """A reference with structure that is shifted, turned and scaled; and a beam that differs."""
+    side, differences = 128, []
+    y, x = np.indices((side, side)) - (side - 1) / 2
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        structure = gaussian_filter(rng.normal(size=(side + 32,) * 2), 8.0)
+        structure = 1 + 0.2 * structure / structure.std()
+        down, right, turn, scale = rng.normal(size=4)
+        moved_y = y + down + (turn * x + scale * y) / side
+        moved_x = x + right + (scale * x - turn * y) / side
+        middle = (side + 31) / 2
+        source = map_coordinates(structure, [moved_y + middle, moved_x + middle])
+        beam = structure[16:-16, 16:-16] * smooth_beam((side, side), variation, seed)
+        shot, reference = rng.poisson(2000 * beam), rng.poisson(2000 * source)
+        prepared = prepare(shot, reference, InversionOptions()).in_units()
+        patterns = motions(prepared.source)
+        differences.append(
+            [beam_difference(prepared, ImageNoise(prepared), each) for each in (None, patterns)]
+        )
+    plain, explained = np.sqrt((np.array(differences) ** 2).mean(axis=0))
+    if variation:
+        assert explained == pytest.approx(plain, rel=0.25)
+    else:
+        assert explained < 0.3 * plain
+        assert plain > 0.005
 
 
 def compare_beams(shot, reference):

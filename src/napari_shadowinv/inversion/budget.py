@@ -25,7 +25,12 @@ from scipy.spatial import KDTree
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.inversion.imperfections import IMPERFECTIONS, SolvedShot, random_waves
+from napari_shadowinv.inversion.imperfections import (
+    IMPERFECTIONS,
+    SolvedShot,
+    motions,
+    random_waves,
+)
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.inversion.readout import LinearResponse
@@ -515,8 +520,15 @@ class Budget:
 
     @cached_property
     def beam_difference(self) -> float:
-        """Relative r.m.s. difference of image and source outside the object."""
-        return beam_difference(self._prepared.in_units(), self._noise)
+        """Relative r.m.s. difference of image and source outside the object.
+
+        Without what the stated registration of the source explains.
+        """
+        prepared, patterns = self._prepared.in_units(), None
+        if self.instrument.registration:
+            source = np.where(prepared.mask, prepared.source, prepared.source[prepared.mask].mean())
+            patterns = self.instrument.registration * motions(source)
+        return beam_difference(prepared, self._noise, patterns)
 
     @cached_property
     def _beam_variation(self) -> tuple[float, str]:

@@ -54,7 +54,9 @@ _SIGNIFICANCE = 5.0  # standard deviations
 _MIN_DIFFERENCE = 2e-3
 
 
-def beam_difference(prepared: Prepared, noise: ImageNoise) -> float:
+def beam_difference(
+    prepared: Prepared, noise: ImageNoise, patterns: FloatArray | None = None
+) -> float:
     """Return the r.m.s. relative difference of image and source outside the object.
 
     Parameters
@@ -63,6 +65,9 @@ def beam_difference(prepared: Prepared, noise: ImageNoise) -> float:
         Image and source in units of the source's power of two.
     noise : ImageNoise
         Noise of that image; differences that it explains do not count.
+    patterns : ndarray, shape (k, H, W), optional
+        Changes of the source by one standard deviation of each number that is known so well, as of
+        its registration; what they explain does not count, either.
 
     Returns
     -------
@@ -91,26 +96,45 @@ def beam_difference(prepared: Prepared, noise: ImageNoise) -> float:
         return 0.0
     deviation = means[quiet] - means[quiet].mean()
     by_noise = by_noise[quiet] / _CELLS**2
-    limit = count - 1 + _SIGNIFICANCE * np.sqrt(2.0 * count)
+    free = count - 1.0
+    if patterns is not None:
+        source = _tile_sums(prepared.source, cell, rows, columns)
+        columns_of = [_tile_sums(each, cell, rows, columns)[quiet] for each in patterns]
+        explained = np.stack(columns_of, axis=1) / source[quiet][:, None]
+        explained -= explained.mean(axis=0)
+        # The likeliest numbers, which are known to be about 0 ± 1.
+        unsure = explained.T @ explained / by_noise.mean() + np.eye(len(patterns))
+        hat = explained @ np.linalg.solve(unsure, explained.T) / by_noise.mean()
+        deviation = deviation - hat @ deviation
+        free = max(free - float(np.trace(hat)), 1.0)
+    limit = free + _SIGNIFICANCE * np.sqrt(2.0 * count)
     if (deviation**2).sum() < limit * by_noise.mean():
         return 0.0
-    square = (deviation**2).sum() / (count - 1) - by_noise.mean()
+    square = (deviation**2).sum() / free - by_noise.mean()
     difference = float(np.sqrt(max(square, 0.0)))
     return difference if difference > _MIN_DIFFERENCE else 0.0
+
+
+def _cell_sums(values: FloatArray | BoolArray, cell: int, rows: int, columns: int) -> FloatArray:
+    """Return sums over the cells of each tile, shape (rows, columns, 4, 4)."""
+    side = cell * _CELLS
+    inner = values[: rows * side, : columns * side]
+    cells = inner.reshape(rows, _CELLS, cell, columns, _CELLS, cell).sum(axis=(2, 5))
+    return np.asarray(np.moveaxis(cells, 2, 1), dtype=np.float64)
+
+
+def _tile_sums(values: FloatArray, cell: int, rows: int, columns: int) -> FloatArray:
+    return np.asarray(_cell_sums(values, cell, rows, columns).sum(axis=(2, 3)))
 
 
 def _cell_ratios(
     prepared: Prepared, noise: ImageNoise, cell: int, rows: int, columns: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return image over source and its variance by noise, shape (rows, columns, 4, 4)."""
-
-    def sums(values: FloatArray | BoolArray) -> FloatArray:
-        side = cell * _CELLS
-        inner = values[: rows * side, : columns * side]
-        cells = inner.reshape(rows, _CELLS, cell, columns, _CELLS, cell).sum(axis=(2, 5))
-        return np.asarray(np.moveaxis(cells, 2, 1), dtype=np.float64)
-
-    image, source, count = (sums(v) for v in (prepared.image, prepared.source, prepared.mask))
+    image, source, count = (
+        _cell_sums(values, cell, rows, columns)
+        for values in (prepared.image, prepared.source, prepared.mask)
+    )
     mean = prepared.source[prepared.mask].mean()
     is_known = (count >= _MIN_USED_SHARE * cell**2) & (source > 0)
     source = np.where(is_known, source, np.nan)
