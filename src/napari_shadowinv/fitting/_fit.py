@@ -246,8 +246,11 @@ def fit(
         count = options.samples if options.samples > 1 else 0
         samples = [posterior.draw_sample() for _ in range(count)]
         is_solved = options.sampling == "resolve"
-        checked = samples if is_solved else samples[: _CHECKED if unsure.imperfect.parts else 0]
-        solved = posterior.solve(checked)
+        if is_solved:
+            checked, solved = samples, posterior.solve(samples)
+        else:
+            checked = samples[: _CHECKED if unsure.imperfect.parts else 0]
+            solved = posterior.solve(checked, steps=1)
         pairs = compare_samples(middle, checked, solved) if solved else None
         samples = solved if is_solved else samples
         errors = errors_by_noise(scene, samples, data.size)

@@ -206,16 +206,35 @@ class Preconditioner:
 
     def times(self, scaled: Unknowns) -> Unknowns:
         """Return S times scaled unknowns: their change."""
-        waves = np.einsum("yxnm,nyx->myx", self._potentials, scaled.potentials)
+        waves = self._potentials_times(scaled.potentials)
         products = map(np.multiply, self._diagonals, scaled.blocks[1:])
         return Unknowns.from_blocks([idctn(waves, axes=(1, 2), norm="ortho"), *products])
 
     def transpose_times(self, slope: Unknowns) -> Unknowns:
         """Return Sᵀ times derivatives: those with respect to scaled unknowns."""
         waves = dctn(slope.potentials, axes=(1, 2), norm="ortho")
-        potentials = np.einsum("yxnm,myx->nyx", self._potentials, waves)
+        potentials = self._transpose_of_potentials_times(waves)
         products = map(np.multiply, self._diagonals, slope.blocks[1:])
         return Unknowns.from_blocks([potentials, *products])
+
+    def hessian_times(self, linear: Linear, scaled: Unknowns) -> Unknowns:
+        """Return Sᵀ H S times scaled unknowns, with half of the transforms that each would take."""
+        waves = self._potentials_times(scaled.potentials)
+        products = map(np.multiply, self._diagonals, scaled.blocks[1:])
+        change = Unknowns.from_blocks([idctn(waves, axes=(1, 2), norm="ortho"), *products])
+        slope = linear.pull(linear.push(change))
+        slope = slope.plus(linear.scene.prior.times_without_roughness(change))
+        of_data = dctn(slope.potentials, axes=(1, 2), norm="ortho")
+        of_data += linear.scene.prior.roughness * waves
+        products = map(np.multiply, self._diagonals, slope.blocks[1:])
+        return Unknowns.from_blocks([self._transpose_of_potentials_times(of_data), *products])
+
+    def _potentials_times(self, scaled: FloatArray) -> FloatArray:
+        """Cosines of the potentials by scaled ones."""
+        return np.asarray(np.einsum("yxnm,nyx->myx", self._potentials, scaled))
+
+    def _transpose_of_potentials_times(self, waves: FloatArray) -> FloatArray:
+        return np.asarray(np.einsum("yxnm,myx->nyx", self._potentials, waves))
 
     def log_size(self) -> float:
         """Return log |det S| plus about half the log-determinant of the prior."""
@@ -335,8 +354,7 @@ def settle(
         def times(flat: FloatArray) -> FloatArray:
             if after_step is not None:
                 after_step(value)  # noqa: B023
-            change = scales.times(now.like(flat))  # noqa: B023
-            return scales.transpose_times(here.hessian_times(change)).flat()  # noqa: B023
+            return scales.hessian_times(here, now.like(flat)).flat()  # noqa: B023
 
         down = -scales.transpose_times(slope).flat()
         step = solve(times, down, tolerance=tolerance, iterations=solving, modes=modes)

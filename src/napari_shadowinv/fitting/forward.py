@@ -614,7 +614,7 @@ class Linear:
                 of_beam = of_instrument[:-6].reshape(of_shape.shape)
                 of_shape += scene._add_beam_pulls(slope, k, of_beam, self._entering[k])
                 slope.frames[k] = of_instrument[-6:]
-        if self._has_others:
+        if scene.beam_modes:
             slope.beam[:] = scene._of_modes(of_shape * self._beam_shape)
         return scene._only_free(slope)
 
@@ -630,7 +630,7 @@ class Linear:
     def _beam_change(self, change: Unknowns, k: int) -> FloatArray:
         """Relative change of the light that enters for an image."""
         scene, imperfect = self.scene, self.scene.imperfect
-        total = scene._modes(change.beam)
+        total = scene._modes(change.beam) if scene.beam_modes else np.zeros(())
         for part, logarithm in self._entering[k].effects:
             changes = change.common if part.is_common else change.separate[k]
             total = total + changes[part.places] * logarithm

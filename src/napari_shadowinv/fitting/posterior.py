@@ -133,6 +133,12 @@ class Posterior:
         """The scene that is explained."""
         return self._scene
 
+    @property
+    def _deviations(self) -> FloatArray:
+        """Standard deviations of the noise, 0 in pixels that are not used."""
+        roots = np.sqrt(self._scene.weights)
+        return np.divide(1, roots, out=np.zeros_like(roots), where=roots > 0)
+
     def likely_smoothness(self) -> tuple[FloatArray, float]:
         """Return λ and κ nearer to the likeliest, shape (M, 2), and by how much they have changed.
 
@@ -175,21 +181,19 @@ class Posterior:
         slope = self._linear.pull(residuals).plus(force)
         return Sample(self._change(slope, tolerance).plus(numbers), noise, force)
 
-    def solve(self, samples: Sequence[Sample]) -> list[Sample]:
+    def solve(self, samples: Sequence[Sample], steps: int = _SOLVING_STEPS) -> list[Sample]:
         """Return samples with the change that explains their images and prior in full.
 
-        Each minimises the objective for images with its noise, from its change to first order
-        (randomize then optimize); the best unknowns are settled as closely before.
+        Each minimises the objective for images with its noise, in at most so many steps from its
+        change to first order (randomize then optimize); the best unknowns are settled before.
         """
         scene = self._scene
-        roots = np.sqrt(scene.weights)
-        deviations = np.divide(1, roots, out=np.zeros_like(roots), where=roots > 0)
 
         def settled(scene: Scene, start: Unknowns) -> Unknowns:
             end, *_ = settle(
                 scene,
                 start,
-                steps=_SOLVING_STEPS,
+                steps=steps,
                 least_gain=_SOLVED_GAIN,
                 after_step=lambda _: self._after_step(),
                 modes=self._modes,
@@ -198,7 +202,7 @@ class Posterior:
 
         base, solved = settled(scene, self._unknowns) if samples else self._unknowns, []
         for sample in samples:
-            images = scene.images + deviations * sample.noise
+            images = scene.images + self._deviations * sample.noise
             noisy = replace(scene, images=images, force=sample.force)
             end = settled(noisy, base.plus(sample.change))
             solved.append(replace(sample, change=end.like(end.flat() - base.flat())))
@@ -217,7 +221,7 @@ class Posterior:
                 block[..., part.places] = self._rng.normal(size=block[..., part.places].shape)
         return numbers
 
-    def response(self, pairs: int) -> Response:
+    def response(self, pairs: int, expected: FloatArray | None = None) -> Response:
         """Return how well the images determine numbers that change the response to fields.
 
         Fields and such numbers together are likeliest for the instrument through which the fewest
@@ -226,7 +230,8 @@ class Posterior:
         present unknowns with fresh noise: pairs of opposite noise, which leaves out its mean.
 
         Derivatives are taken along a number and what responds to it, so that it matters little
-        whether the rest has settled; one linear step is enough for each of these fits.
+        whether the rest has settled; one linear step is enough for each of these fits. What is
+        expected changes little with the unknowns, so that of others nearby may be given.
         """
         scene, unknowns = self._scene, self._unknowns
         rng = np.random.default_rng(_RESPONSE_SEED)
@@ -246,17 +251,16 @@ class Posterior:
             forces = np.array([product(change.flat(), slope.flat()) for change in changes])
             return np.asarray(forces - numbers)
 
-        model = scene.model(unknowns, self._counts)
-        roots = np.sqrt(scene.weights)
-        deviations = np.divide(1, roots, out=np.zeros_like(roots), where=roots > 0)
-        expected = np.zeros(len(units))
-        for _ in range(pairs):
-            noise = deviations * rng.normal(size=model.shape)
-            for sign in (1, -1):
-                images = model + sign * noise
-                step = self._change(gradient(images, unknowns), _REFITTED)
-                refitted = unknowns.plus(unknowns.like(-step.flat()))
-                expected += along(gradient(images, refitted)) / (2 * pairs)
+        if expected is None:
+            model, deviations = scene.model(unknowns, self._counts), self._deviations
+            expected = np.zeros(len(units))
+            for _ in range(pairs):
+                noise = deviations * rng.normal(size=model.shape)
+                for sign in (1, -1):
+                    images = model + sign * noise
+                    step = self._change(gradient(images, unknowns), _REFITTED)
+                    refitted = unknowns.plus(unknowns.like(-step.flat()))
+                    expected += along(gradient(images, refitted)) / (2 * pairs)
         return Response(
             changes,
             numbers=numbers,
@@ -413,9 +417,7 @@ class Posterior:
 
     def _times(self, flat: FloatArray) -> FloatArray:
         self._after_step()
-        change = self._scales.times(self._unknowns.like(flat))
-        turned = self._linear.hessian_times(change)
-        return self._scales.transpose_times(turned).flat()
+        return self._scales.hessian_times(self._linear, self._unknowns.like(flat)).flat()
 
     def _change(self, slope: Unknowns, tolerance: float) -> Unknowns:
         """The change of the unknowns that undoes a slope."""

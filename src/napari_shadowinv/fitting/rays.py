@@ -323,8 +323,11 @@ class RayModel:
 
 def _entries(matrix: csr_array) -> tuple[IntArray, IntArray, FloatArray]:
     """Begins of rows, columns and values; unsigned, for which no index counts from the end."""
-    unsigned = np.dtype(f"u{matrix.indices.itemsize}")
+    unsigned = _UNSIGNED[matrix.indices.itemsize]
     return matrix.indptr.view(unsigned), matrix.indices.view(unsigned), matrix.data
+
+
+_UNSIGNED = {4: np.uint32, 8: np.uint64}
 
 
 def at_rest() -> FloatArray:

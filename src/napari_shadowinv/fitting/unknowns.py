@@ -238,11 +238,16 @@ class Prior:
     def times(self, change: Unknowns) -> Unknowns:
         """Return the terms' Hessian times a change."""
         waves = dctn(change.potentials, axes=(1, 2), norm="ortho")
-        waves *= self._rough_weights
-        slope = idctn(waves, axes=(1, 2), norm="ortho")
+        waves *= self.roughness
+        slope = self.times_without_roughness(change)
+        slope.potentials[:] += idctn(waves, axes=(1, 2), norm="ortho")
+        return slope
+
+    def times_without_roughness(self, change: Unknowns) -> Unknowns:
+        """Return the same without λ and κ, whose terms are diagonal in the cosines."""
+        slope = self.tie * self._fading * change.potentials
         for axis, steps in enumerate(self._steps(change.potentials), 1):
             slope -= self.tie * _differences(steps, axis)
-        slope += self.tie * self._fading * change.potentials
         if self.fiducials is not None:
             weights = 1 / self.fiducials.errors[:, None] ** 2
             self._add_there(slope, weights * self._displacements_there(change.potentials))
@@ -282,7 +287,8 @@ class Prior:
         return KNOT**2 * self.smoothness[:, :, None, None] * powers
 
     @cached_property
-    def _rough_weights(self) -> FloatArray:
+    def roughness(self) -> FloatArray:
+        """Penalty of each field's cosines by both, shape (M, …)."""
         return np.asarray(self.of_rough.sum(axis=1))
 
     @cached_property
@@ -297,7 +303,7 @@ class Prior:
         lowest = (np.pi / (max(self.rays.shape) * KNOT)) ** 2 + (0.2 / self.decay) ** 2
         # A fifth of the coefficients or so lies in the pad.
         tied = self.tie * (0.2 * squares + lowest)
-        return np.asarray(self._rough_weights + KNOT**2 * tied)
+        return np.asarray(self.roughness + KNOT**2 * tied)
 
     @cached_property
     def _weights(self) -> list[FloatArray]:
