@@ -102,11 +102,13 @@ def beam_difference(
         columns_of = [_tile_sums(each, cell, rows, columns)[quiet] for each in patterns]
         explained = np.stack(columns_of, axis=1) / source[quiet][:, None]
         explained -= explained.mean(axis=0)
-        # The likeliest numbers, which are known to be about 0 ± 1.
+        # The likeliest numbers, which are known to be about 0 ± 1: what exceeds that is not known.
         unsure = explained.T @ explained / by_noise.mean() + np.eye(len(patterns))
-        hat = explained @ np.linalg.solve(unsure, explained.T) / by_noise.mean()
-        deviation = deviation - hat @ deviation
-        free = max(free - float(np.trace(hat)), 1.0)
+        answer = np.linalg.solve(unsure, explained.T) / by_noise.mean()
+        numbers = answer @ deviation
+        numbers /= max(1.0, float(np.sqrt((numbers**2).mean())))
+        deviation = deviation - explained @ numbers
+        free = max(free - float(np.trace(explained @ answer)), 1.0)
     limit = free + _SIGNIFICANCE * np.sqrt(2.0 * count)
     if (deviation**2).sum() < limit * by_noise.mean():
         return 0.0
