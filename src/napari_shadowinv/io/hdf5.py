@@ -132,10 +132,10 @@ def hdf5_in_memory(path: Path, *, seal: bool = False) -> Iterator[BytesIO]:
     content = BytesIO()  # on a full disk, the HDF5 library would end the process
     yield content
     if seal:
-        checksum = hashlib.sha256(content.getbuffer()).hexdigest()
+        checksum = hashlib.sha256(content.getvalue()).hexdigest()
         content.seek(0, os.SEEK_END)
         content.write(_SEAL + checksum.encode())
-    path.write_bytes(content.getbuffer())
+    path.write_bytes(content.getvalue())
 
 
 def check_hdf5_seal(path: Path) -> None:

@@ -367,7 +367,7 @@ def write_npy(path: Path, array: AnyArray, pixel_size: float | None = None) -> N
     content = BytesIO()
     np.save(content, array, allow_pickle=False)
     # numpy gives no reason when it cannot write to a file.
-    path.write_bytes(content.getbuffer())
+    path.write_bytes(content.getvalue())
 
 
 def write_tiff(path: Path, plane: AnyArray, pixel_size: float | None = None) -> None:
@@ -390,7 +390,7 @@ def write_png(path: Path, plane: AnyArray, pixel_size: float | None = None) -> N
     content = BytesIO()
     Image.fromarray(grey).save(content, "PNG")
     # Only when all of it is there: a full disk then gives one plain error.
-    path.write_bytes(content.getbuffer())
+    path.write_bytes(content.getvalue())
 
 
 _B16_HEADER, _B16_EXTENDED_HEADER = 24, 128

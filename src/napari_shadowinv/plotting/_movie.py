@@ -281,5 +281,5 @@ def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> 
         for frame in frames:
             film.append_data(in_few_colours(frame))
             count += 1
-    path.write_bytes(content.getbuffer())
+    path.write_bytes(content.getvalue())
     return count
