@@ -3,6 +3,7 @@
 # make docs   build the documentation site into build/docs; GALLERY=1 runs the examples for it, too
 # make coverage  run the tests once more and report which lines they reach
 # make test-oldest  test the core with the lowest versions that pyproject.toml allows
+# make test-newest CORE_PYTHON=python3.14  test the core with the newest versions, on any Python
 # make gallery make the pictures of docs/gallery.md again
 # make dist   build the source distribution and the wheel in dist/
 # make check-wheel  install the wheel into an empty environment and use it there
@@ -13,8 +14,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 ON_SCREEN := xvfb-run -a -s "-screen 0 2560x1440x24"
 ON_BOTH_CORES := -n 2 --dist loadfile
-OLDEST := .venv-oldest
-OLDEST_TOOLS := "pytest>=8.2" "pytest-xdist>=3.6" "hypothesis>=6.100" "shapely>=2.0" "pyamg>=5.1" \
+CORE_PYTHON ?= $(BIN)/python
+CORE_TOOLS := "pytest>=8.2" "pytest-xdist>=3.6" "hypothesis>=6.100" "shapely>=2.0" "pyamg>=5.1" \
 	"pyyaml>=6.0" "threadpoolctl>=3.2"
 CORE_TESTS := tests/geometry tests/transport tests/fitting tests/physics tests/io tests/inversion tests/preprocessing \
 	tests/cli/test_shot_commands.py tests/plotting tests/stack/test_lazy.py tests/stack/test_run.py \
@@ -23,7 +24,7 @@ CORE_TESTS := tests/geometry tests/transport tests/fitting tests/physics tests/i
 # Keep byte code, though a container may say otherwise: the tests start hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-pyside kernels coverage test-oldest docs gallery lint dist check-wheel format clean
+.PHONY: demo test test-pyside kernels coverage test-oldest test-newest docs gallery lint dist check-wheel format clean
 
 demo: $(VENV)/installed
 	$(BIN)/shadowinv demo --out demo
@@ -55,11 +56,14 @@ coverage: $(VENV)/installed-dev
 		--cov-report=term:skip-covered
 
 # Without pytest-qt its setting is unknown, so the configuration is not strict here.
-test-oldest: $(VENV)/installed-dev
-	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(OLDEST)
-	$(BIN)/uv pip install --quiet --python $(OLDEST)/bin/python --resolution lowest-direct \
-		--editable . $(OLDEST_TOOLS)
-	NUMBA_CACHE_DIR=$(CURDIR)/$(OLDEST)/numba $(OLDEST)/bin/python -m pytest \
+test-oldest: RESOLUTION := lowest-direct
+test-newest: RESOLUTION := highest
+test-oldest test-newest: CORE = $(CURDIR)/$(VENV)-$(@:test-%=%)
+test-oldest test-newest: $(VENV)/installed-dev
+	$(BIN)/uv venv --quiet --clear --python $(CORE_PYTHON) $(CORE)
+	$(BIN)/uv pip install --quiet --python $(CORE)/bin/python --resolution $(RESOLUTION) \
+		--editable . $(CORE_TOOLS)
+	NUMBA_CACHE_DIR=$(CORE)/numba $(CORE)/bin/python -m pytest \
 		-o addopts="--strict-markers --import-mode=importlib" $(ON_BOTH_CORES) -q $(CORE_TESTS)
 
 lint: $(VENV)/installed-dev
@@ -94,4 +98,4 @@ $(BIN)/pip:
 	$(BIN)/pip install --quiet --upgrade pip
 
 clean:
-	rm -rf $(VENV) $(OLDEST) demo dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-oldest $(VENV)-newest demo dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis
