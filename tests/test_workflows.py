@@ -15,7 +15,7 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / ".github" / "workflows"
-NAMES = ("docs", "lint", "release", "tests", "wheels")
+NAMES = ("docs", "lint", "nightly", "release", "tests", "wheels")
 
 WORKFLOW_KEYS = {"name", "on", "permissions", "concurrency", "env", "defaults", "jobs"}
 JOB_KEYS = {
@@ -36,7 +36,7 @@ STEP_KEYS = {"name", "id", "if", "uses", "run", "with", "env", "shell", "working
 RUNNERS = {"ubuntu-latest", "macos-latest", "windows-latest"}
 EVENTS = {"push", "pull_request", "workflow_call", "workflow_dispatch", "schedule", "release"}
 CONTEXTS = {"github", "matrix", "runner", "env", "needs", "steps", "inputs"}
-ACTION = re.compile(r"[\w.-]+/[\w./-]+@[\w./-]+")
+ACTION = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{40}")  # a tag can be moved, a commit cannot
 EXPRESSION = re.compile(r"\$\{\{(.*?)\}\}")
 PROPERTY = re.compile(r"(?<![\w.'-])([a-z]+)\.([\w-]+)")
 
@@ -120,7 +120,7 @@ def step_mistakes(step: Any) -> list[str]:
     if ("uses" in step) == ("run" in step):
         mistakes.append("a step must have either uses or run")
     if "uses" in step and not ACTION.fullmatch(step["uses"]):
-        mistakes.append(f"{step['uses']} has no version")
+        mistakes.append(f"{step['uses']} names no commit")
     if "with" in step and "run" in step:
         mistakes.append("with is for uses")
     for path in re.findall(r"\.ci/[\w-]+", step.get("run", "")):
@@ -152,7 +152,8 @@ def test_a_workflow_has_no_mistake(name: str) -> None:
         (("check", "name", "${{ matrix.system }}"), "check: matrix.system is not in the matrix"),
         (("build", "runs-on", "ubuntu"), "build: unknown runner ubuntu"),
         (("build", "steps", [{"name": "x"}]), "build: a step must have either uses or run"),
-        (("build", "steps", [{"uses": "a/b"}]), "build: a/b has no version"),
+        (("build", "steps", [{"uses": "a/b"}]), "build: a/b names no commit"),
+        (("build", "steps", [{"uses": "a/b@v1"}]), "build: a/b@v1 names no commit"),
         (("build", "steps", [{"run": "sh .ci/none"}]), "build: there is no .ci/none"),
         (("build", "if", "git.ref == 'x'"), "build: unknown context git"),
     ],
@@ -174,10 +175,27 @@ def test_the_tests_run_on_every_system_python_and_binding() -> None:
         match[1] for name in classifiers if (match := re.search(r"Python :: (3\.\d+)$", name))
     ]
     assert set(matrix["os"]) == RUNNERS
-    assert matrix["python"] == pythons == ["3.11", "3.12", "3.13"]
+    assert matrix["python"] == pythons == ["3.11", "3.12", "3.13", "3.14"]
     assert matrix["qt"] == ["pyqt6", "pyside6"]
-    assert len(list(product(*matrix.values()))) == 18
+    assert len(list(product(*matrix.values()))) == 24
     assert job["env"] == dict.fromkeys(("QT_API", "PYTEST_QT_API"), "${{ matrix.qt }}")
+
+
+def test_an_action_has_one_commit_in_all_workflows_and_its_version_beside_it() -> None:
+    text = "".join(path.read_text("utf-8") for path in FOLDER.iterdir())
+    pins = set(re.findall(r"uses: ([\w-]+/[\w-]+)@(\S+) # v\d+\.\d+", text))
+    actions = [action for action, _ in pins]
+    assert len(actions) == len(set(actions)) == 6
+    assert text.count("uses: ") == text.count(" # v") + text.count("uses: ./.github")
+
+
+def test_the_newest_packages_are_tested_every_night() -> None:
+    content = workflow("nightly")
+    assert set(content["on"]) == {"schedule", "workflow_dispatch"}
+    (job,) = content["jobs"].values()
+    assert "scientific-python-nightly-wheels" in job["env"]["UV_INDEX"]
+    assert job["env"]["UV_PRERELEASE"] == "allow"
+    assert any(step.get("run", "").startswith("make test-newest") for step in job["steps"])
 
 
 def test_exactly_one_step_tests_on_each_system() -> None:
