@@ -164,3 +164,21 @@ def test_the_manifest_says_where_the_plugin_belongs() -> None:
     schema = pytest.importorskip("npe2.manifest.schema")
     assert manifest["categories"]
     assert set(manifest["categories"]) <= {str(category) for category in schema.Category}
+
+
+# Containers
+
+
+def test_both_containers_install_the_same_files_in_the_same_way() -> None:
+    docker = (ROOT / "containers" / "Dockerfile").read_text("utf-8")
+    apptainer = (ROOT / "containers" / "shadowinv.def").read_text("utf-8")
+    (copied,) = re.findall(r"^%files\n((?: +.*\n)+)", apptainer, re.MULTILINE)
+    sources = {line.split()[0] for line in copied.splitlines()}
+    copies = re.findall(r"^COPY (.*) \S+$", docker, re.MULTILINE)
+    assert {name for names in copies for name in names.split()} == sources
+    assert all((ROOT / source).exists() for source in sources)
+    assert re.findall(r"^FROM (.*)$", docker, re.MULTILINE) == re.findall(
+        r"^From: (.*)$", apptainer, re.MULTILINE
+    )
+    for definition in (docker, apptainer):
+        assert "sh /src/containers/install" in definition

@@ -15,7 +15,7 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / ".github" / "workflows"
-NAMES = ("docs", "lint", "nightly", "release", "tests", "wheels")
+NAMES = ("containers", "docs", "lint", "nightly", "release", "tests", "wheels")
 
 WORKFLOW_KEYS = {"name", "on", "permissions", "concurrency", "env", "defaults", "jobs"}
 JOB_KEYS = {
@@ -196,6 +196,16 @@ def test_the_newest_packages_are_tested_every_night() -> None:
     assert "scientific-python-nightly-wheels" in job["env"]["UV_INDEX"]
     assert job["env"]["UV_PRERELEASE"] == "allow"
     assert any(step.get("run", "").startswith("make test-newest") for step in job["steps"])
+
+
+def test_the_containers_are_built_and_run_as_the_documentation_says() -> None:
+    runs = "\n".join(step.get("run", "") for step in steps_of("containers"))
+    page = (ROOT / "docs" / "batch.md").read_text("utf-8")
+    (section,) = re.findall(r"### In a container\n(.*?)\n### ", page, re.DOTALL)
+    commands = re.findall(r"^    (.*)$", section, re.MULTILINE)
+    assert len(commands) == 4
+    for command in commands:
+        assert command in runs
 
 
 def test_exactly_one_step_tests_on_each_system() -> None:
