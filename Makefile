@@ -7,6 +7,7 @@
 # make gallery make the pictures of docs/gallery.md again
 # make dist   build the source distribution and the wheel in dist/
 # make check-wheel  install the wheel into an empty environment and use it there
+# make placeholders  list what must be filled in before a release
 # make format put the code into the project's format
 
 PYTHON ?= python3
@@ -24,7 +25,7 @@ CORE_TESTS := tests/geometry tests/transport tests/fitting tests/physics tests/i
 # Keep byte code, though a container may say otherwise: the tests start hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-pyside kernels coverage test-oldest test-newest docs gallery lint dist check-wheel format clean
+.PHONY: demo test test-pyside kernels coverage test-oldest test-newest docs gallery lint dist check-wheel placeholders format clean
 
 demo: $(VENV)/installed
 	$(BIN)/shadowinv demo --out demo
@@ -72,6 +73,8 @@ lint: $(VENV)/installed-dev
 	$(BIN)/mypy
 	$(BIN)/npe2 validate --imports napari.yaml
 	@sh .ci/lint-workflows
+	$(BIN)/check-jsonschema --builtin-schema vendor.citation-file-format CITATION.cff
+	$(BIN)/check-jsonschema --builtin-schema vendor.readthedocs .readthedocs.yaml
 
 dist: $(VENV)/installed-dev
 	rm -rf dist
@@ -79,6 +82,9 @@ dist: $(VENV)/installed-dev
 
 check-wheel: dist
 	sh .ci/check-wheel $(BIN)/python
+
+placeholders:
+	@git grep -n PLACEHOLDER_ -- . ':!tests' ':!Makefile' ':!.github' ':!CHANGELOG.md' || echo "none is left"
 
 format: $(VENV)/installed-dev
 	$(BIN)/ruff check --fix .

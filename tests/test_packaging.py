@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -166,7 +167,53 @@ def test_the_manifest_says_where_the_plugin_belongs() -> None:
     assert set(manifest["categories"]) <= {str(category) for category in schema.Category}
 
 
-# Containers
+def test_the_project_has_its_addresses(metadata: Message) -> None:
+    labels = {url.split(", ")[0] for url in metadata.get_all("Project-URL", [])}
+    assert labels == {"Source", "Issues", "Documentation", "Changelog", "Paper"}
+
+
+# Archives, documentation, conda, containers
+
+
+def test_all_archives_have_the_same_keywords_and_licence(metadata: Message) -> None:
+    citation = loaded(ROOT / "CITATION.cff")
+    archive = json.loads((ROOT / ".zenodo.json").read_text("utf-8"))
+    assert citation["keywords"] == archive["keywords"]
+    assert sorted(citation["keywords"]) == metadata["Keywords"].split(",")
+    assert archive["license"] == citation["license"] == metadata["License-Expression"]
+    assert archive["creators"] == citation["authors"]
+    assert (archive["title"], archive["upload_type"]) == (citation["title"], "software")
+
+
+def test_read_the_docs_builds_what_make_docs_builds() -> None:
+    settings = loaded(ROOT / ".readthedocs.yaml")
+    rule = re.search(r"sphinx-build (.*) docs build/docs", (ROOT / "Makefile").read_text("utf-8"))
+    assert rule is not None
+    assert ("-W" in rule[1].split()) == settings["sphinx"]["fail_on_warning"]
+    assert settings["sphinx"]["configuration"] == "docs/conf.py"
+    (install,) = settings["python"]["install"]
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    assert set(install["extra_requirements"]) <= set(extras["optional-dependencies"])
+    python = settings["build"]["tools"]["python"]
+    assert f"Programming Language :: Python :: {python}" in extras["classifiers"]
+
+
+CONDA_NAMES = {"dask": "dask-core", "matplotlib": "matplotlib-base"}  # without windows and servers
+
+
+def test_the_conda_recipe_requires_what_the_wheel_requires(metadata: Message) -> None:
+    recipe = loaded(ROOT / "conda" / "recipe.yaml")
+    needs = {f"python {metadata['Requires-Python']}", "distributed >=2024.8"}
+    for need in metadata.get_all("Requires-Dist", []):
+        match = re.fullmatch(r"([\w-]+)(?:\[.*\])?(>=[\d.]+)", need)
+        if match:
+            needs.add(f"{CONDA_NAMES.get(match[1].lower(), match[1].lower())} {match[2]}")
+    context = recipe["context"]
+    run = recipe["requirements"]["run"]
+    run = {text.replace("${{ python_min }}", context["python_min"]) for text in run}
+    assert {text.replace("-", "_") for text in run} == {text.replace("-", "_") for text in needs}
+    assert context["version"] == __version__
+    assert recipe["build"]["python"]["entry_points"] == ["shadowinv = napari_shadowinv.cli:app"]
 
 
 def test_both_containers_install_the_same_files_in_the_same_way() -> None:
