@@ -8,6 +8,7 @@
 # make dist   build the source distribution and the wheel in dist/
 # make check-wheel  install the wheel into an empty environment and use it there
 # make placeholders  list what must be filled in before a release
+# make paper  build the paper of paper/ into build/paper.html
 # make format put the code into the project's format
 
 PYTHON ?= python3
@@ -25,7 +26,7 @@ CORE_TESTS := tests/geometry tests/transport tests/fitting tests/physics tests/i
 # Keep byte code, though a container may say otherwise: the tests start hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-pyside kernels coverage test-oldest test-newest docs gallery lint dist check-wheel placeholders format clean
+.PHONY: demo test test-pyside kernels coverage test-oldest test-newest docs gallery lint dist check-wheel placeholders paper format clean
 
 demo: $(VENV)/installed
 	$(BIN)/shadowinv demo --out demo
@@ -85,6 +86,14 @@ check-wheel: dist
 
 placeholders:
 	@git grep -n PLACEHOLDER_ -- . ':!tests' ':!Makefile' ':!.github' ':!CHANGELOG.md' || echo "none is left"
+
+# Embedded pictures make it a page of its own.
+paper: $(VENV)/installed-dev
+	@mkdir -p build
+	$(BIN)/uv run --quiet --no-project --with pypandoc_binary python -c 'import pypandoc; \
+		pypandoc.convert_file("paper/paper.md", "html", outputfile="build/paper.html", extra_args=[ \
+		"--standalone", "--citeproc", "--mathml", "--embed-resources", "--resource-path=paper"])'
+	@echo "open build/paper.html"
 
 format: $(VENV)/installed-dev
 	$(BIN)/ruff check --fix .

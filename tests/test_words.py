@@ -25,7 +25,7 @@ FACES = {"cli", "_napari"}
 BELOW_THE_FACES = [path for path in SOURCES if not FACES & set(path.parts)]
 FILES = [*SOURCES, *sorted((ROOT / "tests").rglob("*.py"))]
 TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "paper").glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 WRITTEN_PAGES = [page for page in PAGES if page.parent.name != "reference"]  # others are generated
 
 VAGUE_WORDS = """
