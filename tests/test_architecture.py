@@ -141,6 +141,18 @@ def test_no_module_is_too_long_to_be_read_at_once():
     assert not {path.name: lines for path, lines in lengths.items() if lines > MOST_LINES}
 
 
+def test_only_one_module_connects_to_events_of_napari():
+    places = [
+        f"{path.name}:{node.lineno}"
+        for path, tree in TREES.items()
+        for node in ast.walk(tree)
+        if module_of(path) != f"{PACKAGE}._napari.events"
+        and isinstance(node, ast.Attribute)
+        and node.attr == "events"
+    ]
+    assert not places, "use _napari/events.py"
+
+
 @cache
 def classes_by_field() -> dict[str, list[str]]:
     """Classes that declare a field, by its name."""

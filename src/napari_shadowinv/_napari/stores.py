@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from napari_shadowinv._napari.events import connect
 from napari_shadowinv._napari.layer_metadata import frame_for, metadata_of, role_of
 from napari_shadowinv._napari.layers import (
     FullLayerData,
@@ -144,14 +145,16 @@ def follow_shots(viewer: Any, layer: Any) -> Callable[[], None]:
         if current != [shot_in_view()]:
             read()
 
-    def leave(event: Any) -> None:
-        if event.value is layer:
-            viewer.dims.events.current_step.disconnect(follow)
-            viewer.layers.events.removed.disconnect(leave)
+    def leave(removed: Any) -> None:
+        if removed is layer:
+            for disconnect in connections:
+                disconnect()
 
-    viewer.dims.events.current_step.connect(follow)
-    viewer.layers.events.removed.connect(leave)
-    layer.events.visible.connect(follow)
+    connections = (
+        connect(viewer.dims, "current_step", follow),
+        connect(viewer.layers, "removed", leave),
+    )
+    connect(layer, "visible", follow)
     follow()
     return reload
 
@@ -177,10 +180,9 @@ def follow_once_added(layer_data: Sequence[FullLayerData]) -> None:
     if viewer is None or not stores:
         return
 
-    def begin(event: Any) -> None:
-        layer = event.value
+    def begin(layer: Any) -> None:
         if role_of(layer) == "arrows" and metadata_of(layer).get("store") in stores:
-            viewer.layers.events.inserted.disconnect(begin)
+            disconnect()
             follow_shots(viewer, layer)
 
-    viewer.layers.events.inserted.connect(begin)
+    disconnect = connect(viewer.layers, "inserted", begin)

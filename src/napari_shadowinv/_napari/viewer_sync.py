@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from napari_shadowinv._napari.events import connect, connect_layers, without_proxy
 from napari_shadowinv._napari.layer_metadata import Frame, frame_of, metadata_of, role_of
 from napari_shadowinv.errors import InputError
 
@@ -86,13 +87,12 @@ _connected: weakref.WeakSet[Any] = weakref.WeakSet()
 
 def connect_viewer(viewer: Any) -> None:
     """Connect to the layers of a viewer, once."""
-    # A widget may get a new proxy each time.
-    events = getattr(viewer.layers.events, "__wrapped__", viewer.layers.events)
-    if events not in _connected:
-        _connected.add(events)
-        _follow_top_image(viewer, events)
-        _place_new_images(viewer, events)
-        _label_films(viewer, events)
+    layers = without_proxy(viewer.layers)
+    if layers not in _connected:
+        _connected.add(layers)
+        _follow_top_image(viewer)
+        _place_new_images(viewer)
+        _label_films(viewer)
 
 
 def show_scale_bar(viewer: Any) -> None:
@@ -114,17 +114,17 @@ def select_once_added(viewer: Any, layer_data: Sequence[Any]) -> None:
         if fields:
             viewer.layers.selection.active = fields[-1]
 
-    def collect(event: Any) -> None:
-        added.append(event.value)
+    def collect(layer: Any) -> None:
+        added.append(layer)
         if len(added) == len(layer_data):
-            viewer.layers.events.inserted.disconnect(collect)
+            disconnect()
             # napari selects a layer after the event of its insertion.
             QTimer.singleShot(0, select)
 
-    viewer.layers.events.inserted.connect(collect)
+    disconnect = connect(viewer.layers, "inserted", collect)
 
 
-def _follow_top_image(viewer: Any, events: Any) -> None:
+def _follow_top_image(viewer: Any) -> None:
     """Show colour bar and name of the plugin's topmost visible image, unless switched off."""
     active: list[Any] = []
 
@@ -141,19 +141,8 @@ def _follow_top_image(viewer: Any, events: Any) -> None:
         elif is_on:
             active.clear()
 
-    def watch(event: Any) -> None:
-        event.value.events.visible.connect(follow)
-        follow()
-
-    def leave(event: Any) -> None:
-        event.value.events.visible.disconnect(follow)
-        follow()
-
-    for layer in viewer.layers:
-        layer.events.visible.connect(follow)
-    events.inserted.connect(watch)
-    events.removed.connect(leave)
-    events.reordered.connect(follow)
+    connect_layers(viewer.layers, "visible", follow)
+    connect(viewer.layers, ("inserted", "removed", "reordered"), follow)
     follow()
 
 
@@ -173,18 +162,17 @@ def _show_bar(layer: Any, on: bool) -> None:
     layer.name_overlay.visible = on
 
 
-def _place_new_images(viewer: Any, events: Any) -> None:
+def _place_new_images(viewer: Any) -> None:
     """Place new images without a scale on results of the same size, or explain how to."""
     # With pixels and lengths together, napari drops the unit of its scale bar.
 
-    def receive(event: Any) -> None:
-        layer = event.value
+    def receive(layer: Any) -> None:
         fields = [result for result in viewer.layers if role_of(result) == "field"]
         fields = [field for field in fields if frame_of(field).units != Frame().units]
         if fields and _is_bare_image(layer):
             _place_on_result(layer, fields)
 
-    events.inserted.connect(receive)
+    connect(viewer.layers, "inserted", receive)
 
 
 def _place_on_result(layer: Any, fields: list[Any]) -> None:
@@ -237,7 +225,7 @@ def plane_in_view(viewer: Any, layer: Any) -> int:
     return min(max(index, 0), len(layer.data) - 1)
 
 
-def _label_films(viewer: Any, events: Any) -> None:
+def _label_films(viewer: Any) -> None:
     """Label the shown film of a pack on the canvas, and restore its contrast."""
     contrasts: weakref.WeakKeyDictionary[Any, _FilmContrast] = weakref.WeakKeyDictionary()
     labels: list[str] = []
@@ -260,17 +248,9 @@ def _label_films(viewer: Any, events: Any) -> None:
                 overlay.text, overlay.visible = text, True
             labels[:] = [text]
 
-    def watch(event: Any) -> None:
-        for emitter in (event.value.events.visible, event.value.events.metadata):
-            emitter.connect(follow)
-        follow()
-
-    for layer in viewer.layers:
-        layer.events.visible.connect(follow)
-        layer.events.metadata.connect(follow)
-    events.inserted.connect(watch)
-    events.removed.connect(follow)
-    viewer.dims.events.current_step.connect(follow)
+    connect_layers(viewer.layers, ("visible", "metadata"), follow)
+    connect(viewer.layers, ("inserted", "removed"), follow)
+    connect(viewer.dims, "current_step", follow)
     follow()
 
 

@@ -13,7 +13,13 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import frame_of
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import labelled
-from napari_shadowinv._napari.widgets._qt import column, notify_errors, while_alive, with_button
+from napari_shadowinv._napari.widgets._qt import (
+    column,
+    layers_while_alive,
+    notify_errors,
+    while_alive,
+    with_button,
+)
 from napari_shadowinv._system.arrays import blocks_of
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
@@ -222,11 +228,8 @@ class LayerPicker(SteadyComboBox):
         self.setToolTip(tip)
         self.fill()
         self.currentIndexChanged.connect(lambda _: self.picked.emit())
-        for emitter in (viewer.layers.events.inserted, viewer.layers.events.removed):
-            while_alive(self, emitter, self.fill)
-        for layer in viewer.layers:
-            while_alive(self, layer.events.name, self.fill)
-        while_alive(self, viewer.layers.events.inserted, self._on_insertion)
+        while_alive(self, viewer.layers, ("inserted", "removed"), self.fill)
+        layers_while_alive(self, viewer.layers, "name", self.fill)
 
     @property
     def layer(self) -> Any | None:
@@ -240,10 +243,7 @@ class LayerPicker(SteadyComboBox):
         elif layer in self.offered:
             self.setCurrentIndex(self.offered.index(layer) + bool(self._none))
 
-    def _on_insertion(self, event: Any) -> None:
-        while_alive(self, event.value.events.name, self.fill)
-
-    def fill(self, event: Any = None) -> None:
+    def fill(self, _: Any = None) -> None:
         """Offer the viewer's current layers; the selection stays while its layer exists."""
         before = self.layer
         offered = [
@@ -279,13 +279,13 @@ class ShotPicker(LayerPicker):
             viewer, ("image",), "Layer of the shot, a greyscale image.", suits=about.may_be_shot
         )
         self.activated.connect(self._choose)
+        while_alive(self, viewer.layers, "inserted", self._on_insertion)
 
     def _choose(self, _: int = 0) -> None:
         self.is_chosen = True
 
-    def _on_insertion(self, event: Any) -> None:
-        super()._on_insertion(event)
-        current, new = self.layer, event.value
+    def _on_insertion(self, new: Any) -> None:
+        current = self.layer
         if self.is_chosen or current is None or new is current or new not in self.offered:
             return
         if _structure(new) > _MIN_STRUCTURE_RATIO * _structure(current) > 0:
@@ -420,10 +420,8 @@ class LayerWatch(QObject):
             if layer is None or any(layer is watched for watched in self._watched):
                 continue
             self._watched.append(layer)
-            for name in ("data", "paint"):
-                if hasattr(layer.events, name):
-                    while_alive(self, getattr(layer.events, name), self._on_event)
+            while_alive(self, layer, ("data", "paint"), self._on_edit)
 
-    def _on_event(self, event: Any) -> None:
-        if any(event.source is picker.layer for picker in self._pickers):
+    def _on_edit(self, layer: Any) -> None:
+        if any(layer is picker.layer for picker in self._pickers):
             self.edited.emit()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import weakref
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 from typing import Any, TypeVar
@@ -22,6 +21,7 @@ from qtpy.QtWidgets import (
     QWidget,
 )
 
+from napari_shadowinv._napari.events import Callback, connect, connect_layers
 from napari_shadowinv._napari.viewer_sync import USER_ERRORS, error_text, show_user_error
 
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -98,17 +98,16 @@ def when_destroyed(owner: QObject, action: Callable[[], Any]) -> None:
     owner.destroyed.connect(once)
 
 
-def while_alive(owner: QObject, emitter: Any, method: Callable[..., Any]) -> None:
-    """Connect a method to an event of a layer or viewer during the life of a Qt object."""
-    emitter.connect(method)
-    reference = weakref.WeakMethod(method)
+def while_alive(owner: QObject, model: Any, names: str | Sequence[str], method: Callback) -> None:
+    """Connect a method to events of a layer or viewer during the life of a Qt object."""
+    when_destroyed(owner, connect(model, names, method))
 
-    def disconnect() -> None:
-        living_method = reference()
-        if living_method is not None:
-            emitter.disconnect(living_method)
 
-    when_destroyed(owner, disconnect)
+def layers_while_alive(
+    owner: QObject, layers: Any, names: str | Sequence[str], method: Callback
+) -> None:
+    """Connect a method to events of all layers, also new ones, during the life of a Qt object."""
+    when_destroyed(owner, connect_layers(layers, names, method))
 
 
 def notify_errors(method: Method) -> Method:

@@ -25,6 +25,7 @@ from napari_shadowinv._napari.widgets._forms import PROBLEM_COLOUR, PathEdit, la
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, kind_of, stack_of
 from napari_shadowinv._napari.widgets._qt import (
     column,
+    layers_while_alive,
     notify_errors,
     side_by_side,
     small_button,
@@ -244,11 +245,8 @@ class ImageTable(QWidget):
         column(self, labelled("Images", self.stacks), self.table)
         self.stacks.picked.connect(self.fill)
         self.table.itemChanged.connect(self._on_edit)
-        for emitter in (viewer.layers.events.removed, viewer.layers.events.reordered):
-            while_alive(self, emitter, self.fill)
-        while_alive(self, viewer.layers.events.inserted, self._on_insertion)
-        for layer in viewer.layers:
-            while_alive(self, layer.events.name, self.fill)
+        while_alive(self, viewer.layers, ("inserted", "removed", "reordered"), self.fill)
+        layers_while_alive(self, viewer.layers, "name", self.fill)
         self.fill()
 
     @property
@@ -261,7 +259,7 @@ class ImageTable(QWidget):
         """The first image in use, whose pixels and units the fields have."""
         return self._reference
 
-    def fill(self, event: Any = None) -> None:
+    def fill(self, _: Any = None) -> None:
         """Show the viewer's current images."""
         stack = self.stacks.layer
         if stack is not None:
@@ -361,10 +359,6 @@ class ImageTable(QWidget):
         if self._reference != old_reference:
             self.reference_changed.emit()
         self.changed.emit()
-
-    def _on_insertion(self, event: Any) -> None:
-        while_alive(self, event.value.events.name, self.fill)
-        self.fill()
 
     def _is_image(self, layer: Any) -> bool:
         is_grey = kind_of(layer) == "image" and not getattr(layer, "rgb", False)

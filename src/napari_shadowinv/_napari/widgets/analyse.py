@@ -126,10 +126,9 @@ class Analyse(qt.Docked):
     def _connect(self) -> None:
         self._timer = qt.timer(self, _REDRAW_MS, self.update_plot, once=True)
         self._watched: list[Any] = []
-        events = self.viewer.layers.events
-        for emitter in (events.inserted, events.removed, events.reordered):
-            qt.while_alive(self, emitter, self._fill)
-        qt.while_alive(self, self.viewer.dims.events.current_step, self._schedule_plot)
+        changes = ("inserted", "removed", "reordered")
+        qt.while_alive(self, self.viewer.layers, changes, self._fill)
+        qt.while_alive(self, self.viewer.dims, "current_step", self._schedule_plot)
         self.lines.picked.connect(self._schedule_plot)
         for signal in (
             self.layers.itemChanged,
@@ -229,7 +228,7 @@ class Analyse(qt.Docked):
             return None
         return np.array([shapes.data_to_world(corner)[-2:] for corner in shapes.data[selected[-1]]])
 
-    def _schedule_plot(self, event: Any = None) -> None:
+    def _schedule_plot(self, _: Any = None) -> None:
         self._watch()
         if not self._timer.isActive():
             self._timer.start()
@@ -239,13 +238,13 @@ class Analyse(qt.Docked):
             if layer is None or any(layer is watched for watched in self._watched):
                 continue
             self._watched.append(layer)
-            qt.while_alive(self, layer.events.set_data, self._on_layer)
+            qt.while_alive(self, layer, "set_data", self._on_layer)
 
-    def _on_layer(self, event: Any) -> None:
-        if any(event.source is layer for layer in (self.lines.layer, *self.checked())):
+    def _on_layer(self, changed: Any) -> None:
+        if any(changed is layer for layer in (self.lines.layer, *self.checked())):
             self._schedule_plot()
 
-    def _fill(self, event: Any = None) -> None:
+    def _fill(self, _: Any = None) -> None:
         """List all grey images; new visible ones are checked."""
         listed, checked = [layer for _, layer in self._items()], self.checked()
         with QSignalBlocker(self.layers):

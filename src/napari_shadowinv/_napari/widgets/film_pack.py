@@ -171,7 +171,7 @@ class CornerEditor(QObject):
         self.scan: Any = None
         self.polygon: Any = None
         self._settle_timer = qt.timer(self, _SETTLE_MS, self._follow, once=True)
-        qt.while_alive(self, viewer.dims.events.current_step, self._on_step)
+        qt.while_alive(self, viewer.dims, "current_step", self._on_step)
 
     @property
     def shown(self) -> bool:

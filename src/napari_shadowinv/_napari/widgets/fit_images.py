@@ -145,7 +145,7 @@ class FitImages(ToolPanel):
         )
 
     def _connect(self) -> None:
-        while_alive(self, self.viewer.layers.selection.events.active, self._on_active)
+        while_alive(self, self.viewer.layers.selection, "active", self._on_active)
         self.images.reference_changed.connect(self._on_reference)
         self.images.reference_beam_entered.connect(self._set_beam)
         self.images.changed.connect(self._show_beams)
@@ -378,7 +378,7 @@ class FitImages(ToolPanel):
         if self._ready and row is not None and row.setup not in (None, setup):
             self.setup.suggest(row.setup, about.setup_origin_of(row.layer))
 
-    def _on_active(self, event: Any = None) -> None:
+    def _on_active(self, _: Any = None) -> None:
         self.view.follow()
 
     def _reference_layer(self) -> Any | None:

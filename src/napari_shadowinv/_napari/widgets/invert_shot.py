@@ -195,7 +195,7 @@ class InvertShot(InversionInputs, LivePanel):
         # Also for runs that are cancelled, or refused before they start.
         self.panel.button.clicked.connect(self._empty_report)
         self.panel.runner.started.connect(self._on_start)
-        while_alive(self, self.viewer.layers.selection.events.active, self._follow_result)
+        while_alive(self, self.viewer.layers.selection, "active", self._follow_result)
         changes = [control.changed for control in self.inputs]
         for signal in (*changes, self.crop.picked, edits.edited):
             signal.connect(self.on_change)
@@ -287,7 +287,7 @@ class InvertShot(InversionInputs, LivePanel):
         results = self._last_results()
         return [] if results is None else field_of(results.layers)
 
-    def _follow_result(self, event: Any = None) -> None:
+    def _follow_result(self, _: Any = None) -> None:
         """Show the report of the inversion whose layer is selected, such as a layer from a file."""
         layer = self.viewer.layers.selection.active
         result = None if layer is None else result_of(layer)

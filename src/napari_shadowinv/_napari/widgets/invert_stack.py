@@ -292,7 +292,7 @@ class InvertStack(InversionInputs, ToolPanel):
         for part in (*self.inputs, self.engine):
             part.changed.connect(self.keep)
         self.panel.runner.progressed.connect(self._on_progress)
-        while_alive(self, self.viewer.dims.events.current_step, self._on_step)
+        while_alive(self, self.viewer.dims, "current_step", self._on_step)
 
     def parts(self) -> dict[str, Any]:
         return {**super().parts(), "engine": self.engine}
