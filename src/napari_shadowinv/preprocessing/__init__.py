@@ -1,7 +1,8 @@
 """Preparation of a shot for its inversion, and the recipe of it.
 
 - the shot: `Radiograph`; the recipe: `Recipe`
-- whether image and source look right: `image_warnings`, `ReferencePair`
+- whether image and source look right: `image_warnings`, `ReferencePair`; a source in register with
+  its image: `align_source`
 - steps: `Dark`, `Rotate`, `Crop`, `Bin`, and filters by name in `FILTERS`; as functions `low_pass`,
   `high_pass`, `butterworth`, `remove_background`, `remove_hot_pixels`
 - estimates of the source by name in `ESTIMATES`; as functions `uniform_source`,

@@ -1,3 +1,4 @@
+from .alignment import AlignedSource, align_source
 from .estimates import (
     Estimate,
     GaussianEstimate,
@@ -50,6 +51,7 @@ __all__ = [
     "FILTERS",
     "FIT_STEPS",
     "STEPS",
+    "AlignedSource",
     "BackgroundFilter",
     "Bin",
     "ButterworthFilter",
@@ -75,6 +77,7 @@ __all__ = [
     "Step",
     "TotalVariationEstimate",
     "UniformEstimate",
+    "align_source",
     "butterworth",
     "check_masks",
     "estimate_source",

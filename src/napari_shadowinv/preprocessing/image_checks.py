@@ -51,7 +51,7 @@ _NOISE_SAMPLES = 50_000
 _COARSE_SIDE_PX = 128
 _MIN_BLOCKS = 16
 _MIN_USABLE_SHARE = 0.999  # share of a block's pixels
-_RING_SHARE = 0.2  # of the side: there is rarely an object
+RING_SHARE = 0.2  # of the side: there is rarely an object
 _MAX_SHIFT = 0.2  # of the side
 # Share of the mismatch that may be left after a shift, by the blur (blocks) of both: a beam that
 # merely differs, smooth as it is, may match somewhere by chance to a quarter.
@@ -301,7 +301,7 @@ class ReferencePair:
     def _ring(self) -> BoolArray:
         """Usable blocks near the border, where there is rarely an object."""
         usable = self._blocks[2]
-        depth = [max(2, round(_RING_SHARE * side)) for side in usable.shape]
+        depth = [max(2, round(RING_SHARE * side)) for side in usable.shape]
         ring = usable.copy()
         ring[depth[0] : -depth[0], depth[1] : -depth[1]] = False
         return ring
@@ -396,7 +396,7 @@ def _fits_after(
     if gain(common) > match:
         return False
     y, x = np.ogrid[rows, columns]
-    y_top, x_left = height * _RING_SHARE, width * _RING_SHARE
+    y_top, x_left = height * RING_SHARE, width * RING_SHARE
     sides = (y < y_top, y >= height - y_top, x < x_left, x >= width - x_left)
     parts = [common & side for side in sides]
     better = [gain(part) < 1 for part in parts if part.sum() >= _MIN_BLOCKS]
