@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,41 @@ pytest.importorskip("napari")
 
 from napari.components import ViewerModel
 
+import napari_shadowinv
 from napari_shadowinv import InversionOptions, invert
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair
 from napari_shadowinv.pipeline import read_pack, run_film
 from simulated_pack import Truth, simulate
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_preferences(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Keep the tests and the preferences of whoever runs them apart."""
+    from napari import settings
+
+    if hasattr(settings, "get_plugin_settings"):
+        settings._clear_plugin_settings_cache()
+        settings._CFG_PATH = str(tmp_path_factory.mktemp("napari") / "settings.yaml")
+
+
+@pytest.fixture
+def preferences() -> Iterator[Any]:
+    """The plugin's preferences, which have their defaults again after a test."""
+    from napari import settings
+
+    if not hasattr(settings, "get_plugin_settings"):
+        pytest.skip("napari before 0.9 has no preferences of plugins")
+    yield settings.get_plugin_settings("napari-shadowinv")
+    settings.get_plugin_settings("napari-shadowinv").reset()
+
+
+@pytest.fixture
+def manifest() -> Any:
+    from npe2 import PluginManifest
+
+    return PluginManifest.from_file(Path(napari_shadowinv.__file__).with_name("napari.yaml"))
 
 
 @pytest.fixture

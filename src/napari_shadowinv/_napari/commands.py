@@ -12,6 +12,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari import layers as results
 from napari_shadowinv._napari import viewer_sync
 from napari_shadowinv._napari.layer_metadata import Frame, frame_of, main_layers
+from napari_shadowinv._napari.preferences import use_preferred_threads
 from napari_shadowinv._napari.shots import radiograph_of, shot_layer
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._typing import FloatArray
@@ -135,6 +136,7 @@ def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> lis
     from napari.qt.threading import create_worker
     from napari.utils import cancelable_progress
 
+    use_preferred_threads()
     bar = cancelable_progress(total=0, desc=f"{activity} {selection.name}")
 
     def finish(outcome: tuple[list[results.FullLayerData], Exception | None]) -> None:

@@ -23,6 +23,7 @@ from napari_shadowinv._napari.layers import (
     significance_variables,
     symmetric_limits,
 )
+from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import intensity_limits
@@ -170,7 +171,7 @@ def _image_layers(
             "metadata": metadata_for(role, kind.unit, setup, **facts, main=role != "reprojection"),
             "visible": False,
             **frame.keywords(stacked=data.ndim == 3),
-            "colormap": kind.colormap,
+            "colormap": colour_map(kind.colormap),
             "contrast_limits": limits or symmetric_limits(planes[0]),
         }
         if data.ndim == 3:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import numpy as np
 
+from napari_shadowinv._napari.preferences import AUTOMATIC, preference
 from napari_shadowinv._typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
 
 Matrix = tuple[tuple[float, ...], ...]
 
-_MAX_LENGTH_UM = 10_000.0  # longer sides are in mm
+_MAX_LENGTH_UM = 10_000.0  # longer sides are in mm, unless the user prefers a unit
+_UNITS_PER_M = {"um": 1e6, "mm": 1e3, "cm": 1e2, "m": 1.0}
 
 
 @dataclass(frozen=True)
@@ -81,16 +83,18 @@ def frame_for(
     units: Sequence[str] | None = None,
     pixel_size: float | None = None,
 ) -> Frame:
-    """Choose a frame in µm, in mm above 1 cm, or in pixels; other arguments take precedence.
+    """Choose a frame in the preferred unit of length, or in pixels.
 
-    `pixel_size` (m) is used without a setup.
+    The automatic unit is µm, or mm above 1 cm. `pixel_size` (m) is used without a setup; the other
+    arguments take precedence.
     """
     frame = Frame()
     side = pixel_size if setup is None else setup.object_pixel_size
     if side is not None:
-        pixel, unit = side * 1e6, "um"
-        if max(shape[-2:]) * pixel > _MAX_LENGTH_UM:
-            pixel, unit = pixel * 1e-3, "mm"
+        unit = preference("units", "length").replace("µ", "u")
+        if unit == AUTOMATIC:
+            unit = "mm" if max(shape[-2:]) * side * 1e6 > _MAX_LENGTH_UM else "um"
+        pixel = side * _UNITS_PER_M[unit]
         frame = Frame(scale=(pixel, pixel), units=(unit, unit))
     overrides = {"scale": scale, "translate": translate, "units": units}
     changes: dict[str, Any] = {
@@ -138,7 +142,10 @@ _LayerData = tuple[Any, dict[str, Any], str]
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of layer; the setup sets ``{unit}`` and ``{symbol}`` in a title."""
+    """A kind of layer; the setup sets ``{unit}`` and ``{symbol}`` in a title.
+
+    `colormap` is a quantity of `preferences.colour_map`.
+    """
 
     role: str
     variable: str
@@ -152,24 +159,24 @@ class Kind:
 
 
 KINDS = (
-    Kind("image", "image", "image", "flux/px²", "gray"),
-    Kind("source", "source", "source", "flux/px²", "gray", shown_of="shot"),
-    Kind("reprojection", "reprojection", "re-projection", "flux/px²", "gray"),
-    Kind("residual", "residual", "residual (% of mean)", "%", "RdBu_r", main=True, shown_of="shot"),
-    Kind("residual", "residual", "residual", "flux/px²", "RdBu_r", main=True, shown_of="stack"),
-    Kind("potential", "potential", "potential ({unit})", colormap="viridis"),
-    Kind("field y", "displacement", "{symbol} ({unit})", colormap="RdBu_r"),
-    Kind("field x", "displacement", "{symbol} ({unit})", colormap="RdBu_r"),
-    Kind("field", "displacement", "{symbol} ({unit})", colormap="inferno", visible=True, main=True),
+    Kind("image", "image", "image", "flux/px²", "image"),
+    Kind("source", "source", "source", "flux/px²", "image", shown_of="shot"),
+    Kind("reprojection", "reprojection", "re-projection", "flux/px²", "image"),
+    Kind("residual", "residual", "residual (% of mean)", "%", "signed", main=True, shown_of="shot"),
+    Kind("residual", "residual", "residual", "flux/px²", "signed", main=True, shown_of="stack"),
+    Kind("potential", "potential", "potential ({unit})", colormap="potential"),
+    Kind("field y", "displacement", "{symbol} ({unit})", colormap="signed"),
+    Kind("field x", "displacement", "{symbol} ({unit})", colormap="signed"),
+    Kind("field", "displacement", "{symbol} ({unit})", colormap="field", visible=True, main=True),
     Kind(
         "uncertainty",
         "displacement_uncertainty",
         "σ of {symbol} ({unit})",
-        colormap="magma",
+        colormap="uncertainty",
         main=True,
         shown_of="shot",
     ),
-    Kind("significance", "significance", "|d|/σ", "1", "cividis", shown_of="shot"),
+    Kind("significance", "significance", "|d|/σ", "1", "significance", shown_of="shot"),
     Kind("structures", "structures", "structures above 2 σ", "1", type="labels", shown_of="shot"),
     Kind("caustic", "caustic", "caustics", type="labels", main=True),
     Kind("field arrows", "displacement", "{arrows}", type="vectors", shown_of="shot"),
@@ -182,7 +189,7 @@ KINDS = (
         visible=True,
         main=True,
     ),
-    Kind("sites", "sites", "sites{share}", colormap="inferno", type="points", shown_of="shot"),
+    Kind("sites", "sites", "sites{share}", colormap="field", type="points", shown_of="shot"),
     Kind("cells", "sites", "power cells", type="shapes", main=True, shown_of="shot"),
 )
 _MAIN_ROLES = {kind.role for kind in KINDS if kind.main}

@@ -23,6 +23,7 @@ from napari_shadowinv._napari.layer_metadata import (
     metadata_for,
     role_of,
 )
+from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import connect_viewer, show_scale_bar
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -392,7 +393,8 @@ def _image(view: _View, kind: Kind) -> Content:
         limits = symmetric_limits(plane)
     else:
         limits = view.intensity_limits
-    return data, words, {"colormap": kind.colormap, "contrast_limits": _nonempty(limits)}
+    look = {"colormap": colour_map(kind.colormap), "contrast_limits": _nonempty(limits)}
+    return data, words, look
 
 
 def _field(view: _View, role: str) -> tuple[Any, Limits, dict[str, str]]:
@@ -493,7 +495,7 @@ def _sites(view: _View, kind: Kind) -> Content:
     look = {
         "features": features,
         "face_color": "displacement",
-        "face_colormap": kind.colormap,
+        "face_colormap": colour_map(kind.colormap),
         "face_contrast_limits": _nonempty((0.0, float(features["displacement"].max(initial=0.0)))),
         "border_width": 0.0,
         "size": 0.7 * spacing * step**0.5,

@@ -27,6 +27,7 @@ from napari_shadowinv._napari.layer_metadata import (
     metadata_for,
 )
 from napari_shadowinv._napari.layers import FullLayerData, Limits, label_colours
+from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
@@ -41,8 +42,8 @@ FLUENCE, DOSE, UNUSABLE = "fluence", "dose", "unusable"
 PER_AREA = "1/(m² MeV)"
 
 KINDS = (
-    Kind(DOSE, "dose", "dose (Gy)", "Gy", "magma"),
-    Kind(FLUENCE, "fluence", f"fluence ({PER_AREA})", PER_AREA, "inferno", visible=True),
+    Kind(DOSE, "dose", "dose (Gy)", "Gy", "uncertainty"),
+    Kind(FLUENCE, "fluence", f"fluence ({PER_AREA})", PER_AREA, "field", visible=True),
     Kind(UNUSABLE, "usable", "unusable", type="labels"),
 )
 
@@ -100,7 +101,7 @@ def pack_layers(
         if kind.type == "image":
             limits = [_limits(film, used) for film, used in zip(data, doses.usable, strict=True)]
             metadata["limits"] = limits
-            look = {"colormap": kind.colormap, "contrast_limits": limits[plane]}
+            look = {"colormap": colour_map(kind.colormap), "contrast_limits": limits[plane]}
         keywords = {
             "name": f"{name} {kind.title}".strip(),
             "metadata": metadata_for(kind.role, kind.unit, result.setup, **metadata),

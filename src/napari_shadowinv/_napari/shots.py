@@ -25,6 +25,7 @@ from napari_shadowinv._napari.layer_metadata import (
     role_of,
 )
 from napari_shadowinv._napari.layers import FullLayerData
+from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import show_caution
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -77,7 +78,7 @@ def shot_layer(
     metadata = {key: value for key, value in more.items() if value is not None}
     keywords = {
         "name": name,
-        "colormap": "gray",
+        "colormap": colour_map("image"),
         "contrast_limits": limits,  # otherwise napari would read two shots of a stack
         "metadata": metadata_for(role, "intensity", setup, **metadata),
         **frame.keywords(stacked=data.ndim > 2),
@@ -98,9 +99,7 @@ def _facts(shot: io.Radiograph, origin: str) -> dict[str, Any]:
 def _frame(shot: io.Radiograph) -> Frame:
     """Return the frame of the object plane, also if a file contains only the pixel size."""
     side = dict(shot.metadata.get("geometry") or {}).get("pixel_size")
-    if shot.setup is not None or side is None:
-        return frame_for(shot.image.shape, shot.setup)
-    return Frame(scale=(side * 1e6, side * 1e6), units=("um", "um"))
+    return frame_for(shot.image.shape, shot.setup, pixel_size=side)
 
 
 def radiograph_of(layer: Any, image: Any, plane: int | None = None) -> io.Radiograph:

@@ -1,6 +1,6 @@
 """Memory, threads and signals.
 
-- `physical_memory`, `available_threads`, `in_ranges`
+- `physical_memory`, `available_threads`, `set_default_threads`, `in_ranges`
 - Ctrl-C, SIGTERM and SIGHUP: `defer_interrupts`, `clear_up_when_terminated`, `handling`
 """
 
@@ -57,8 +57,18 @@ def _nested(name: str) -> list[Path]:
     return [path, *path.parents]
 
 
+_default_threads: int | None = None
+
+
+def set_default_threads(threads: int | None) -> None:
+    """Set the number of threads of all later work that requests none; None for all cores."""
+    global _default_threads
+    _default_threads = threads
+
+
 def available_threads(threads: int | None) -> int:
-    """Return `threads`, or the number of cores this process may use where it is None."""
+    """Return `threads`; where it is None the default, or the number of cores of this process."""
+    threads = _default_threads if threads is None else threads
     if threads is not None:
         return threads
     try:

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -27,6 +26,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import solveh_banded
 
 from napari_shadowinv._system.arrays import PIXELS, VECTOR, check_finite, plain_array
+from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import FloatArray, IntArray
@@ -426,7 +426,7 @@ def synthetic_image(
     bands = _bands(shape[0])
     image = np.zeros(shape)
     report("image", 0, len(bands))
-    pool = ThreadPoolExecutor(threads or os.cpu_count())
+    pool = ThreadPoolExecutor(available_threads(threads))
     try:
         coefficients = np.stack(list(pool.map(_spline_coefficients, field)))
         for done, (top, window) in enumerate(pool.map(image_of_band, bands), start=1):

@@ -147,6 +147,35 @@ def test_what_the_user_typed_is_at_hand_and_says_for_what(
     assert setup_origin_of(new) == "typed for 'new'"
 
 
+@pytest.mark.parametrize("kind", [InvertShot, InvertStack])
+def test_the_last_setup_is_selected_where_that_is_preferred(
+    viewer: ViewerModel, opened: Any, plain: Any, shot: Array, preferences: Any, kind: Any
+) -> None:
+    preferences.widgets.last_setup = True
+    tool = opened(kind)
+    assert tool.setup.setup() is None  # there is no last one
+    typed(tool, 5.0)
+    entered = tool.setup.setup()
+    tool._keeper.write()
+    viewer.layers.clear()
+    new = viewer.add_image(shot, name="new")
+    later = opened(kind)
+    assert later.setup.setup() == entered
+    assert later.setup.note.text() == "Typed for 'plain', in an earlier session."
+    # The image has no setup of its own before it is edited.
+    assert setup_of(new) is None
+    # None is a choice, too.
+    later.setup.picker.set_kind("none")
+    later._keeper.write()
+    assert opened(kind).setup.setup() is None
+    later.setup.picker.set_kind("proton")
+    later._keeper.write()
+    preferences.widgets.last_setup = False
+    viewer.layers.clear()
+    viewer.add_image(shot, name="newest")
+    assert opened(kind).setup.setup() is None
+
+
 def test_a_setup_from_a_toml_file_says_so(
     opened: Any, plain: Any, tmp_path: Path, proton_setup: ProtonSetup, monkeypatch: Any
 ) -> None:

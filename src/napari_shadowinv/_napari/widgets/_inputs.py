@@ -16,6 +16,7 @@ from qtpy.QtWidgets import QWidget
 
 from napari_shadowinv import preprocessing
 from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.preferences import preference
 from napari_shadowinv._napari.shots import radiograph_of, source_of_shot
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
@@ -88,6 +89,7 @@ class SetupPicker(QWidget):
         super().__init__()
         self._layer: Any = None
         self._name, self._stores = "", True
+        self._last = _NONE  # the kind that the user chose last
         self._entered: dict[str, _Entry] = {}
         self._shown: dict[str, _Entry] = {}
         self.picker = forms.ModelPicker(
@@ -123,15 +125,17 @@ class SetupPicker(QWidget):
 
     def state(self) -> dict[str, Any]:
         """Return the setups that the user entered; the selection depends on the image."""
-        return {"own": {kind: asdict(entry) for kind, entry in self._entered.items()}}
+        own = {kind: asdict(entry) for kind, entry in self._entered.items()}
+        return {"own": own, "last": self._last}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Restore the entered setups, without selecting one."""
+        """Restore the entered setups; select the last one only if the user prefers that."""
         saved = state.get("own")
         for kind, entry in saved.items() if isinstance(saved, Mapping) else ():
             origin = str(entry["origin"]).removesuffix(_EARLIER) + _EARLIER
             self._entered[kind] = _Entry(dict(entry["values"]), origin)
-        self._show(_NONE)
+        self._last = str(state.get("last", _NONE))
+        self._show_default()
 
     def follow(self, layer: Any, name: str = "", *, store: bool = True) -> None:
         """Show the setup of another image, or of files; with `store`, the image stores changes."""
@@ -144,7 +148,7 @@ class SetupPicker(QWidget):
         if setup is not None:
             self.suggest(setup, about.setup_origin_of(layer) or f"{about.CAME_WITH} '{layer.name}'")
         elif not is_typed_before:
-            self._show(_NONE)
+            self._show_default()
             self.changed.emit()
 
     def suggest(self, setup: Setup, origin: str) -> None:
@@ -163,10 +167,16 @@ class SetupPicker(QWidget):
         """Show a setup from the user: loaded from `origin`, or typed if that is empty."""
         kind = str(values["kind"])
         entry = _Entry(dict(values), origin or self._typed_origin())
+        self._last = kind
         self._show(kind, entry)
         self._remember(kind, entry)
         self._store_with_image()
         self.changed.emit()
+
+    def _show_default(self) -> None:
+        """Show the setup of images without one of their own: none, or the user's last."""
+        is_last = preference("widgets", "last_setup") and self._last in self._entered
+        self._show(self._last if is_last else _NONE)
 
     def _show(self, kind: str, entry: _Entry | None = None) -> None:
         """Show a setup or none; the forms of other kinds keep the last entries."""
@@ -188,6 +198,7 @@ class SetupPicker(QWidget):
             else:
                 origin = old_entry.origin.removesuffix(_CHANGED) + _CHANGED
             self._remember(kind, _Entry(values, origin))
+        self._last = kind
         self._show_origin()
         self._store_with_image()
         self.changed.emit()

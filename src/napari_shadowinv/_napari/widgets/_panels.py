@@ -18,6 +18,7 @@ from qtpy.QtCore import QObject, Qt, Signal
 
 from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import main_layers
+from napari_shadowinv._napari.preferences import use_preferred_threads
 from napari_shadowinv._napari.viewer_sync import (
     USER_ERRORS,
     error_text,
@@ -108,6 +109,7 @@ class Runner(QObject):
             return
         box = self._box = _Mailbox(tag)
         self._to_stop.append(box)
+        use_preferred_threads()
         threading.Thread(target=_run, args=(work, box), name="shadowinv", daemon=False).start()
         self._timer.start()
         self.started.emit()

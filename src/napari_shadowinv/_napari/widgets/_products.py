@@ -20,6 +20,7 @@ from napari_shadowinv._napari.layer_metadata import (
     setup_of,
 )
 from napari_shadowinv._napari.layers import add_layers
+from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
@@ -482,7 +483,7 @@ def map_layer(measured: ProductResult, name: str, layer: Any) -> Any:
     unit = f"{prefix}{measured.variables[name].unit}"
     keywords = {
         "name": layer_name(f"{measured.title} ({unit})", layer.name.partition(" – ")[2]),
-        "colormap": "RdBu_r",
+        "colormap": colour_map("signed"),
         "contrast_limits": (-factor * largest, factor * largest),
         "metadata": metadata_for("product", unit),
         **frame_of(layer).keywords(),

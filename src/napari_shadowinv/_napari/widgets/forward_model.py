@@ -14,6 +14,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
 from napari_shadowinv._napari.layer_metadata import Frame, frame_for, frame_of
 from napari_shadowinv._napari.layers import FullLayerData
+from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
@@ -148,6 +149,7 @@ class ForwardJob(Job):
         keywords = {
             "name": self.name,
             "metadata": about.metadata_for(about.SHOT, self.unit, self.setup, **inputs),
+            "colormap": colour_map("image"),
             "contrast_limits": intensity_limits(content.image),
             **frame.keywords(),
         }

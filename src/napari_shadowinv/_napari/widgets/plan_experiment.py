@@ -14,6 +14,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
 from napari_shadowinv._napari.layer_metadata import Frame, frame_for
 from napari_shadowinv._napari.layers import FullLayerData
+from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
@@ -87,6 +88,7 @@ class PlanJob(Job):
         keywords = {
             "name": f"{plan.title}, planned",
             "metadata": about.metadata_for(about.SHOT, "counts", setup),
+            "colormap": colour_map("image"),
             "contrast_limits": intensity_limits(plan.images[0]),
             **frame.keywords(),
         }

@@ -1,0 +1,116 @@
+"""Preferences of the plugin in napari, and what follows them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from napari.components import ViewerModel
+from napari.layers import Image
+
+from napari_shadowinv import ProtonSetup, add_inversion, invert
+from napari_shadowinv._napari import preferences as about
+from napari_shadowinv._napari.layer_metadata import frame_for, role_of
+from napari_shadowinv._napari.samples import toroid
+from napari_shadowinv._system.machine import available_threads, set_default_threads
+from napari_shadowinv.inversion import Inversion
+
+
+@pytest.fixture
+def configurations(manifest: Any) -> dict[str, Any]:
+    return dict(manifest.contributions.configurations)
+
+
+def test_the_manifest_has_the_defaults(configurations: dict[str, Any]) -> None:
+    declared = {
+        group: {name: field.default for name, field in configuration.properties.items()}
+        for group, configuration in configurations.items()
+    }
+    assert declared == about.DEFAULTS
+
+
+def test_napari_has_every_colour_map_on_offer(configurations: dict[str, Any]) -> None:
+    offered = {
+        name for field in configurations["colour_maps"].properties.values() for name in field.enum
+    }
+    assert {Image(np.eye(2), colormap=name).colormap.name for name in offered} == offered
+
+
+def test_new_layers_have_the_preferred_colours(
+    viewer: ViewerModel, solved: Inversion, preferences: Any
+) -> None:
+    add_inversion(viewer, solved, all_layers=True)
+    colours = preferences.colour_maps
+    colours.field, colours.signed, colours.image = "viridis", "PiYG", "gray_r"
+    layers = add_inversion(viewer, solved, all_layers=True)
+    names = {role_of(layer): layer.colormap.name for layer in layers if isinstance(layer, Image)}
+    assert names["field"] == "viridis"
+    assert names["residual"] == names["field y"] == "PiYG"
+    assert names["image"] == names["reprojection"] == "gray_r"
+    assert names["potential"] == "viridis"
+    # Layers that were there keep their colours.
+    assert {role_of(layer): layer.colormap.name for layer in viewer.layers[:3]}["image"] == "gray"
+    assert toroid()[-1][1]["colormap"] == "gray_r"
+
+
+@pytest.mark.parametrize(
+    ("choice", "unit", "scale"),
+    [("automatic", "mm", 0.02), ("µm", "um", 20), ("cm", "cm", 2e-3), ("m", "m", 2e-5)],
+)
+def test_axes_have_the_preferred_unit(
+    preferences: Any, choice: str, unit: str, scale: float
+) -> None:
+    preferences.units.length = choice
+    frame = frame_for((600, 400), None, pixel_size=20e-6)  # 12 mm high
+    assert frame.units == (unit, unit)
+    assert frame.scale == pytest.approx((scale, scale))
+
+
+def test_a_unit_that_napari_must_know(
+    viewer: ViewerModel, preferences: Any, proton_setup: ProtonSetup, solved: Inversion
+) -> None:
+    preferences.units.length = "mm"
+    (field, *_) = add_inversion(viewer, solved, proton_setup)
+    assert {str(unit) for unit in field.units} == {"millimeter"}
+    assert field.scale == pytest.approx([1.5e-3, 1.5e-3])
+
+
+def test_threads_are_limited_where_none_are_requested(preferences: Any) -> None:
+    cores = available_threads(None)
+    try:
+        preferences.widgets.threads = cores + 3
+        about.use_preferred_threads()
+        assert available_threads(None) == cores + 3
+        assert available_threads(1) == 1
+        preferences.widgets.threads = 0
+        about.use_preferred_threads()
+        assert available_threads(None) == cores
+    finally:
+        set_default_threads(None)
+
+
+def test_results_do_not_depend_on_threads() -> None:
+    image = np.random.default_rng(1).poisson(200, (40, 50)).astype(float)
+    potentials = []
+    try:
+        for threads in (1, 3):
+            set_default_threads(threads)
+            potentials.append(invert(image).potential)
+    finally:
+        set_default_threads(None)
+    np.testing.assert_array_equal(*potentials)
+
+
+def test_an_older_napari_has_the_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr("napari.settings.get_plugin_settings", raising=False)
+    assert about.preference("units", "length") == "automatic"
+    assert about.colour_map("field") == "inferno"
+    about.use_preferred_threads()
+    assert available_threads(None) >= 1
+
+
+def test_a_value_that_is_not_offered_is_refused(preferences: Any) -> None:
+    with pytest.raises(ValueError, match="not one of the allowed"):
+        preferences.colour_maps.field = "no such map"
+    assert about.colour_map("field") == "inferno"
