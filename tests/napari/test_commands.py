@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from napari.components import ViewerModel
 
+from helpers.shifted_pair import shifted_pair
 from napari_shadowinv import (
     FitShot,
     InputError,
@@ -18,10 +19,18 @@ from napari_shadowinv import (
     invert,
 )
 from napari_shadowinv._napari import commands
-from napari_shadowinv._napari.layer_metadata import is_estimate, role_of, setup_of
+from napari_shadowinv._napari.layer_metadata import (
+    KEY,
+    is_estimate,
+    role_of,
+    setup_of,
+    source_of,
+    usable_of,
+)
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair
+from napari_shadowinv.preprocessing import align_source
 
 
 @pytest.fixture
@@ -128,6 +137,73 @@ def test_an_inversion_is_refined_from_any_of_its_layers(
     assert " – shot refined" in keywords["name"]
     assert keywords["translate"] == (30.0, 60.0)
     assert "uncertainty" in by_role
+
+
+def outline(viewer: ViewerModel, layer: Any, low: int, high: int) -> Any:
+    """A rectangle over the pixels from `low` to `high` of both axes, in the world of a layer."""
+    corners = [layer.data_to_world((y, x)) for y in (low, high) for x in (low, high)]
+    rectangle = np.array(corners)[[0, 1, 3, 2]]
+    return viewer.add_shapes([rectangle], shape_type="rectangle", units=layer.units)
+
+
+def placed_shot(viewer: ViewerModel, shot: np.ndarray, setup: ProtonSetup) -> Any:
+    layer = add_shot(viewer, shot, setup)
+    layer.translate = (30.0, 60.0)
+    layer.metadata[KEY] |= {"source": 2 * shot, "usable": shot < shot.max()}
+    return layer
+
+
+@pytest.mark.parametrize("selected", ["image", "rectangle"])
+def test_a_crop_keeps_place_setup_source_and_mask(
+    viewer: ViewerModel, shot: np.ndarray, proton_setup: ProtonSetup, selected: str
+) -> None:
+    layer = placed_shot(viewer, shot, proton_setup)
+    rectangle = outline(viewer, layer, 5, 14)
+    ((data, keywords, _),) = commands.crop(
+        {"image": layer, "rectangle": rectangle}[selected], viewer
+    )
+    np.testing.assert_array_equal(data, shot[5:15, 5:15])
+    cropped = viewer.add_image(data, **keywords)
+    assert cropped.name == "shot cropped to 10 × 10 px"
+    np.testing.assert_allclose(cropped.data_to_world((0, 0)), layer.data_to_world((5, 5)))
+    assert setup_of(cropped) == proton_setup
+    np.testing.assert_array_equal(source_of(cropped), 2 * data)
+    np.testing.assert_array_equal(usable_of(cropped), data < shot.max())
+
+
+def test_without_a_rectangle_there_is_no_crop(viewer: ViewerModel, shot: np.ndarray) -> None:
+    with pytest.raises(InputError, match="no rectangle to crop to: draw one in a shapes layer"):
+        commands.crop(add_shot(viewer, shot), viewer)
+
+
+def test_binned_pixels_are_larger_and_stay_in_place(
+    viewer: ViewerModel, shot: np.ndarray, proton_setup: ProtonSetup
+) -> None:
+    layer = placed_shot(viewer, shot, proton_setup)
+    ((data, keywords, _),) = commands.bin_pixels(layer)
+    assert data.sum() == pytest.approx(shot.sum())
+    binned = viewer.add_image(data, **keywords)
+    assert setup_of(binned).pixel_size == pytest.approx(2 * proton_setup.pixel_size)
+    np.testing.assert_allclose(binned.data_to_world((3, 4)), layer.data_to_world((6.5, 8.5)))
+    assert source_of(binned).sum() == pytest.approx(2 * data.sum())
+
+
+def test_a_source_is_moved_to_fit_its_image(viewer: ViewerModel) -> None:
+    image, source = shifted_pair((2.3, -1.6))
+    layer = add_shot(viewer, image)
+    with pytest.raises(InputError, match="no source for 'shot' is selected: select its source"):
+        commands.align_source(layer, viewer)
+    beam = viewer.add_image(source, name="beam")
+    viewer.layers.selection = {layer, beam}
+    ((data, keywords, _),) = commands.align_source(layer, viewer)
+    assert role_of(keywords) == "source"
+    assert keywords["name"].startswith("beam moved by y +2.")
+    np.testing.assert_array_equal(data, align_source(image, source).source)
+    # Nothing need be selected where only one source fits.
+    beam.metadata[KEY] = {"role": "source"}
+    viewer.layers.selection = {layer}
+    ((again, _, _),) = commands.align_source(layer, viewer)
+    np.testing.assert_array_equal(again, data)
 
 
 def registered(name: str) -> Any:

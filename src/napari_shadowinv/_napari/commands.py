@@ -1,4 +1,7 @@
-"""Commands of the menus *Layers > Measure* and *Filter* for the selected image or shown shot."""
+"""Commands of the menus *Layers > Measure*, *Filter*, *Transform* and *Register*.
+
+They work on the selected image or shown shot; `open_widgets` has those that only open a widget.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari import layers as results
 from napari_shadowinv._napari import viewer_sync
 from napari_shadowinv._napari.layer_metadata import Frame, frame_of, main_layers
+from napari_shadowinv._napari.open_widgets import open_widget
 from napari_shadowinv._napari.preferences import use_preferred_threads
 from napari_shadowinv._napari.shots import radiograph_of, shot_layer
 from napari_shadowinv._system.progress import ShouldStop
@@ -25,7 +29,7 @@ if TYPE_CHECKING:
 
     import napari
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Radiograph
+    from napari_shadowinv.preprocessing import Radiograph, Step
 
 
 @dataclass(frozen=True)
@@ -65,8 +69,7 @@ def refine(
     job = refinement(layer, layer, name, psf=0.0)
     if viewer is None or not viewer_sync.in_event_loop():
         return list(job.work(lambda _: None, lambda: False).layer_data)
-    _, tool = viewer.window.add_plugin_dock_widget("napari-shadowinv", "Invert shot")
-    tool.refine_layer(layer)
+    open_widget(viewer, "Invert shot").refine_layer(layer)
     return []
 
 
@@ -94,6 +97,94 @@ def estimate_source(
 ) -> list[napari.types.LayerDataTuple]:
     """Estimate the undisturbed beam as the image of least total variation near the selected one."""
     return _start(_select_image(layer, viewer), _estimate_beam, "Estimating the source of", viewer)
+
+
+@viewer_sync.notify_errors(otherwise=list)
+def crop(
+    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
+) -> list[napari.types.LayerDataTuple]:
+    """Cut the selected image to the rectangle of the topmost shapes, or begin to draw one."""
+    from napari.utils.notifications import show_info
+
+    from napari_shadowinv._napari.widgets._layers import crop_of, image_of, new_shapes
+
+    shown = [] if viewer is None else [each for each in viewer.layers if each.visible]
+    shapes = [each for each in shown if each.__class__.__name__ == "Shapes" and len(each.data)]
+    if layer in shapes:
+        shapes = [layer]
+        layer = next((each for each in reversed(shown) if _is_image(each)), None)
+    selection = _select_image(layer, viewer, about.may_be_source)
+    image_of(layer)
+    region = crop_of(shapes[-1], layer) if shapes else None
+    if region is None:
+        if viewer is None or not viewer_sync.in_event_loop():
+            raise InputError("there is no rectangle to crop to: draw one in a shapes layer")
+        new_shapes(viewer, layer, "crop", "add_rectangle")
+        show_info(f"Draw a rectangle on '{selection.name}', then choose this again")
+        return []
+    from napari_shadowinv.preprocessing import Crop
+
+    rows, columns = region
+    size = f"{columns.stop - columns.start} × {rows.stop - rows.start} px"
+    step = Crop(y=(rows.start, rows.stop), x=(columns.start, columns.stop))
+    return [_moved_layer(selection, layer, step, f"cropped to {size}")]
+
+
+@viewer_sync.notify_errors(otherwise=list)
+def bin_pixels(
+    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
+) -> list[napari.types.LayerDataTuple]:
+    """Sum blocks of 2 × 2 pixels of the selected image."""
+    from napari_shadowinv.preprocessing import Bin
+
+    selection = _select_image(layer, viewer, about.may_be_source)
+    return [_moved_layer(selection, layer, Bin(factor=2), "binned 2 × 2")]
+
+
+@viewer_sync.notify_errors(otherwise=list)
+def align_source(
+    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
+) -> list[napari.types.LayerDataTuple]:
+    """Shift a source so that its borders fit those of the selected image."""
+    selection = _select_image(layer, viewer)
+    source, name = _source_for(selection, layer, viewer)
+    from napari_shadowinv.preprocessing import align_source as fit_source
+
+    def align(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
+        aligned = fit_source(selection.image, source, about.usable_of(layer))
+        (y, x), (y_error, x_error) = aligned.shift, aligned.error
+        shift = f"y {y:+.2f} ± {y_error:.2f}, x {x:+.2f} ± {x_error:.2f} px"
+        made_from = {"image": selection.name, "source": f"{name}, moved by {shift}"}
+        moved = replace(selection, name=name, role=about.SOURCE)
+        return [_filtered_layer(moved, aligned.source, f"moved by {shift}", made_from=made_from)]
+
+    return _start(selection, align, "Aligning the source with", viewer)
+
+
+def _source_for(selection: _Selection, layer: Any, viewer: Any) -> tuple[FloatArray, str]:
+    """Return the source of an image and its name: selected with it, supplied, or the only one."""
+    layers = [] if viewer is None else [each for each in viewer.layers if each is not layer]
+    fitting = [
+        each
+        for each in layers
+        if _is_image(each) and each.ndim == 2 and tuple(each.data.shape) == selection.image.shape
+    ]
+    selected = [each for each in fitting if each in viewer.layers.selection]
+    sources = [each for each in fitting if about.role_of(each) == about.SOURCE]
+    for candidates in (selected, sources):
+        if len(candidates) == 1:
+            return np.asarray(candidates[0].data, dtype=np.float64), candidates[0].name
+    supplied = about.source_of(layer)
+    if supplied is None:
+        raise InputError(
+            f"no source for '{selection.name}' is selected: select its source, too (Ctrl+click), "
+            "an image of the same size"
+        )
+    return supplied, f"{selection.name} source"
+
+
+def _is_image(layer: Any) -> bool:
+    return layer.__class__.__name__ == "Image" and not layer.rgb
 
 
 def _select_image(
@@ -208,6 +299,31 @@ def _estimate_beam(selection: _Selection, should_stop: ShouldStop) -> list[resul
     selection = replace(selection, role=about.SOURCE)
     title = "source by total variation"
     return [_filtered_layer(selection, source, title, made_from=made_from)]
+
+
+def _moved_layer(
+    selection: _Selection, layer: Any, step: Step, title: str
+) -> results.FullLayerData:
+    """Return an image after a step that moves pixels, with its source and usable pixels."""
+    shot = replace(
+        selection.shot,
+        setup=selection.setup,
+        source=about.source_of(layer),
+        mask=about.usable_of(layer),
+    )
+    moved = step.apply(shot)
+    frame = selection.frame.beneath(step.matrix(shot.shape))
+    return shot_layer(
+        moved.image,
+        f"{selection.name} {title}",
+        moved.setup,
+        intensity_limits(moved.image),
+        selection.role,
+        frame=frame,
+        setup_origin=selection.setup_origin or None,
+        source=moved.source,
+        usable=moved.mask,
+    )
 
 
 def _filtered_layer(

@@ -88,7 +88,7 @@ class PathEdit(QtWidgets.QWidget):
         self.edit = QtWidgets.QLineEdit()
         self.edit.setPlaceholderText(example)
         self.edit.setMinimumWidth(60)
-        side_by_side((with_button(self.edit, "…", title, self._choose), 0), holder=self)
+        side_by_side((with_button(self.edit, "…", title, self.choose), 0), holder=self)
         self.edit.editingFinished.connect(self.changed)
 
     @property
@@ -100,7 +100,8 @@ class PathEdit(QtWidgets.QWidget):
         path, _ = QtWidgets.QFileDialog.getOpenFileName(self, self._title, "", self._files)
         return str(path)
 
-    def _choose(self) -> None:
+    def choose(self) -> None:
+        """Ask for the path."""
         path = self.ask()
         if path:
             self.edit.setText(path)

@@ -339,6 +339,20 @@ class ProductForm(QtWidgets.QWidget):
         return shape_fields(shapes.shape_type[index], to_pixels(world))
 
     @qt.notify_errors
+    def choose(self, layer: Any) -> None:
+        """Select the result that a layer belongs to, or raise an `InputError`."""
+        result = None if layer is None else result_of(layer) or _store_of(layer)
+        of_result = [
+            each
+            for each in self.result.offered
+            if result is not None and result in (result_of(each), _store_of(each))
+        ]
+        if not of_result:
+            raise InputError(
+                "no result is selected: select a layer of an inversion, a fit or a store of shots"
+            )
+        self.result.layer = layer if layer in of_result else of_result[-1]
+
     def _run_or_cancel(self) -> None:
         if self.panel.runner.running:
             self.panel.cancel()

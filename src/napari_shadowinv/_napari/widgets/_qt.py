@@ -158,9 +158,10 @@ class Docked(QWidget):
         super().hideEvent(event)
         dock = self._dock
         if dock is not None and dock.isHidden() and not self._in_front:
-            QTimer.singleShot(0, self._come_to_front)
+            QTimer.singleShot(0, self.come_to_front)
 
-    def _come_to_front(self) -> None:
+    def come_to_front(self) -> None:
+        """Show the dock in front of the others, also after it was closed."""
         if self._dock is not None and self._dock.parent().isVisible():
             self._in_front = True
             self._dock.show()

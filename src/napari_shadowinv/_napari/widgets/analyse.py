@@ -151,6 +151,24 @@ class Analyse(qt.Docked):
             if listed is layer:
                 item.setCheckState(Qt.CheckState.Checked if on else Qt.CheckState.Unchecked)
 
+    @qt.notify_errors
+    def plot_layer(self, layer: Any) -> None:
+        """Plot only one layer; without a line yet, begin to draw it."""
+        if not any(layer is listed for _, listed in self._items()):
+            raise InputError("no image is selected: select a grey image in the layer list")
+        self.tabs.setCurrentIndex(0)
+        for checked in self.checked():
+            self.check(checked, on=checked is layer)
+        self.check(layer)
+        if self.lines.layer is None:
+            self._draw()
+
+    @qt.notify_errors
+    def measure_layer(self, layer: Any) -> None:
+        """Show the form for products of the result that a layer belongs to."""
+        self.tabs.setCurrentWidget(self.products)
+        self.products.choose(layer)
+
     def update_plot(self) -> None:
         vertices = self._vertices()
         layers = self.checked()

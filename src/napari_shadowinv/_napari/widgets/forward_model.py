@@ -23,7 +23,7 @@ from napari_shadowinv._napari.widgets._grid_files import GRID, GRID_KIND, GridFi
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, shown_plane
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
-from napari_shadowinv._napari.widgets._qt import side_by_side
+from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -324,6 +324,18 @@ class ForwardModel(ToolPanel):
         self.restore_last()
         self._ready = True
         self._on_change()
+
+    @notify_errors
+    def start_from(self, layer: Any) -> None:
+        """Select a field or potential, whose image is to be predicted."""
+        if layer is None or not any(layer is offered for offered in self.potential.offered):
+            name = "no layer" if layer is None else f"layer '{layer.name}'"
+            raise InputError(
+                f"{name} is selected: select the field or the potential of a result, or an image "
+                "of a potential"
+            )
+        self.object.set_kind(_LAYER)
+        self.potential.layer = layer
 
     def state(self) -> dict[str, Any]:
         return {

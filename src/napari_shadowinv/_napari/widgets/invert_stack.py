@@ -297,6 +297,11 @@ class InvertStack(InversionInputs, ToolPanel):
     def parts(self) -> dict[str, Any]:
         return {**super().parts(), "engine": self.engine}
 
+    def choose_folder(self) -> None:
+        """Take the shots from a watched folder, and ask which."""
+        self.shots.picker.set_kind(_FOLDER)
+        self.shots.folder.folder.choose()
+
     def request(self) -> StackRequest:
         layer = self.shots.layer
         recipe = self.recipe()

@@ -1,0 +1,81 @@
+"""The setup of an image, stored with its layer: `ImageSetup`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.widgets import _forms as forms
+from napari_shadowinv._napari.widgets import _qt as qt
+from napari_shadowinv._napari.widgets._inputs import SetupPicker
+from napari_shadowinv._napari.widgets._layers import LayerPicker
+from napari_shadowinv._napari.widgets._results import place_together
+from napari_shadowinv.errors import InputError
+
+if TYPE_CHECKING:
+    import napari
+
+
+class ImageSetup(qt.Docked):
+    """Choose an image, enter its setup, and press Apply: all widgets then use the setup."""
+
+    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+        super().__init__()
+        self.viewer = viewer
+        self.image = LayerPicker(
+            viewer,
+            ("image",),
+            "Layer of an image, or of a stack of shots with a common setup.",
+            suits=lambda layer: not about.belongs_to_result(layer),
+        )
+        self.setup = SetupPicker()
+        self.status = forms.wrapping_label()
+        self.apply_button = qt.push_button(
+            "Apply", "Store the setup with the image, and show the image at its scale.", self.apply
+        )
+        self._keeper = qt.StateKeeper(self, "image-setup", self.setup.state)
+        rows = (forms.labelled("Image", self.image), self.setup, self.apply_button, self.status)
+        qt.column(self, *rows, margin=6).addStretch(1)
+        self.setup.restore(self._keeper.load())
+        self.image.picked.connect(self._follow)
+        self.setup.changed.connect(self._keeper.changed)
+        self._follow()
+
+    @qt.notify_errors
+    def choose(self, layer: Any) -> None:
+        """Show the setup of a layer, or raise an `InputError` if it can have none."""
+        if not any(layer is offered for offered in self.image.offered):
+            raise InputError(
+                f"layer '{layer.name}' is no image, or part of a result, which has its setup "
+                "already: select an image"
+                if layer is not None
+                else "no layer is selected: select an image in the layer list"
+            )
+        self.image.layer = layer
+
+    @qt.notify_errors
+    def apply(self) -> None:
+        """Store the setup with the image, and place the image and those of its size."""
+        layer: Any = self.image.layer
+        if layer is None:
+            raise InputError("there is no image: open one (File → Open), or a sample")
+        setup = self.setup.setup()
+        about.store_setup(layer, setup, self.setup.origin)
+        if setup is None:
+            self._say(f"'{layer.name}' has no setup now")
+            return
+        place_together(self.viewer, layer, setup, ())
+        self._say(f"'{layer.name}' has this setup now")
+
+    def show_problem(self, text: str) -> None:
+        """Show a problem until another image is chosen."""
+        self._say(text, forms.PROBLEM_STYLE)
+
+    def _say(self, text: str, style: str = "") -> None:
+        self.status.setText(text)
+        self.status.setStyleSheet(style)
+        self.status.setVisible(bool(text))
+
+    def _follow(self) -> None:
+        self._say("")
+        self.setup.follow(self.image.layer, store=False)

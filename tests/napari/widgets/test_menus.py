@@ -1,0 +1,187 @@
+"""Entries of napari's menus that open a widget, and its preferences."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from napari_shadowinv import ProtonSetup
+from napari_shadowinv._napari.layer_metadata import role_of, setup_of, setup_origin_of
+from napari_shadowinv._napari.layers import add_layers, inversion_layers
+from napari_shadowinv._napari.preferences import preference
+from napari_shadowinv._napari.widgets.analyse import Analyse
+from napari_shadowinv._napari.widgets.forward_model import ForwardModel
+from napari_shadowinv._napari.widgets.image_setup import ImageSetup
+from napari_shadowinv._napari.widgets.invert_stack import InvertStack
+from napari_shadowinv._system.machine import available_threads, set_default_threads
+from napari_shadowinv.inversion import Inversion
+
+PATIENCE = 60_000  # ms
+
+
+@pytest.fixture
+def choose(window: Any, in_loop: Any) -> Any:
+    """Choose an entry of a menu."""
+    from napari._app_model import get_app_model
+
+    def execute(name: str) -> None:
+        in_loop(get_app_model().commands.execute_command, f"napari-shadowinv.{name}")
+
+    return execute
+
+
+def add_some(window: Any, inversion: Inversion, *roles: str) -> list[Any]:
+    """Add the layers of a result with these roles, in their order."""
+    described = {role_of(each[1]): each for each in inversion_layers(inversion)}
+    return add_layers(window, [described[role] for role in roles])
+
+
+def docked(window: Any, kind: type) -> Any:
+    """The only widget of a class in the window."""
+    (widget,) = [each for each in window.window.dock_widgets.values() if isinstance(each, kind)]
+    return widget
+
+
+def test_the_selected_image_is_plotted_along_a_line(
+    window: Any, choose: Any, messages: list[str]
+) -> None:
+    choose("plot_along_line")
+    assert messages == ["No image is selected: select a grey image in the layer list"]
+    window.add_image(np.ones((20, 30)), name="other")
+    image = window.add_image(np.ones((20, 30)), name="shot")
+    choose("plot_along_line")
+    analyse = docked(window, Analyse)
+    assert analyse.tabs.currentIndex() == 0
+    assert analyse.checked() == [image]
+    assert analyse.lines.layer.name == "shot profile"
+    assert analyse.lines.layer.mode == "add_line"
+
+
+def test_products_are_measured_of_the_selected_result(
+    window: Any, choose: Any, solved: Inversion, messages: list[str]
+) -> None:
+    field, arrows = add_some(window, solved, "field", "arrows")
+    add_some(window, solved, "field")
+    window.layers.selection.active = arrows
+    choose("measure_products")
+    analyse = docked(window, Analyse)
+    assert analyse.tabs.currentWidget() is analyse.products
+    assert analyse.products.result.layer is field
+    assert not messages
+    window.layers.selection.active = window.add_image(np.ones((20, 30)))
+    choose("measure_products")
+    assert messages[-1].startswith("No result is selected: select a layer of an inversion")
+
+
+def test_an_image_is_predicted_from_the_selected_potential(
+    window: Any, choose: Any, solved: Inversion, messages: list[str]
+) -> None:
+    potential, arrows = add_some(window, solved, "potential", "arrows")
+    window.layers.selection.active = potential
+    choose("predict_image")
+    forward = docked(window, ForwardModel)
+    assert forward.object.kind == "layer"
+    assert forward.potential.layer is potential
+    window.layers.selection.active = arrows
+    choose("predict_image")
+    assert "is selected: select the field or the potential of a result" in messages[-1]
+    assert forward.potential.layer is potential
+
+
+def test_a_folder_is_chosen_and_watched(
+    window: Any, choose: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "napari_shadowinv._napari.widgets._stack_jobs._FolderEdit.ask", lambda _: str(tmp_path)
+    )
+    choose("watch_folder")
+    stack = docked(window, InvertStack)
+    assert stack.shots.is_watched
+    assert stack.shots.folder.path == tmp_path
+
+
+def test_a_setup_is_stored_with_its_image(
+    window: Any, choose: Any, proton_setup: ProtonSetup, solved: Inversion, messages: list[str]
+) -> None:
+    stack = window.add_image(np.ones((3, 20, 30)), name="shots")
+    mask = window.add_labels(np.zeros((20, 30), int))
+    window.layers.selection.active = stack
+    choose("edit_setup")
+    widget = docked(window, ImageSetup)
+    widget.setup.picker.set_kind("proton")
+    widget.apply_button.click()
+    assert "'Kinetic energy (MeV)' is missing" in messages[-1]
+    assert widget.status.text() == messages[-1]
+    widget.setup.picker.form.set_values(proton_setup.model_dump())
+    assert setup_of(stack) is None  # not before Apply
+    widget.apply_button.click()
+    assert setup_of(stack) == proton_setup
+    assert setup_origin_of(stack) == "typed for 'shots'"
+    np.testing.assert_allclose(stack.scale, (1, 1.5, 1.5))
+    np.testing.assert_allclose(mask.scale, (1.5, 1.5))
+    # The same widget shows another image, whose setup is none, and refuses a result.
+    image = window.add_image(np.ones((20, 30)), name="other")
+    choose("edit_setup")
+    assert docked(window, ImageSetup) is widget
+    assert widget.image.layer is image
+    assert widget.setup.setup() is None
+    (window.layers.selection.active,) = add_some(window, solved, "field")
+    choose("edit_setup")
+    assert "is no image, or part of a result" in messages[-1]
+
+
+def test_an_open_widget_is_not_opened_twice(window: Any, choose: Any, qtbot: Any) -> None:
+    window.add_image(np.ones((20, 30)))
+    choose("analyse")  # in the menu Plugins
+    analyse = docked(window, Analyse)
+    qtbot.waitUntil(analyse.isVisible, timeout=PATIENCE)
+    dock = analyse.parent()
+    dock.hide()
+    choose("plot_along_line")
+    assert docked(window, Analyse) is analyse
+    assert analyse.isVisible()
+
+
+def test_the_dialog_of_napari_shows_and_keeps_the_preferences(
+    window: Any, qtbot: Any, preferences: Any
+) -> None:
+    from napari._qt.dialogs.preferences_dialog import PreferencesDialog
+
+    dialog = PreferencesDialog(window.window._qt_window)
+    qtbot.addWidget(dialog)
+    pages = {dialog._list.item(row).text(): row for row in range(dialog._list.count())}
+    dialog._list.setCurrentRow(pages["Shadowgrams and proton radiographs"])
+    page = dialog._stack.currentWidget()
+    choices = [
+        box
+        for box in page.findChildren(type_of("QComboBox"))
+        if box.findText("cm") >= 0 and box.findText("mm") >= 0
+    ]
+    (lengths,) = choices
+    lengths.setCurrentIndex(lengths.findText("mm"))
+    assert preference("units", "length") == "mm"
+    dialog.reject()
+    assert preference("units", "length") == "automatic"
+
+
+def type_of(name: str) -> Any:
+    from qtpy import QtWidgets
+
+    return getattr(QtWidgets, name)
+
+
+def test_runs_have_the_preferred_number_of_threads(
+    open_widget: Any, qtbot: Any, preferences: Any
+) -> None:
+    preferences.widgets.threads = 7
+    seen: list[int] = []
+    try:
+        runner = open_widget("Invert shot").panel.runner
+        runner.start(lambda on_progress, should_stop: seen.append(available_threads(None)))
+        qtbot.waitUntil(lambda: not runner.running, timeout=PATIENCE)
+    finally:
+        set_default_threads(None)
+    assert seen == [7]
