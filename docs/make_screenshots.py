@@ -20,11 +20,14 @@ from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
+import napari.settings
 import numpy as np
 from make_film_pictures import pack_of_page
+from napari._qt.dialogs.preferences_dialog import PreferencesDialog
 from napari._qt.dialogs.qt_notification import NapariQtNotification
 from PIL import Image
-from qtpy.QtCore import QSettings
+from qtpy.QtCore import QPoint, QSettings
+from qtpy.QtGui import QImage
 from qtpy.QtWidgets import QApplication
 
 import napari
@@ -40,6 +43,8 @@ PLUGIN = "napari-shadowinv"
 LARGEST_FILE = 300_000  # bytes
 FRAMES, SHOWN = 6, 2
 ABOVE, BELOW = 190, 50  # px of the canvas that colour bar and scale bar take
+MENU_X, MENU_Y = 90, 24  # px, of the menu *Layers* in the menu bar
+MENU_PICTURE = (900, 400)  # px, upper left part of the window
 NIGHT_ARROWS = 7.0  # their length, as the tutorial tells to type
 # What the tutorial tells to type.
 PROTON_FIELDS = {
@@ -328,10 +333,64 @@ def two_energies_window() -> None:
     photograph(viewer, "tutorial-two-energies.png")
 
 
+def photograph_menus(viewer: napari.Viewer, name: str, *titles: str) -> None:
+    """Save the upper left of the window with the entries of some submenus of *Layers* unfolded."""
+    window = viewer.window._qt_window
+    window.move(0, 0)
+    settle()
+    pictures = []
+    for title in titles:
+        menu = viewer.window.layers_menu
+        menu.popup(viewer.window.main_menu.mapToGlobal(QPoint(MENU_X, MENU_Y)))
+        settle()
+        (entry,) = [each for each in menu.actions() if each.text().replace("&", "") == title]
+        menu.setActiveAction(entry)
+        entry.menu().popup(menu.mapToGlobal(menu.actionGeometry(entry).topRight()))
+        settle()
+        image = QApplication.primaryScreen().grabWindow(0, 0, 0, *MENU_PICTURE).toImage()
+        pixels = image.convertToFormat(QImage.Format.Format_RGB888)
+        stride, height = pixels.bytesPerLine(), pixels.height()
+        rows = np.frombuffer(pixels.constBits().asarray(stride * height), np.uint8)
+        pictures.append(rows.reshape(height, stride)[:, : 3 * pixels.width()])
+        entry.menu().close()
+        menu.close()
+    stack = np.concatenate(pictures).reshape(-1, MENU_PICTURE[0], 3)
+    Image.fromarray(stack).quantize(256).save(HERE / name, optimize=True)
+    print(f"wrote {HERE / name} {stack.shape[1]}×{stack.shape[0]}")
+
+
+def menus_window() -> None:
+    """The menus with entries of the plugin, and the setup of an image."""
+    viewer = new_window("menus", height=560)
+    viewer.open_sample(PLUGIN, "toroid")
+    settle()
+    photograph_menus(viewer, "napari-menus.png", "Measure", "Transform")
+    viewer.close()
+
+
+def preferences_window() -> None:
+    """The plugin's page of napari's preferences."""
+    viewer = new_window("preferences")
+    dialog = PreferencesDialog(viewer.window._qt_window)
+    rows = [dialog._list.item(row).text() for row in range(dialog._list.count())]
+    dialog._list.setCurrentRow(rows.index("Shadowgrams and proton radiographs"))
+    dialog.resize(1065, 620)
+    dialog.show()
+    settle(2.0)
+    path = HERE / "napari-preferences.png"
+    dialog.grab().save(str(path))
+    Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)
+    print(f"wrote {path}")
+    dialog.close()
+    viewer.close()
+
+
 def make_as_new_user(make: Callable[[], None]) -> None:
     """Make pictures with widgets that remember nothing, and change no settings of one's own."""
     with tempfile.TemporaryDirectory() as settings:
         QSettings.setPath(QSettings.Format.IniFormat, QSettings.Scope.UserScope, settings)
+        napari.settings._clear_plugin_settings_cache()
+        napari.settings._CFG_PATH = f"{settings}/settings.yaml"
         make()
 
 
@@ -372,6 +431,8 @@ WINDOWS = {
     "fit": fit_window,
     "film": film_window,
     "two-energies": two_energies_window,
+    "menus": menus_window,
+    "preferences": preferences_window,
 }
 
 if __name__ == "__main__":
