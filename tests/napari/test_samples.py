@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from napari.components import ViewerModel
 from napari_shadowinv import OpticalSetup, ProtonSetup, read
 from napari_shadowinv._napari import samples
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of, source_of
+from napari_shadowinv.io import public_images
 
 SHOTS = ("toroid", "toroid_with_caustics", "four_toroids", "coaxial_line")
 
@@ -75,6 +77,28 @@ def test_the_run_is_lazy_and_changes_with_time() -> None:
     assert contrast[1] > 1.5 * contrast[0]
     low, high = keywords["contrast_limits"]
     assert low < planes.mean() < high
+
+
+def test_without_a_network_the_menu_says_so_once(
+    make_napari_viewer: Any,
+    in_loop: Any,
+    messages: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from napari._app_model import get_app_model
+
+    name = next(name for name in public_images.PUBLIC_FILES if name.startswith("burner/"))
+    file = replace(public_images.PUBLIC_FILES[name], address=f"http://127.0.0.1:9/{name}")
+    monkeypatch.setitem(public_images.PUBLIC_FILES, name, file)
+    monkeypatch.setattr(public_images, "cache_folder", lambda: tmp_path)
+    window = make_napari_viewer()
+    in_loop(lambda: get_app_model().commands.execute_command("napari-shadowinv.burner").result())
+    (message,) = messages
+    start = f"{Path(name).name} could not be downloaded (no connection): connect to the network, or"
+    assert message.startswith(start)
+    assert "\n" not in message
+    assert not window.layers
 
 
 def test_the_burner_comes_with_its_reference(

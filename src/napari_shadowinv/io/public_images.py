@@ -99,8 +99,8 @@ def fetch_public_file(name: str, *, cache: Path | None = None) -> Path:
         elif (response := getattr(error, "response", None)) is not None:
             reason = f"the server answered {response.status_code}"
         raise OSError(
-            f"{file.address} could not be downloaded ({reason}): connect to the network, or put "
-            f"the file into {path.parent}"
+            f"{path.name} could not be downloaded ({reason}): connect to the network, or save "
+            f"{file.address} in {path.parent}"
         ) from error
     return path
 
