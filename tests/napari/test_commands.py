@@ -159,6 +159,9 @@ def test_a_crop_keeps_place_setup_source_and_mask(
 ) -> None:
     layer = placed_shot(viewer, shot, proton_setup)
     rectangle = outline(viewer, layer, 5, 14)
+    if selected == "rectangle":
+        rectangle.name = "shot crop"  # drawn for it, whatever lies above
+        viewer.add_image(np.ones((50, 50)), name="other")
     ((data, keywords, _),) = commands.crop(
         {"image": layer, "rectangle": rectangle}[selected], viewer
     )
@@ -199,6 +202,10 @@ def test_a_source_is_moved_to_fit_its_image(viewer: ViewerModel) -> None:
     assert role_of(keywords) == "source"
     assert keywords["name"].startswith("beam moved by y +2.")
     np.testing.assert_array_equal(data, align_source(image, source).source)
+    # What is in place stays there.
+    viewer.layers.selection = {layer, viewer.add_image(data, name="moved")}
+    with pytest.raises(InputError, match=r"'moved' need not be moved: its shift is y [+-]0\.0"):
+        commands.align_source(layer, viewer)
     # Nothing need be selected where only one source fits.
     beam.metadata[KEY] = {"role": "source"}
     viewer.layers.selection = {layer}
@@ -220,6 +227,23 @@ def test_from_the_menu_the_selected_layer_is_filtered_beside_the_window(
     in_loop(registered("remove_hot_pixels"))
     qtbot.waitUntil(lambda: len(window.layers) == 2, timeout=30_000)
     assert window.layers[-1].data[10, 20] < 700
+
+
+def test_from_the_menu_the_selected_image_is_not_its_own_source(
+    make_napari_viewer: Any, in_loop: Any, qtbot: Any
+) -> None:
+    window = make_napari_viewer()
+    image, source = shifted_pair((2.3, -1.6))
+    beam = window.add_image(source, name="beam", metadata={KEY: {"role": "source"}})
+    add_shot(window, image)
+    in_loop(registered("align_source"))
+    qtbot.waitUntil(lambda: len(window.layers) == 3, timeout=30_000)
+    moved = window.layers[-1]
+    assert moved.name.startswith("beam moved by y +2.")
+    in_loop(registered("bin_pixels"))
+    assert len(window.layers) == 4
+    np.testing.assert_allclose(window.layers[-1].data[0, 0], moved.data[:2, :2].sum())
+    assert beam in window.layers
 
 
 def test_from_the_menu_an_inversion_brings_its_layers_and_the_scale_bar(

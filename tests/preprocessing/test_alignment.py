@@ -16,6 +16,7 @@ def test_the_shift_is_right_within_its_error(shift):
     aligned = align_source(image, source)
     assert aligned.error.max() < 0.1
     assert (np.abs(aligned.shift - shift) < 3 * aligned.error).all()
+    assert aligned.is_significant == any(shift)
     assert ReferencePair(image, aligned.source, np.ones(image.shape, bool)).shift is None
 
 

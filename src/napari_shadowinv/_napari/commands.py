@@ -14,6 +14,7 @@ import numpy as np
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari import layers as results
 from napari_shadowinv._napari import viewer_sync
+from napari_shadowinv._napari.events import without_proxy
 from napari_shadowinv._napari.layer_metadata import Frame, frame_of, main_layers
 from napari_shadowinv._napari.open_widgets import open_widget
 from napari_shadowinv._napari.preferences import use_preferred_threads
@@ -108,11 +109,13 @@ def crop(
 
     from napari_shadowinv._napari.widgets._layers import crop_of, image_of, new_shapes
 
+    layer, viewer = without_proxy(layer), without_proxy(viewer)
     shown = [] if viewer is None else [each for each in viewer.layers if each.visible]
     shapes = [each for each in shown if each.__class__.__name__ == "Shapes" and len(each.data)]
     if layer in shapes:
-        shapes = [layer]
-        layer = next((each for each in reversed(shown) if _is_image(each)), None)
+        shapes, images = [layer], [each for each in shown if _is_image(each)]
+        drawn_for = [each for each in images if layer.name == f"{each.name} crop"]
+        layer = next(reversed(drawn_for or images), None)
     selection = _select_image(layer, viewer, about.may_be_source)
     image_of(layer)
     region = crop_of(shapes[-1], layer) if shapes else None
@@ -146,6 +149,7 @@ def align_source(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
     """Shift a source so that its borders fit those of the selected image."""
+    layer, viewer = without_proxy(layer), without_proxy(viewer)
     selection = _select_image(layer, viewer)
     source, name = _source_for(selection, layer, viewer)
     from napari_shadowinv.preprocessing import align_source as fit_source
@@ -154,6 +158,8 @@ def align_source(
         aligned = fit_source(selection.image, source, about.usable_of(layer))
         (y, x), (y_error, x_error) = aligned.shift, aligned.error
         shift = f"y {y:+.2f} ± {y_error:.2f}, x {x:+.2f} ± {x_error:.2f} px"
+        if not aligned.is_significant:
+            raise InputError(f"'{name}' need not be moved: its shift is {shift}")
         made_from = {"image": selection.name, "source": f"{name}, moved by {shift}"}
         moved = replace(selection, name=name, role=about.SOURCE)
         return [_filtered_layer(moved, aligned.source, f"moved by {shift}", made_from=made_from)]

@@ -22,6 +22,8 @@ _MAX_STEPS = 30
 _STEP_TOLERANCE_PX = 1e-3
 _OUTLIER_DEVIATIONS = 3.0  # an object may reach the border
 _MAX_ERROR_PX = 0.5
+_SIGNIFICANT_ERRORS = 2.0
+_MIN_SHIFT_PX = 0.05  # interpolation would change more than it mends
 
 
 class AlignedSource(NamedTuple):
@@ -40,6 +42,12 @@ class AlignedSource(NamedTuple):
     source: FloatArray
     shift: FloatArray
     error: FloatArray
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the shift along an axis is above twice its error, and above 0.05 px."""
+        limits = np.maximum(_SIGNIFICANT_ERRORS * self.error, _MIN_SHIFT_PX)
+        return bool((np.abs(self.shift) > limits).any())
 
 
 def align_source(
