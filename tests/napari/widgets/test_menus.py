@@ -104,7 +104,12 @@ def test_a_folder_is_chosen_and_watched(
 
 
 def test_a_setup_is_stored_with_its_image(
-    window: Any, choose: Any, proton_setup: ProtonSetup, solved: Inversion, messages: list[str]
+    window: Any,
+    choose: Any,
+    proton_setup: ProtonSetup,
+    solved: Inversion,
+    messages: list[str],
+    assert_it_fits: Any,
 ) -> None:
     stack = window.add_image(np.ones((3, 20, 30)), name="shots")
     mask = window.add_labels(np.zeros((20, 30), int))
@@ -116,6 +121,7 @@ def test_a_setup_is_stored_with_its_image(
     assert "'Kinetic energy (MeV)' is missing" in messages[-1]
     assert widget.status.text() == messages[-1]
     widget.setup.picker.form.set_values(proton_setup.model_dump())
+    assert_it_fits(widget)
     assert setup_of(stack) is None  # not before Apply
     widget.apply_button.click()
     assert setup_of(stack) == proton_setup

@@ -480,15 +480,7 @@ class ToolPanel(qt.Docked):
         self.viewer, self.panel = viewer, panel
         self._ready = False
         self._running_preview = False
-        content = QtWidgets.QWidget()
-        self.column = qt.column(content, margin=6)
-        self.column.setAlignment(Qt.AlignmentFlag.AlignTop)
-        self.area = QtWidgets.QScrollArea()
-        self.area.setWidgetResizable(True)
-        self.area.setFrameShape(QtWidgets.QFrame.Shape.NoFrame)
-        self.area.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        self.area.setWidget(content)
-        qt.column(self, self.area)
+        self.area, self.column = qt.scrolling_column(self)
         self._keeper = qt.StateKeeper(self, name, self.state)
         self._revealed: QtWidgets.QWidget | None = None
         self._revealing = qt.timer(self, _SETTLE_MS, self._reveal, once=True)

@@ -12,9 +12,11 @@ import numpy as np
 from qtpy.QtCore import QObject, QSettings, QSize, Qt, QTimer
 from qtpy.QtWidgets import (
     QDockWidget,
+    QFrame,
     QHBoxLayout,
     QMainWindow,
     QPushButton,
+    QScrollArea,
     QSizePolicy,
     QToolButton,
     QVBoxLayout,
@@ -45,6 +47,19 @@ def column(holder: QWidget, *widgets: QWidget, margin: int = 0) -> QVBoxLayout:
     for widget in widgets:
         layout.addWidget(widget)
     return layout
+
+
+def scrolling_column(holder: QWidget) -> tuple[QScrollArea, QVBoxLayout]:
+    """Fill a widget with a column that scrolls vertically; return its area and its layout."""
+    content, area = QWidget(), QScrollArea()
+    layout = column(content, margin=6)
+    layout.setAlignment(Qt.AlignmentFlag.AlignTop)
+    area.setWidgetResizable(True)
+    area.setFrameShape(QFrame.Shape.NoFrame)
+    area.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+    area.setWidget(content)
+    column(holder, area)
+    return area, layout
 
 
 def side_by_side(*widgets: tuple[QWidget, int], holder: QWidget | None = None) -> QWidget:

@@ -34,8 +34,14 @@ class ImageSetup(qt.Docked):
             "Apply", "Store the setup with the image, and show the image at its scale.", self.apply
         )
         self._keeper = qt.StateKeeper(self, "image-setup", self.setup.state)
-        rows = (forms.labelled("Image", self.image), self.setup, self.apply_button, self.status)
-        qt.column(self, *rows, margin=6).addStretch(1)
+        self.area, rows = qt.scrolling_column(self)
+        for row in (
+            forms.labelled("Image", self.image),
+            self.setup,
+            self.apply_button,
+            self.status,
+        ):
+            rows.addWidget(row)
         self.setup.restore(self._keeper.load())
         self.image.picked.connect(self._follow)
         self.setup.changed.connect(self._keeper.changed)
