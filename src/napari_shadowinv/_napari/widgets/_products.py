@@ -338,7 +338,6 @@ class ProductForm(QtWidgets.QWidget):
         world = np.array([shapes.data_to_world(c)[-2:] for c in shapes.data[index]])
         return shape_fields(shapes.shape_type[index], to_pixels(world))
 
-    @qt.notify_errors
     def choose(self, layer: Any) -> None:
         """Select the result that a layer belongs to, or raise an `InputError`."""
         result = None if layer is None else result_of(layer) or _store_of(layer)
@@ -353,6 +352,7 @@ class ProductForm(QtWidgets.QWidget):
             )
         self.result.layer = layer if layer in of_result else of_result[-1]
 
+    @qt.notify_errors
     def _run_or_cancel(self) -> None:
         if self.panel.runner.running:
             self.panel.cancel()
