@@ -152,7 +152,7 @@ def test_an_open_widget_is_not_opened_twice(window: Any, choose: Any, qtbot: Any
 
 
 def test_the_dialog_of_napari_shows_and_keeps_the_preferences(
-    window: Any, qtbot: Any, preferences: Any
+    preferences: Any, window: Any, qtbot: Any
 ) -> None:
     from napari._qt.dialogs.preferences_dialog import PreferencesDialog
 
@@ -180,7 +180,7 @@ def type_of(name: str) -> Any:
 
 
 def test_runs_have_the_preferred_number_of_threads(
-    open_widget: Any, qtbot: Any, preferences: Any
+    preferences: Any, open_widget: Any, qtbot: Any
 ) -> None:
     preferences.widgets.threads = 7
     seen: list[int] = []
