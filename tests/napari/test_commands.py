@@ -175,8 +175,10 @@ def test_a_crop_keeps_place_setup_source_and_mask(
 
 
 def test_without_a_rectangle_there_is_no_crop(viewer: ViewerModel, shot: np.ndarray) -> None:
+    layer = add_shot(viewer, shot)
+    viewer.add_shapes([[(3, 3), (20, 20)]], shape_type="line", name="profile")
     with pytest.raises(InputError, match="no rectangle to crop to: draw one in a shapes layer"):
-        commands.crop(add_shot(viewer, shot), viewer)
+        commands.crop(layer, viewer)
 
 
 def test_binned_pixels_are_larger_and_stay_in_place(

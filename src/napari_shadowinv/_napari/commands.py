@@ -111,7 +111,7 @@ def crop(
 
     layer, viewer = without_proxy(layer), without_proxy(viewer)
     shown = [] if viewer is None else [each for each in viewer.layers if each.visible]
-    shapes = [each for each in shown if each.__class__.__name__ == "Shapes" and len(each.data)]
+    shapes = [each for each in shown if _has_outline(each)]
     if layer in shapes:
         shapes, images = [layer], [each for each in shown if _is_image(each)]
         drawn_for = [each for each in images if layer.name == f"{each.name} crop"]
@@ -187,6 +187,12 @@ def _source_for(selection: _Selection, layer: Any, viewer: Any) -> tuple[FloatAr
             "an image of the same size"
         )
     return supplied, f"{selection.name} source"
+
+
+def _has_outline(layer: Any) -> bool:
+    """Whether a layer has shapes other than lines."""
+    is_of_shapes = layer.__class__.__name__ == "Shapes"
+    return is_of_shapes and not {"line", "path"}.issuperset(layer.shape_type)
 
 
 def _is_image(layer: Any) -> bool:
