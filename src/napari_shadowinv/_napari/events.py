@@ -76,8 +76,8 @@ def connect_layers(layers: Any, names: str | Sequence[str], callback: Callback) 
     undo.append(connect(layers, "inserted", watch))
 
     def disconnect() -> None:
-        for disconnect_one in undo:
-            disconnect_one()
+        for disconnect_signals in undo:
+            disconnect_signals()
 
     return disconnect
 
