@@ -145,10 +145,9 @@ def test_only_one_module_connects_to_events_of_napari():
     places = [
         f"{path.name}:{node.lineno}"
         for path, tree in TREES.items()
-        for node in ast.walk(tree)
         if module_of(path) != f"{PACKAGE}._napari.events"
-        and isinstance(node, ast.Attribute)
-        and node.attr == "events"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and node.attr == "events"
     ]
     assert not places, "use _napari/events.py"
 

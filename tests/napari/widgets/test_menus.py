@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from qtpy.QtCore import QObject
+from qtpy.QtWidgets import QComboBox
 
 from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of, setup_origin_of
 from napari_shadowinv._napari.layers import add_layers, inversion_layers
 from napari_shadowinv._napari.preferences import preference
+from napari_shadowinv._napari.widgets._panels import Runner
 from napari_shadowinv._napari.widgets.analyse import Analyse
 from napari_shadowinv._napari.widgets.forward_model import ForwardModel
 from napari_shadowinv._napari.widgets.image_setup import ImageSetup
@@ -92,13 +95,13 @@ def test_an_image_is_predicted_from_the_selected_potential(
 
 
 def test_a_folder_is_chosen_and_watched(
-    window: Any, choose: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    opened: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
         "napari_shadowinv._napari.widgets._stack_jobs._FolderEdit.ask", lambda _: str(tmp_path)
     )
-    choose("watch_folder")
-    stack = docked(window, InvertStack)
+    stack = opened(InvertStack)
+    stack.choose_folder()
     assert stack.shots.is_watched
     assert stack.shots.folder.path == tmp_path
 
@@ -109,7 +112,6 @@ def test_a_setup_is_stored_with_its_image(
     proton_setup: ProtonSetup,
     solved: Inversion,
     messages: list[str],
-    assert_it_fits: Any,
 ) -> None:
     stack = window.add_image(np.ones((3, 20, 30)), name="shots")
     mask = window.add_labels(np.zeros((20, 30), int))
@@ -121,7 +123,7 @@ def test_a_setup_is_stored_with_its_image(
     assert "'Kinetic energy (MeV)' is missing" in messages[-1]
     assert widget.status.text() == messages[-1]
     widget.setup.picker.form.set_values(proton_setup.model_dump())
-    assert_it_fits(widget)
+    assert widget.area.horizontalScrollBar().maximum() == 0
     assert setup_of(stack) is None  # not before Apply
     widget.apply_button.click()
     assert setup_of(stack) == proton_setup
@@ -163,7 +165,7 @@ def test_the_dialog_of_napari_shows_and_keeps_the_preferences(
     page = dialog._stack.currentWidget()
     choices = [
         box
-        for box in page.findChildren(type_of("QComboBox"))
+        for box in page.findChildren(QComboBox)
         if box.findText("cm") >= 0 and box.findText("mm") >= 0
     ]
     (lengths,) = choices
@@ -173,21 +175,14 @@ def test_the_dialog_of_napari_shows_and_keeps_the_preferences(
     assert preference("units", "length") == "automatic"
 
 
-def type_of(name: str) -> Any:
-    from qtpy import QtWidgets
-
-    return getattr(QtWidgets, name)
-
-
-def test_runs_have_the_preferred_number_of_threads(
-    preferences: Any, open_widget: Any, qtbot: Any
-) -> None:
+def test_runs_have_the_preferred_number_of_threads(preferences: Any, qtbot: Any) -> None:
     preferences.widgets.threads = 7
-    seen: list[int] = []
+    threads: list[int] = []
+    owner = QObject()
+    runner = Runner(owner)
     try:
-        runner = open_widget("Invert shot").panel.runner
-        runner.start(lambda on_progress, should_stop: seen.append(available_threads(None)))
+        runner.start(lambda on_progress, should_stop: threads.append(available_threads(None)))
         qtbot.waitUntil(lambda: not runner.running, timeout=PATIENCE)
     finally:
         set_default_threads(None)
-    assert seen == [7]
+    assert threads == [7]
