@@ -487,21 +487,26 @@ class Damage:
     noted: dict[int, dict[str, Any]] = field(default_factory=dict)
 
 
-def find_damage(layout: Layout, *, every_byte: bool = False) -> Damage:
+def find_damage(
+    layout: Layout, *, every_byte: bool = False, numbers: Collection[int] | None = None
+) -> Damage:
     """Look for files of a store that are lost, exchanged or damaged.
 
-    With `every_byte` all files are read, otherwise only reports and the checksums of chunks.
+    With `every_byte` all files are read, otherwise only reports and the checksums of chunks. With
+    `numbers` only the files of these shots are looked at.
     """
     names = layout.of_each_shot
     shots: dict[int, str] = {}
     noted: dict[int, dict[str, Any]] = {}
-    for index in range(layout.shots):
+    for index in range(layout.shots) if numbers is None else numbers:
         problem, report = _check_again(partial(_inspect_record, layout, index, names, every_byte))
         if problem:
             shots[index] = problem
         elif report:
             values = {**report, **report.get(LABELS, {})}
             noted[index] = {k: values[k] for k in layout.of_many_shots if k in values}
+    if numbers is not None:
+        return Damage(shots)
     keys = [*layout.keys_of_many, *layout.fixed]
     damaged = {key: text for key in keys if (text := _chunk_problem(layout, key, every_byte))}
     problems = [*damaged.values()]
