@@ -51,6 +51,7 @@ TASKS: dict[str, tuple[str, ...]] = {
     "Invert many shots": (
         "run_stack",
         "RunOptions",
+        "merge_stack",
         "watch_stack",
         "WatchOptions",
         "invert_stack",

@@ -18,7 +18,7 @@ from .pipeline import run
 from .pipeline.rerun import Rerun, rerun
 from .pipeline.run_options import RunOptions, WatchOptions
 from .preprocessing import Recipe
-from .stack import invert_stack, run_stack, stack_statistics, watch_stack
+from .stack import invert_stack, merge_stack, run_stack, stack_statistics, watch_stack
 
 __version__: str
 
@@ -54,6 +54,7 @@ __all__ = [
     "fit",
     "invert",
     "invert_stack",
+    "merge_stack",
     "plan_sites",
     "poisson_invert",
     "project",

@@ -120,8 +120,8 @@ def test_version_and_help() -> None:
 
 
 COMMANDS = (
-    "invert", "rerun", "fit", "film", "forward", "info", "demo", "batch", "watch", "status",
-    "export", "movie",
+    "invert", "rerun", "fit", "film", "forward", "info", "demo", "batch", "merge", "watch",
+    "status", "export", "movie",
 )  # fmt: skip
 
 

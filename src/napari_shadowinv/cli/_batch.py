@@ -1,6 +1,6 @@
 """Output of the commands for many shots.
 
-- progress and summary of `shadowinv batch`: `run_batch`
+- progress and summary of `shadowinv batch`: `run_batch`; of `shadowinv merge`: `run_merge`
 - a line for each shot of `shadowinv watch`, and a summary: `run_watch`
 - the tables of `shadowinv status`: `status_tables`
 """
@@ -38,7 +38,9 @@ from napari_shadowinv.io.store import (
     DAMAGED,
     DONE,
     FAILED,
+    SHARDS,
     STATUS_NAMES,
+    UNREAD,
     StackStore,
     check_store_path,
 )
@@ -88,7 +90,8 @@ def run_batch(
     """Invert all shots into a store, and print a summary."""
     from napari_shadowinv.stack import run_stack
 
-    _check_store(out, resume, run.overwrite)
+    if run.part is None:
+        _check_store(out, resume, run.overwrite)
     try:
         with _ProgressBar(quiet) as bar:
             run_stack(
@@ -102,20 +105,51 @@ def run_batch(
                 should_stop=is_interrupted,
             )
     except (KeyboardInterrupt, InversionCancelled):
-        counts = _counts_text(StackStore(out)) if out.exists() else "nothing written"
-        say_on_stderr(f"Cancelled: {counts}. Repeat the command with --resume to continue.")
+        counts = _counts_text(_store_of(run, out)) if out.exists() else "nothing written"
+        flag = " with --resume" if run.part is None else ""
+        say_on_stderr(f"Cancelled: {counts}. Repeat the command{flag} to continue.")
         raise typer.Exit(cancel_exit_code()) from None
-    store = StackStore(out)
+    store = _store_of(run, out)
     if not quiet:
-        say(_summary(store, bar.status))
+        say(two_columns("Batch", _summary_rows(store, *_run_rows(run, bar.status))))
     exit_unless_reliable(store)
+
+
+def _store_of(run: RunOptions, out: Path) -> StackStore:
+    """Open the store of a run, for the shots of its shard."""
+    from napari_shadowinv.stack import numbers_of
+
+    store = StackStore(out)
+    return StackStore(out, numbers=numbers_of(run, len(store.names)))
+
+
+def _run_rows(run: RunOptions, status: RunStatus | None) -> Rows:
+    """Describe the run that has ended."""
+    text = "nothing to do"
+    if status is not None and status.ended:
+        text = f"{status.ended} shots in {status.seconds:.1f} s, {_rate_text(status)}"
+    shard = [] if run.shard is None else [("shard", f"{run.shard}; merge the store after the last")]
+    return [("this run", text), *shard]
+
+
+def run_merge(store: Path, quiet: bool) -> None:
+    """Complete a store that was written in shards, and print a summary."""
+    from napari_shadowinv.stack import merge_stack
+
+    merge_stack(store)
+    merged = StackStore(store)
+    if not quiet:
+        say(two_columns("Merge", _summary_rows(merged)))
+    exit_unless_reliable(merged)
 
 
 def exit_unless_reliable(store: StackStore) -> None:
     """Exit with an error code if a shot is not done, or its result is not reliable."""
-    if (store.statuses() != DONE).any():
+    statuses = store.statuses()
+    if not np.isin(statuses, (DONE, UNREAD)).all():
         raise typer.Exit(EXIT_FAILED_SHOTS)
-    if not all(_is_reliable(report) for report in store.reports()):
+    reports = zip(statuses, store.reports(), strict=True)
+    if not all(_is_reliable(report) for status, report in reports if status == DONE):
         raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
@@ -212,18 +246,14 @@ def _counts_text(store: StackStore) -> str:
     return ", ".join(f"{counts[name]} {name}" for name in names)
 
 
-def _summary(store: StackStore, status: RunStatus | None) -> Table:
-    this_run = "nothing to do"
-    if status is not None and status.ended:
-        this_run = f"{status.ended} shots in {status.seconds:.1f} s, {_rate_text(status)}"
-    rows = [
+def _summary_rows(store: StackStore, *run: tuple[str, str]) -> Rows:
+    return [
         ("shots", _counts_text(store)),
-        ("this run", this_run),
+        *run,
         *_site_rows(store),
         *_trouble_rows(store),
         ("written", str(store.path)),
     ]
-    return two_columns("Batch", rows)
 
 
 def _recipe_rows(store: StackStore) -> Rows:
@@ -240,6 +270,17 @@ def _recipe_rows(store: StackStore) -> Rows:
     rows = [("source", _list_text(files) or source or str(store.attributes["source_image"]))]
     steps = () if provenance is None else provenance.recipe.steps
     return rows + [("step", step.summary) for step in steps]
+
+
+def _shard_rows(store: StackStore) -> Rows:
+    """Return the state of shards that are not merged yet."""
+    from napari_shadowinv.stack import incomplete_shards
+
+    if SHARDS not in store.attributes:
+        return []
+    incomplete = incomplete_shards(store)
+    text = f"not merged; incomplete: {incomplete}" if incomplete else "all complete: merge them"
+    return [("shards", f"{store.attributes[SHARDS]}, {text}")]
 
 
 def _beam_rows(store: StackStore) -> Rows:
@@ -398,6 +439,7 @@ def store_rows(store: StackStore, *, trouble: bool = True) -> Rows:
         ("kind", f"stack of {len(store.names)} shots, shadowinv {attributes['package_version']}"),
         ("created", str(attributes["created"])),
         ("shots", _counts_text(store)),
+        *_shard_rows(store),
         ("image", str(attributes["image_size"])),
         *_recipe_rows(store),
         *_beam_rows(store),

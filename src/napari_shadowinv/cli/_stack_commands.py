@@ -1,4 +1,4 @@
-"""Commands for many shots: `batch`, `watch`, `status`, `export` and `movie`."""
+"""Commands for many shots: `batch`, `merge`, `watch`, `status`, `export` and `movie`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 HELP = {
     "source": "Image of the undisturbed beam; batch also takes a glob matching one image per "
     "shot. Default: uniform.",
-    "scheduler": "Address of a dask scheduler (tcp://host:8786), threads, or processes (default).",
+    "scheduler": "Address of a dask scheduler (tcp://host:8786), threads (default with --shard) or "
+    "processes (default without).",
     "format": "tiff (float32, one file per shot and component), pradformat (one file per shot), or "
     "csv (a table with one row per shot).",
     "shots": "A quoted glob, a list of files, a multi-page TIFF with one shot per page, or a table "
@@ -32,6 +33,12 @@ shadowinv batch 'shots/*.tif' --source-from polynomial --low-pass 1 --out night.
 shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
 shadowinv batch pack.csv --setup setup.toml --out pack.shadowinv.zarr
 shadowinv batch shots.csv --fit --recipe recipe.toml --out fits.shadowinv.zarr
+shadowinv batch 'shots/*.tif' --out night.shadowinv.zarr --shard 3/40
+
+[bold]Shards[/bold]
+With --shard 1/40 to --shard 40/40 the command inverts one of 40 parts of the shots. Shards may run
+at the same time, on machines that share a file system. A repeated shard continues, without
+--resume. When all have ended, shadowinv merge completes the store.
 
 [bold]pack.csv[/bold] (one inversion per row; flags apply where a cell is empty)
 file, energy, brightness, mask, exclude
@@ -118,7 +125,17 @@ def batch(
     from napari_shadowinv.cli._batch import run_batch
 
     resume = resume or run.redo_failed
-    run_batch(shots, out, run, resume=resume, scheduler=scheduler or "processes", **inputs)
+    # A shard has a core or a few: it needs no cluster of processes on its machine.
+    engine = scheduler or ("processes" if run.shard is None else "threads")
+    run_batch(shots, out, run, resume=resume, scheduler=engine, **inputs)
+
+
+@notify_errors
+def merge(store: _flags.StoreFolder, quiet: _flags.Quiet = False) -> None:
+    """Complete a store that batch --shard has written, when all shards have ended."""
+    from napari_shadowinv.cli._batch import run_merge
+
+    run_merge(store, quiet)
 
 
 @notify_errors

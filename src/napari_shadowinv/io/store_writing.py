@@ -3,6 +3,7 @@
 - create a store with all shots pending: `create_store`, from its `Contents`
 - make room for more shots: `grow_store`
 - write a shot, or why it failed, also in a worker: `ShotWriter`; gather numbers: `summarise`
+- end the writing in shards: `finish_shards`
 - a store that grows by one shot at a time while its run goes on: `GrowingStore`
 
 The folder's own ``zarr.json`` holds a copy of every array's shape, and who opens the store goes
@@ -25,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from napari_shadowinv._system.hidden_files import hidden_name, sweep
+from napari_shadowinv._system.hidden_files import hidden_name, remove_drafts, sweep
 from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
@@ -35,9 +36,12 @@ from napari_shadowinv.io.store import (
     FAILED,
     FORMAT,
     PENDING,
+    SHARDS,
+    SHOT_FILES,
     STATUS_NAMES,
     StackStore,
     columns_of_store,
+    is_stack,
     read_attributes,
 )
 from napari_shadowinv.io.store_checksums import (
@@ -87,11 +91,13 @@ class ShotWriter:
     path: Path
     store_id: str  # another store may have taken its place
     shots: int  # it may have had fewer when this process opened it before
+    shards: int | None = None  # None once they are merged
     opened: dict[str, Any] | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def of(cls, store: StackStore) -> ShotWriter:
-        return cls(store.path, store.attributes["store_id"], len(store.names))
+        attributes = store.attributes
+        return cls(store.path, attributes["store_id"], len(store.names), attributes.get(SHARDS))
 
     def write(self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
         """Write a shot and its report; it is done when this returns, pending if this fails."""
@@ -105,10 +111,11 @@ class ShotWriter:
         self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any], status: int
     ) -> None:
         attributes = read_attributes(self.path)
-        if attributes.get("store_id") != self.store_id:
+        if [attributes.get("store_id"), attributes.get(SHARDS)] != [self.store_id, self.shards]:
             raise StoreError(
                 f"{self.path} is missing or is not the store the run started with: all workers "
-                "must share one file system, and the store must not be replaced during the run"
+                "must share one file system, and the store must not be replaced or merged during "
+                "the run"
             )
         group = self.arrays()
         with _as_store_errors(self.path):
@@ -214,9 +221,14 @@ class Contents:
     attributes: Mapping[str, Any]
 
 
-def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> StackStore:
-    """Create a store with all its shots pending; it appears completely or not at all."""
-    if path.exists() and not overwrite:
+def create_store(
+    path: Path, contents: Contents, *, overwrite: bool = False, shared: bool = False
+) -> StackStore:
+    """Create a store with all its shots pending; it appears completely or not at all.
+
+    Where several processes create a `shared` store at the same moment, all use that of the first.
+    """
+    if path.exists() and not (overwrite or shared):
         raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")
     sweep(path.parent)
     new = hidden_name(path)
@@ -225,13 +237,18 @@ def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> 
             # Zarr writes in a thread of its own, which would go on behind our back.
             with defer_interrupts():
                 _write_template(new, contents)
-            if path.exists():
+            if path.exists() and not shared:
                 old = hidden_name(path)
                 os.replace(path, old)
                 os.replace(new, path)
                 shutil.rmtree(old, ignore_errors=True)
             else:
-                os.replace(new, path)
+                try:
+                    os.replace(new, path)
+                except OSError:
+                    # A folder that has content is not replaced: another process was faster.
+                    if not (shared and is_stack(path)):
+                        raise
     finally:
         shutil.rmtree(new, ignore_errors=True)
     return StackStore(path)
@@ -249,6 +266,21 @@ def remove_unfinished(path: Path) -> None:
                 Path(folder, name).unlink(missing_ok=True)
 
 
+def finish_shards(path: Path) -> None:
+    """Remove from a store, and from beside it, all traces of its having been written in shards.
+
+    All shards must have ended, on all machines.
+    """
+    remove_unfinished(path)
+    remove_drafts(path)
+    remove_drafts(path / "zarr.json", ".json")
+    with _as_store_errors(path):
+        document = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+        for name in (SHARDS, SHOT_FILES):
+            document["attributes"].pop(name, None)
+        _replace_description(path, document)
+
+
 def grow_store(
     path: Path,
     values: Mapping[str, AnyArray],
@@ -259,13 +291,12 @@ def grow_store(
 
     The coordinates, `values`, are of the new shots. `arrays` are open already, or opened.
     """
-    file = path / "zarr.json"
     with _as_store_errors(path):
         arrays = _open_to_write(path) if arrays is None else arrays
         longer = [name for name, array in arrays.items() if is_along_shots(array)]
         before = arrays["status"].shape[0]
         length = before + len(values["shot"])
-        metadata = json.loads(file.read_text(encoding="utf-8"))
+        metadata = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
         for name in longer:
             array = arrays[name]
             together = array.chunks[0]
@@ -279,8 +310,12 @@ def grow_store(
         for name in longer:
             metadata["consolidated_metadata"]["metadata"][name]["shape"][0] = length
         # From here on the store is longer.
-        with replacing(file, overwrite=True) as draft:
-            draft.write_text(json.dumps(reseal(metadata), indent=2), encoding="utf-8")
+        _replace_description(path, metadata)
+
+
+def _replace_description(path: Path, document: dict[str, Any]) -> None:
+    with replacing(path / "zarr.json", overwrite=True) as draft:
+        draft.write_text(json.dumps(reseal(document), indent=2), encoding="utf-8")
 
 
 def _write_template(path: Path, contents: Contents) -> None:

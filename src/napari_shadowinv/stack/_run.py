@@ -11,7 +11,7 @@ import json
 import queue
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -34,6 +34,7 @@ from napari_shadowinv.io.store import (
     DONE,
     FAILED,
     PENDING,
+    UNREAD,
     StackStore,
     check_files,
     check_store_path,
@@ -61,6 +62,7 @@ from napari_shadowinv.stack._plan import (
     dtype_of,
     values_of_beam,
 )
+from napari_shadowinv.stack._shards import Shard, check_shard, check_shots, numbers_of
 from napari_shadowinv.stack._shots import Reader, checksum, read_shot
 from napari_shadowinv.stack._worker import InvertTask, ShotOutcome, TaskContext, run_shots
 
@@ -174,6 +176,10 @@ def run_stack(
     completely, so a run may be interrupted or killed at any time. Shots that have arrived since the
     store was created are appended, whatever their names: a shot keeps its number.
 
+    With a shard, such as ``RunOptions(shard="3/40")``, the call inverts the 3rd of 40 parts of the
+    shots. Other processes, on any machine, may write the other parts into the same store at the
+    same time, without a lock. `merge_stack` completes the store.
+
     Parameters
     ----------
     shots, recipe, source, mask, source_mask, reader
@@ -195,7 +201,7 @@ def run_stack(
     Returns
     -------
     xarray.Dataset
-        The store, opened lazily; `status` has the outcome of each shot.
+        The store, opened lazily; `status` has the outcome of each shot. With a shard, its shots.
 
     Raises
     ------
@@ -221,6 +227,8 @@ def run_stack(
         reader=reader,
         warm_start=run.warm_start,
     )
+    stack = replace(stack, shard=Shard.of(run.part, stack.shots, path))
+    numbers = numbers_of(run, len(stack.shots))
     again = (PENDING, FAILED) if run.redo_failed else (PENDING,)
 
     def prepare(stage: str) -> None:
@@ -230,28 +238,33 @@ def run_stack(
     if is_local(scheduler):
         # Once, instead of in all workers during their first shot.
         ensure_compiled(lambda news: prepare(f"compiling, {news.message}"), should_stop)
-    with clear_up_when_terminated(), locked(path):
-        remove_unfinished(path)
-        store = StackStore(path) if path.exists() and not run.overwrite else None
+    with clear_up_when_terminated(), nullcontext() if stack.shard else locked(path):
+        store = StackStore(path, numbers=numbers) if path.exists() and not run.overwrite else None
         arrived = False
         if store is not None:
             stack = resume(store, stack, stored)
+            if stack.shard is None:
+                remove_unfinished(path)
             store = reopen_damaged(store)
             arrived = len(stack.shots) > len(store.names)
             if not arrived and not np.isin(store.statuses(), again).any():
                 _Run(stack, store, (), on_progress, should_stop).report("nothing to do")
-                return read_stack(path)
+                return read_stack(path, numbers=numbers)
         # Before the store is created: a scheduler that does not respond must leave nothing behind.
         with engine_for(scheduler, run.workers, should_stop) as engine:
             if store is None:
                 if stack.chooses_sites:
                     prepare("how many sites the first shots need")
-                stack = choose_sites(stack, should_stop)
-                store = create_store(path, contents_of(stack, stored), overwrite=run.overwrite)
+                contents = contents_of(choose_sites(stack, should_stop), stored)
+                is_shared = stack.shard is not None
+                create_store(path, contents, overwrite=run.overwrite, shared=is_shared)
+                store = StackStore(path, numbers=numbers)
+                # It may be that of another shard.
+                stack = resume(store, stack, stored)
             elif arrived:
                 store = append_shots(store, stack, stored)
             _Run(stack, store, again, on_progress, should_stop).run_on(engine)
-    return read_stack(path)
+    return read_stack(path, numbers=numbers)
 
 
 def stored_variables(
@@ -297,6 +310,7 @@ class _Run:
             for index in np.flatnonzero(statuses == FAILED)
             if index not in self._todo
         ]
+        self._total = int((statuses != UNREAD).sum())
         self._ended = 0
         self._began = time.monotonic()
 
@@ -312,11 +326,11 @@ class _Run:
             return
         done, failed = self._counts[DONE], self._counts[FAILED]
         status = RunStatus(
-            total=len(shots),
+            total=self._total,
             done=done,
             failed=failed,
             doubtful=self._doubtful,
-            waiting=len(shots) - done - failed,
+            waiting=self._total - done - failed,
             ended=self._ended,
             seconds=time.monotonic() - self._began,
             engine=engine,
@@ -327,14 +341,18 @@ class _Run:
         self._on_progress(status)
 
     def run_on(self, engine: Engine) -> None:
-        """Invert all pending shots, and summarise their reports."""
+        """Invert all pending shots, and summarise their reports unless other shards do so, too."""
         try:
             self._work_on(engine)
         except BaseException:
             with suppress(OSError):
-                summarise(self._store)
+                self._summarise()
             raise
-        summarise(self._store)
+        self._summarise()
+
+    def _summarise(self) -> None:
+        if self._stack.shard is None:
+            summarise(self._store)
 
     def _work_on(self, engine: Engine) -> None:
         self.report(engine.name)
@@ -420,6 +438,8 @@ def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
     attributes: dict[str, Any] = {**attributes_of(stack), **identity}
     if stack.as_arrived:
         attributes |= NUMBERED_AS_ARRIVED
+    if stack.shard is not None:
+        attributes |= stack.shard.attributes
     if isinstance(stack.task, InvertTask) and stack.task.sites_chosen:
         attributes[_CHOSEN_SITES] = stack.task.recipe.options.n_sites
     return Contents(stack.sizes, _variables(stack, dtype), _coordinates(stack), attributes)
@@ -491,8 +511,11 @@ def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
             f"{store.path} was written by watching a folder, where each shot starts from the one "
             "before: continue with shadowinv watch, overwrite the store, or choose another name"
         )
+    check_shard(store, stack.shard)
     shots = stack.shots.reordered(_order(store, stack.shots.names))
     stack = match_store(store, replace(stack, shots=shots), dtype)
+    if stack.shard is not None:
+        check_shots(store, stack.shard, len(shots))
     for index in np.flatnonzero(store.statuses() == DONE):
         changed = stack.changed(int(index), store.report(int(index)))
         if changed:
@@ -504,16 +527,17 @@ def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
 
 
 def reopen_damaged(store: StackStore) -> StackStore:
-    """Read all of a store, mark its damaged shots as pending, and return it as it is now.
+    """Read the files of a store, mark damaged shots as pending, and return it as it is now.
 
     A `FileFormatError` if there is damage that cannot be repaired from the shots.
     """
-    damage = StackStore(store.path, every_byte=True).damage
+    numbers = store.numbers
+    damage = StackStore(store.path, every_byte=True, numbers=numbers).damage
     for index in damage.shots:
         ShotWriter.of(store).reopen(index)
     if not (damage.shots or damage.files):
         return store
-    store = StackStore(store.path)
+    store = StackStore(store.path, numbers=numbers)
     if damage.files:
         summarise(store)
         check_files(store := StackStore(store.path, every_byte=True))

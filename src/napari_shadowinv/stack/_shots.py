@@ -70,6 +70,10 @@ class ImageReference:
         """Return whether the image still agrees with the metadata from `load`."""
         return bool(self.read()[1]["sha256"] == origin.get("sha256"))
 
+    def identity(self, folder: Path) -> str:
+        """Describe the image without reading files, whose paths are relative to a folder."""
+        return ""
+
 
 @dataclass(frozen=True, eq=False)
 class ArrayReference(ImageReference):
@@ -79,6 +83,9 @@ class ArrayReference(ImageReference):
 
     def read(self) -> tuple[AnyArray, dict[str, Any]]:
         return self.image, {"sha256": checksum(self.image)}
+
+    def identity(self, folder: Path) -> str:
+        return checksum(self.image)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +138,9 @@ class FileReference(ImageReference):
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare a file like those of a table's rows, and a page by its checksum."""
         return super().unchanged(origin) if self.page is not None else _agrees(self.path, origin)
+
+    def identity(self, folder: Path) -> str:
+        return f"{_relative_text(self.path, folder)} {self.page}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +210,11 @@ class RowsReference(ImageReference):
         setups = (setup_before, self.setup)
         return _differences(*({} if setup is None else setup.model_dump() for setup in setups))
 
+    def identity(self, folder: Path) -> str:
+        files = {name: _relative_text(path, folder) for name, path in self._files().items()}
+        setup = None if self.setup is None else self.setup.model_dump_json()
+        return json.dumps([self._summaries(), files, setup])
+
     def _files(self) -> dict[str, Path]:
         """Return the files by the names of their columns and the numbers of their rows."""
         return {
@@ -210,6 +225,14 @@ class RowsReference(ImageReference):
 
     def _summaries(self) -> list[dict[str, Any]]:
         return [row.summary for row in self.rows]
+
+
+def _relative_text(path: Path, folder: Path) -> str:
+    """Return a path relative to a folder, as a file system may be mounted elsewhere on a host."""
+    try:
+        return text_of(os.path.relpath(path, folder))
+    except ValueError:  # on another drive
+        return text_of(path)
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:

@@ -49,6 +49,7 @@ from napari_shadowinv.stack._run import (
     match_store,
     stored_variables,
 )
+from napari_shadowinv.stack._shards import check_shard
 from napari_shadowinv.stack._shots import (
     FileReference,
     ImageReference,
@@ -205,6 +206,7 @@ class Watch:
         if overwrite or not self._path.exists():
             return
         store = StackStore(self._path)
+        check_shard(store, None)
         again = (PENDING, FAILED) if redo_failed else (PENDING,)
         self._redo = {store.names[i] for i in np.flatnonzero(np.isin(store.statuses(), again))}
         for name, report in zip(store.names, store.reports(), strict=True):
@@ -478,8 +480,8 @@ def watch_stack(
     except InversionCancelled:
         return None
     with clear_up_when_terminated(), locked(path):
-        remove_unfinished(path)
         loop.open(overwrite=watch.overwrite, redo_failed=watch.redo_failed)
+        remove_unfinished(path)
         with observing(
             arrivals, polling=watch.polling, on_note=lambda text: loop.report(note=text)
         ):
