@@ -104,9 +104,8 @@ def file_contents(store: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize("order", [(1, 2, 3, 4), (3, 1, 4, 2)])
-def test_shards_in_any_order_equal_a_single_run(order, any_night, single, out, facility_night):
-    for number in order:
+def test_shards_in_any_order_equal_a_single_run(any_night, single, out, facility_night):
+    for number in (3, 1, 4, 2):
         shard = in_one_thread(any_night, out, f"{number}/4")
         assert list(shard.shot) == list(range(number - 1, 6, 4))
         assert (shard.status == DONE).all()
@@ -156,18 +155,23 @@ def test_killed_shards_and_merges_are_repeated(
     processes: ShardProcesses, job, single, out, facility_night
 ):
     rng = random.Random(5)
-    kills = Counter[bool]()
+    remains = 0
+
+    def kill(shard: str | None, *operations: int) -> None:
+        nonlocal remains
+        kill_at = rng.randint(*operations)
+        assert processes.run({**job, "shard": shard, "kill_at": kill_at}) == [-9]
+        remains += len(facility_night.leftovers(out.parent, (out.name, "source.npy")))
+
     for shard in ("3/3", "1/3", "2/3"):
-        for _ in range(4):
-            (code,) = processes.run({**job, "shard": shard, "kill_at": rng.randint(1, 300)})
-            kills[code == -9] += 1
-            assert code in (0, -9)
+        for _ in range(2):
+            # While it creates the store, or writes its two shots.
+            kill(shard, 1, 85 if out.exists() else 240)
         assert processes.run({**job, "shard": shard}) == [0]
-    for _ in range(4):
-        (code,) = processes.run({**job, "shard": None, "kill_at": rng.randint(1, 300)})
-        assert code == -9
+    for _ in range(2):
+        kill(None, 150, 300)
     assert processes.run({**job, "shard": None}) == [0]
-    assert kills[True] >= 6
+    assert remains > 0
     assert facility_night.differences(out, single) == []
     assert facility_night.leftovers(out.parent, (out.name, "source.npy")) == []
 
