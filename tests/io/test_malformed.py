@@ -230,7 +230,6 @@ BAD: dict[str, tuple[str, Callable[[Path], object]]] = {
     "cube packed mat": ("a.mat", mat7(CUBE)),
     "cube hdf mat": ("a.mat", mat73(CUBE)),
     "cube npy": ("a.npy", npy(CUBE)),
-    "cube tiff": ("a.tif", tiff(CUBE)),
     "cube spe": ("a.spe", spe(CUBE, frames=4)),
     "cube pradformat": ("a.h5", prad(CUBE)),
     "zero mat": ("a.mat", mat5(ZERO)),

@@ -168,7 +168,7 @@ def test_several_pages_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "stack.tif"
     tifffile.imwrite(path, np.zeros((5, 6, 7), np.uint8), photometric="minisblack")
     with pytest.raises(FileFormatError, match="has 5 pages: expected one"):
-        read(path)
+        read_radiograph(path)
 
 
 def test_sixteen_bit_colour_png_is_refused(tmp_path: Path) -> None:
@@ -232,10 +232,10 @@ def test_any_hdf5_gives_the_array_that_is_named(tmp_path: Path) -> None:
         np.testing.assert_array_equal(radiograph.image, expected)
         assert radiograph.metadata["variable"] == name
     for wrong in ("shot", "shots", "note"):
-        with pytest.raises(InputError, match=f"no array '{wrong}': it holds 'shots/beam'"):
+        with pytest.raises(InputError, match=f"no array '{wrong}': it holds 'shots/3/image'"):
             read(path, variable=wrong)
-    with pytest.raises(FileFormatError, match=r"'stack' with shape \(2, 6, 9\)"):
-        read(path, variable="stack")
+    with pytest.raises(FileFormatError, match=r"holds 2 frames in 'stack': expected one image"):
+        read_radiograph(path, variable="stack")
     path.write_bytes(path.read_bytes()[:-2000])
     with pytest.raises(FileFormatError, match="damaged or truncated"):
         read(path, variable="shots/3/image")

@@ -184,6 +184,15 @@ def test_lists_and_patterns_are_stacks_too(viewer: ViewerModel, run: Path) -> No
     np.testing.assert_array_equal(data[:, 0, 0].compute(), [1, 10])
 
 
+def test_pages_of_a_tiff_are_a_lazy_stack(viewer: ViewerModel, tmp_path: Path) -> None:
+    planes = np.random.default_rng(0).uniform(1, 9, (3, 12, 17)).astype(np.float32)
+    tifffile.imwrite(tmp_path / "film.tif", planes, photometric="minisblack")
+    (layer,) = add_layers(viewer, read_paths(str(tmp_path / "film.tif")))
+    assert (layer.name, role_of(layer)) == ("film", "shot")
+    assert layer.data.chunksize == (1, 12, 17)
+    np.testing.assert_array_equal(layer.data, planes)
+
+
 def test_a_stray_file_is_dark_and_gives_a_warning(run: Path) -> None:
     tifffile.imwrite(run / "shot3.tif", np.ones((5, 5), np.float32))
     complete = (run / "shot1.tif").read_bytes()

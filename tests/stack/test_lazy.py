@@ -266,9 +266,13 @@ class TestInputs:
         with pytest.raises(InputError, match=words):
             invert_stack(shots)
 
-    def test_a_folder_is_refused(self, night):
-        with pytest.raises(InputError, match="is a folder: specify the files"):
-            invert_stack(night.folder)
+    def test_folder_stands_for_its_images(self, night, expected):
+        (night.folder / "settings.csv").write_text("gain\n3\n")
+        np.testing.assert_array_equal(self.potential(night.folder, source=night.source), expected)
+
+    def test_folder_without_images_is_refused(self, tmp_path):
+        with pytest.raises(FileFormatError, match="contains no image: expected a folder"):
+            invert_stack(tmp_path)
 
     def test_files_of_which_none_can_be_read_are_refused(self, tmp_path):
         (tmp_path / "a.tif").write_bytes(b"")

@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import dask.array as da
+import h5py
 import numpy as np
 import pytest
 import tifffile
 import xarray as xr
+import zarr
 
-from napari_shadowinv import invert_stack, run_stack, synthetic_image
+from napari_shadowinv import invert_stack, read, run_stack, synthetic_image
 from napari_shadowinv.io.store import DONE
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.stack._shots import find_shots
@@ -45,6 +47,23 @@ def write_table(images: np.ndarray, folder: Path) -> Path:
     return path
 
 
+def write_hdf5(images: np.ndarray, folder: Path) -> Path:
+    path = folder / "run.h5"
+    with h5py.File(path, "w") as file:
+        file["entry/data/data"] = images.reshape(2, -1, *SHAPE)
+        file["flat"] = images
+    return path
+
+
+def write_folder(images: np.ndarray, folder: Path) -> Path:
+    return write_files(images, folder)[0].parent
+
+
+def open_netcdf(images: np.ndarray, folder: Path) -> xr.DataArray:
+    xr.Dataset({"image": (("shot", "y", "x"), images)}).to_netcdf(folder / "run.nc")
+    return xr.open_dataset(folder / "run.nc").image
+
+
 KINDS = {
     "numpy": lambda images, _: images,
     "dask of one shot": lambda images, _: da.from_array(images, chunks=(1, -1, -1)),
@@ -57,6 +76,12 @@ KINDS = {
     "files": write_files,
     "glob": lambda images, folder: str(write_files(images, folder)[0].parent / "shot_*.tif"),
     "table": write_table,
+    "array of HDF5": lambda images, folder: f"{write_hdf5(images, folder)}::/entry/data/data",
+    "folder": write_folder,
+    "lazy frames": lambda images, folder: read(f"{write_hdf5(images, folder)}::flat"),
+    "xarray of a file": open_netcdf,
+    "h5py": lambda images, folder: h5py.File(write_hdf5(images, folder))["flat"],
+    "zarr": lambda images, _: zarr.array(images),
 }
 
 
@@ -72,7 +97,7 @@ def test_stack_of_any_kind_runs_with_default_options(kind, images, reference, tm
     np.testing.assert_array_equal(stack.potential.compute(), reference.potential)
 
 
-@pytest.mark.parametrize("kind", ["dask of many shots", "table"])
+@pytest.mark.parametrize("kind", ["dask of many shots", "table", "array of HDF5"])
 def test_store_of_any_kind_runs_with_default_options(kind, images, reference, tmp_path):
     stored = run_stack(KINDS[kind](images, tmp_path), tmp_path / "out.shadowinv.zarr")
     assert (stored.status == DONE).all()

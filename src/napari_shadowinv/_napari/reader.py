@@ -30,7 +30,7 @@ def get_reader(path: str | Sequence[str]) -> ReaderFunction | None:
 
 
 def _can_read(path: Path) -> bool:
-    from napari_shadowinv._napari.shots import images_in
+    from napari_shadowinv.io.frames import images_in
 
     if path.is_dir():
         return bool(images_in(path))
@@ -52,7 +52,8 @@ def _is_image_name(path: Path) -> bool:
 @notify_errors(otherwise=lambda: [(None,)])  # napari then adds no layer
 def read_paths(path: str | Sequence[str]) -> list[Any]:
     """Read paths that `get_reader` accepts as layers; in a window, errors become notifications."""
-    from napari_shadowinv._napari.shots import images_in, stack_layers
+    from napari_shadowinv._napari.shots import stack_layers
+    from napari_shadowinv.io.frames import images_in
 
     if not isinstance(path, str):
         return list(stack_layers([Path(item) for item in path]))
@@ -85,14 +86,17 @@ def _matches(pattern: str) -> list[Path]:
 def _read_file(path: Path) -> list[FullLayerData]:
     from napari_shadowinv._napari.layer_metadata import result_of
     from napari_shadowinv._napari.result_files import layers_of_dataset
-    from napari_shadowinv._napari.shots import radiograph_layers
+    from napari_shadowinv._napari.shots import frame_layers, radiograph_layers
     from napari_shadowinv.io import Radiograph, read
+    from napari_shadowinv.io.frames import FRAMES_FORMAT
 
     content = read(path)
     if isinstance(content, Radiograph):
         for caution in content.warnings:
             show_caution(f"{path.name}: {caution.text}")
         return radiograph_layers(content)
+    if content.attrs.get("format") == FRAMES_FORMAT:
+        return frame_layers(content, path.stem)
     layers = layers_of_dataset(content, path.stem)
     _show_in_window(layers)
     result = result_of(layers[0][1])

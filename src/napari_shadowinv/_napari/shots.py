@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -29,11 +28,12 @@ from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import show_caution
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.files import in_counting_order, sha256
-from napari_shadowinv.io.formats import RADIOGRAPH_SUFFIXES
+from napari_shadowinv.io.files import sha256
 from napari_shadowinv.physics.units import intensity_limits
 
 if TYPE_CHECKING:
+    import xarray
+
     from napari_shadowinv.physics.setup import Setup
 
 
@@ -139,21 +139,6 @@ def load_radiograph(shot: io.Radiograph, name: str) -> io.Radiograph:
     return replace(shot, image=plane_of(shot.image, name), metadata=metadata)
 
 
-def images_in(folder: Path) -> list[Path]:
-    """List a folder's images with the most frequent suffix, in natural order."""
-    # A table of settings next to a run of TIFFs is not a shot.
-    files = [
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in RADIOGRAPH_SUFFIXES and path.is_file() and path.name[0] != "."
-    ]
-    counts = Counter(path.suffix.lower() for path in files)
-    if not counts:
-        return []
-    most_frequent = max(sorted(counts), key=lambda suffix: counts[suffix])
-    return in_counting_order(path for path in files if path.suffix.lower() == most_frequent)
-
-
 def stack_layers(paths: Sequence[Path], name: str = "") -> list[FullLayerData]:
     """Describe a run of shots as a lazy stack; only the first readable shot is read now."""
     # Unreadable shots, or shots of another shape, are zero and give a warning when shown.
@@ -174,6 +159,12 @@ def stack_layers(paths: Sequence[Path], name: str = "") -> list[FullLayerData]:
         **_facts(first, origin),
     )
     return [layer]
+
+
+def frame_layers(frames: xarray.Dataset, name: str) -> list[FullLayerData]:
+    """Describe the frames of one file as a lazy stack."""
+    images = frames["image"].data
+    return [shot_layer(images, name, None, intensity_limits(np.asarray(images[0])))]
 
 
 def lazy_stack(

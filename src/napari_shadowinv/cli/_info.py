@@ -42,12 +42,17 @@ def _rows(path: Path, variable: str | None) -> _summary.Rows:
     from napari_shadowinv.cli._batch import store_rows
     from napari_shadowinv.io import Radiograph, is_stack, read
     from napari_shadowinv.io.formats import format_of
+    from napari_shadowinv.io.frames import find_frames
     from napari_shadowinv.io.hdf5 import read_hdf5
     from napari_shadowinv.io.images import read_npy
     from napari_shadowinv.io.store import StackStore
 
     if is_stack(path):
         return store_rows(StackStore(path))
+    frames = find_frames(path, variable)
+    if len(frames) > 1:
+        return _frame_rows(read(path, variable=variable))
+    path, variable = frames[0].path, frames[0].variable
     form = format_of(path)
     if form.name == "mat":
         return _matlab_rows(path, variable)
@@ -66,6 +71,16 @@ def _rows(path: Path, variable: str | None) -> _summary.Rows:
     if isinstance(content, Radiograph):
         return _radiograph_rows(content)
     return _result_rows(content)
+
+
+def _frame_rows(frames: Radiograph | xarray.Dataset) -> _summary.Rows:
+    """Describe many images by their number and the first."""
+    from napari_shadowinv.io import Radiograph
+
+    assert not isinstance(frames, Radiograph)
+    names = frames["name"].values
+    kind = f"{len(names)} frames, {names[0]} to {names[-1]}"
+    return [("kind", kind), *_array_rows(frames["image"][0].values)]
 
 
 def _matlab_rows(path: Path, variable: str | None) -> _summary.Rows:

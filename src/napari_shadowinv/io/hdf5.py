@@ -1,6 +1,7 @@
 """Arrays of any HDF5 file, by name.
 
 - the array that the user names: `read_hdf5`, as an image `read_plane`; the choice: `list_arrays`
+- one of many frames in an array: `read_hdf5_frame`; their number: `count_frames`
 - for callers that know the layout: an item, `member`; its values, `load_dataset`; `check_arrays`
 - write one: `hdf5_in_memory`; compare its checksum: `check_hdf5_seal`
 
@@ -12,9 +13,12 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 import os
+import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from importlib import import_module
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -27,9 +31,12 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 
 _MAX_LISTED = 30
+_MAX_DEPTH = 2  # groups within groups that are listed
 _SEAL = b"\nshadowinv sha256 "
 _BLOCK_BYTES = 1 << 20
 _MAX_LINKS = 16
+_INDEX = re.compile(r"(?P<name>.+)\[(?P<index>\d+(,\d+)*)\]")
+_DEFAULTS = ("signal", "default")  # attributes of a NeXus group: its array, or the group to look in
 
 
 def member(path: Path, group: Any, name: str, depth: int = 0) -> Any | None:
@@ -72,6 +79,7 @@ def members(path: Path, group: Any) -> Iterator[tuple[str, Any]]:
 def load_dataset(path: Path, dataset: Any) -> AnyArray:
     """Return the values of an array, refusing missing ones, which HDF5 would replace by zeros."""
     check_size(path, _memory_bytes(path, dataset))
+    _check_filters(path, dataset)
     _check_promise(path, dataset)
     return np.asarray(dataset[()])
 
@@ -84,6 +92,12 @@ def _check_promise(path: Path, dataset: Any) -> None:
 
 def _memory_bytes(path: Path, dataset: Any) -> int:
     """Return the bytes in memory of an array, which must be in the file itself."""
+    array_bytes = dataset.size * max(8, dataset.dtype.itemsize)
+    return int(max(_chunk_bytes(path, dataset), array_bytes))
+
+
+def _chunk_bytes(path: Path, dataset: Any) -> int:
+    """Return the bytes in memory of a chunk of an array, which must be in the file itself."""
     layout = dataset.id.get_create_plist()
     if layout.get_external_count():
         external_file = layout.get_external(0)[0].decode(errors="replace")
@@ -93,8 +107,7 @@ def _memory_bytes(path: Path, dataset: Any) -> int:
         names = ", ".join(map(repr, source_files))
         _refuse_other_file(path, dataset.name, f"as a virtual array from {names}")
     # One chunk may be far larger than what is used of it.
-    chunk = int(np.prod(dataset.chunks or (0,), dtype=float)) * dataset.dtype.itemsize
-    return int(max(chunk, dataset.size * max(8, dataset.dtype.itemsize)))
+    return int(np.prod(dataset.chunks or (0,), dtype=float)) * int(dataset.dtype.itemsize)
 
 
 def check_arrays(path: Path) -> None:
@@ -169,45 +182,148 @@ def read_hdf5(path: Path, name: str) -> AnyArray:
     import h5py
 
     with h5py.File(path, "r") as file:
-        item = member(path, file, name)
-        if isinstance(item, h5py.Dataset) and _is_numeric(item):
-            return load_dataset(path, item)
-        content = ", ".join(list_arrays(path, file)) or "none"
-    raise InputError(f"{path} has no array {name!r}: it holds {content}")
+        dataset, number = _find_array(path, file, name)
+        if number is not None:
+            return _load_frame(path, dataset, number)
+        return load_dataset(path, dataset)
 
 
 def read_plane(path: Path, name: str) -> tuple[AnyArray, dict[str, Any]]:
-    """Read one array as an image, whatever else the file is."""
-    array = read_hdf5(path, name)
-    if array.ndim != 2 or array.size == 0:
+    """Read one array, or one frame of it as ``entry/data/data[3]``, as an image."""
+    axes = count_frames(path, name)
+    if math.prod(axes) != 1:
+        first = ",".join("0" * len(axes))
         raise FileFormatError(
-            f"{path} holds {name!r} with shape {array.shape}: expected an image of shape "
-            "(height, width); choose or save one plane"
+            f"{path} holds {math.prod(axes)} frames in {name!r}: expected one image; choose one, "
+            f"such as '{name}[{first}]', or invert all as a stack of shots"
         )
+    array = read_hdf5_frame(path, name, 0) if axes else read_hdf5(path, name)
     return array, {"kind": "hdf5", "variable": name}
+
+
+@as_file_errors
+def count_frames(path: Path, name: str) -> tuple[int, ...]:
+    """Return the lengths of the axes before the last two of an array; none if it is one image."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        dataset, number = _find_array(path, file, name)
+        if dataset.ndim < 2 or 0 in dataset.shape:
+            raise FileFormatError(
+                f"{path} holds {name!r} with shape {dataset.shape}: expected an image of shape "
+                "(height, width), or many with the shots first; choose another array"
+            )
+        return dataset.shape[:-2] if number is None else ()
+
+
+@as_file_errors
+def read_hdf5_frame(path: Path, name: str, number: int) -> AnyArray:
+    """Read frame `number` of an array, counted over all its axes before the last two."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        return _load_frame(path, _find_array(path, file, name)[0], number)
+
+
+def _find_array(path: Path, file: Any, name: str) -> tuple[Any, int | None]:
+    """Return an array by its name, and the number of the frame that the name ends with."""
+    item, index = _member_or_default(path, file, name), None
+    if item is None and (match := _INDEX.fullmatch(name)):
+        item = _member_or_default(path, file, match["name"])
+        index = tuple(map(int, match["index"].split(",")))
+    if item is None or not _is_numeric(item):
+        content = ", ".join(list_arrays(path, file)) or "none"
+        raise InputError(f"{path} has no array {name!r}: it holds {content}")
+    if index is None:
+        return item, None
+    axes = item.shape[:-2]
+    if len(index) != len(axes) or any(map(int.__ge__, index, axes)):
+        last = ",".join(str(length - 1) for length in axes)
+        frames = f"frames from [{','.join('0' * len(axes))}] to [{last}]" if axes else "one image"
+        raise InputError(f"{path} has no {name!r}: the array holds {frames}; correct the index")
+    return item, int(np.ravel_multi_index(index, axes)) if axes else 0
+
+
+def _member_or_default(path: Path, file: Any, name: str) -> Any | None:
+    """Return an array by its name, or that which a NeXus group of this name shows by default."""
+    import h5py
+
+    item = member(path, file, name)
+    for _ in range(_MAX_LINKS):
+        if not isinstance(item, h5py.Group):
+            break
+        defaults = (item.attrs[key] for key in _DEFAULTS if key in item.attrs)
+        default = next(defaults, None)
+        default = default.decode() if isinstance(default, bytes) else default
+        item = member(path, item, default) if isinstance(default, str) else None
+    return item
+
+
+def _load_frame(path: Path, dataset: Any, number: int) -> AnyArray:
+    """Return one frame, refusing a missing one, which HDF5 would replace by zeros."""
+    index = tuple(map(int, np.unravel_index(number, dataset.shape[:-2])))
+    frame_bytes = math.prod(dataset.shape[-2:]) * max(8, dataset.dtype.itemsize)
+    check_size(path, max(_chunk_bytes(path, dataset), frame_bytes))
+    _check_filters(path, dataset)
+    if not _is_written(dataset, index):
+        raise FileFormatError(
+            f"{path} does not hold frame {number} of {dataset.name!r} yet: wait until it is "
+            "written, or copy the file again"
+        )
+    return np.asarray(dataset[index])
+
+
+def _is_written(dataset: Any, index: tuple[int, ...]) -> bool:
+    """Return whether all chunks of a frame are in the file."""
+    if dataset.chunks is None:
+        return bool(dataset.id.get_storage_size())
+    sides = zip(dataset.shape[-2:], dataset.chunks[-2:], strict=True)
+    places = itertools.product(*(range(0, length, chunk) for length, chunk in sides))
+    chunks = (dataset.id.get_chunk_info_by_coord((*index, *place)) for place in places)
+    return all(chunk.byte_offset is not None for chunk in chunks)
+
+
+def _check_filters(path: Path, dataset: Any) -> None:
+    """Refuse an array that is compressed by a filter that HDF5 does not have."""
+    import h5py
+
+    layout = dataset.id.get_create_plist()
+    filters = [layout.get_filter(k) for k in range(layout.get_nfilters())]
+    missing = [each for each in filters if not h5py.h5z.filter_avail(each[0])]
+    if missing:
+        with suppress(ImportError):
+            import_module("hdf5plugin")  # adds its filters
+            missing = [each for each in missing if not h5py.h5z.filter_avail(each[0])]
+    for code, _, _, title in missing:
+        label = f"{code}, {title.decode(errors='replace')}" if title else str(code)
+        raise FileFormatError(
+            f"{path} holds {dataset.name!r} compressed by a filter that is not installed "
+            f"({label}): install the package hdf5plugin, or save it with gzip"
+        )
 
 
 def list_arrays(path: Path, file: Any) -> list[str]:
     """List the first images of an open file and its groups, with shape and type."""
+    arrays = itertools.islice(_iterate_named_datasets(path, file), 10 * _MAX_LISTED)
     images = [
         f"{name!r} ({'×'.join(map(str, item.shape))} {item.dtype})"
-        for name, item in itertools.islice(_iterate_shallow_datasets(path, file), 10 * _MAX_LISTED)
-        if _is_numeric(item) and item.ndim in (2, 3)
+        for name, item in arrays
+        if _is_numeric(item) and item.ndim >= 2
     ]
     return images if len(images) <= _MAX_LISTED else [*images[:_MAX_LISTED], "…"]
 
 
-def _iterate_shallow_datasets(path: Path, file: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the datasets of the file and of its groups."""
+def _iterate_named_datasets(
+    path: Path, group: Any, prefix: str = "", depth: int = 0
+) -> Iterator[tuple[str, Any]]:
+    """Yield the datasets of a group and of groups in it, as deep as files usually go."""
     import h5py
 
-    for name, item in members(path, file):
+    for name, item in members(path, group):
         if isinstance(item, h5py.Dataset):
-            yield name, item
-        elif isinstance(item, h5py.Group):
-            for inner, dataset in members(path, item):
-                if isinstance(dataset, h5py.Dataset):
-                    yield f"{name}/{inner}", dataset
+            yield f"{prefix}{name}", item
+        elif isinstance(item, h5py.Group) and depth < _MAX_DEPTH:
+            yield from _iterate_named_datasets(path, item, f"{prefix}{name}/", depth + 1)
 
 
 def _is_numeric(item: Any) -> bool:

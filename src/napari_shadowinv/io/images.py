@@ -190,8 +190,8 @@ def read_tiff(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     with _open_tiff(path) as tiff:
         if len(tiff.pages) != 1:
             raise FileFormatError(
-                f"{path} has {len(tiff.pages)} pages: expected one radiograph per file; save the "
-                "page you need separately"
+                f"{path} has {len(tiff.pages)} pages: expected one image; invert all of them as a "
+                "stack of shots, or save the page you need separately"
             )
         return _read_page(path, tiff.pages[0].aspage())
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
@@ -31,6 +32,13 @@ from napari_shadowinv.io.formats import (
     formats_for,
     function,
     suffixes_for,
+)
+from napari_shadowinv.io.frames import (
+    Frame,
+    find_frames,
+    lazy_frames,
+    read_frame,
+    split_address,
 )
 from napari_shadowinv.io.hdf5 import check_arrays, check_hdf5_seal, hdf5_in_memory
 from napari_shadowinv.io.images import film_warnings, to_grey
@@ -67,26 +75,30 @@ _DISTANCES = {"source_object_distance", "object_image_distance"}
 def read(
     path: Path, *, channel: str | int | None = None, variable: str | None = None
 ) -> Radiograph | xarray.Dataset:
-    """Read an image or a result.
+    """Read an image or a result, or many images lazily.
 
     Parameters
     ----------
     path : str or Path
-        TIFF (8, 16 or 32 bits, one page) and other pictures, NPY, MATLAB (version 5 to 7.3), frames
+        TIFF (8, 16 or 32 bits) and other pictures, NPY, MATLAB (version 5 to 7.3), frames
         of cameras (one each), numbers as text, tracks in CR-39, a pradformat radiograph or
-        inversion, a ``.shadowinv`` result, or a ``.shadowinv.zarr`` store of many shots (read
-        lazily).
+        inversion, an array of any HDF5 file as ``file.h5::/entry/data/data``, a ``.shadowinv``
+        result, or a ``.shadowinv.zarr`` store of many shots (read lazily). Of many images, a TIFF
+        with several pages, an array with more than two axes, a folder, or a pattern such as
+        ``"shots/*.tif"``.
     channel : {"red", "green", "blue", "mean"} or int, optional
         Channel to take from a colour image whose channels differ.
     variable : str, optional
         Name of the array to take from a MATLAB file that holds several, or from any HDF5 file,
-        with its groups: ``"shots/3/image"``. For CR-39 the tracks to count:
-        ``"diameter=4:12 contrast=:40 eccentricity=:15 bin=300"``; see `read_cpsa`.
+        with its groups: ``"shots/3/image"``; ``"entry/data/data[3]"`` is one frame of many. For
+        CR-39 the tracks to count: ``"diameter=4:12 contrast=:40 eccentricity=:15 bin=300"``; see
+        `read_cpsa`.
 
     Returns
     -------
     Radiograph or xarray.Dataset
-        A dataset for a result or an inversion, a radiograph for all else.
+        A dataset for a result or an inversion; a dataset with the variable ``image``
+        (shot, y, x) for many images, which dask reads one by one; a radiograph for all else.
 
     Raises
     ------
@@ -97,6 +109,23 @@ def read(
     """
     if is_stack(path):
         return read_stack(path)
+    frames = find_frames(path, variable)
+    if len(frames) > 1:
+        return lazy_frames(frames, partial(_image_of, channel=channel))
+    return _read_file(frames[0].path, channel, frames[0].variable)
+
+
+def _image_of(frame: Frame, channel: str | int | None) -> AnyArray:
+    if frame.number is None:
+        return read_radiograph(frame.path, channel=channel, variable=frame.variable).image
+    image, _ = read_frame(frame.path, frame.number, channel=channel, variable=frame.variable)
+    return image
+
+
+@as_file_errors
+def _read_file(
+    path: Path, channel: str | int | None, variable: str | None
+) -> Radiograph | xarray.Dataset:
     file_format = format_of(path)
     if variable is not None and not file_format.named_reader:
         raise InputError(
@@ -164,8 +193,9 @@ def _complete_setup(path: Path, geometry: dict[str, Any]) -> Setup | None:
 def read_radiograph(
     path: str | Path, *, channel: str | int | None = None, variable: str | None = None
 ) -> Radiograph:
-    """Read an image, as by `read`; a result raises a `FileFormatError`, too."""
-    content = read(path, channel=channel, variable=variable)
+    """Read one image, as by `read`; a result or many images raise a `FileFormatError`, too."""
+    path, variable = split_address(path, variable)
+    content = read_stack(path) if is_stack(path) else _read_file(path, channel, variable)
     if not isinstance(content, Radiograph):
         if ResultKind.of(content.attrs) is ResultKind.FILM_DOSES:
             raise FileFormatError(

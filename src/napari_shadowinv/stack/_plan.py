@@ -31,6 +31,7 @@ from napari_shadowinv.inversion import count_sites
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, check_source, number_of_sites
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import sha256, text_of
+from napari_shadowinv.io.frames import split_address
 from napari_shadowinv.io.store import FORMAT, OWN_SETUPS
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import Setup
@@ -408,11 +409,11 @@ def _describe_inputs(
             inputs.recipe.setup, stack_shots.shape
         )  # refuses a wrong setup
     if isinstance(source, (str, Path)):
-        path = Path(source)
+        path, variable = split_address(source, measured.variable)
         origin = Origin(
             file=text_of(path.name),
             sha256=sha256(path) if path.is_file() else "",  # else a pattern of several files
-            variable=measured.variable,
+            variable=variable,
             shape=stack_shots.shape,
         )
         provenance = inputs.provenance.with_image(source=origin)

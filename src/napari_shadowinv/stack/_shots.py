@@ -8,12 +8,9 @@
 from __future__ import annotations
 
 import functools
-import glob
 import hashlib
 import inspect
 import json
-import os
-import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -30,9 +27,9 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.fitting import FitShot
-from napari_shadowinv.io.files import in_counting_order, sha256, text_of
+from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.formats import PRADFORMAT, TEXT, kind_of
-from napari_shadowinv.io.images import read_tiff_page, tiff_pages
+from napari_shadowinv.io.frames import Frame, find_frames, read_frame, split_address
 from napari_shadowinv.io.read_write import read_radiograph
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
 from napari_shadowinv.pipeline.files import read_part
@@ -46,7 +43,6 @@ if TYPE_CHECKING:
 Reader = Callable[..., ArrayLike]
 Value = TypeVar("Value")
 
-_GLOB = re.compile(r"[*?\[]")
 _MAX_SHAPE_READS = 3  # shots that are read for the shape of all
 
 
@@ -111,21 +107,24 @@ class BlockReference(ImageReference):
 
 @dataclass(frozen=True)
 class FileReference(ImageReference):
-    """A file that holds one image, or a page of a TIFF that holds many."""
+    """A file that holds one image, or a page of a TIFF or frame of an array that holds many."""
 
     path: Path  # absolute, so that a worker elsewhere finds it
     reader: Reader
     page: int | None = None  # the reader takes it as a keyword
+    variable: str | None = None  # the same, of an array in an HDF5 file
 
     def __dask_tokenize__(self) -> tuple[Any, ...]:
         # A changed file is another input, so dask must not reuse its result.
         from dask.base import normalize_token
 
         file_stamp = stamp(self.path) if self.path.exists() else {}
-        return (str(self.path), normalize_token(self.reader), self.page, *file_stamp.values())
+        part = (self.page, self.variable)
+        return (str(self.path), normalize_token(self.reader), *part, *file_stamp.values())
 
     def read(self) -> tuple[AnyArray, dict[str, Any]]:
-        options: dict[str, Any] = {} if self.page is None else {"page": self.page}
+        parts = {"page": self.page, "variable": self.variable}
+        options: dict[str, Any] = {k: v for k, v in parts.items() if v is not None}
         warnings: list[Caution] = []
         if "warnings" in inspect.signature(self.reader).parameters:
             options["warnings"] = warnings
@@ -289,7 +288,7 @@ def read_shot(
     path, channel, variable
         As for `napari_shadowinv.io.read_radiograph`, whose errors this raises.
     page : int, optional
-        Of a TIFF with many pages, from 0.
+        Of a TIFF with many pages, or frame of the array `variable` in an HDF5 file, from 0.
     warnings : list of Caution, optional
         Receives the reasons to doubt the image.
 
@@ -300,7 +299,7 @@ def read_shot(
     if page is None:
         shot = read_radiograph(path, channel=channel, variable=variable)
     else:
-        image, file_warnings = read_tiff_page(path, page, channel=channel)
+        image, file_warnings = read_frame(path, page, channel=channel, variable=variable)
         shot = Radiograph(image, warnings=file_warnings)
     if warnings is not None:
         warnings.extend(file_doubts(shot))
@@ -390,7 +389,7 @@ def find_shots(
     if hasattr(shots, "dims") and hasattr(shots, "coords"):
         return _from_xarray(shots)
     if isinstance(shots, Sequence) and all(isinstance(item, (str, Path)) for item in shots):
-        return _from_files([Path(item) for item in shots], reader, shape)
+        return _from_files(shots, reader, shape)
     if isinstance(shots, Sequence) and all(np.ndim(item) == 2 for item in shots):
         shapes = {np.shape(item) for item in shots}
         if len(shapes) > 1:
@@ -412,48 +411,51 @@ def find_shots(
 
 
 def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shots:
-    path = Path(text)
-    # Path.is_dir raises an error if a name is too long.
-    if os.path.isdir(path):
-        raise InputError(f"{text} is a folder: specify the files, such as '{text}/*.tif'")
-    if _GLOB.search(text) and not os.path.exists(path):
-        paths = in_counting_order(map(Path, glob.glob(text, recursive=True)))
-        if not paths:
-            raise InputError(
-                f"no file matches {text}: expected shots; check the folder and pattern"
-            )
-        return _from_files(paths, reader, shape)
-    pages = _page_count(path, reader)
-    if pages == 1:
-        return _from_files([path], reader, shape)
-    items = [
-        Shot(f"{text_of(path.name)}[{page}]", FileReference(path.absolute(), reader, page))
-        for page in range(pages)
-    ]
+    items = _shots_of(find_frames(text, **_parts_of(text, reader)), reader)
     return Shots(items, shape or usual_shape(items))
 
 
-def _page_count(path: Path, reader: Reader) -> int:
-    """Return the number of pages of a TIFF, if the reader can select them."""
-    knows_pages = "page" in inspect.signature(reader).parameters
-    return tiff_pages(path) if knows_pages and kind_of(path) == "tiff" else 1
+def _parts_of(text: str, reader: Reader) -> dict[str, Any]:
+    """Return the array that a reader selects, and whether it can select frames."""
+    keywords = inspect.signature(reader).parameters
+    if split_address(text)[1] is not None and "variable" not in keywords:
+        raise InputError(
+            f"shots are {text}, and their reader does not select an array: give the file alone, or "
+            "a reader with the keyword 'variable'"
+        )
+    variable = getattr(reader, "keywords", {}).get("variable")
+    return {"variable": variable, "numbered": "page" in keywords}
 
 
-def _from_files(paths: Sequence[Path], reader: Reader, shape: tuple[int, int] | None) -> Shots:
+def _shots_of(frames: Sequence[Frame], reader: Reader) -> list[Shot]:
+    names = _distinct_names(frames)
+    return [
+        Shot(name, FileReference(frame.path.absolute(), reader, frame.number, frame.variable))
+        for name, frame in zip(names, frames, strict=True)
+    ]
+
+
+def _from_files(
+    paths: Sequence[str | Path], reader: Reader, shape: tuple[int, int] | None
+) -> Shots:
     if not paths:
         raise InputError("shots are an empty list: expected at least one path")
-    items = [
-        Shot(name, FileReference(path.absolute(), reader))
-        for name, path in zip(_names_of(paths), paths, strict=True)
-    ]
+    frames: list[Frame] = []
+    for path in paths:
+        parts = _parts_of(str(path), reader)
+        if split_address(path, parts["variable"])[1] is None:
+            frames.append(Frame(Path(path), text_of(Path(path).name)))
+        else:
+            frames += find_frames(path, **parts)
+    items = _shots_of(frames, reader)
     return Shots(items, shape or usual_shape(items))
 
 
-def _names_of(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Names of files, with their folders if they differ only there."""
-    names = tuple(text_of(path.name) for path in paths)
+def _distinct_names(frames: Sequence[Frame]) -> tuple[str, ...]:
+    """Return the names of frames, with their folders if they differ only there."""
+    names = tuple(frame.name for frame in frames)
     if len(set(names)) < len(names):
-        names = tuple(text_of(path) for path in paths)
+        names = tuple(text_of(frame.path.with_name(frame.name)) for frame in frames)
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)
         raise InputError(f"shots contain {twice} twice: expected each file once")
@@ -496,12 +498,18 @@ def _from_xarray(shots: xarray.DataArray | xarray.Dataset) -> Shots:
             )
         shots = shots[chosen[0]]
     name = next((dim for dim in shots.dims if str(dim).lower() not in PLANE), "shot")
-    coordinate = shots.coords.get(name)
+    coordinate, labels = shots.coords.get(name), shots.coords.get("name")
+    if not shots.variable._in_memory and name in shots.dims:
+        shots = shots.chunk({name: 1})  # otherwise the whole file would be read
     values, _ = unpack_array(shots, "shots", ("shot", *PLANE))
-    return _from_array(values, None if coordinate is None else coordinate.values)
+    return _from_array(
+        values,
+        None if coordinate is None else coordinate.values,
+        None if labels is None or labels.dims != (name,) else labels.values,
+    )
 
 
-def _from_array(shots: Any, coordinate: Any = None) -> Shots:
+def _from_array(shots: Any, coordinate: Any = None, labels: Any = None) -> Shots:
     da: Any = import_module("dask.array")
     if shots.ndim != 3 or 0 in shots.shape:
         raise InputError(
@@ -517,10 +525,14 @@ def _from_array(shots: Any, coordinate: Any = None) -> Shots:
     if isinstance(shots, da.Array):
         array = shots.rechunk((1, -1, -1))
         images = [BlockReference(array, index) for index in range(count)]
-    else:
+    elif isinstance(shots, np.ndarray):
         array = da.from_array(np.asarray(shots), chunks=(1, -1, -1))
         images = [ArrayReference(plane) for plane in np.asarray(shots)]
-    names = map(str, range(count) if coordinate is None else coordinate)
+    else:  # of h5py or zarr
+        array = da.from_array(shots, chunks=(1, -1, -1))
+        images = [BlockReference(array, index) for index in range(count)]
+    numbers = range(count) if coordinate is None else coordinate
+    names = map(str, numbers if labels is None else labels)
     items = [Shot(name, image) for name, image in zip(names, images, strict=True)]
     return Shots(items, (shots.shape[1], shots.shape[2]), coordinate, array, mask)
 
@@ -548,9 +560,10 @@ def find_source(source: Any, *, reader: Reader = read_shot) -> AnyArray | Shots 
     """Return the undisturbed beam as one image, or as many."""
     if source is None:
         return None
-    single = isinstance(source, (str, Path)) and not _GLOB.search(str(source))
-    if single and _page_count(Path(source), reader) == 1:
-        return FileReference(Path(source).absolute(), reader).read()[0]
+    if isinstance(source, (str, Path)):
+        frames = find_frames(source, **_parts_of(str(source), reader))
+        if len(frames) == 1:
+            return _shots_of(frames, reader)[0].images.read()[0]
     if getattr(source, "ndim", None) == 2:
         return np.asarray(source)
     sources = find_shots(source, reader=reader)
@@ -571,7 +584,8 @@ def table_shots(
         ]
     rows, unused = rows_to_invert(table)
     shots = []
-    for name, row in zip(_names_of([row.file for row in rows]), rows, strict=True):
+    files = [Frame(row.file, text_of(row.file.name)) for row in rows]
+    for name, row in zip(_distinct_names(files), rows, strict=True):
         (row,) = _with_absolute_paths([row])
         setup = row_setup(row, _read_geometry(row, channel, variable), recipe)
         images = RowsReference((row,), recipe, channel, variable, True, setup, unused)

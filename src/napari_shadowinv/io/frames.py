@@ -1,0 +1,216 @@
+"""Frames: images of a file that holds many, or of a folder, each read on demand.
+
+- all frames that a path stands for: `find_frames`; the images of a folder: `images_in`
+- an array of an HDF5 file as ``file.h5::/entry/data/data``: `split_address`
+- one frame: `read_frame`; all of them as a lazy dataset: `lazy_frames`
+
+Any axes of an array before the last two count frames. At most one frame is in memory at a time.
+"""
+
+from __future__ import annotations
+
+import glob
+import math
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.files import in_counting_order, text_of
+from napari_shadowinv.io.formats import PRADFORMAT, RADIOGRAPH_SUFFIXES, RESULT, TIFF, format_of
+from napari_shadowinv.io.hdf5 import count_frames, read_hdf5_frame
+from napari_shadowinv.io.images import read_tiff_page, tiff_pages, to_grey
+
+if TYPE_CHECKING:
+    import xarray
+
+_GLOB = re.compile(r"[*?\[]")
+_ADDRESS = "::"  # between a file and the name of an array in it
+FRAMES_FORMAT = "shadowinv frames"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of a file.
+
+    Attributes
+    ----------
+    path : Path
+    name : str
+        For messages and tables.
+    number : int or None
+        Page of a TIFF or frame of an HDF5 array, counted over all leading axes; None if the file
+        holds one image.
+    variable : str or None
+        Name of the array in an HDF5 file.
+    """
+
+    path: Path
+    name: str
+    number: int | None = None
+    variable: str | None = None
+
+
+def split_address(path: str | Path, variable: str | None = None) -> tuple[Path, str | None]:
+    """Return the file and the name of the array of ``file.h5::/entry/data/data``."""
+    file, separator, name = str(path).partition(_ADDRESS)
+    if variable is not None or not separator or os.path.exists(path):
+        return Path(path), variable
+    return Path(file), name or "/"
+
+
+def images_in(folder: Path) -> list[Path]:
+    """List a folder's images with the most frequent suffix, in natural order."""
+    # A table of settings next to a run of TIFFs is not a shot.
+    files = [
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in RADIOGRAPH_SUFFIXES and path.is_file() and path.name[0] != "."
+    ]
+    counts = Counter(path.suffix.lower() for path in files)
+    if not counts:
+        return []
+    most_frequent = max(sorted(counts), key=lambda suffix: counts[suffix])
+    return in_counting_order(path for path in files if path.suffix.lower() == most_frequent)
+
+
+def find_frames(
+    path: str | Path, variable: str | None = None, *, numbered: bool = True
+) -> list[Frame]:
+    """Return the frames of a TIFF, of an array of an HDF5 file, of a folder or of a pattern.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file, also as ``file.h5::/entry/data/data``, a folder of images, or a pattern such as
+        ``shots/*.tif``.
+    variable : str, optional
+        Name of the array in each HDF5 file, with its groups.
+    numbered : bool, optional
+        Whether frames can be read by their numbers. Otherwise each file is a frame.
+
+    Returns
+    -------
+    list of Frame
+        Without a number where a file holds one image. The files of a folder or pattern are opened
+        only to count the frames in their arrays.
+
+    Raises
+    ------
+    FileFormatError
+        If a file cannot be read, or a folder has no images.
+    InputError
+        If a file has no such array, or no file matches the pattern.
+    """
+    file, variable = split_address(path, variable)
+    if os.path.isdir(file):
+        files = images_in(file)
+        if not files:
+            raise FileFormatError(f"{file} contains no image: expected a folder of radiographs")
+    elif _GLOB.search(str(file)) and not os.path.exists(file):
+        files = in_counting_order(map(Path, glob.glob(str(file), recursive=True)))
+        if not files:
+            raise InputError(
+                f"no file matches {file}: expected shots; check the folder and pattern"
+            )
+    elif numbered and variable is None:
+        return _pages_of(file)
+    else:
+        files = [file]
+    if not numbered or variable is None:
+        return [Frame(each, text_of(each.name), variable=variable) for each in files]
+    if len(files) == 1:
+        return _frames_of_array(files[0], variable)
+    return [frame for each in files for frame in _readable_frames(each, variable)]
+
+
+def _readable_frames(path: Path, variable: str) -> list[Frame]:
+    """Return the frames of one file among many, which fails alone if it cannot be read."""
+    try:
+        return _frames_of_array(path, variable)
+    except (OSError, ValueError):
+        return [Frame(path, text_of(path.name), variable=variable)]
+
+
+def _pages_of(path: Path) -> list[Frame]:
+    name = text_of(path.name)
+    count = tiff_pages(path) if format_of(path) is TIFF else 1
+    if count == 1:
+        return [Frame(path, name)]
+    return [Frame(path, f"{name}[{page}]", page) for page in range(count)]
+
+
+def _frames_of_array(path: Path, variable: str) -> list[Frame]:
+    name = text_of(path.name)
+    axes = count_frames(path, variable) if format_of(path) in (PRADFORMAT, RESULT) else ()
+    if math.prod(axes) <= 1:
+        return [Frame(path, name, variable=variable)]
+    return [
+        Frame(path, f"{name}[{','.join(map(str, index))}]", number, variable)
+        for number, index in enumerate(np.ndindex(*axes))
+    ]
+
+
+def read_frame(
+    path: Path, number: int, *, channel: str | int | None = None, variable: str | None = None
+) -> tuple[FloatArray, tuple[Caution, ...]]:
+    """Read a page of a TIFF or a frame of an HDF5 array, with warnings as of a `Radiograph`."""
+    if variable is None:
+        return read_tiff_page(path, number, channel=channel)
+    return to_grey(read_hdf5_frame(path, variable, number), channel, path), ()
+
+
+def lazy_frames(frames: Sequence[Frame], read: Callable[[Frame], AnyArray]) -> xarray.Dataset:
+    """Describe frames as a dataset whose images dask reads on demand.
+
+    Parameters
+    ----------
+    frames : sequence of Frame
+    read : callable
+        Returns the image of a frame, shape (H, W). The first is read now.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``image`` (shot, y, x), a chunk for each frame, and the coordinate ``name``.
+    """
+    import xarray as xr
+    from dask.base import tokenize
+
+    da: Any = import_module("dask.array")
+    first = read(frames[0])
+    stamps = {frame.path: frame.path.stat().st_mtime_ns for frame in frames}
+    layer = f"frames-{tokenize([repr(frame) for frame in frames], *stamps.values())}"
+    tasks = {
+        (layer, index, 0, 0): (_read_block, read, frame, first.shape)
+        for index, frame in enumerate(frames)
+    }
+    chunks = ((1,) * len(frames), *((side,) for side in first.shape))
+    image = da.Array(tasks, layer, chunks, dtype=first.dtype)
+    names = np.array([frame.name for frame in frames], dtype=str)
+    return xr.Dataset(
+        {"image": (("shot", "y", "x"), image, {"units": "1", "long_name": "Image"})},
+        coords={"name": ("shot", names, {"long_name": "Name of the shot"})},
+        attrs={"format": FRAMES_FORMAT},
+    )
+
+
+def _read_block(
+    read: Callable[[Frame], AnyArray], frame: Frame, shape: tuple[int, ...]
+) -> AnyArray:
+    image = read(frame)
+    if image.shape != shape:
+        raise FileFormatError(
+            f"{frame.name} has {' × '.join(map(str, image.shape))} pixels, the first frame "
+            f"{' × '.join(map(str, shape))}: expected images of one size; leave it out"
+        )
+    return image[np.newaxis]

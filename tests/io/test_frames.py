@@ -1,0 +1,169 @@
+"""Frames of files that hold many: each is read alone, and missing ones are not zeros."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+
+from napari_shadowinv import FileFormatError, InputError, read
+from napari_shadowinv.io import hdf5, read_radiograph
+from napari_shadowinv.io.frames import find_frames, read_frame
+
+CUBE = np.arange(2 * 3 * 5 * 7, dtype=np.uint16).reshape(2, 3, 5, 7)
+
+
+@pytest.fixture
+def nexus(tmp_path: Path) -> Path:
+    """A NeXus file as a detector writes it, with a chunk for each frame."""
+    path = tmp_path / "run_12.nxs"
+    with h5py.File(path, "w") as file:
+        data = file.create_dataset("entry/data/data", data=CUBE, chunks=(1, 1, 5, 7))
+        file["entry/single"] = CUBE[:1, :1]
+        file["entry/times"] = np.arange(6.0)
+        file.attrs["default"], file["entry"].attrs["default"] = "entry", np.bytes_("data")
+        data.parent.attrs["signal"] = "data"
+    return path
+
+
+@pytest.fixture
+def loaded(monkeypatch) -> list[int]:
+    """Number of values of each part of an HDF5 file that is loaded."""
+    sizes: list[int] = []
+    getitem = h5py.Dataset.__getitem__
+
+    def logged(dataset, *args, **kwargs):
+        values = getitem(dataset, *args, **kwargs)
+        sizes.append(np.size(values))
+        return values
+
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", logged)
+    return sizes
+
+
+@pytest.mark.parametrize("name", ["/entry/data/data", "entry/data", "/", ""])
+def test_address_names_an_array_or_a_default_of_nexus(nexus, name):
+    frames = read(f"{nexus}::{name}")
+    assert frames.image.dims == ("shot", "y", "x")
+    np.testing.assert_array_equal(frames.image, CUBE.reshape(6, 5, 7))
+    assert list(frames.name.values) == [f"run_12.nxs[{i},{j}]" for i in (0, 1) for j in (0, 1, 2)]
+
+
+def test_lazy_frames_load_only_computed_frames(nexus, loaded):
+    frames = read(f"{nexus}::/entry/data/data")
+    assert loaded == [35]
+    frames.image[2:4].compute()
+    assert loaded == [35] * 3
+
+
+def test_index_selects_one_frame(nexus, loaded):
+    shot = read(f"{nexus}::/entry/data/data[1,2]")
+    np.testing.assert_array_equal(shot.image, CUBE[1, 2])
+    assert shot.metadata["variable"] == "/entry/data/data[1,2]"
+    assert loaded == [35]
+    again = read_radiograph(nexus, variable="/entry/data/data[1,2]")
+    np.testing.assert_array_equal(again.image, CUBE[1, 2])
+
+
+def test_leading_axes_of_length_one_are_one_image(nexus):
+    assert read(f"{nexus}::/entry/single").image.shape == (5, 7)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("entry/data/data[1]", r"frames from \[0,0\] to \[1,2\]"),
+        ("entry/data/data[1,3]", r"frames from \[0,0\] to \[1,2\]"),
+        (
+            "entry/datum",
+            r"has no array 'entry/datum': it holds 'entry/data/data' \(2×3×5×7 uint16\)",
+        ),
+        ("entry/times", r"with shape \(6,\): expected an image"),
+    ],
+)
+def test_wrong_name_or_index_is_refused(nexus, name, words):
+    with pytest.raises((InputError, FileFormatError), match=words):
+        read(f"{nexus}::{name}")
+
+
+def test_many_images_are_no_radiograph(nexus):
+    with pytest.raises(FileFormatError, match=r"6 frames .* such as 'entry/data/data\[0,0\]'"):
+        read_radiograph(nexus, variable="entry/data/data")
+
+
+def test_frame_that_is_not_written_yet_is_refused(tmp_path):
+    path = tmp_path / "growing.h5"
+    with h5py.File(path, "w") as file:
+        data = file.create_dataset("data", (4, 8, 8), "u2", chunks=(1, 4, 8))
+        data[:2] = 7
+        data[2, :4] = 7
+        file.create_dataset("never", (4, 8, 8), "u2")
+    assert read_frame(path, 1, variable="data")[0].min() == 7
+    for number, name in ((2, "data"), (3, "data"), (0, "never")):
+        with pytest.raises(FileFormatError, match=f"does not hold frame {number} of '/{name}' yet"):
+            read_frame(path, number, variable=name)
+
+
+def test_filter_that_is_not_installed_is_named(tmp_path, monkeypatch):
+    path = tmp_path / "packed.h5"
+    with h5py.File(path, "w") as file:
+        layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        layout.set_chunk((1, 8, 8))
+        layout.set_filter(32008, h5py.h5z.FLAG_OPTIONAL)
+        space = h5py.h5s.create_simple((2, 8, 8))
+        h5py.h5d.create(file.id, b"data", h5py.h5t.NATIVE_UINT16, space, layout)
+        for number in range(2):
+            file["data"].id.write_direct_chunk((number, 0, 0), bytes(64))
+    monkeypatch.setattr(hdf5, "import_module", _missing)
+    with pytest.raises(FileFormatError, match=r"not installed \(32008\): install .* hdf5plugin"):
+        read(f"{path}::data")
+
+
+def _missing(name: str) -> None:
+    raise ImportError(name)
+
+
+def test_frames_in_other_files_are_refused(tmp_path, nexus):
+    path = tmp_path / "master.h5"
+    layout = h5py.VirtualLayout((6, 5, 7), "u2")
+    layout[:] = h5py.VirtualSource(nexus, "flat", (6, 5, 7))
+    with h5py.File(path, "w") as file:
+        file.create_virtual_dataset("all", layout)
+        file["linked"] = h5py.ExternalLink(nexus.name, "entry/data/data")
+    with pytest.raises(FileFormatError, match="as a virtual array from"):
+        read(f"{path}::all")
+    with pytest.raises(FileFormatError, match="does not hold 'linked' itself but links to"):
+        read(f"{path}::linked")
+
+
+def test_tiff_folder_and_pattern_give_lazy_frames(tmp_path):
+    planes = CUBE.reshape(6, 5, 7)
+    folder = tmp_path / "shots"
+    folder.mkdir()
+    for number, plane in enumerate(planes):
+        tifffile.imwrite(folder / f"shot_{number + 5}.tif", plane)
+    film = tmp_path / "film.tif"
+    tifffile.imwrite(film, planes, photometric="minisblack")
+    for path, name in ((film, "film.tif[4]"), (folder, "shot_9.tif"), (folder / "*", "shot_9.tif")):
+        frames = read(path)
+        assert str(frames.name[4].values) == name
+        np.testing.assert_array_equal(frames.image, planes)
+
+
+def test_frame_of_another_size_is_named(tmp_path):
+    for number, side in enumerate((5, 6)):
+        np.save(tmp_path / f"shot_{number}.npy", np.ones((5, side)))
+    with pytest.raises(
+        FileFormatError, match=r"shot_1.npy has 5 × 6 pixels, the first frame 5 × 5"
+    ):
+        read(tmp_path).image.compute()
+
+
+def test_unreadable_file_among_many_is_a_frame(tmp_path, nexus):
+    (tmp_path / "run_13.nxs").write_bytes(nexus.read_bytes()[:900])
+    names = [frame.name for frame in find_frames(f"{tmp_path}/*.nxs::/entry/data/data")]
+    assert len(names) == 7
+    assert names[-1] == "run_13.nxs"
