@@ -74,13 +74,16 @@ def _rows(path: Path, variable: str | None) -> _summary.Rows:
 
 
 def _frame_rows(frames: Radiograph | xarray.Dataset) -> _summary.Rows:
-    """Describe many images by their number and the first."""
+    """Describe many images by their names and the first."""
     from napari_shadowinv.io import Radiograph
 
     assert not isinstance(frames, Radiograph)
-    names = frames["name"].values
-    kind = f"{len(names)} frames, {names[0]} to {names[-1]}"
-    return [("kind", kind), *_array_rows(frames["image"][0].values)]
+    names, images = frames["name"].values, frames["image"]
+    return [
+        ("kind", f"{len(names)} frames, {names[0]} to {names[-1]}"),
+        ("shape", f"{images.shape}, [shot, y, x]"),
+        *((f"first: {name}", text) for name, text in _array_rows(images[0].values)[2:]),
+    ]
 
 
 def _matlab_rows(path: Path, variable: str | None) -> _summary.Rows:
