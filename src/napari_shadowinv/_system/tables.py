@@ -36,12 +36,15 @@ class Table(NamedTuple):
     path : Path
     header : list of str
         Column names in lower case.
+    titles : list of str
+        Column names as in the file.
     rows : dict of int to list of str
         Cells of each row, as many as there are columns, by its line in the file.
     """
 
     path: Path
     header: list[str]
+    titles: list[str]
     rows: dict[int, list[str]]
 
     def position_of(self, column: str) -> int:
@@ -70,7 +73,8 @@ def read_table(path: Path) -> Table:
     """
     records = _records(path, small_text(path, _EXPECTED, "utf-8-sig"))
     _, names = next(records, (0, []))
-    header = [name.lower() for name in _without_empty_end(names)]
+    titles = _without_empty_end(names)
+    header = [name.lower() for name in titles]
     rows = {}
     for line, cells in records:
         if len(_without_empty_end(cells)) > len(header):
@@ -81,7 +85,7 @@ def read_table(path: Path) -> Table:
         rows[line] = [*cells, *[""] * len(header)][: len(header)]
     if header and not rows:
         raise InputError(f"{path} has no rows below its column names: expected at least one")
-    return Table(path, header, rows)
+    return Table(path, header, titles, rows)
 
 
 def read_rows(

@@ -92,5 +92,6 @@ app.command(cls=HelpfulCommand, epilog=_stack_commands.BATCH_EPILOG)(_stack_comm
 app.command(cls=HelpfulCommand)(_stack_commands.merge)
 app.command(cls=HelpfulCommand, epilog=_stack_commands.WATCH_EPILOG)(_stack_commands.watch)
 app.command(cls=HelpfulCommand)(_stack_commands.status)
+app.command(cls=HelpfulCommand)(_stack_commands.join)
 app.command(cls=HelpfulCommand)(_stack_commands.export)
 app.command(cls=HelpfulCommand)(_stack_commands.movie)

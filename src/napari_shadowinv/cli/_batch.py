@@ -34,6 +34,7 @@ from napari_shadowinv.cli._terminal import (
     say_on_stderr,
 )
 from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.io.shot_columns import joined_columns
 from napari_shadowinv.io.store import (
     DAMAGED,
     DONE,
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
+    from napari_shadowinv.io.store_columns import Column as StoreColumn
     from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
     from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.stack import RunStatus
@@ -294,6 +296,12 @@ def _beam_rows(store: StackStore) -> Rows:
     return rows
 
 
+def _joined_rows(attributes: Mapping[str, Any]) -> Rows:
+    """Return the columns of a shot table."""
+    titles = [column.title for column in joined_columns(attributes)]
+    return [("shot table", ", ".join(titles))] if titles else []
+
+
 def _fit_rows(attributes: Mapping[str, Any]) -> Rows:
     """Return the choices of the fit."""
     choices = {**json.loads(attributes["fit"]), "fields": json.loads(attributes["fields"])}
@@ -394,7 +402,18 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
     is_damaged = bool(store.damage.shots or store.damage.files)
     if not every:
         return tables, is_damaged
-    columns = [column for column in store.columns if column.format]
+    joined = joined_columns(store.attributes)
+    own_columns = [column for column in store.columns if column.format and column not in joined]
+    listed = [_column_table(store, own_columns)]
+    listed += [_column_table(store, joined)] if joined else []  # of a shot table
+    # A column of the table above would leave them a few letters a line.
+    notes = [(f"shot {index}", note) for index, note in _notes(store)]
+    tables += [*listed, *([two_columns("Reasons and warnings", notes)] if notes else [])]
+    return tables, is_damaged
+
+
+def _column_table(store: StackStore, columns: Sequence[StoreColumn]) -> Table:
+    """List columns of each shot."""
     shots = Table(box=box.SIMPLE)
     for heading in ("shot", "name", "status"):
         shots.add_column(heading, overflow="fold")
@@ -405,13 +424,10 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
             str(index),
             plain(store.names[index]),
             STATUS_NAMES[status],
-            *(column.text(report) for column in columns),
+            *(plain(column.text(report)) for column in columns),
             style="red" if status in (FAILED, DAMAGED) else "",
         )
-    # A column of the table above would leave them a few letters a line.
-    notes = [(f"shot {index}", note) for index, note in _notes(store)]
-    tables += [shots, *([two_columns("Reasons and warnings", notes)] if notes else [])]
-    return tables, is_damaged
+    return shots
 
 
 def _notes(store: StackStore) -> Iterator[tuple[int, str]]:
@@ -444,6 +460,7 @@ def store_rows(store: StackStore, *, trouble: bool = True) -> Rows:
         *_recipe_rows(store),
         *_beam_rows(store),
         ("stored", str(attributes["stored"])),
+        *_joined_rows(attributes),
         *([] if store.field is None else _fit_rows(attributes)),
         ("options", options_text(json.loads(attributes["options"]))),
         *_site_rows(store),

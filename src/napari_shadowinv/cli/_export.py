@@ -122,13 +122,17 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
         rows = csv.writer(f)
         listed = [column.heading for column in content.columns]
         rows.writerow(["shot", "name", "status", *listed, "reason", *headings])
-        keys = [*(column.key for column in content.columns), "reason"]
+        keys = [*(column.entry or column.key for column in content.columns), "reason"]
         for index in indices:
-            report = (reports[index].get(key, "") for key in keys)
+            report = (_escape_entry(reports[index].get(key, "")) for key in keys)
             peak = (f"{columns[name][index]:.9g}" for name in names)
             status = STATUS_NAMES[statuses[index]]
             rows.writerow([index, _escape_cell(content.names[index]), status, *report, *peak])
     return out
+
+
+def _escape_entry(value: Any) -> Any:
+    return _escape_cell(value) if isinstance(value, str) else value
 
 
 def _escape_cell(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Commands for many shots: `batch`, `merge`, `watch`, `status`, `export` and `movie`."""
+"""Commands for many shots: `batch`, `merge`, `watch`, `status`, `join`, `export`, `movie`."""
 
 from __future__ import annotations
 
@@ -19,10 +19,13 @@ HELP = {
     "processes (default without).",
     "format": "tiff (float32, one file per shot and component), pradformat (one file per shot), or "
     "csv (a table with one row per shot).",
-    "shots": "A quoted glob, a list of files, a multi-page TIFF with one shot per page, or a table "
-    "(.csv) with one row per shot.",
+    "shots": "A quoted glob, a folder, a list of files, a multi-page TIFF with one shot per page, "
+    "an array of frames in HDF5 (run.h5::/entry/data/data), or a table (.csv) of images with one "
+    "row per shot.",
     "fit": "Fit the forward model to each shot instead of inverting it, with the recipe's section "
     "[fit]; table rows with the same shot are images of one object.",
+    "table": "Table with a row for each shot: CSV with the column 'shot' or 'number', or HDF5 as "
+    "file.h5::/entry/shots.",
     "out": "Output folder, or file for csv. Default: the store's name, in the current folder.",
 }
 BATCH_EPILOG = """
@@ -31,6 +34,7 @@ shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr
 shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr --resume
 shadowinv batch 'shots/*.tif' --source-from polynomial --low-pass 1 --out night.shadowinv.zarr
 shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
+shadowinv batch run.h5::/entry/data/data --shot-table shots.csv --out run.shadowinv.zarr
 shadowinv batch pack.csv --setup setup.toml --out pack.shadowinv.zarr
 shadowinv batch shots.csv --fit --recipe recipe.toml --out fits.shadowinv.zarr
 shadowinv batch 'shots/*.tif' --out night.shadowinv.zarr --shard 3/40
@@ -175,6 +179,21 @@ def status(
         say(table)
     if verify and is_damaged:
         raise typer.Exit(EXIT_FAILED_SHOTS)
+
+
+@notify_errors
+def join(
+    store: _flags.StoreFolder,
+    table: Annotated[str, typer.Argument(help=HELP["table"], show_default=False)],
+    quiet: _flags.Quiet = False,
+) -> None:
+    """Join a shot table to a store by the numbers of the shots, such as after a watch."""
+    from napari_shadowinv.io.shot_columns import joined_columns
+    from napari_shadowinv.stack import join_shot_table
+
+    columns = joined_columns(join_shot_table(store, table).attrs)
+    if not quiet:
+        say(f"Joined to {store}: {', '.join(column.title for column in columns)}")
 
 
 @notify_errors

@@ -31,6 +31,7 @@ from napari_shadowinv.inversion.variables import (
 )
 from napari_shadowinv.io.files import check_folder_of
 from napari_shadowinv.io.formats import STORE
+from napari_shadowinv.io.shot_columns import joined_columns
 from napari_shadowinv.io.store_checksums import (
     FIXED,
     SEAL,
@@ -86,12 +87,14 @@ def fitted_field(attributes: Mapping[Any, Any]) -> str | None:
 
 
 def columns_of_store(attributes: Mapping[Any, Any]) -> tuple[Column, ...]:
-    """Return the columns of a store, by its attributes."""
+    """Return the columns of a store, by its attributes; those of a shot table last."""
+    joined = joined_columns(attributes)
     if fitted_field(attributes) is not None:
-        return columns_of(FITS)
+        return *columns_of(FITS), *joined
     if OWN_SETUPS not in attributes:
-        return columns_of(INVERSIONS)
-    return columns_of(ROWS, json.loads(attributes.get("setup", "{}")).get("kind", "proton"))
+        return *columns_of(INVERSIONS), *joined
+    kind = json.loads(attributes.get("setup", "{}")).get("kind", "proton")
+    return *columns_of(ROWS, kind), *joined
 
 
 def _read_document(path: Path) -> dict[str, Any]:

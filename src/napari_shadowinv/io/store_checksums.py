@@ -39,6 +39,7 @@ from zarr.storage import LocalStore
 from napari_shadowinv._system.safety import check_regular, check_size, small_text
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import check_promise
+from napari_shadowinv.io.shot_columns import PREFIX
 
 _METADATA, _CHUNKS = "zarr.json", "/c/"
 # Where the formats of chunks keep the number of texts, and of unpacked bytes.
@@ -178,7 +179,7 @@ _CRC_BYTES = 4
 Report = dict[str, Any]
 
 _READS = 3  # of a shot that another process may be writing again
-_RECORD = ("status", "report")  # arrays with an entry for each shot that are no fields
+RECORD = ("status", "report")  # arrays with an entry for each shot that are no fields
 
 
 class Status(IntEnum):
@@ -248,7 +249,7 @@ class Layout:
         return tuple(
             name
             for name in self.arrays
-            if _has_shots(self.arrays[name]) and self._together(name) == 1 and name not in _RECORD
+            if _has_shots(self.arrays[name]) and self._together(name) == 1 and name not in RECORD
         )
 
     @cached_property
@@ -309,7 +310,7 @@ def note_shot(
     """Return a shot's place, labels and the checksums of its written chunks, for its report."""
     chunks: dict[str, str | None] = {}
     for name, array in arrays.items():
-        if not is_along_shots(array) or name in _RECORD:
+        if not is_along_shots(array) or name in RECORD:
             continue
         if not has_checksums(array):
             return {}
@@ -380,7 +381,7 @@ def check_chunk(layout: Layout, key: str, name: str, index: int) -> None:
     problem = ""
     if name in layout.of_each_shot:
         problem, _ = _check_again(partial(_inspect_shot, layout, index, (name,)))
-    elif name not in _RECORD:
+    elif name not in RECORD:
         problem = _chunk_problem(layout, key, every_byte=False)
     if problem:
         raise _damage_error(layout, name, index, problem)
@@ -504,7 +505,11 @@ def find_damage(
             shots[index] = problem
         elif report:
             values = {**report, **report.get(LABELS, {})}
-            noted[index] = {k: values[k] for k in layout.of_many_shots if k in values}
+            noted[index] = {
+                key: value
+                for key, value in values.items()
+                if key in layout.of_many_shots or key.startswith(PREFIX)
+            }
     if numbers is not None:
         return Damage(shots)
     keys = [*layout.keys_of_many, *layout.fixed]

@@ -49,6 +49,8 @@ class Column:
         Format specification in tables for people, which omit columns without one.
     width : int
         Least number of characters of a table's column.
+    entry : str
+        Name of its entry in a shot's report, if it is not the key.
     """
 
     key: str
@@ -60,6 +62,7 @@ class Column:
     value: Callable[[Any], Any] | None = None
     format: str = ""
     width: int = 0
+    entry: str = ""
 
     @property
     def fill(self) -> Any:
@@ -83,11 +86,12 @@ class Column:
 
     def of(self, report: Mapping[str, Any]) -> Any:
         """Return the value from a shot's report, or the fill value."""
-        return report.get(self.key, self.fill)
+        return report.get(self.entry or self.key, self.fill)
 
     def text(self, report: Mapping[str, Any]) -> str:
         """Return the value from a shot's report as text, empty without a value."""
-        return format(report[self.key], self.format) if self.key in report else ""
+        entry = self.entry or self.key
+        return format(report[entry], self.format) if entry in report else ""
 
 
 def _error(part: str) -> Callable[[Any], float]:

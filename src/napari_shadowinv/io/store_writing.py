@@ -5,6 +5,7 @@
 - write a shot, or why it failed, also in a worker: `ShotWriter`; gather numbers: `summarise`
 - end the writing in shards: `finish_shards`
 - a store that grows by one shot at a time while its run goes on: `GrowingStore`
+- columns of a shot table for a store that exists: `join_columns`
 
 The folder's own ``zarr.json`` holds a copy of every array's shape, and who opens the store goes
 by that copy. So a store changes its length in one moment: when that one file is replaced.
@@ -17,7 +18,7 @@ import os
 import secrets
 import shutil
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -29,8 +30,9 @@ import numpy as np
 from napari_shadowinv._system.hidden_files import hidden_name, remove_drafts, sweep
 from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv._typing import AnyArray
-from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import replacing
+from napari_shadowinv.io.shot_columns import JOINED, describe_columns, joined_columns
 from napari_shadowinv.io.store import (
     DONE,
     FAILED,
@@ -175,6 +177,79 @@ def _open_arrays(path: Path, store_id: str, shots: int) -> dict[str, Any]:
             "the file system is in sync on all machines, then run again to resume"
         )
     return arrays
+
+
+def check_column_keys(columns: Iterable[Column], taken: Collection[str]) -> None:
+    """Refuse columns of a shot table whose names a store uses itself."""
+    for column in columns:
+        if column.key in taken:
+            raise InputError(
+                f"the shot table has the column '{column.key}', a name that the store uses itself: "
+                "rename the column"
+            )
+
+
+def join_columns(
+    store: StackStore, columns: Sequence[Column], rows: Sequence[Mapping[str, Any]]
+) -> StackStore:
+    """Join columns of a shot table to a store, and return it as it is now.
+
+    The values, `rows` for all shots, go into the reports of shots that have ended; a process killed
+    meanwhile leaves a store that can be joined again.
+    """
+    before = {column.key: column for column in joined_columns(store.attributes)}
+    arrays = ShotWriter.of(store).arrays()
+    taken = {*arrays, *(column.key for column in store.columns)} - before.keys()
+    check_column_keys(columns, taken)
+    for column in columns:
+        existing = before.get(column.key, column)
+        if (existing.unit, existing.kind) != (column.unit, column.kind):
+            raise InputError(
+                f"the shot table has '{column.key}' as {_kind_text(column)}, and {store.path} as "
+                f"{_kind_text(existing)}: correct the table, or rename the column"
+            )
+    joined = {**before, **{column.key: column for column in columns}}
+    with _as_store_errors(store.path), defer_interrupts():
+        new = [column for column in columns if column.key not in before]
+        if new:
+            _create_columns(store, new, describe_columns(joined.values()))
+        entries = {column.entry for column in columns}
+        for index in np.flatnonzero(np.isin(store.statuses(), (DONE, FAILED))).tolist():
+            report = store.report(index)
+            kept = {key: value for key, value in report.items() if key not in entries}
+            changed = {**kept, **rows[index]}
+            if changed != report:
+                text = np.array([json.dumps(changed)], dtype=object)
+                arrays["report"][index : index + 1] = text
+    joined_store = StackStore(store.path)
+    summarise(joined_store)
+    return joined_store
+
+
+def _kind_text(column: Column) -> str:
+    if column.kind is str:
+        return "text"
+    return "numbers" if column.unit == "1" else f"numbers in {column.unit}"
+
+
+def _create_columns(store: StackStore, columns: Sequence[Column], description: str) -> None:
+    """Create the arrays of more columns; the folder lists them once all are there."""
+    import zarr
+
+    shots = len(store.names)
+    group = zarr.open_group(store.path, mode="r+")
+    for column in columns:
+        shutil.rmtree(store.path / column.key, ignore_errors=True)  # left by a killed process
+        _create_array(group, column.key, _variable_of(column, shots), {"shot": shots})
+    file = store.path / "zarr.json"
+    document = json.loads(file.read_text(encoding="utf-8"))
+    document["attributes"][JOINED] = description
+    for column in columns:
+        text = (store.path / column.key / "zarr.json").read_text(encoding="utf-8")
+        document["consolidated_metadata"]["metadata"][column.key] = json.loads(text)
+    with replacing(file, overwrite=True) as draft:
+        draft.write_text(json.dumps(reseal(document), indent=2), encoding="utf-8")
+    _open_arrays.cache_clear()  # it has been opened without them
 
 
 def summarise(store: StackStore) -> None:
@@ -360,11 +435,14 @@ def _shot_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Vari
         "status": Variable(("shot",), np.dtype("int8"), status),
         "report": Variable(("shot",), str, report),
     }
-    for column in columns_of_store(attributes):
-        dtype = str if column.kind is str else np.dtype(column.kind)
-        fill: AnyArray = np.full(shots, column.fill, dtype=column.dtype)
-        variables[column.key] = Variable(("shot",), dtype, column.labels, fill)
-    return variables
+    columns = columns_of_store(attributes)
+    return variables | {column.key: _variable_of(column, shots) for column in columns}
+
+
+def _variable_of(column: Column, shots: int) -> Variable:
+    dtype = str if column.kind is str else np.dtype(column.kind)
+    fill: AnyArray = np.full(shots, column.fill, dtype=column.dtype)
+    return Variable(("shot",), dtype, column.labels, fill)
 
 
 def _create_array(group: Any, name: str, variable: Variable, sizes: Mapping[str, int]) -> None:

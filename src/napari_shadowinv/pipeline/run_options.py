@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any, Literal, Self
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
@@ -76,6 +77,13 @@ class RunOptions(_StoreOptions):
         "also at the same time and from several machines; merge it when they have ended.",
         json_schema_extra={"metavar": "K/N"},
     )
+    shot_table: Path | None = Field(
+        default=None,
+        title="Shot table",
+        description="Table with a row for each shot (CSV, or HDF5 as file.h5::/entry/shots) that "
+        "is stored with the shots by the numbers in their names: energies, delays, remarks.",
+        json_schema_extra={"metavar": "FILE"},
+    )
     workers: int | None = Field(
         default=None,
         ge=1,
@@ -102,6 +110,11 @@ class RunOptions(_StoreOptions):
             raise CombinationError(
                 f"{{shard}} is {self.shard} and {{overwrite}} is set, but a shard cannot overwrite "
                 "the store of the others: remove the store first, or choose another name"
+            )
+        if self.shard is not None and self.shot_table is not None:
+            raise CombinationError(
+                f"{{shard}} is {self.shard} and {{shot_table}} is {self.shot_table}, but shards "
+                "cannot join a table: join it to the merged store with shadowinv join"
             )
         return self
 

@@ -7,12 +7,13 @@
   (the shots of a run's shard: `numbers_of`; shards that have not ended: `incomplete_shards`)
 - watch a folder and invert each shot as soon as it arrives: `watch_stack`
 - what a run reports: `RunStatus`
+- join a shot table to a store: `join_shot_table`
 - mean, spread and peaks across shots: `stack_statistics`
 """
 
 from napari_shadowinv.stack._lazy import invert_stack, stack_statistics
 from napari_shadowinv.stack._plan import STORED
-from napari_shadowinv.stack._run import RunStatus, run_stack
+from napari_shadowinv.stack._run import RunStatus, join_shot_table, run_stack
 from napari_shadowinv.stack._shards import incomplete_shards, merge_stack, numbers_of
 from napari_shadowinv.stack._shots import read_shot
 from napari_shadowinv.stack._worker import ShotOutcome
@@ -24,6 +25,7 @@ __all__ = [
     "ShotOutcome",
     "incomplete_shards",
     "invert_stack",
+    "join_shot_table",
     "merge_stack",
     "numbers_of",
     "read_shot",

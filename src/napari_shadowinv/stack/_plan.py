@@ -6,7 +6,7 @@ Its number of sites follows from the accuracy: `choose_sites`.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -32,7 +32,11 @@ from napari_shadowinv.inversion.normalise import bytes_per_pixel, check_source, 
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.frames import split_address
+from napari_shadowinv.io.shot_columns import JOINED, ShotTable, describe_columns
 from napari_shadowinv.io.store import FORMAT, OWN_SETUPS
+from napari_shadowinv.io.store_checksums import RECORD
+from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, Column, columns_of
+from napari_shadowinv.io.store_writing import check_column_keys
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Inputs, collect_inputs
@@ -98,12 +102,29 @@ class Stack:
     as_arrived: bool = False  # whether its shots are numbered as they arrive in a folder
     chained: bool = False  # whether each shot starts from an earlier one, without groups
     shard: Shard | None = None  # the part of the shots that is to be inverted
+    columns: tuple[Column, ...] = ()  # of a shot table, whose rows the shots have
 
     @property
     def chooses_sites(self) -> bool:
         """Whether the number of sites still has to be derived from the accuracy."""
         is_adaptive = self.beam is not None and self.task.recipe.options.is_adaptive
         return is_adaptive and isinstance(self.task, InvertTask)
+
+    def with_table(self, table: ShotTable) -> Stack:
+        """Return the stack with the columns of a shot table; each shot has its row."""
+        kind = FITS if isinstance(self.task, FitTask) else ROWS if self.task.by_row else INVERSIONS
+        setup_kind = "proton" if self.task.setup is None else self.task.setup.kind
+        own_columns = (column.key for column in columns_of(kind, setup_kind))
+        of_store = {*self.task.labels, *coordinates_of(self), *own_columns, *RECORD, "setup"}
+        check_column_keys(table.columns, of_store)
+        rows = zip(self.shots.items, table.rows_of(self.shots.names), strict=True)
+        items = [replace(shot, entries=entries) for shot, entries in rows]
+        return replace(self, shots=replace(self.shots, items=items), columns=table.columns)
+
+    @property
+    def rows(self) -> list[Mapping[str, Any]]:
+        """The row of a shot table that each shot has."""
+        return [shot.entries for shot in self.shots.items]
 
     def with_sites(self, n_sites: int) -> Stack:
         """Return the stack with the number of sites derived from the accuracy."""
@@ -501,7 +522,8 @@ def coordinates_of(stack: Stack) -> dict[str, Any]:
 
 def attributes_of(stack: Stack) -> dict[str, str]:
     attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.task.setup).attrs
-    return {"format": FORMAT, **attributes, **stack.task.attributes}
+    joined = {JOINED: describe_columns(stack.columns)} if stack.columns else {}
+    return {"format": FORMAT, **attributes, **stack.task.attributes, **joined}
 
 
 def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:

@@ -30,6 +30,7 @@ from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
+from napari_shadowinv.io.shot_columns import read_shot_table
 from napari_shadowinv.io.store import (
     DONE,
     FAILED,
@@ -45,6 +46,7 @@ from napari_shadowinv.io.store_writing import (
     Variable,
     create_store,
     grow_store,
+    join_columns,
     remove_unfinished,
     summarise,
 )
@@ -229,6 +231,8 @@ def run_stack(
     )
     stack = replace(stack, shard=Shard.of(run.part, stack.shots, path))
     numbers = numbers_of(run, len(stack.shots))
+    if run.shot_table is not None:
+        stack = stack.with_table(read_shot_table(run.shot_table))
     again = (PENDING, FAILED) if run.redo_failed else (PENDING,)
 
     def prepare(stage: str) -> None:
@@ -246,6 +250,8 @@ def run_stack(
             if stack.shard is None:
                 remove_unfinished(path)
             store = reopen_damaged(store)
+            if stack.columns:
+                store = join_columns(store, stack.columns, stack.rows)
             arrived = len(stack.shots) > len(store.names)
             if not arrived and not np.isin(store.statuses(), again).any():
                 _Run(stack, store, (), on_progress, should_stop).report("nothing to do")
@@ -265,6 +271,43 @@ def run_stack(
                 store = append_shots(store, stack, stored)
             _Run(stack, store, again, on_progress, should_stop).run_on(engine)
     return read_stack(path, numbers=numbers)
+
+
+def join_shot_table(store: str | Path, table: str | Path) -> xarray.Dataset:
+    """Join a shot table to a store that exists, by the numbers in the names of its shots.
+
+    Its columns become variables along ``shot``. A table that was corrected or has more columns
+    can be joined again.
+
+    Parameters
+    ----------
+    store : str or Path
+        ``name.shadowinv.zarr``.
+    table : str or Path
+        Comma-separated values, or HDF5 as ``file.h5::/entry/shots``: a compound dataset, or a
+        group of datasets of one length. The column ``shot`` or ``number`` has the numbers.
+
+    Returns
+    -------
+    xarray.Dataset
+        The store, opened lazily. Values are NaN or empty where a cell is empty, or the shot is
+        not done yet.
+
+    Raises
+    ------
+    InputError
+        If the table lacks a shot, its numbers cannot be used, or a column has the name of
+        something else in the store.
+    FileFormatError
+        If one of the two cannot be read, or another process is writing to the store.
+    """
+    path = check_store_path(store)
+    columns = read_shot_table(table)
+    with clear_up_when_terminated(), locked(path):
+        content = StackStore(path)
+        check_files(content)
+        join_columns(content, columns.columns, columns.rows_of(content.names))
+    return read_stack(path)
 
 
 def stored_variables(
@@ -424,7 +467,8 @@ class _Run:
             lost = [index for index in batch if index in self._todo]
             outcomes = [ShotOutcome(index, FAILED, 0.0, str(error)) for index in lost]
             for index in lost:
-                self._writer.fail(index, {"reason": str(error)})
+                entries = self._stack.shots.items[index].entries
+                self._writer.fail(index, {"reason": str(error), **entries})
         if outcomes is None:
             return False
         for outcome in outcomes:

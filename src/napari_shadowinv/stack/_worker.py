@@ -593,6 +593,7 @@ def try_shot(
     except Exception as error:
         # No error of a reader or a solver may stop the other shots.
         failure = failure_text(error)
+    origin = {**origin, **shot.entries}
     return Attempt(began, time.perf_counter() - began, origin, result, failure)
 
 
