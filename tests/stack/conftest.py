@@ -10,6 +10,7 @@ import pytest
 
 from helpers.night import OPTIONS, grouped, make_shots
 from napari_shadowinv import invert, plan_sites, run_stack
+from napari_shadowinv.stack import _folder_events, watch
 
 
 @dataclass(frozen=True)
@@ -74,3 +75,16 @@ def night(make_night) -> Night:
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
     return tmp_path / "night.shadowinv.zarr"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, compiled: None) -> Path:
+    (tmp_path / "live").mkdir()
+    return tmp_path / "live"
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """End at once when asked to."""
+    monkeypatch.setattr(watch, "_POLL_S", 0.02)
+    monkeypatch.setattr(_folder_events, "_FOLDER_CHECK_S", 0.1)

@@ -65,12 +65,19 @@ def test_the_commands_work_as_shown(folder, night):
     (guessing,) = [command for command in COMMANDS if "--source-from" in command]
     command = [*guessing.replace("'", "").split()[1:], *fast]
     assert runner.invoke(app, command).exit_code == 0
-    (watching,) = [command for command in COMMANDS if command.startswith("shadowinv watch")]
-    result = runner.invoke(app, [*watching.split()[1:], "--idle", "0.2", "--n-sites", "100"])
-    assert result.exit_code == 0, result.output
-    assert result.stdout.splitlines()[0] == "Watching shots for *.tif; press Ctrl-C to stop."
+    watches = [command for command in COMMANDS if command.startswith("shadowinv watch")]
+    for watching in watches:
+        if "--status-file" in watching:
+            tifffile.imwrite("shots/shot_3.tif", night.images[4].astype("float32"))
+        result = runner.invoke(app, [*watching.split()[1:], "--idle", "0.2", "--n-sites", "100"])
+        assert result.exit_code == 0, result.output
+        assert result.stdout.splitlines()[0].startswith("Watching shots for *.tif; ")
+    keys = re.findall(r'"(\w+)":', re.findall(r"```text\n(\{.*?)```", PAGE, re.DOTALL)[0])
+    status = Path("status.json").read_text()
+    assert [key for key in keys if f'"{key}"' not in status] == []
+    Path("day.csv").write_text("shot, delay (ns)\n" + "".join(f"{k}, {k}.5\n" for k in range(6)))
     commands = [command for command in COMMANDS if not re.search("batch|watch", command)]
-    assert len(commands) == 7
+    assert len(commands) == 8
     for command in commands:
         result = runner.invoke(app, command.split()[1:])
         assert result.exit_code == 0, result.output

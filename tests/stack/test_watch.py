@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 
 from helpers.command_line import flat, shadowinv
-from helpers.night import OPTIONS, grouped, make_shots
+from helpers.night import OPTIONS
 from helpers.store_content import content
+from helpers.watched import IMAGES, SETTLE, SOURCE, Watched, put, watched_once, whole
 from napari_shadowinv import (
     FileFormatError,
     InputError,
     InversionOptions,
     Recipe,
-    WatchOptions,
     invert,
     plan_sites,
     read,
@@ -32,98 +32,9 @@ from napari_shadowinv import (
 from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv.cli import _batch
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
-from napari_shadowinv.stack import RunStatus, _folder_events, watch
+from napari_shadowinv.stack import RunStatus, _folder_events
 
-IMAGES, SOURCE = make_shots(6)
-SETTLE = 0.1
-
-
-class Watched:
-    """A folder watched in a thread, and its progress."""
-
-    def __init__(self, folder: Path, out: Path, **choices: Any) -> None:
-        self.folder, self.out = folder, out
-        self.events: list[RunStatus] = []
-        self.error: Exception | None = None
-        self._stop = threading.Event()
-        defaults = {"source": SOURCE, "options": OPTIONS, "pattern": "*.npy", "settle": SETTLE}
-        self._choices = grouped(defaults | choices, WatchOptions)
-        self._thread = threading.Thread(target=self._watch)
-
-    def _watch(self) -> None:
-        try:
-            self.result = watch_stack(
-                self.folder,
-                self.out,
-                on_progress=self.events.append,
-                should_stop=self._stop.is_set,
-                **self._choices,
-            )
-        except Exception as error:
-            self.error = error
-
-    def __enter__(self) -> Watched:
-        self._thread.start()
-        self.until(lambda: any(not event.stage for event in self.events) or self.error)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join(30)
-        assert not self._thread.is_alive()
-
-    def until(self, condition: Callable[[], Any]) -> None:
-        end = time.monotonic() + 30
-        while not condition():
-            assert time.monotonic() < end, self.events
-            time.sleep(0.005)
-
-    def ended(self, count: int) -> list[RunStatus]:
-        """Wait until a number of shots have ended."""
-        self.until(lambda: self.error or len(self.shots) >= count)
-        if self.error is not None:
-            raise self.error
-        return self.shots
-
-    @property
-    def shots(self) -> list[RunStatus]:
-        return [event for event in self.events if event.outcome is not None]
-
-
-@pytest.fixture
-def folder(tmp_path: Path, compiled: None) -> Path:
-    (tmp_path / "live").mkdir()
-    return tmp_path / "live"
-
-
-@pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """End at once when asked to."""
-    monkeypatch.setattr(watch, "_POLL_S", 0.02)
-    monkeypatch.setattr(_folder_events, "_FOLDER_CHECK_S", 0.1)
-
-
-def put(folder: Path, *indices: int) -> None:
-    for index in indices:
-        np.save(folder / f"shot_{index}.npy", IMAGES[index])
-
-
-def whole(index: int) -> bytes:
-    """The content of a shot's file."""
-    from io import BytesIO
-
-    file = BytesIO()
-    np.save(file, IMAGES[index])
-    return file.getvalue()
-
-
-def watched_once(folder: Path, out: Path, **choices: Any) -> Any:
-    """Invert the existing files and return the store."""
-    with Watched(folder, out, idle=0.2, **choices) as watch:
-        watch.until(lambda: not watch._thread.is_alive())
-    if watch.error is not None:
-        raise watch.error
-    return watch.result
+pytestmark = pytest.mark.usefixtures("impatient")
 
 
 def test_watch_inverts_existing_files_first_then_arrivals(folder, out):

@@ -40,6 +40,7 @@ from napari_shadowinv.io.store import (
     DONE,
     FAILED,
     SHARDS,
+    SKIPPED,
     STATUS_NAMES,
     UNREAD,
     StackStore,
@@ -146,9 +147,12 @@ def run_merge(store: Path, quiet: bool) -> None:
 
 
 def exit_unless_reliable(store: StackStore) -> None:
-    """Exit with an error code if a shot is not done, or its result is not reliable."""
+    """Exit with an error code if a shot is not done, or its result is not reliable.
+
+    Shots that were skipped on purpose, or belong to another shard, do not count.
+    """
     statuses = store.statuses()
-    if not np.isin(statuses, (DONE, UNREAD)).all():
+    if not np.isin(statuses, (DONE, SKIPPED, UNREAD)).all():
         raise typer.Exit(EXIT_FAILED_SHOTS)
     reports = zip(statuses, store.reports(), strict=True)
     if not all(_is_reliable(report) for status, report in reports if status == DONE):
@@ -244,7 +248,8 @@ class _ProgressBar:
 def _counts_text(store: StackStore) -> str:
     statuses = store.statuses()
     counts = {name: np.sum(statuses == status) for status, name in enumerate(STATUS_NAMES)}
-    names = ["done", "failed", "pending", *(["damaged"] if counts["damaged"] else [])]
+    names = ["done", "failed", "pending"]
+    names += [name for name in ("skipped", "damaged") if counts[name]]
     return ", ".join(f"{counts[name]} {name}" for name in names)
 
 
@@ -343,6 +348,12 @@ def _trouble_rows(store: StackStore) -> Rows:
         if len(indices) > _MAX_LISTED:
             hidden = len(indices) - _MAX_LISTED
             rows.append((label, f"and {hidden} more: shadowinv status {store.path} --all"))
+    skipped = [store.names[index] for index in np.flatnonzero(statuses == SKIPPED)]
+    rows += (
+        [("skipped", f"{_list_text(skipped)}; a watch without --latest inverts them")]
+        if skipped
+        else []
+    )
     rows += [(STATUS_NAMES[DAMAGED], problem) for problem in store.damage.files[:_MAX_LISTED]]
     if store.damage.shots or store.damage.files:
         rows.append(("warning", "repeat the run with --resume to repair the damage"))
@@ -495,7 +506,9 @@ class _WatchPrinter:
             self._print_shot(status)
         elif not self.is_watching:
             self.is_watching = True
-            counts = f"{status.done} done, {status.failed} failed; " if status.total else ""
+            skipped = f", {status.skipped} skipped" if status.skipped else ""
+            counts = f"{status.done} done, {status.failed} failed{skipped}; "
+            counts = counts if status.total else ""
             self._print(
                 self.out,
                 f"Watching {self.folder} for {self.pattern}; {counts}press Ctrl-C to stop.",
@@ -506,6 +519,7 @@ class _WatchPrinter:
         assert outcome is not None
         name = f"{status.name} (again, as the file has changed)" if status.again else status.name
         waiting = f"  {status.waiting} waiting" if status.waiting else ""
+        waiting += f"  {status.skipped} skipped" if status.skipped else ""
         if outcome.reason:
             self._print(self.err, f"failed: {name}: {outcome.reason}", "red")
             return
@@ -566,10 +580,12 @@ def run_watch(
 
 
 def _print_summary(status: RunStatus | None, out: Path, quiet: bool) -> None:
-    done, failed, waiting = 0, 0, 0
+    done, failed, skipped, waiting = 0, 0, 0, 0
     if status is not None:
         done, failed, waiting = status.done, status.failed, status.waiting
-    remaining = f", {waiting} not yet inverted" if waiting else ""
+        skipped = status.skipped
+    remaining = f", {skipped} skipped" if skipped else ""
+    remaining += f", {waiting} not yet inverted" if waiting else ""
     if not done:
         text = f"Stopped: {failed} failed, nothing written" if failed else "Stopped: no shots"
         text = f"{text}{remaining}; repeat the command to watch again."

@@ -65,6 +65,7 @@ WATCH_EPILOG = """
 shadowinv watch shots --source reference.tif --out night.shadowinv.zarr
 shadowinv watch shots --pattern '*.bmp' --channel mean --bin 2 --out night.shadowinv.zarr
 shadowinv watch shots --source reference.tif --out night.shadowinv.zarr --idle 600
+shadowinv watch shots --latest --status-file status.json --out night.shadowinv.zarr
 
 Press Ctrl-C to stop. The same command continues with the same store.
 

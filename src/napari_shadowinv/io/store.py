@@ -50,8 +50,8 @@ if TYPE_CHECKING:
 
 FORMAT = "shadowinv stack"
 STORE_SUFFIX = STORE.suffix
-PENDING, DONE, FAILED, DAMAGED = map(int, Status)
 UNREAD = -1  # status of a shot that was not looked at; never stored
+PENDING, DONE, FAILED, DAMAGED, SKIPPED = map(int, Status)
 STATUS_NAMES = tuple(status.name.lower() for status in Status)
 # Attribute of a store whose shots are rows of a table, each with its own setup in its report.
 OWN_SETUPS = "table_of_shots"
@@ -157,7 +157,7 @@ class StackStore:
             self.statuses()
 
     def statuses(self) -> AnyArray:
-        """Return PENDING, DONE, FAILED, DAMAGED or UNREAD for each shot."""
+        """Return PENDING, DONE, FAILED, DAMAGED, SKIPPED or UNREAD for each shot."""
         damaged = self.damage.shots
         if self.numbers is None and not damaged:
             return self._values("status")
@@ -302,9 +302,9 @@ def read_stack(path: Path, *, numbers: Sequence[int] | None = None) -> xarray.Da
     -------
     xarray.Dataset
         Dimensions shot, y, x and component. ``status`` is 0 where a shot is pending, 1 done,
-        2 failed, 3 damaged; the values of shots that are not done are NaN, and damaged shots
-        cannot be read. Where shots have different setups, ``setup`` has one for each shot, empty
-        until the shot is done.
+        2 failed, 3 damaged, 4 skipped in a watched folder; the values of shots that are not done
+        are NaN, and damaged shots cannot be read. Where shots have different setups, ``setup`` has
+        one for each shot, empty until the shot is done.
 
     Raises
     ------

@@ -40,6 +40,7 @@ from napari_shadowinv.io.store import (
     PENDING,
     SHARDS,
     SHOT_FILES,
+    SKIPPED,
     STATUS_NAMES,
     StackStore,
     columns_of_store,
@@ -131,6 +132,11 @@ class ShotWriter:
             text = json.dumps({**report, **note})
             group["report"][index : index + 1] = np.array([text], dtype=object)
             group["status"][index : index + 1] = np.int8(status)
+
+    def skip(self, index: int) -> None:
+        """Mark a shot as skipped that has not ended."""
+        with _as_store_errors(self.path):
+            self.arrays()["status"][index : index + 1] = np.int8(SKIPPED)
 
     def reopen(self, index: int) -> None:
         """Mark a shot as pending that is to be done again, and forget its report and fields."""
@@ -519,15 +525,25 @@ class GrowingStore:
         text = str(self._writer.arrays()["report"][index])
         return dict(json.loads(text or "{}"))
 
-    def append(self, name: str) -> int:
-        """Make room for one more shot, pending, and return its number."""
-        index = len(self)
-        values = {"shot": np.array([index]), "name": np.array([name], dtype=object)}
+    def append(self, *names: str) -> int:
+        """Make room for more shots, pending, and return the number of the last."""
+        first = len(self)
+        numbers = range(first, first + len(names))
+        values = {"shot": np.array(numbers), "name": np.array(names, dtype=object)}
         grow_store(self.path, values, self._attributes, self._writer.arrays())
-        self._numbers[name] = index
-        self._statuses.append(PENDING)
-        self._counts[PENDING] += 1
-        return index
+        self._numbers.update(zip(names, numbers, strict=True))
+        self._statuses.extend([PENDING] * len(names))
+        self._counts[PENDING] += len(names)
+        return numbers[-1]
+
+    def skip(self, names: Collection[str]) -> None:
+        """Mark shots that have not ended as skipped; they get their numbers now."""
+        new = [name for name in names if name not in self._numbers]
+        if new:
+            self.append(*new)
+        for name in names:
+            self._writer.skip(self._numbers[name])
+            self._set_status(self._numbers[name], SKIPPED)
 
     def reopen(self, index: int) -> None:
         """Mark a shot as pending that is to be done again, and forget its fields."""

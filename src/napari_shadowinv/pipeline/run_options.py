@@ -149,6 +149,19 @@ class WatchOptions(_StoreOptions):
         "simultaneously, unless that one failed or did not converge. Fits, and shots with "
         "estimated sources, always start from zero.",
     )
+    latest: bool = Field(
+        default=False,
+        title="Latest",
+        description="Invert the newest file first and skip those that came while others were "
+        "inverted. A watch without this choice inverts skipped shots later.",
+    )
+    status_file: Path | None = Field(
+        default=None,
+        title="Status file",
+        description="JSON file with the newest shot, its age and field, the numbers of shots, the "
+        "rate and the last warning, replaced at least once a second, for another program to show.",
+        json_schema_extra={"metavar": "FILE"},
+    )
     skip_existing: bool = Field(
         default=False,
         title="Skip existing files",

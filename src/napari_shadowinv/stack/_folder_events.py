@@ -84,7 +84,7 @@ class Arrivals:
         self._reports_closing = reports_closing
         try:
             with os.scandir(self.folder) as entries:
-                names = [Path(entry.name) for entry in entries if self._matches(entry.name)]
+                names = [Path(entry.name) for entry in entries if self.matches(entry.name)]
         except OSError as error:
             raise self._folder_error(error) from None
         now = time.time()
@@ -125,6 +125,13 @@ class Arrivals:
             self._woken = True
             self._changed.notify_all()
 
+    def take_all(self) -> list[str]:
+        """Return the names of all waiting files."""
+        with self._changed:
+            names = list(self._ready)
+            self._ready.clear()
+            return names
+
     def peek(self, count: int) -> list[str]:
         """Return the names of the first waiting files, and keep them."""
         with self._changed:
@@ -134,6 +141,10 @@ class Arrivals:
         """Wait again for a file that changed while it was read."""
         with self._changed:
             self._settle_later(name)
+
+    def matches(self, name: str) -> bool:
+        """Return whether a name is that of a shot."""
+        return not name.startswith(".") and fnmatch.fnmatch(name, self._pattern)
 
     def check(self) -> None:
         """Raise an error if the folder no longer exists."""
@@ -165,7 +176,7 @@ class Arrivals:
 
     def _on_name(self, path: str, handle: Callable[[str], None]) -> None:
         folder, name = os.path.split(path)
-        if Path(folder) == self.folder and self._matches(name):
+        if Path(folder) == self.folder and self.matches(name):
             self.last_event = time.monotonic()
             handle(name)
             self._changed.notify_all()
@@ -211,9 +222,6 @@ class Arrivals:
                 self._settling[name] = (stamp_now, now)
                 due = min(due, now + self._settle)
         return due
-
-    def _matches(self, name: str) -> bool:
-        return not name.startswith(".") and fnmatch.fnmatch(name, self._pattern)
 
     def _stamp(self, name: str) -> Stamp | None:
         """Return size and time of a file; None if it is no file, or was removed."""

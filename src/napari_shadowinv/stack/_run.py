@@ -35,6 +35,7 @@ from napari_shadowinv.io.store import (
     DONE,
     FAILED,
     PENDING,
+    SKIPPED,
     UNREAD,
     StackStore,
     check_files,
@@ -93,6 +94,8 @@ class RunStatus:
         Numbers of shots, including earlier runs.
     doubtful : int
         Shots that are done, with warnings.
+    skipped : int
+        Shots of a watched folder that came while newer ones were inverted.
     waiting : int
         Shots that have not ended; of a watched folder, files that have arrived.
     ended : int
@@ -119,6 +122,7 @@ class RunStatus:
     done: int = 0
     failed: int = 0
     doubtful: int = 0
+    skipped: int = 0
     waiting: int = 0
     ended: int = 0
     seconds: float = 0.0
@@ -149,6 +153,7 @@ class RunStatus:
             f"{self.done} done" if is_watch else f"{self.done} of {self.total} done",
             f"{self.failed} failed" if self.failed else "",
             f"{self.doubtful} with warnings" if self.doubtful else "",
+            f"{self.skipped} skipped" if self.skipped else "",
             f"{self.waiting} waiting" if is_watch and self.waiting else "",
         ]
         return ", ".join(filter(None, numbers))
@@ -233,7 +238,7 @@ def run_stack(
     numbers = numbers_of(run, len(stack.shots))
     if run.shot_table is not None:
         stack = stack.with_table(read_shot_table(run.shot_table))
-    again = (PENDING, FAILED) if run.redo_failed else (PENDING,)
+    again = (PENDING, SKIPPED, *([FAILED] if run.redo_failed else []))
 
     def prepare(stage: str) -> None:
         if on_progress is not None:

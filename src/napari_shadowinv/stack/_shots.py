@@ -11,6 +11,7 @@ import functools
 import hashlib
 import inspect
 import json
+import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

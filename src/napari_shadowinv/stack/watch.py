@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
@@ -29,7 +29,14 @@ from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.files import sha256, text_of
-from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_store_path
+from napari_shadowinv.io.store import (
+    DONE,
+    FAILED,
+    PENDING,
+    SKIPPED,
+    StackStore,
+    check_store_path,
+)
 from napari_shadowinv.io.store_writing import GrowingStore, create_store, remove_unfinished
 from napari_shadowinv.pipeline.run_options import WatchOptions
 from napari_shadowinv.stack._folder_events import Arrivals, checked_folder, observing
@@ -59,6 +66,7 @@ from napari_shadowinv.stack._shots import (
     read_shot,
     stamp,
 )
+from napari_shadowinv.stack._status_file import StatusFile
 from napari_shadowinv.stack._worker import (
     AnyTask,
     Attempt,
@@ -150,7 +158,8 @@ class _RunningShot:
 class Watch:
     """The loop: inverts two files simultaneously, and writes them in the order of arrival.
 
-    Shots alternate between two lanes; each starts from the last result in its lane.
+    Shots alternate between two lanes; each starts from the last result in its lane. With `latest`,
+    the newest file is next, and all others that wait are skipped.
     """
 
     def __init__(
@@ -161,6 +170,7 @@ class Watch:
         arrivals: Arrivals,
         on_progress: OnStatus | None,
         should_stop: ShouldStop | None,
+        latest: bool = False,
     ) -> None:
         self._path, self._dtype, self._stacks = path, dtype, stacks
         self._arrivals, self._on_progress, self._should_stop = arrivals, on_progress, should_stop
@@ -177,6 +187,8 @@ class Watch:
         self._running: deque[_RunningShot] = deque()
         self._lanes: list[Inversion | Fit | None] = [None] * _LANES
         self._redo: set[str] = set()
+        self._latest = latest
+        self._skipped: dict[str, None] = {}  # not in the store yet, in order of arrival
         self._begun = self._ended = 0
         self._last = self._busy_since = time.monotonic()
         self._busy_s = 0.0
@@ -191,6 +203,7 @@ class Watch:
             done=0 if store is None else store.count(DONE),
             failed=early + (0 if store is None else store.count(FAILED)),
             doubtful=len(self._doubtful),
+            skipped=len(self._skipped) + (0 if store is None else store.count(SKIPPED)),
             waiting=self._arrivals.waiting + len(self._running),
             ended=self._ended,
             seconds=self._busy_s + (time.monotonic() - self._busy_since if self._running else 0.0),
@@ -207,7 +220,7 @@ class Watch:
             return
         store = StackStore(self._path)
         check_shard(store, None)
-        again = (PENDING, FAILED) if redo_failed else (PENDING,)
+        again = (PENDING, SKIPPED, *([FAILED] if redo_failed else []))
         self._redo = {store.names[i] for i in np.flatnonzero(np.isin(store.statuses(), again))}
         for name, report in zip(store.names, store.reports(), strict=True):
             self._note_report(name, report)
@@ -217,7 +230,7 @@ class Watch:
 
     def run(self, idle: float | None = None, most: int | None = None) -> None:
         """Invert existing and arriving files until the watch ends."""
-        for name in sorted(self._redo):
+        for name in () if self._latest else sorted(self._redo):
             self._arrivals.put_back(name)
         self.report()
         try:
@@ -228,6 +241,8 @@ class Watch:
         finally:
             self._abandoned.set()
             self._pool.shutdown(cancel_futures=True)
+            if self._latest:
+                self._skip_waiting()
             self.report()
 
     def _is_over(self, idle: float | None, most: int | None) -> bool:
@@ -251,10 +266,36 @@ class Watch:
             self._finish()
             return
         arrived = self._arrivals.next_name(_POLL_S)
+        if arrived is not None and self._latest:
+            *older, arrived = arrived, *self._arrivals.take_all()
+            self._skip(older)
         if arrived is not None:
             self._begin(arrived)
 
+    def _skip(self, names: Iterable[str]) -> None:
+        """Note shots that are not inverted, unless an earlier version of them was."""
+        store, running = self.store, {text_of(shot.name) for shot in self._running}
+        for name in map(text_of, names):
+            index = None if store is None else store.number(name)
+            is_stored = store is not None and index is not None and store.status(index) == SKIPPED
+            if not is_stored and name not in running and self._previous_report(name) is None:
+                self._skipped[name] = None
+
+    def _skip_waiting(self) -> None:
+        """Store as skipped what is not inverted when the watch ends."""
+        unfinished = [shot.name for shot in self._running]
+        self._running.clear()
+        self._skip([*unfinished, *self._arrivals.take_all()])
+        if self.store is not None:
+            with suppress(OSError):  # a watch without this choice finds their files
+                self._store_skipped(self.store)
+
+    def _store_skipped(self, store: GrowingStore) -> None:
+        store.skip(self._skipped)
+        self._skipped.clear()
+
     def _begin(self, name: str) -> None:
+        self._skipped.pop(text_of(name), None)
         while any(name == running.name for running in self._running):
             self._finish()  # it may have changed since it was read
         file = self._stacks.file(name)
@@ -318,7 +359,7 @@ class Watch:
         index = None if store is None else store.number(name)
         if store is None or index is None or name in self._early:
             return self._early.get(name)
-        pending = name in self._redo or store.status(index) == PENDING
+        pending = name in self._redo or store.status(index) in (PENDING, SKIPPED)
         return None if pending else store.report(index)
 
     def _submit(self, name: str, lane: int) -> Future[Attempt]:
@@ -338,7 +379,8 @@ class Watch:
     def _prepare(self, name: str, shot: Shot) -> Attempt | None:
         """Describe the stack by its first shot; return a failed attempt if that is impossible."""
         began = time.perf_counter()
-        names = [name, *self._arrivals.peek(MAX_TRIED_SHOTS - 1)]
+        waiting = [*reversed(self._skipped), *self._arrivals.peek(MAX_TRIED_SHOTS)]
+        names = [name, *waiting[: MAX_TRIED_SHOTS - 1]]
         stack = self._stack
         if stack is None:
             try:
@@ -375,12 +417,14 @@ class Watch:
         if attempt.result is None and (self._task is None or self.store is None):
             early[name] = {**attempt.origin, "reason": attempt.failure, "seconds": attempt.seconds}
             return ShotOutcome(len(early) - 1, FAILED, attempt.seconds, attempt.failure)
-        store = self.store or self._create_store([*early, name])
+        store = self.store or self._create_store([*early, *self._skipped, name])
         for early_name in list(early):
             index = store.number(early_name)
             report = early.pop(early_name)
             if early_name != name:
                 store.fail(store.append(early_name) if index is None else index, report)
+        if self._skipped:
+            self._store_skipped(store)
         number = store.number(name)
         index = store.append(name) if number is None else number
         if store.status(index) == DONE:
@@ -422,9 +466,11 @@ def watch_stack(
     """Invert, or fit, each file that arrives in a folder as soon as it is completely written.
 
     Existing files come first, in counting order of their names, then new ones in the order in
-    which they were completed; each gets the next number of the store. A file that cannot be
-    inverted fails alone, with its reason. A file that is written again later is inverted again,
-    under the same number. Another call with the same store resumes it, without repeating shots.
+    which they were completed; each gets the next number of the store. With `WatchOptions.latest`,
+    the newest file comes first, and those that came meanwhile are skipped until a call without it.
+    A file that cannot be inverted fails alone, with its reason. A file that is written again later
+    is inverted again, under the same number. Another call with the same store resumes it, without
+    repeating shots.
 
     Parameters
     ----------
@@ -474,7 +520,41 @@ def watch_stack(
     existing = not watch.skip_existing
     arrivals = Arrivals(place, watch.pattern, settle=watch.settle, existing=existing)
     stacks = StackMaker(describe, place, reader, chained=watch.warm_start)
-    loop = Watch(path, np.dtype(watch.dtype), stacks, arrivals, on_progress, should_stop)
+    with ExitStack() as opened:
+        if watch.status_file is not None:
+            on_progress = _with_status_file(watch.status_file, arrivals, path, on_progress, opened)
+        loop = Watch(
+            path, np.dtype(watch.dtype), stacks, arrivals, on_progress, should_stop, watch.latest
+        )
+        return _run_watch(loop, path, arrivals, watch, should_stop)
+
+
+def _with_status_file(
+    file: Path, arrivals: Arrivals, store: Path, on_progress: OnStatus | None, opened: ExitStack
+) -> OnStatus:
+    """Return a receiver of the status that also writes it to a file until `opened` closes."""
+
+    def notify(text: str) -> None:
+        if on_progress is not None:
+            on_progress(RunStatus(engine=WATCHING, note=text))
+
+    status_file = opened.enter_context(StatusFile(file, arrivals, store, notify))
+
+    def update(status: RunStatus) -> None:
+        status_file.update(status)
+        if on_progress is not None:
+            on_progress(status)
+
+    return update
+
+
+def _run_watch(
+    loop: Watch,
+    path: Path,
+    arrivals: Arrivals,
+    watch: WatchOptions,
+    should_stop: ShouldStop | None,
+) -> xarray.Dataset | None:
     try:
         ensure_compiled(lambda news: loop.report(stage=f"compiling, {news.message}"), should_stop)
     except InversionCancelled:

@@ -1,0 +1,232 @@
+"""A watch of the latest shots, and the status file of a watch."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+import time
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.command_line import flat, shadowinv
+from helpers.night import OPTIONS
+from helpers.watched import SETTLE, SOURCE, Watched, put, watched_once
+from napari_shadowinv import InputError, WatchOptions, read, run_stack, watch_stack
+from napari_shadowinv.io.store import DONE, FAILED, SKIPPED, StackStore
+from napari_shadowinv.stack import _status_file
+
+pytestmark = pytest.mark.usefixtures("impatient")
+
+
+class Gate:
+    """A reader that waits until it is opened, as an inversion that takes long."""
+
+    def __init__(self) -> None:
+        self.opened = threading.Event()
+        self.names: list[str] = []
+
+    def __call__(self, path: Path) -> np.ndarray:
+        self.names.append(path.name)
+        assert self.opened.wait(30)
+        return np.load(path)
+
+
+def numbers_of(stored) -> list[tuple[str, int]]:
+    names = [name.removeprefix("shot_").removesuffix(".npy") for name in stored.name.values]
+    return list(zip(names, stored.status.values.tolist(), strict=True))
+
+
+def test_latest_shot_is_next_and_the_others_are_skipped(folder, out):
+    gate = Gate()
+    put(folder, 0)
+    with Watched(folder, out, reader=gate, latest=True) as watch:
+        watch.until(lambda: len(gate.names) == 1)
+        put(folder, 1)
+        watch.until(lambda: len(gate.names) == 2)  # two at once
+        for number in (2, 3, 4):
+            put(folder, number)
+            watch.until(lambda count=number - 1: watch_waiting(watch) == count)
+        gate.opened.set()
+        last = watch.ended(3)[-1]
+        put(folder, 5)
+        assert watch.ended(4)[-1].name == "shot_5.npy"
+    assert [event.name for event in watch.shots[:3]] == ["shot_0.npy", "shot_1.npy", "shot_4.npy"]
+    assert (last.done, last.skipped, last.waiting) == (3, 2, 0)
+    assert last.text == "3 done, 3 with warnings, 2 skipped"
+    expected = [("0", DONE), ("1", DONE), ("2", SKIPPED), ("3", SKIPPED), ("4", DONE), ("5", DONE)]
+    assert numbers_of(watch.result) == expected
+    assert np.isnan(watch.result.displacement[2]).all()
+    assert "skipped" in watch.result.status.attrs["flag_meanings"].split()
+    assert not StackStore(out, every_byte=True).damage.files
+    assert not StackStore(out, every_byte=True).damage.shots
+
+    listed = flat(shadowinv("status", out).output)
+    assert "4 done, 0 failed, 0 pending, 2 skipped" in listed
+    assert "shot_2.npy, shot_3.npy; a watch without --latest inverts them" in listed
+
+    again = watched_once(folder, out, reader=gate)
+    assert numbers_of(again) == [(name, DONE) for name, _ in expected]
+
+
+def watch_waiting(watch: Watched) -> int:
+    """Files that have arrived and were not begun."""
+    return watch.loop_arrivals.waiting
+
+
+@pytest.fixture(autouse=True)
+def seen_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Show the arrivals of a watch to the test."""
+    from napari_shadowinv.stack import watch
+
+    made = watch.Arrivals
+
+    def arrivals(*args, **keywords):
+        Watched.loop_arrivals = made(*args, **keywords)
+        return Watched.loop_arrivals
+
+    monkeypatch.setattr(watch, "Arrivals", arrivals)
+
+
+def test_existing_files_are_skipped_but_the_newest_and_done_ones(folder, out, tmp_path):
+    put(folder, 1)
+    watched_once(folder, out, warm_start=False)
+    put(folder, 0, 2, 3)
+    (folder / "shot_4.npy").write_bytes(b"")
+    stored = watched_once(folder, out, latest=True, warm_start=False)
+    expected = [("1", DONE), ("0", SKIPPED), ("2", SKIPPED), ("3", SKIPPED), ("4", FAILED)]
+    assert numbers_of(stored) == expected
+    status = (out / "status/c/1").stat()
+    stored = watched_once(folder, out, latest=True, warm_start=False)
+    assert numbers_of(stored) == expected  # the newest has failed, and nothing else is newer
+    assert (out / "status/c/1").stat() == status
+    (folder / "shot_4.npy").unlink()
+    put(folder, 4)
+    files = [folder / f"shot_{number}.npy" for number in range(5)]
+    later = run_stack(files, out, recipe_of_watch(), source=SOURCE, run={"redo_failed": True})
+    assert numbers_of(later) == [(name, DONE) for name, _ in expected]
+
+
+def recipe_of_watch():
+    from napari_shadowinv import Recipe
+
+    return Recipe(options=OPTIONS)
+
+
+def test_shots_in_work_are_skipped_when_the_watch_ends(folder, out):
+    gate = Gate()
+    put(folder, 0)
+    with Watched(folder, out, reader=gate, latest=True) as watch:
+        gate.opened.set()
+        watch.ended(1)
+        gate.opened.clear()
+        put(folder, 1)
+        watch.until(lambda: "shot_1.npy" in gate.names)
+        watch._stop.set()
+        gate.opened.set()
+    assert (watch.events[-1].skipped, watch.events[-1].waiting) == (1, 0)
+    assert numbers_of(watch.result) == [("0", DONE), ("1", SKIPPED)]
+
+
+def test_command_counts_skipped_shots_and_ends_well(folder, out):
+    put(folder, 0, 1, 2)
+    result = shadowinv(
+        "watch", folder, "--pattern", "*.npy", "--out", out, "--n-sites", 100,
+        "--latest", "--max-shots", 1, "--settle", SETTLE,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert "Stopped: 1 done, 0 failed, 2 skipped; repeat" in result.stdout
+    assert numbers_of(read(out)) == [("0", SKIPPED), ("1", SKIPPED), ("2", DONE)]
+
+
+def test_status_file_describes_the_newest_shot(folder, out, tmp_path, monkeypatch):
+    monkeypatch.setattr(_status_file, "_MIN_INTERVAL_S", 0.01)
+    path = tmp_path / "status.json"
+    with Watched(folder, out, status_file=path) as watch:
+        assert json.loads(path.read_text())["newest"] is None
+        put(folder, 0)
+        watch.ended(1)
+        (folder / "shot_1.npy").write_bytes(b"")
+        watch.ended(2)
+        put(folder, 2)
+        watch.ended(3)
+        watch.until(lambda: (json.loads(path.read_text())["newest"] or {}).get("shot") == 2)
+        first = json.loads(path.read_text())
+        watch.until(lambda: json.loads(path.read_text())["time"] > first["time"])  # without a shot
+        later = json.loads(path.read_text())
+    assert first["state"] == "watching"
+    assert (first["done"], first["failed"], first["skipped"], first["waiting"]) == (2, 1, 0, 0)
+    assert (first["folder"], first["store"]) == (str(folder), str(out))
+    assert first["rate_per_s"] > 0
+    newest = first["newest"]
+    assert (newest["name"], newest["status"]) == ("shot_2.npy", "done")
+    peak = float(np.hypot(*watch.result.displacement.values[2]).max())
+    assert newest["peak"] == {"symbol": "|d|", "value": pytest.approx(peak, rel=1e-6), "unit": "px"}
+    assert newest["facts"]["displacement"].startswith("peak |d| ")
+    assert newest["numbers"]["verdict"] == str(watch.result.verdict.values[2])
+    assert newest["numbers"]["image_residual"] == float(watch.result.image_residual[2])
+    written = (folder / "shot_2.npy").stat().st_mtime
+    assert datetime.fromisoformat(newest["written"]).timestamp() == pytest.approx(written, abs=2e-3)
+    passed = datetime.fromisoformat(later["time"]) - datetime.fromisoformat(first["time"])
+    assert later["newest"]["age_s"] - newest["age_s"] == pytest.approx(
+        passed.total_seconds(), abs=5e-3
+    )
+    warning = first["last_warning"]
+    assert (warning["name"], warning["code"]) == ("shot_2.npy", "closed-edge")
+    assert json.loads(path.read_text())["state"] == "stopped"
+
+
+def test_status_file_is_always_complete(folder, out, tmp_path, monkeypatch):
+    monkeypatch.setattr(_status_file, "_MIN_INTERVAL_S", 0.0)
+    monkeypatch.setattr(_status_file, "_INTERVAL_S", 0.001)
+    path = tmp_path / "status.json"
+    put(folder, *range(6))
+    with Watched(folder, out, status_file=path, max_shots=6) as watch:
+        times = set()
+        while watch._thread.is_alive():
+            times.add(json.loads(path.read_text())["time"])
+    assert len(times) > 5
+    assert [each.name for each in tmp_path.iterdir() if each.name.startswith(".status")] == []
+
+
+def test_watch_that_fails_leaves_its_reason_in_the_status_file(folder, out, tmp_path):
+    path = tmp_path / "status.json"
+    with Watched(folder, out, status_file=path) as watch:
+        shutil.rmtree(folder)
+        watch.until(lambda: not watch._thread.is_alive())
+    status = json.loads(path.read_text())
+    assert status["state"] == "failed"
+    assert "can no longer be read" in status["reason"]
+
+
+def test_status_file_that_cannot_be_written_is_noted_once(folder, out, tmp_path, monkeypatch):
+    monkeypatch.setattr(_status_file, "_MIN_INTERVAL_S", 0.01)
+    place = tmp_path / "display"
+    place.mkdir()
+    with Watched(folder, out, status_file=place / "status.json") as watch:
+        place.rename(tmp_path / "elsewhere")
+        put(folder, 0, 1)
+        watch.ended(2)
+        watch.until(lambda: any(event.note for event in watch.events))
+    (note,) = [event.note for event in watch.events if event.note]
+    assert note.startswith("the status file cannot be written: ")
+    assert list(watch.result.status.values) == [DONE, DONE]
+
+
+@pytest.mark.parametrize(
+    ("name", "pattern", "words"),
+    [
+        ("status.json", "*", "would be taken for a shot of the watched folder"),
+        ("nowhere/status.json", "*.npy", "does not exist; create it first"),
+    ],
+)
+def test_wrong_status_file_is_refused_at_once(folder, out, name, pattern, words):
+    began = time.monotonic()
+    with pytest.raises(OSError if "nowhere" in name else InputError, match=words):
+        watch_stack(
+            folder, out, watch=WatchOptions(status_file=folder / name, pattern=pattern, idle=0.1)
+        )
+    assert time.monotonic() < began + 5
