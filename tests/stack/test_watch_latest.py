@@ -183,8 +183,8 @@ def test_status_file_is_always_complete(folder, out, tmp_path, monkeypatch):
     monkeypatch.setattr(_status_file, "_MIN_INTERVAL_S", 0.0)
     monkeypatch.setattr(_status_file, "_INTERVAL_S", 0.001)
     path = tmp_path / "status.json"
-    put(folder, *range(6))
-    with Watched(folder, out, status_file=path, max_shots=6) as watch:
+    put(folder, 0, 1, 2)
+    with Watched(folder, out, status_file=path, max_shots=3) as watch:
         times = set()
         while watch._thread.is_alive():
             times.add(json.loads(path.read_text())["time"])

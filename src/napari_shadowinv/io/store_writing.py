@@ -536,9 +536,9 @@ class GrowingStore:
         self._counts[PENDING] += len(names)
         return numbers[-1]
 
-    def skip(self, names: Collection[str]) -> None:
-        """Mark shots that have not ended as skipped; they get their numbers now."""
-        new = [name for name in names if name not in self._numbers]
+    def skip(self, names: Collection[str], *following: str) -> None:
+        """Mark shots that have not ended as skipped; they and those following get their numbers."""
+        new = [name for name in (*names, *following) if name not in self._numbers]
         if new:
             self.append(*new)
         for name in names:

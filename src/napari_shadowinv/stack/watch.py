@@ -290,8 +290,9 @@ class Watch:
             with suppress(OSError):  # a watch without this choice finds their files
                 self._store_skipped(self.store)
 
-    def _store_skipped(self, store: GrowingStore) -> None:
-        store.skip(self._skipped)
+    def _store_skipped(self, store: GrowingStore, *following: str) -> None:
+        """Number the skipped shots, and shots that follow them."""
+        store.skip(self._skipped, *following)
         self._skipped.clear()
 
     def _begin(self, name: str) -> None:
@@ -315,6 +316,10 @@ class Watch:
         attempt.add_done_callback(lambda _: self._arrivals.wake())
         self._busy_since = self._busy_since if self._running else time.monotonic()
         self._running.append(_RunningShot(name, stamp_now, lane, attempt))
+        if self._latest and self.store is not None:
+            # Now, as the shot must not wait for it once it is done.
+            with defer_interrupts():
+                self._store_skipped(self.store, text_of(name))
         self.report()
 
     def _finish(self) -> None:
