@@ -77,7 +77,7 @@ def test_the_commands_work_as_shown(folder, night):
     assert [key for key in keys if f'"{key}"' not in status] == []
     Path("day.csv").write_text("shot, delay (ns)\n" + "".join(f"{k}, {k}.5\n" for k in range(6)))
     commands = [command for command in COMMANDS if not re.search("batch|watch", command)]
-    assert len(commands) == 8
+    assert len(commands) == 9
     for command in commands:
         result = runner.invoke(app, command.split()[1:])
         assert result.exit_code == 0, result.output

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.cli._inputs import protect_store
 from napari_shadowinv.cli._terminal import escape_invisible
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -18,6 +19,8 @@ from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.files import make_folder
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
+from napari_shadowinv.io.ome_zarr import OME_ZARR_SUFFIX, write_ome_zarr
+from napari_shadowinv.io.openpmd import check_openpmd_setup, write_openpmd
 from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.io.store import STATUS_NAMES, StackStore, read_stack
 from napari_shadowinv.io.store_shots import open_shots, parse_shots
@@ -28,7 +31,7 @@ if TYPE_CHECKING:
     import xarray
 
 _FORMULA_SIGNS = ("=", "+", "-", "@")
-FORMATS = ("tiff", "pradformat", "csv")
+FORMATS = ("tiff", "pradformat", "openpmd", "ome-zarr", "csv")
 
 
 def export_shots(
@@ -46,6 +49,10 @@ def export_shots(
             f"{store} holds fits, expected inversions for pradformat: use --format tiff or csv"
         )
     dataset = open_shots(store, shots)
+    if form == "openpmd":
+        return _write_openpmd(dataset, out, overwrite)
+    if form == "ome-zarr":
+        return _write_ome_zarr(dataset, out, variables)
     jobs = list(_tiff_jobs(dataset, variables) if form == "tiff" else _pradformat_jobs(dataset))
     make_folder(out)
     for name, *_ in jobs:
@@ -66,7 +73,7 @@ def _stem(shot: xarray.Dataset) -> str:
 _Job = tuple[str, Callable[[], Any], Any]
 
 
-def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[_Job]:
+def _check_images(dataset: xarray.Dataset, variables: list[str]) -> None:
     for variable in variables:
         dims = dataset[variable].dims if variable in dataset else ()
         if dims[:1] != ("shot",) or dims[-2:] != ("y", "x"):
@@ -75,6 +82,54 @@ def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[_Job]:
                 f"the store has no images {variable!r}: expected one or more of "
                 f"{', '.join(map(str, images))}"
             )
+
+
+def _write_openpmd(dataset: xarray.Dataset, out: Path, overwrite: bool) -> list[Path]:
+    """Write the fields of each shot as a file of a series."""
+    check_openpmd_setup(setup_from_dataset(dataset))
+    make_folder(out)
+    series = f"{out.name}_%06T{PRADFORMAT.suffix}"
+    files = [
+        out / f"{out.name}_{index:06d}{PRADFORMAT.suffix}" for index in dataset["index"].values
+    ]
+    for file in files:
+        check_output(file, overwrite)
+    for file, position in zip(files, range(dataset.sizes["shot"]), strict=True):
+        shot = dataset.isel(shot=position)
+        setup = check_openpmd_setup(setup_from_dataset(shot))
+        with replacing(file, overwrite) as temporary:
+            write_openpmd(temporary, shot, setup, series, int(shot["index"]))
+    return files
+
+
+def _write_ome_zarr(dataset: xarray.Dataset, out: Path, variables: list[str]) -> list[Path]:
+    """Write each variable of all shots as one image."""
+    _check_images(dataset, variables)
+    make_folder(out)
+    shots = dataset.sizes["shot"]
+    setups = [setup_from_dataset(dataset.isel(shot=shot)) for shot in range(shots)]
+    sizes = {None if setup is None else setup.object_pixel_size for setup in setups}
+    if len(sizes) > 1:
+        raise InputError(
+            "the shots have pixels of different sizes, expected one for an image of all of them: "
+            "choose shots of one size, or use --format tiff"
+        )
+    written = []
+    for variable in variables:
+        field = dataset[variable].transpose("shot", ..., "y", "x")
+        is_vector = "component" in field.dims
+        channels = [f"{variable}_{c}" for c in ("y", "x")] if is_vector else [variable]
+
+        def plane_of(shot: int, channel: int, field: Any = field) -> AnyArray:
+            return np.asarray(field[(shot, channel) if field.ndim > 3 else shot])
+
+        path = out / f"{variable}{OME_ZARR_SUFFIX}"
+        written.append(write_ome_zarr(path, variable, channels, shots, plane_of, *sizes))
+    return written
+
+
+def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[_Job]:
+    _check_images(dataset, variables)
     for index in range(dataset.sizes["shot"]):
         shot = dataset.isel(shot=index)
         setup = setup_from_dataset(shot)

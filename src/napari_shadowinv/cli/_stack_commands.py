@@ -17,8 +17,9 @@ HELP = {
     "shot. Default: uniform.",
     "scheduler": "Address of a dask scheduler (tcp://host:8786), threads (default with --shard) or "
     "processes (default without).",
-    "format": "tiff (float32, one file per shot and component), pradformat (one file per shot), or "
-    "csv (a table with one row per shot).",
+    "format": "tiff (float32, one file per shot and component), pradformat or openpmd (one file "
+    "per shot), ome-zarr (one image per variable with all shots), or csv (a table with a row per "
+    "shot).",
     "shots": "A quoted glob, a folder, a list of files, a multi-page TIFF with one shot per page, "
     "an array of frames in HDF5 (run.h5::/entry/data/data), or a table (.csv) of images with one "
     "row per shot.",
@@ -201,11 +202,12 @@ def join(
 def export(
     store: _flags.StoreFolder,
     form: Annotated[
-        str, typer.Option("--format", metavar="tiff|pradformat|csv", help=HELP["format"])
+        str, typer.Option("--format", metavar="tiff|pradformat|…", help=HELP["format"])
     ],
     shots: _flags.ChosenShots = None,
     variables: Annotated[
-        str, typer.Option(help="For tiff: variables to export, separated by commas.")
+        str,
+        typer.Option(help="For tiff and ome-zarr: variables to export, separated by commas."),
     ] = "potential",
     out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
     overwrite: _flags.Overwrite = False,
