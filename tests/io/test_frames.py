@@ -72,6 +72,13 @@ def test_leading_axes_of_length_one_are_one_image(nexus):
     assert read(f"{nexus}::/entry/single").image.shape == (5, 7)
 
 
+def test_default_that_leads_to_itself_is_no_array(nexus):
+    with h5py.File(nexus, "r+") as file:
+        file["entry"].attrs["default"] = "/entry"
+    with pytest.raises(InputError, match="has no array '/': it holds 'entry/data/data'"):
+        read(f"{nexus}::/")
+
+
 @pytest.mark.parametrize(
     ("name", "words"),
     [

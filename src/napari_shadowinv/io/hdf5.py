@@ -256,7 +256,7 @@ def _member_or_default(path: Path, file: Any, name: str) -> Any | None:
         default = next(defaults, None)
         default = default.decode() if isinstance(default, bytes) else default
         item = member(path, item, default) if isinstance(default, str) else None
-    return item
+    return item if isinstance(item, h5py.Dataset) else None
 
 
 def _load_frame(path: Path, dataset: Any, number: int) -> AnyArray:
