@@ -311,6 +311,7 @@ def join_shot_table(store: str | Path, table: str | Path) -> xarray.Dataset:
     with clear_up_when_terminated(), locked(path):
         content = StackStore(path)
         check_files(content)
+        check_shard(content, None)
         join_columns(content, columns.columns, columns.rows_of(content.names))
     return read_stack(path)
 

@@ -140,7 +140,7 @@ class FileReference(ImageReference):
         return super().unchanged(origin) if self.page is not None else _agrees(self.path, origin)
 
     def identity(self, folder: Path) -> str:
-        return f"{_relative_text(self.path, folder)} {self.page}"
+        return f"{_relative_text(self.path, folder)} {self.page} {self.variable}"
 
 
 @dataclass(frozen=True, eq=False)
