@@ -184,7 +184,7 @@ class Posterior:
     def solve(self, samples: Sequence[Sample], steps: int = _SOLVING_STEPS) -> list[Sample]:
         """Return samples with the change that explains their images and prior in full.
 
-        Each minimises the objective for images with its noise, in at most so many steps from its
+        Each minimises the objective for images with its noise, in at most `steps` steps from its
         change to first order (randomize then optimize); the best unknowns are settled before.
         """
         scene = self._scene

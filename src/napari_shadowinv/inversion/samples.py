@@ -319,12 +319,12 @@ class Pairs:
 
     @property
     def shift(self) -> FloatArray:
-        """What the mean of linear samples lacks."""
+        """Difference of the means, solved less linear."""
         return (self.solved - self.linear) / self.count
 
     @property
     def factor(self) -> FloatArray:
-        """What the deviation of linear samples is to be multiplied by; 1 where chance explains it.
+        """Ratio of the deviations, solved over linear; 1 where chance explains it.
 
         The logarithm of the ratio of two deviations with a correlation ρ scatters by
         √((1 - ρ²) / (n - 1)); it is shrunk as by James and Stein.

@@ -89,7 +89,7 @@ class RunOptions(_StoreOptions):
         ge=1,
         title="Workers",
         description="Shots that are processed at once on this machine. Default: one per core.",
-        json_schema_extra={"metavar": "N"},
+        json_schema_extra={**_RARE, "metavar": "N"},
     )
 
     @field_validator("shard")
@@ -166,6 +166,7 @@ class WatchOptions(_StoreOptions):
         default=False,
         title="Skip existing files",
         description="Skip files that are in the folder at the start.",
+        json_schema_extra=_RARE,
     )
     settle: float = Field(
         default=1.0,
@@ -192,5 +193,5 @@ class WatchOptions(_StoreOptions):
         ge=1,
         title="Maximum number of shots",
         description="Stop after N shots, done or failed.",
-        json_schema_extra={"metavar": "N"},
+        json_schema_extra={**_RARE, "metavar": "N"},
     )
