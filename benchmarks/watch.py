@@ -212,7 +212,7 @@ def latest(folder: Path, seconds: float, rate: float, side: int, sites: int) -> 
     watch_stack(
         live,
         out,
-        Recipe(options=InversionOptions(n_sites=sites)),
+        Recipe(options=InversionOptions(n_sites=sites or None)),
         source=np.full((side, side), 1000.0 / 8),
         on_progress=note,
         should_stop=is_over,
@@ -231,7 +231,9 @@ def latest(folder: Path, seconds: float, rate: float, side: int, sites: int) -> 
     replaced = np.array([following - written[name] for (name, _), (_, following) in pairwise(late)])
     seconds_of = dict(zip(store.names, (r.get("seconds") for r in store.reports()), strict=True))
     shot = float(np.median([seconds_of[name] for name, _ in late]))
-    print(f"\n{count} frames of {side} × {side} px, {rate:g} a second, {sites} sites, the latest\n")
+    n_sites = next(report["n_sites"] for report in store.reports() if "n_sites" in report)
+    size = f"{side} × {side} px, {n_sites} sites"
+    print(f"\n{count} frames of {size}, {rate:g} a second, the latest\n")
     print("| | |\n|---|---|")
     print(
         f"| inverted | {len(names)}, {(len(late) - 1) / (late[-1][1] - late[0][1]):.1f} a second |"
@@ -313,7 +315,7 @@ def main() -> None:
     )
     parser.add_argument("--latest-rate", type=float, default=20, help="frames written a second")
     parser.add_argument("--latest-side", type=int, default=128, help="of a frame in px")
-    parser.add_argument("--latest-sites", type=int, default=2000)
+    parser.add_argument("--latest-sites", type=int, default=0, help="0 for the accuracy's number")
     parser.add_argument("--stack-frames", type=int, default=30, help="0 leaves them out")
     parser.add_argument("--stack-sites", type=int, nargs="+", default=(0, 40_000, 10_000))
     arguments = parser.parse_args()

@@ -11,13 +11,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zarr
 
 from helpers.command_line import flat, shadowinv
 from helpers.night import OPTIONS
 from helpers.watched import SETTLE, SOURCE, Watched, put, watched_once
 from napari_shadowinv import InputError, WatchOptions, read, run_stack, watch_stack
 from napari_shadowinv.io.store import DONE, FAILED, SKIPPED, StackStore
+from napari_shadowinv.io.store_writing import GrowingStore
 from napari_shadowinv.stack import _status_file
+from napari_shadowinv.stack._run import NUMBERED_AS_ARRIVED
 
 pytestmark = pytest.mark.usefixtures("impatient")
 
@@ -129,6 +132,22 @@ def test_shots_in_work_are_skipped_when_the_watch_ends(folder, out):
         gate.opened.set()
     assert (watch.events[-1].skipped, watch.events[-1].waiting) == (1, 0)
     assert numbers_of(watch.result) == [("0", DONE), ("1", SKIPPED)]
+
+
+def test_room_of_a_growing_store_is_not_seen_and_given_back(folder, out):
+    put(folder, 0, 1)
+    watched_once(folder, out)
+    growing = GrowingStore(StackStore(out), NUMBERED_AS_ARRIVED)
+    growing.skip(["shot_8.npy", "shot_9.npy"])
+    assert zarr.open_array(out / "displacement").shape[0] > 4  # by its own description
+    store = StackStore(out, every_byte=True)  # as if the watch had been killed
+    assert store.statuses().tolist() == [DONE, DONE, SKIPPED, SKIPPED]
+    assert not store.damage.shots
+    assert not store.damage.files
+    assert read(out).sizes["shot"] == 4
+    growing.close()
+    lengths = {zarr.open_array(out / name).shape[0] for name in ("displacement", "status", "name")}
+    assert lengths == {4}
 
 
 def test_command_counts_skipped_shots_and_ends_well(folder, out):

@@ -62,6 +62,7 @@ from napari_shadowinv.io.store_columns import Column
 
 _TOGETHER = 1024  # values of a coordinate along shots that are one file
 _SMALL = 64  # values that are not worth compressing
+_ROOM = 64  # shots for which the arrays of a growing store are extended at a time
 
 
 class StoreError(OSError):
@@ -367,26 +368,29 @@ def grow_store(
     values: Mapping[str, AnyArray],
     attributes: Mapping[str, Any],
     arrays: Mapping[str, Any] | None = None,
+    room: int = 0,
 ) -> None:
     """Make room for more shots, pending; a process killed meanwhile leaves the store unchanged.
 
-    The coordinates, `values`, are of the new shots. `arrays` are open already, or opened.
+    The coordinates, `values`, are of the new shots. `arrays` are open already, or opened; they get
+    `room` for more shots than the store has then.
     """
     with _as_store_errors(path):
         arrays = _open_to_write(path) if arrays is None else arrays
         longer = [name for name, array in arrays.items() if is_along_shots(array)]
-        before = arrays["status"].shape[0]
-        length = before + len(values["shot"])
         metadata = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+        before = metadata["consolidated_metadata"]["metadata"]["status"]["shape"][0]
+        length = before + len(values["shot"])
         for name in longer:
             array = arrays[name]
             together = array.chunks[0]
             # Beyond the end stated in the folder's own copy: nobody sees it yet.
-            array.resize((length, *array.shape[1:]))
+            if array.shape[0] < length:
+                array.resize((length + room, *array.shape[1:]))
             if name in values:
-                array[before:] = values[name]
+                array[before:length] = values[name]
             elif together > 1 and (before - 1) // together < (length - 1) // together:
-                array[before:] = array.fill_value  # a file that is not there has been lost
+                array[before:length] = array.fill_value  # a file that is not there has been lost
         metadata["attributes"].update(attributes)
         for name in longer:
             metadata["consolidated_metadata"]["metadata"][name]["shape"][0] = length
@@ -530,11 +534,18 @@ class GrowingStore:
         first = len(self)
         numbers = range(first, first + len(names))
         values = {"shot": np.array(numbers), "name": np.array(names, dtype=object)}
-        grow_store(self.path, values, self._attributes, self._writer.arrays())
+        grow_store(self.path, values, self._attributes, self._writer.arrays(), _ROOM)
         self._numbers.update(zip(names, numbers, strict=True))
         self._statuses.extend([PENDING] * len(names))
         self._counts[PENDING] += len(names)
         return numbers[-1]
+
+    def close(self) -> None:
+        """Give the arrays their final length, which programs may read that ignore the folder's."""
+        with _as_store_errors(self.path):
+            for array in self._writer.arrays().values():
+                if is_along_shots(array) and array.shape[0] != len(self):
+                    array.resize((len(self), *array.shape[1:]))
 
     def skip(self, names: Collection[str], *following: str) -> None:
         """Mark shots that have not ended as skipped; they and those following get their numbers."""

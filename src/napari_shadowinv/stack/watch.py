@@ -243,6 +243,9 @@ class Watch:
             self._pool.shutdown(cancel_futures=True)
             if self._latest:
                 self._skip_waiting()
+            if self.store is not None:
+                with suppress(OSError):  # the folder's own copy has the length
+                    self.store.close()
             self.report()
 
     def _is_over(self, idle: float | None, most: int | None) -> bool:
