@@ -10,6 +10,9 @@ searched for leftovers. One in 500 shots is empty and fails.
 
 Bytes must be equal, except for times and the store's identifier: `created`, `store_id` and the
 seal over both in `zarr.json`, seconds in reports and their column, the identifier in reports.
+
+CPU times, which depend less on other work of the machine, are those of all processes with their
+start.
 """
 
 from __future__ import annotations
@@ -18,14 +21,16 @@ import argparse
 import json
 import os
 import random
+import resource
 import signal
 import struct
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -167,6 +172,33 @@ class Night:
         return (self.folder / "night.shadowinv.zarr" / "status" / "c" / str(last)).exists()
 
 
+@dataclass
+class Times:
+    """Time of a part of the night, and CPU time of the processes that it started (s)."""
+
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+
+    def text(self, shots: int) -> str:
+        """Return both, and the CPU time of a shot."""
+        per_shot = 1e3 * self.cpu_seconds / shots
+        return f"{self.seconds:.0f} s, CPU {self.cpu_seconds:.0f} s, {per_shot:.1f} ms a shot"
+
+
+@contextmanager
+def timed() -> Iterator[Times]:
+    """Time a block; its times are known after it."""
+    times, began, before = Times(), time.perf_counter(), cpu_seconds()
+    yield times
+    times.seconds, times.cpu_seconds = time.perf_counter() - began, cpu_seconds() - before
+
+
+def cpu_seconds() -> float:
+    """Return the CPU time of all processes that were started and have ended."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
 def check(process: subprocess.Popen[str]) -> None:
     """Wait for a command, and end the benchmark unless it has written its shots."""
     _, errors = process.communicate()
@@ -177,9 +209,8 @@ def check(process: subprocess.Popen[str]) -> None:
 def compare(night: Night, killed: int, seed: int) -> list[tuple[str, str]]:
     """Invert the shots both ways, and return the rows of the table."""
     rng = random.Random(seed)
-    began = time.perf_counter()
-    check(night.batch("single.shadowinv.zarr"))
-    single = time.perf_counter() - began
+    with timed() as single:
+        check(night.batch("single.shadowinv.zarr"))
 
     order = rng.sample(range(1, night.shards + 1), night.shards)
     kills = {
@@ -187,31 +218,24 @@ def compare(night: Night, killed: int, seed: int) -> list[tuple[str, str]]:
         for number in rng.sample(order[1:], min(killed, night.shards) - 1)
     }
     kills[order[0]] = Kill(None, rng.uniform(0, MAX_DELAY_S))
-    began = time.perf_counter()
-    with ThreadPoolExecutor(AT_ONCE) as pool:
+    with timed() as sharded, ThreadPoolExecutor(AT_ONCE) as pool:
         runs = list(pool.map(lambda number: night.run_shard(number, kills.get(number)), order))
-    sharded = time.perf_counter() - began
     names = ("shots", "reference.npy", "night.shadowinv.zarr", "single.shadowinv.zarr")
     unfinished = len(leftovers(night.folder, names))
-    began = time.perf_counter()
-    check(night.start("merge", "night.shadowinv.zarr", "--quiet"))
-    merging = time.perf_counter() - began
+    with timed() as merging:
+        check(night.start("merge", "night.shadowinv.zarr", "--quiet"))
 
     store, expected = (night.folder / f"{name}.shadowinv.zarr" for name in ("night", "single"))
     files = sum(path.is_file() for path in store.rglob("*"))
     unequal = differences(store, expected)
     remains = leftovers(night.folder, names)
-    per_shot = 1e3 / night.shots
     return [
         ("shots, shards", f"{night.shots}, {night.shards}"),
-        ("single run, one thread", f"{single:.0f} s, {single * per_shot:.1f} ms a shot"),
-        (
-            f"shards, {AT_ONCE} at once, with repeats",
-            f"{sharded:.0f} s, {sharded * per_shot:.1f} ms a shot",
-        ),
+        ("single run, one thread", single.text(night.shots)),
+        (f"shards, {AT_ONCE} at once, with repeats", sharded.text(night.shots)),
         ("shards killed and repeated", str(sum(runs))),
         ("leftovers before the merge", str(unfinished)),
-        ("merge", f"{merging:.1f} s"),
+        ("merge", merging.text(night.shots)),
         ("files that differ from the single run", f"{len(unequal)} of {files} {unequal[:3] or ''}"),
         ("leftovers after it", f"{len(remains)} {remains[:3] or ''}"),
     ]
