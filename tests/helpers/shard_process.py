@@ -3,7 +3,7 @@
     python -m helpers.shard_process
 
 Each line on its input is a list of jobs to run at the same time; a line of its output has their
-exit codes. A job is killed at its n-th operation on a file of the store, if asked for.
+exit codes. A job is killed at its n-th change of a file of the store, if asked for.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -24,7 +24,7 @@ import numpy as np
 from helpers.night import OPTIONS, make_shots
 from napari_shadowinv import Recipe, RunOptions, invert, merge_stack, run_stack
 
-_OPERATIONS = {"open", "os.rename", "os.mkdir", "os.remove", "os.rmdir", "shutil.rmtree"}
+_CHANGES = {"os.rename", "os.mkdir", "os.remove", "os.rmdir"}
 
 
 class ShardProcesses:
@@ -62,18 +62,28 @@ def shard_processes() -> Iterator[ShardProcesses]:
         processes.close()
 
 
-def _kill_at(operation: int) -> None:
-    """Kill this process when it begins an operation on a file of a store."""
+def note_changes(note: Callable[[], None]) -> None:
+    """Call a function before each change of a file of a store in this process."""
+
+    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+        is_writing = event == "open" and arguments[2] & (os.O_WRONLY | os.O_RDWR)
+        if (is_writing or event in _CHANGES) and ".shadowinv.zarr" in str(arguments[0]):
+            note()
+
+    sys.addaudithook(hook)
+
+
+def _kill_at(change: int) -> None:
+    """Kill this process when it begins a change of a file of a store."""
     count = 0
 
-    def note(event: str, arguments: tuple[object, ...]) -> None:
+    def note() -> None:
         nonlocal count
-        if event in _OPERATIONS and ".shadowinv.zarr" in str(arguments[0]):
-            count += 1
-            if count == operation:
-                os.kill(os.getpid(), signal.SIGKILL)
+        count += 1
+        if count == change:
+            os.kill(os.getpid(), signal.SIGKILL)
 
-    sys.addaudithook(note)
+    note_changes(note)
 
 
 def _work(out: str, shots: str, source: str, shard: str | None, kill_at: int | None) -> None:
