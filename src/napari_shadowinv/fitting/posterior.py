@@ -221,7 +221,7 @@ class Posterior:
                 block[..., part.places] = self._rng.normal(size=block[..., part.places].shape)
         return numbers
 
-    def response(self, pairs: int, expected: FloatArray | None = None) -> Response:
+    def response(self, pairs: int) -> Response:
         """Return how well the images determine numbers that change the response to fields.
 
         Fields and such numbers together are likeliest for the instrument through which the fewest
@@ -230,8 +230,7 @@ class Posterior:
         present unknowns with fresh noise: pairs of opposite noise, which leaves out its mean.
 
         Derivatives are taken along a number and what responds to it, so that it matters little
-        whether the rest has settled; one linear step is enough for each of these fits. What is
-        expected changes little with the unknowns, so that of others nearby may be given.
+        whether the rest has settled; one linear step is enough for each of these fits.
         """
         scene, unknowns = self._scene, self._unknowns
         rng = np.random.default_rng(_RESPONSE_SEED)
@@ -251,16 +250,15 @@ class Posterior:
             forces = np.array([product(change.flat(), slope.flat()) for change in changes])
             return np.asarray(forces - numbers)
 
-        if expected is None:
-            model, deviations = scene.model(unknowns, self._counts), self._deviations
-            expected = np.zeros(len(units))
-            for _ in range(pairs):
-                noise = deviations * rng.normal(size=model.shape)
-                for sign in (1, -1):
-                    images = model + sign * noise
-                    step = self._change(gradient(images, unknowns), _REFITTED)
-                    refitted = unknowns.plus(unknowns.like(-step.flat()))
-                    expected += along(gradient(images, refitted)) / (2 * pairs)
+        model, deviations = scene.model(unknowns, self._counts), self._deviations
+        expected = np.zeros(len(units))
+        for _ in range(pairs):
+            noise = deviations * rng.normal(size=model.shape)
+            for sign in (1, -1):
+                images = model + sign * noise
+                step = self._change(gradient(images, unknowns), _REFITTED)
+                refitted = unknowns.plus(unknowns.like(-step.flat()))
+                expected += along(gradient(images, refitted)) / (2 * pairs)
         return Response(
             changes,
             numbers=numbers,

@@ -266,10 +266,9 @@ def _settle_response(
     least_gain: float,
 ) -> tuple[Scene, Minimum]:
     """Find the numbers that change the response to fields, and how uncertain they are."""
-    turns, before, expected = 1, None, None
+    turns, before = 1, None
     for _ in range(rounds):
-        is_fresh = expected is None
-        response = _posterior(scene, end, rng, on_step).response(_PAIRS, expected)
+        response = _posterior(scene, end, rng, on_step).response(_PAIRS)
         mean, precision = _mean_of_numbers(response)
         remaining = np.maximum(mean, scene.least_numbers()) - response.numbers
         # Steps that turn back hover about their end: their mean is nearer to it.
@@ -282,10 +281,8 @@ def _settle_response(
             unknowns = unknowns.plus(unknowns.like(share * each.flat()))
         end = replace(end, unknowns=unknowns)
         end = settle_minimum(scene, end, on_step, least_gain=least_gain)
-        if is_settled and is_fresh:
+        if is_settled:
             break
-        # The slopes that are expected are found again where the numbers have settled.
-        expected = None if is_settled else response.expected
     # Numbers that have not settled are at least as uncertain as they would still have moved.
     covariance = np.linalg.inv(precision) + np.outer(remaining, remaining)
     return replace(scene, spread=np.asarray(np.linalg.cholesky(covariance))), end
