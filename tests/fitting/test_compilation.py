@@ -54,18 +54,19 @@ def test_code_of_other_kernels_is_no_reason_not_to_compile(tmp_path: Path) -> No
 import os, time
 from pathlib import Path
 from napari_shadowinv.fitting import _ray_kernels as kernels
-from napari_shadowinv.fitting.compilation import is_compiled
+from napari_shadowinv.fitting import compilation
 
 folder = Path(kernels.collect.stats.cache_path)
 folder.mkdir(parents=True, exist_ok=True)
 version = "py{0.major}{0.minor}".format(__import__("sys").version_info)
-answers = [is_compiled()]
+answers = [compilation.is_compiled()]
 for when in (0.0, time.time()):
-    for name in ("deposit", "gather", "boxes", "collect", "rows_times", "transpose_times"):
+    for kernel in compilation._KERNELS:
+        name = kernel.py_func.__name__
         path = folder / f"_ray_kernels.{name}-1.{version}.nbi"
         path.touch()
         os.utime(path, (when, when))
-    answers.append(is_compiled())
+    answers.append(compilation.is_compiled())
 print(answers)
 """
     # The middle one is of a source that has changed since.
@@ -107,14 +108,7 @@ def test_parts_of_kernels_are_compiled_into_them_only() -> None:
     assert len(parts) > 4
     assert all(part.targetoptions.get("inline") == "always" for part in parts.values())
     kernels = compiled.keys() - parts.keys()
-    assert kernels == {
-        "boxes",
-        "collect",
-        "deposit",
-        "gather",
-        "rows_times",
-        "transpose_times",
-    }
+    assert kernels == {kernel.py_func.__name__ for kernel in compilation._KERNELS}
     # None of them calls another.
     called = {name for kernel in kernels for name in compiled[kernel].py_func.__code__.co_names}
     assert not called & kernels

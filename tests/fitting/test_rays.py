@@ -151,15 +151,23 @@ def test_rays_that_start_beyond_the_edge_arrive() -> None:
     np.testing.assert_allclose(image[:6].sum(axis=0), 15, rtol=1e-12)
 
 
-def test_beyond_the_image_lies_what_a_larger_detector_would_see() -> None:
-    larger = RayModel(SIZE, 8, beyond=3)
-    potential, beam = wavy(larger, FOLDED), larger.around(uneven())
+@pytest.mark.parametrize("frame", [at_rest(), np.array([6.0, 0.8, 0.1, -5.0, -0.1, 1.3])])
+def test_beyond_the_image_lies_what_a_larger_detector_would_see(frame: FloatArray) -> None:
+    """Also by rays of the strip, of which those cells are left out that reach no pixel."""
+    larger = RayModel(SIZE, 8, beyond=8)
+    y, x = places(larger)
+    potential = wavy(larger, FOLDED) + 90 * np.cos(y / 15) * np.sin(x / 10)
+    beam = larger.around(uneven())
     counts = larger.ray_counts(potential)
-    image = larger.image(potential, counts, beam)
-    assert image.shape == larger.seen == (46, 60)
+    image = larger.image(potential, counts, beam, frame)
+    assert image.shape == larger.seen == (56, 70)
     np.testing.assert_allclose(
-        image[3:-3, 3:-3], model_of().image(potential, counts, beam), rtol=1e-12, atol=1e-12
+        image[8:-8, 8:-8], model_of().image(potential, counts, beam, frame), rtol=1e-12, atol=1e-12
     )
+    strip = larger.around(np.zeros(SIZE))
+    strip[:8] = strip[-8:] = strip[:, :8] = strip[:, -8:] = 1.0
+    of_strip = model_of().image(potential, counts, strip, frame)
+    assert of_strip.sum() > 20
 
 
 def test_a_detector_shifted_by_whole_pixels_sees_the_image_shifted() -> None:

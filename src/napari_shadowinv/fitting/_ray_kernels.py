@@ -6,20 +6,20 @@ row of them is traced at once; the spline's values along y, which a row shares, 
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
+from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.geometry.compiler import njit
 
 __all__ = [
     "KNOT",
     "MOST_RAYS",
+    "add_corners",
     "boxes",
     "collect",
     "deposit",
     "gather",
+    "merge",
     "rows_times",
     "spline_tables",
     "transpose_times",
@@ -28,7 +28,11 @@ __all__ = [
 KNOT = 2  # px between knots
 MOST_RAYS = 64  # along a cell's side
 
-_ONE = np.uint32(1)  # unsigned, for which no index counts from the end
+_TABLE = 8 * MOST_RAYS  # numbers of splines and slopes for cells with one number of rays
+# Places in flat arrays, of 64 rays each.
+_ROWS = 8 * MOST_RAYS
+_V, _U, _SHARE_V, _SHARE_U, _SLOPE_V, _SLOPE_U, _DOWN, _RIGHT = range(0, 8 * MOST_RAYS, MOST_RAYS)
+_LANDED = 8 * MOST_RAYS
 _FAST = {"contract", "reassoc", "nsz"}  # sums in an order that suits the processor
 # A part that is compiled by itself, too, may sum in another order there, and which of both a
 # process calls depends on whether it compiled them or found them compiled.
@@ -44,74 +48,105 @@ def spline_tables(places: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 @njit(**_PART)
-def _slopes_of_row(
+def _misses(
     potential: FloatArray,
     row: int,
     column: int,
-    tables: FloatArray,
-    a: int,
-    n: int,
-    m: int,
-    out: FloatArray,
-) -> None:
-    """Gradient of a potential, (y, x), at row `a` of a cell's n rows of m rays."""
-    s0 = s1 = s2 = s3 = p0 = p1 = p2 = p3 = 0.0
+    cells: tuple[int, int],
+    frame: FloatArray,
+    pad: int,
+    size: tuple[int, int],
+) -> bool:
+    """Whether a cell of the strip is certain to send no ray to a pixel inside the guard.
+
+    Slopes of a spline lie between the least and the largest difference of its coefficients.
+    """
+    y, x = KNOT * row - pad, KNOT * column - pad
+    strip = (pad + 1) // KNOT
+    if strip <= row < cells[0] - strip and strip <= column < cells[1] - strip:
+        return False
+    least_y = most_y = potential[row + 1, column] - potential[row, column]
+    least_x = most_x = potential[row, column + 1] - potential[row, column]
     for i in range(4):
-        plain, steep = tables[n, 0, i, a], tables[n, 1, i, a]
-        c0, c1 = potential[row + i, column], potential[row + i, column + 1]
-        c2, c3 = potential[row + i, column + 2], potential[row + i, column + 3]
-        s0, s1, s2, s3 = s0 + steep * c0, s1 + steep * c1, s2 + steep * c2, s3 + steep * c3
-        p0, p1, p2, p3 = p0 + plain * c0, p1 + plain * c1, p2 + plain * c2, p3 + plain * c3
-    for b in range(m):
-        out[0, b] = (
-            tables[m, 0, 0, b] * s0
-            + tables[m, 0, 1, b] * s1
-            + tables[m, 0, 2, b] * s2
-            + tables[m, 0, 3, b] * s3
-        )
-        out[1, b] = (
-            tables[m, 1, 0, b] * p0
-            + tables[m, 1, 1, b] * p1
-            + tables[m, 1, 2, b] * p2
-            + tables[m, 1, 3, b] * p3
-        )
+        for j in range(3):
+            rise = potential[row + j + 1, column + i] - potential[row + j, column + i]
+            least_y, most_y = min(least_y, rise), max(most_y, rise)
+            rise = potential[row + i, column + j + 1] - potential[row + i, column + j]
+            least_x, most_x = min(least_x, rise), max(most_x, rise)
+    # The middle of the rectangle in which rays land, and half of its sides.
+    y, x = y + (KNOT - (most_y + least_y) / KNOT) / 2, x + (KNOT - (most_x + least_x) / KNOT) / 2
+    tall, wide = (KNOT + (most_y - least_y) / KNOT) / 2, (KNOT + (most_x - least_x) / KNOT) / 2
+    v = frame[0] + frame[1] * y + frame[2] * x
+    u = frame[3] + frame[4] * y + frame[5] * x
+    of_v = abs(frame[1]) * tall + abs(frame[2]) * wide
+    of_u = abs(frame[4]) * tall + abs(frame[5]) * wide
+    misses_v = v + of_v < 0.5 or v - of_v > size[0] - 1.5
+    return misses_v or u + of_u < 0.5 or u - of_u > size[1] - 1.5
 
 
+# Arrays of the parts below are flat, and each part writes one, so that the compiler need not
+# suspect that what it writes changes what it reads; loops go on to a multiple of 8, where tables
+# are zero.
 @njit(**_PART)
-def _share(place: float, steepness: float) -> tuple[float, float]:
-    """Share of a ray between two pixels' centres that goes to the next pixel, and its slope."""
-    t = min(max((place - 0.5) * steepness + 0.5, 0.0), 1.0)
-    nearer = min(t, 1 - t)
-    part = 2 * nearer * nearer
-    return (part if t < 0.5 else 1 - part), 4 * nearer * steepness
+def _evaluate_rows(
+    potential: FloatArray, row: int, column: int, tables: FloatArray, n: int, out: FloatArray
+) -> None:
+    """Slopes along y, then values, of the four columns of splines at a cell's n rows of rays."""
+    at = tables[_TABLE * n : _TABLE * (n + 1)]
+    for s in range(4):
+        c0, c1 = potential[row, column + s], potential[row + 1, column + s]
+        c2, c3 = potential[row + 2, column + s], potential[row + 3, column + s]
+        for a in range((n + 7) // 8 * 8):
+            out[64 * s + a] = (
+                at[256 + a] * c0 + at[320 + a] * c1 + at[384 + a] * c2 + at[448 + a] * c3
+            )
+            out[64 * (4 + s) + a] = (
+                at[a] * c0 + at[64 + a] * c1 + at[128 + a] * c2 + at[192 + a] * c3
+            )
 
 
 @njit(**_PART)
 def _land(
-    slopes: FloatArray,
+    rows: FloatArray,
+    a: int,
+    tables: FloatArray,
     m: int,
     y: float,
     x: float,
     frame: FloatArray,
     steepness: float,
     size: tuple[int, int],
-    pixels: AnyArray,
-    shares: FloatArray,
+    with_slopes: bool,
+    out: FloatArray,
 ) -> None:
-    """The pixel at or before each ray of a row, and the share of the next one, with its slope."""
+    """The pixel at or before each ray of row `a`, and the share of the next one, with its slope."""
+    at = tables[_TABLE * m : _TABLE * (m + 1)]
+    s0, s1, s2, s3 = rows[a], rows[64 + a], rows[128 + a], rows[192 + a]
+    p0, p1, p2, p3 = rows[256 + a], rows[320 + a], rows[384 + a], rows[448 + a]
+    f0, f1, f2, f3, f4, f5 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     last_row, last_column = size[0] - 2.0, size[1] - 2.0
-    for b in range(m):
-        down = y - slopes[0, b]
-        right = x + (b + 0.5) * (KNOT / m) - slopes[1, b]
-        v = frame[0] + frame[1] * down + frame[2] * right
-        u = frame[3] + frame[4] * down + frame[5] * right
+    step = KNOT / m
+    for b in range((m + 7) // 8 * 8):
+        down = y - (at[b] * s0 + at[64 + b] * s1 + at[128 + b] * s2 + at[192 + b] * s3)
+        right = at[256 + b] * p0 + at[320 + b] * p1 + at[384 + b] * p2 + at[448 + b] * p3
+        right = x + (b + 0.5) * step - right
         # Rays that miss land in the outermost pixels, which nobody looks at.
-        v = min(max(v, 0.0), last_row)
-        u = min(max(u, 0.0), last_column)
-        i, j = math.floor(v), math.floor(u)
-        pixels[0, b], pixels[1, b] = np.uint32(i), np.uint32(j)
-        shares[0, b], shares[2, b] = _share(v - i, steepness)
-        shares[1, b], shares[3, b] = _share(u - j, steepness)
+        v = min(max(f0 + f1 * down + f2 * right, 0.0), last_row)
+        u = min(max(f3 + f4 * down + f5 * right, 0.0), last_column)
+        i, j = np.floor(v), np.floor(u)
+        out[_V + b], out[_U + b] = i, j
+        # Between two pixels' centres the share rises from 0 to 1 as two parabolas.
+        t = min(max((v - i - 0.5) * steepness + 0.5, 0.0), 1.0)
+        nearer = min(t, 1 - t)
+        out[_SHARE_V + b] = 2 * nearer * nearer if t < 0.5 else 1 - 2 * nearer * nearer
+        if with_slopes:
+            out[_SLOPE_V + b] = 4 * nearer * steepness
+        t = min(max((u - j - 0.5) * steepness + 0.5, 0.0), 1.0)
+        nearer = min(t, 1 - t)
+        out[_SHARE_U + b] = 2 * nearer * nearer if t < 0.5 else 1 - 2 * nearer * nearer
+        if with_slopes:
+            out[_SLOPE_U + b] = 4 * nearer * steepness
+            out[_DOWN + b], out[_RIGHT + b] = down, right
 
 
 @njit(**_PART)
@@ -129,8 +164,9 @@ def _flux_of_row(
     i, j = KNOT * row, KNOT * column
     at_left = upper * beam[i, j] + lower * beam[i + 1, j]
     at_right = upper * beam[i, j + 1] + lower * beam[i + 1, j + 1]
-    for b in range(m):
-        first = _first_pixels_share(b, m)
+    half = m / 2
+    for b in range((m + 7) // 8 * 8):
+        first = min(max(half - b, 0.0), 1.0)
         out[b] = first * at_left + (1 - first) * at_right
 
 
@@ -145,61 +181,86 @@ def deposit(
     frame: FloatArray,
     pad: int,
     steepness: float,
-    images: FloatArray,
+    size: tuple[int, int],
+    corners: FloatArray,
+    reached: IntArray,
 ) -> None:
-    """Share the rays of bands of cells among the pixels of each band's image."""
-    rows, columns = counts.shape[1:]
-    bands, size = images.shape[0], (images.shape[1], images.shape[2])
-    slopes, shares = np.empty((2, MOST_RAYS)), np.empty((4, MOST_RAYS))
-    pixels, flux = np.empty((2, MOST_RAYS), np.uint32), np.empty(MOST_RAYS)
+    """Add the rays of bands of cells up at the pixel at or before each, by the pixel they go to.
+
+    `corners` has the shape (bands, pixels × 4): for the pixel itself, that to its right, that below
+    it, and that below to the right. `reached` are the first row of each band, and that after the
+    last.
+    """
+    cells = counts.shape[1], counts.shape[2]
+    bands, width = len(corners), np.uint32(size[1])
+    rows, landed, flux = np.zeros(_ROWS), np.zeros(_LANDED), np.zeros(MOST_RAYS)
     for band in range(start, stop):
-        image = images[band]
-        for row in range(rows * band // bands, rows * (band + 1) // bands):
-            for column in range(columns):
+        sums = corners[band]
+        first, last = np.uint32(size[0]), np.uint32(0)
+        for row in range(cells[0] * band // bands, cells[0] * (band + 1) // bands):
+            for column in range(cells[1]):
+                if _misses(potential, row, column, cells, frame, pad, size):
+                    continue
                 n, m = counts[0, row, column], counts[1, row, column]
+                _evaluate_rows(potential, row, column, tables, n, rows)
                 for a in range(n):
                     y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
-                    _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
-                    _land(slopes, m, y, x, frame, steepness, size, pixels, shares)
+                    _land(rows, a, tables, m, y, x, frame, steepness, size, False, landed)
                     _flux_of_row(beam, row, column, a, n, m, flux)
                     for b in range(m):
-                        i, j = pixels[0, b], pixels[1, b]
-                        i1, j1 = i + _ONE, j + _ONE
-                        down, right = shares[0, b], shares[1, b]
-                        below = flux[b] * down
+                        i, j = np.uint32(landed[_V + b]), np.uint32(landed[_U + b])
+                        first, last = min(first, i), max(last, i)
+                        below = flux[b] * landed[_SHARE_V + b]
                         above = flux[b] - below
-                        image[i, j] += above - above * right
-                        image[i, j1] += above * right
-                        image[i1, j] += below - below * right
-                        image[i1, j1] += below * right
+                        right = landed[_SHARE_U + b]
+                        to_right, to_corner = above * right, below * right
+                        pixel = (i * width + j) * np.uint32(4)
+                        sums[pixel] += above - to_right
+                        sums[pixel + np.uint32(1)] += to_right
+                        sums[pixel + np.uint32(2)] += below - to_corner
+                        sums[pixel + np.uint32(3)] += to_corner
+        reached[band, 0], reached[band, 1] = first, last + np.uint32(1)
+
+
+@njit(nogil=True, error_model="numpy")
+def add_corners(
+    start: int,
+    stop: int,
+    corners: FloatArray,
+    reached: IntArray,
+    width: int,
+    guard: int,
+    image: FloatArray,
+) -> None:
+    """Add the sums of `deposit` up in rows of an image, which lies within a guard."""
+    for row in range(start, stop):
+        for band in range(len(corners)):
+            sums = corners[band]
+            for k in range(2):
+                i = row + guard - k
+                if reached[band, 0] <= i < reached[band, 1]:
+                    first = 4 * (i * width + guard) + 2 * k
+                    for column in range(image.shape[1]):
+                        pixel = first + 4 * column
+                        image[row, column] += sums[pixel] + sums[pixel - 3]
 
 
 @njit(**_PART)
-def _add_moments(
-    to_y: FloatArray,
-    to_x: FloatArray,
-    slopes: FloatArray,
-    m: int,
-    y: float,
-    x: float,
-    moments: FloatArray,
-) -> None:
+def _add_moments(pulls: FloatArray, landed: FloatArray, m: int, moments: FloatArray) -> None:
     """Add the contribution of a row of rays to the derivatives of a frame."""
     for b in range(m):
-        in_v, in_u = to_y[b], to_x[b]
-        landed_y = y - slopes[0, b]
-        landed_x = x + (b + 0.5) * (KNOT / m) - slopes[1, b]
+        in_v, in_u = pulls[b], pulls[64 + b]
         moments[0] += in_v
-        moments[1] += in_v * landed_y
-        moments[2] += in_v * landed_x
+        moments[1] += in_v * landed[_DOWN + b]
+        moments[2] += in_v * landed[_RIGHT + b]
         moments[3] += in_u
-        moments[4] += in_u * landed_y
-        moments[5] += in_u * landed_x
+        moments[4] += in_u * landed[_DOWN + b]
+        moments[5] += in_u * landed[_RIGHT + b]
 
 
 @njit(**_PART)
 def _add_to_beam(
-    bright: FloatArray, row: int, column: int, a: int, n: int, m: int, of_beam: FloatArray
+    pulls: FloatArray, row: int, column: int, a: int, n: int, m: int, of_beam: FloatArray
 ) -> None:
     """Add the contribution of a row of rays to the beam's derivatives in its cell's four pixels."""
     upper = _first_pixels_share(a, n) / (n * m) * KNOT**2
@@ -207,13 +268,61 @@ def _add_to_beam(
     pull_left = pull_right = 0.0
     for b in range(m):
         share = _first_pixels_share(b, m)
-        pull_left += share * bright[b]
-        pull_right += (1 - share) * bright[b]
+        pull_left += share * pulls[128 + b]
+        pull_right += (1 - share) * pulls[128 + b]
     i, j = KNOT * row, KNOT * column
     of_beam[i, j] += upper * pull_left
     of_beam[i, j + 1] += upper * pull_right
     of_beam[i + 1, j] += lower * pull_left
     of_beam[i + 1, j + 1] += lower * pull_right
+
+
+@njit(**_PART)
+def _add_row(
+    pulls: FloatArray,
+    tables: FloatArray,
+    a: int,
+    n: int,
+    m: int,
+    frame: FloatArray,
+    sums: FloatArray,
+) -> None:
+    """Add the pull on row `a` of rays to sums over a cell's rows, for each spline along y."""
+    at = tables[_TABLE * n : _TABLE * (n + 1)]
+    p0, p1, p2, p3 = at[a], at[64 + a], at[128 + a], at[192 + a]
+    s0, s1, s2, s3 = at[256 + a], at[320 + a], at[384 + a], at[448 + a]
+    f1, f2, f4, f5 = frame[1], frame[2], frame[4], frame[5]
+    for b in range((m + 7) // 8 * 8):
+        along = f1 * pulls[b] + f4 * pulls[64 + b]
+        across = f2 * pulls[b] + f5 * pulls[64 + b]
+        sums[b] += s0 * along
+        sums[64 + b] += s1 * along
+        sums[128 + b] += s2 * along
+        sums[192 + b] += s3 * along
+        sums[256 + b] += p0 * across
+        sums[320 + b] += p1 * across
+        sums[384 + b] += p2 * across
+        sums[448 + b] += p3 * across
+
+
+@njit(**_PART)
+def _subtract_sums(
+    sums: FloatArray, tables: FloatArray, m: int, row: int, column: int, gradient: FloatArray
+) -> None:
+    """Subtract a cell's sums from the derivatives by its coefficients."""
+    at = tables[_TABLE * m : _TABLE * (m + 1)]
+    for r in range(4):
+        g0 = g1 = g2 = g3 = 0.0
+        for b in range((m + 7) // 8 * 8):
+            along, across = sums[64 * r + b], sums[256 + 64 * r + b]
+            g0 += along * at[b] + across * at[256 + b]
+            g1 += along * at[64 + b] + across * at[320 + b]
+            g2 += along * at[128 + b] + across * at[384 + b]
+            g3 += along * at[192 + b] + across * at[448 + b]
+        gradient[row + r, column] -= g0
+        gradient[row + r, column + 1] -= g1
+        gradient[row + r, column + 2] -= g2
+        gradient[row + r, column + 3] -= g3
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
@@ -227,60 +336,56 @@ def gather(
     frame: FloatArray,
     pad: int,
     steepness: float,
-    pull: FloatArray,
+    size: tuple[int, int],
+    slopes: FloatArray,
     gradients: FloatArray,
     of_beam: FloatArray,
     beam_is_free: bool,
     of_frame: FloatArray,
     frame_is_free: bool,
 ) -> None:
-    """Gradients with respect to coefficients, beam and frame, from the pull where rays land."""
-    rows, columns = counts.shape[1:]
-    bands = len(gradients)
-    size = pull.shape[0], pull.shape[1]
-    slopes, shares = np.empty((2, MOST_RAYS)), np.empty((4, MOST_RAYS))
-    pixels, flux = np.empty((2, MOST_RAYS), np.uint32), np.empty(MOST_RAYS)
-    to_y, to_x, bright = np.empty(MOST_RAYS), np.empty(MOST_RAYS), np.empty(MOST_RAYS)
-    lifted, shifted = np.empty(4), np.empty(4)
+    """Gradients with respect to coefficients, beam and frame, from the pull where rays land.
+
+    `slopes` are the pull at each pixel, how much more it is to the right, and below, and how much
+    the latter grows to the right; flat.
+    """
+    cells = counts.shape[1], counts.shape[2]
+    bands, width = len(gradients), np.uint32(size[1])
+    rows, landed, flux = np.zeros(_ROWS), np.zeros(_LANDED), np.zeros(MOST_RAYS)
+    pulls, sums = np.zeros(3 * MOST_RAYS), np.zeros(8 * MOST_RAYS)
     for band in range(start, stop):
         gradient, moments = gradients[band], of_frame[band]
-        for row in range(rows * band // bands, rows * (band + 1) // bands):
-            for column in range(columns):
+        for row in range(cells[0] * band // bands, cells[0] * (band + 1) // bands):
+            for column in range(cells[1]):
+                if _misses(potential, row, column, cells, frame, pad, size):
+                    continue
                 n, m = counts[0, row, column], counts[1, row, column]
+                _evaluate_rows(potential, row, column, tables, n, rows)
+                sums[:] = 0.0
                 for a in range(n):
                     y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
-                    _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
-                    _land(slopes, m, y, x, frame, steepness, size, pixels, shares)
+                    _land(rows, a, tables, m, y, x, frame, steepness, size, True, landed)
                     _flux_of_row(beam, row, column, a, n, m, flux)
                     for b in range(m):
-                        i, j = pixels[0, b], pixels[1, b]
-                        i1, j1 = i + _ONE, j + _ONE
-                        down, right = shares[0, b], shares[1, b]
-                        above, beside = pull[i, j], pull[i, j1]
-                        below, across = pull[i1, j], pull[i1, j1]
-                        twist = across - beside - below + above
+                        i, j = np.uint32(landed[_V + b]), np.uint32(landed[_U + b])
+                        pixel = (i * width + j) * np.uint32(4)
+                        below, right = landed[_SHARE_V + b], landed[_SHARE_U + b]
+                        to_right, to_below = (
+                            slopes[pixel + np.uint32(1)],
+                            slopes[pixel + np.uint32(2)],
+                        )
+                        twist = slopes[pixel + np.uint32(3)]
+                        to_right += below * twist
+                        pulls[b] = flux[b] * landed[_SLOPE_V + b] * (to_below + right * twist)
+                        pulls[64 + b] = flux[b] * landed[_SLOPE_U + b] * to_right
                         if beam_is_free:
-                            at_left = above + down * (below - above)
-                            bright[b] = at_left + right * (beside - above + down * twist)
-                        to_y[b] = flux[b] * shares[2, b] * (below - above + right * twist)
-                        to_x[b] = flux[b] * shares[3, b] * (beside - above + down * twist)
+                            pulls[128 + b] = slopes[pixel] + below * to_below + right * to_right
+                    _add_row(pulls, tables, a, n, m, frame, sums)
                     if frame_is_free:
-                        _add_moments(to_y, to_x, slopes, m, y, x, moments)
-                    for s in range(4):
-                        to_lift = to_shift = 0.0
-                        for b in range(m):
-                            along = frame[1] * to_y[b] + frame[4] * to_x[b]
-                            across = frame[2] * to_y[b] + frame[5] * to_x[b]
-                            to_lift += along * tables[m, 0, s, b]
-                            to_shift += across * tables[m, 1, s, b]
-                        lifted[s], shifted[s] = to_lift, to_shift
-                    for r in range(4):
-                        for s in range(4):
-                            gradient[row + r, column + s] -= (
-                                tables[n, 1, r, a] * lifted[s] + tables[n, 0, r, a] * shifted[s]
-                            )
+                        _add_moments(pulls, landed, m, moments)
                     if beam_is_free:
-                        _add_to_beam(bright, row, column, a, n, m, of_beam)
+                        _add_to_beam(pulls, row, column, a, n, m, of_beam)
+                _subtract_sums(sums, tables, m, row, column, gradient)
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
@@ -298,22 +403,45 @@ def boxes(
     found: IntArray,
 ) -> None:
     """First row and column of the pixels that each cell reaches, and those after the last."""
-    columns = counts.shape[2]
-    slopes, shares = np.empty((2, MOST_RAYS)), np.empty((4, MOST_RAYS))
-    pixels = np.empty((2, MOST_RAYS), np.uint32)
+    cells = counts.shape[1], counts.shape[2]
+    rows, landed = np.zeros(_ROWS), np.zeros(_LANDED)
     for row in range(start, stop):
-        for column in range(columns):
+        for column in range(cells[1]):
+            found[row, column] = 0
+            if _misses(potential, row, column, cells, frame, pad, size):
+                continue
             n, m = counts[0, row, column], counts[1, row, column]
+            _evaluate_rows(potential, row, column, tables, n, rows)
             first_row, first_column, last_row, last_column = size[0], size[1], 0, 0
             for a in range(n):
                 y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
-                _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
-                _land(slopes, m, y, x, frame, steepness, size, pixels, shares)
+                _land(rows, a, tables, m, y, x, frame, steepness, size, False, landed)
                 for b in range(m):
-                    i, j = int(pixels[0, b]), int(pixels[1, b])
+                    i, j = int(landed[_V + b]), int(landed[_U + b])
                     first_row, last_row = min(first_row, i), max(last_row, i + 2)
                     first_column, last_column = min(first_column, j), max(last_column, j + 2)
             found[row, column] = first_row, first_column, last_row, last_column
+
+
+@njit(**_PART)
+def _subtract(
+    block: FloatArray,
+    c: int,
+    steep: float,
+    plain: float,
+    u0: float,
+    u1: float,
+    u2: float,
+    u3: float,
+    v0: float,
+    v1: float,
+    v2: float,
+    v3: float,
+) -> None:
+    block[c] -= steep * u0 + plain * v0
+    block[c + 1] -= steep * u1 + plain * v1
+    block[c + 2] -= steep * u2 + plain * v2
+    block[c + 3] -= steep * u3 + plain * v3
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
@@ -330,94 +458,206 @@ def collect(
     size: tuple[int, int],
     boxes: IntArray,
     begins: IntArray,
-    width: int,
+    guard: int,
     middle: tuple[float, float],
     free: tuple[bool, bool],
-    places: IntArray,
-    values: FloatArray,
+    used: IntArray,
+    pixels: IntArray,
+    of_splines: FloatArray,
+    of_others: FloatArray,
 ) -> None:
-    """Derivatives of the pixels in each cell's box by its coefficients, its beam and the frame.
+    """Derivatives of the pixels that each cell reaches by its coefficients, its beam and the frame.
 
-    `places` are numbers of pixels in lines of `width`, and of coefficients, beam and frame.
+    A cell's lines begin at `begins`; `used` says how many there are. A line is a pixel's number
+    without the guard, its derivatives by the 16 coefficients, and by 4 pixels of the beam and the
+    frame, of which there may be none.
     """
-    columns = counts.shape[2]
-    slopes, shares = np.empty((2, MOST_RAYS)), np.empty((4, MOST_RAYS))
-    pixels = np.empty((2, MOST_RAYS), np.uint32)
-    flux, first = np.empty(MOST_RAYS), np.empty(4)
+    cells = counts.shape[1], counts.shape[2]
+    rows, landed = np.zeros(_ROWS), np.zeros(_LANDED)
+    flux = np.zeros(MOST_RAYS)
     beam_is_free, frame_is_free = free
-    last = potential.size + beam.size
+    others = of_others.shape[1]
+    width = size[1] - 2 * guard
     for row in range(start, stop):
-        for column in range(columns):
+        for column in range(cells[1]):
             n, m = counts[0, row, column], counts[1, row, column]
             first_row, first_column, last_row, last_column = boxes[row, column]
             wide = last_column - first_column
-            block = np.zeros((max(last_row - first_row, 0) * max(wide, 0), 26))
-            if not block.size:
+            area = max(last_row - first_row, 0) * max(wide, 0)
+            if area == 0:
                 continue
+            block, other = np.zeros(16 * area), np.zeros((area, others))
+            is_reached, sums = np.zeros(area, np.bool_), np.zeros(8 * area)
+            last_seen, touched = np.full(area, -1), np.empty(area, np.int64)
+            of_y = tables[_TABLE * n : _TABLE * (n + 1)]
+            of_x = tables[_TABLE * m : _TABLE * (m + 1)]
+            _evaluate_rows(potential, row, column, tables, n, rows)
             for a in range(n):
                 y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
-                _slopes_of_row(potential, row, column, tables, a, n, m, slopes)
-                _land(slopes, m, y, x, frame, steepness, size, pixels, shares)
+                _land(rows, a, tables, m, y, x, frame, steepness, size, True, landed)
                 _flux_of_row(beam, row, column, a, n, m, flux)
                 upper = _first_pixels_share(a, n) / (n * m) * KNOT**2
                 lower = KNOT**2 / (n * m) - upper
+                plain0, plain1, plain2, plain3 = of_y[a], of_y[64 + a], of_y[128 + a], of_y[192 + a]
+                steep0, steep1 = of_y[256 + a], of_y[320 + a]
+                steep2, steep3 = of_y[384 + a], of_y[448 + a]
+                n_touched = 0
                 for b in range(m):
-                    landed_y = y - slopes[0, b] - middle[0]
-                    landed_x = x + (b + 0.5) * (KNOT / m) - slopes[1, b] - middle[1]
+                    landed_y = landed[_DOWN + b] - middle[0]
+                    landed_x = landed[_RIGHT + b] - middle[1]
                     part = _first_pixels_share(b, m)
-                    first[:] = upper * part, upper * (1 - part), lower * part, lower * (1 - part)
+                    p0, p1, p2, p3 = of_x[b], of_x[64 + b], of_x[128 + b], of_x[192 + b]
+                    s0, s1, s2, s3 = of_x[256 + b], of_x[320 + b], of_x[384 + b], of_x[448 + b]
                     for q in range(4):
-                        i, j = int(pixels[0, b]) + q // 2, int(pixels[1, b]) + q % 2
+                        i, j = int(landed[_V + b]) + q // 2, int(landed[_U + b]) + q % 2
                         if not (first_row <= i < last_row and first_column <= j < last_column):
                             continue
                         p = (i - first_row) * wide + j - first_column
-                        in_v = shares[0, b] if q // 2 else 1 - shares[0, b]
-                        in_u = shares[1, b] if q % 2 else 1 - shares[1, b]
-                        to_v = flux[b] * in_u * (shares[2, b] if q // 2 else -shares[2, b])
-                        to_u = flux[b] * in_v * (shares[3, b] if q % 2 else -shares[3, b])
-                        if beam_is_free:
-                            for s in range(4):
-                                block[p, 16 + s] += in_v * in_u * first[s]
+                        below, right = landed[_SHARE_V + b], landed[_SHARE_U + b]
+                        in_v, in_u = below if q // 2 else 1 - below, right if q % 2 else 1 - right
+                        to_v, to_u = flux[b] * in_u * landed[_SLOPE_V + b], flux[b] * in_v
+                        to_v = to_v if q // 2 else -to_v
+                        to_u *= landed[_SLOPE_U + b] if q % 2 else -landed[_SLOPE_U + b]
+                        if beam_is_free and in_v * in_u > 0:
+                            is_reached[p] = True
+                            other[p, 0] += in_v * in_u * upper * part
+                            other[p, 1] += in_v * in_u * upper * (1 - part)
+                            other[p, 2] += in_v * in_u * lower * part
+                            other[p, 3] += in_v * in_u * lower * (1 - part)
                         if to_v == 0 and to_u == 0:  # half of the pairs of a ray and a pixel
                             continue
+                        is_reached[p] = True
                         along = frame[1] * to_v + frame[4] * to_u
                         across = frame[2] * to_v + frame[5] * to_u
-                        for r in range(4):
-                            steep = tables[n, 1, r, a] * along
-                            plain = tables[n, 0, r, a] * across
-                            for s in range(4):
-                                block[p, 4 * r + s] -= (
-                                    steep * tables[m, 0, s, b] + plain * tables[m, 1, s, b]
-                                )
+                        if last_seen[p] != a:
+                            last_seen[p] = a
+                            touched[n_touched] = p
+                            n_touched += 1
+                            sums[8 * p : 8 * p + 8] = 0.0
+                        t0, t1, t2, t3 = (
+                            sums[8 * p],
+                            sums[8 * p + 1],
+                            sums[8 * p + 2],
+                            sums[8 * p + 3],
+                        )
+                        t4, t5, t6, t7 = (
+                            sums[8 * p + 4],
+                            sums[8 * p + 5],
+                            sums[8 * p + 6],
+                            sums[8 * p + 7],
+                        )
+                        sums[8 * p], sums[8 * p + 1] = t0 + along * p0, t1 + along * p1
+                        sums[8 * p + 2], sums[8 * p + 3] = t2 + along * p2, t3 + along * p3
+                        sums[8 * p + 4], sums[8 * p + 5] = t4 + across * s0, t5 + across * s1
+                        sums[8 * p + 6], sums[8 * p + 7] = t6 + across * s2, t7 + across * s3
                         if frame_is_free:
-                            block[p, 20] += to_v
-                            block[p, 21] += to_v * landed_y
-                            block[p, 22] += to_v * landed_x
-                            block[p, 23] += to_u
-                            block[p, 24] += to_u * landed_y
-                            block[p, 25] += to_u * landed_x
-            entry = begins[row, column]
-            coefficient = row * potential.shape[1] + column
-            beam_pixel = potential.size + KNOT * (row * beam.shape[1] + column)
-            for p in range(len(block)):
-                pixel = (first_row + p // wide) * width + first_column + p % wide
-                for r in range(4):
-                    for s in range(4):
-                        places[0, entry] = pixel
-                        places[1, entry] = coefficient + r * potential.shape[1] + s
-                        values[entry] = block[p, 4 * r + s]
-                        entry += 1
-                if beam_is_free:
-                    for s in range(4):
-                        places[0, entry] = pixel
-                        places[1, entry] = beam_pixel + s // 2 * beam.shape[1] + s % 2
-                        values[entry] = block[p, 16 + s]
-                        entry += 1
-                if frame_is_free:
-                    for s in range(6):
-                        places[0, entry], places[1, entry] = pixel, last + s
-                        values[entry] = block[p, 20 + s]
-                        entry += 1
+                            other[p, -6] += to_v
+                            other[p, -5] += to_v * landed_y
+                            other[p, -4] += to_v * landed_x
+                            other[p, -3] += to_u
+                            other[p, -2] += to_u * landed_y
+                            other[p, -1] += to_u * landed_x
+                for k in range(n_touched):
+                    p = touched[k]
+                    u0, u1, u2, u3 = sums[8 * p], sums[8 * p + 1], sums[8 * p + 2], sums[8 * p + 3]
+                    v0, v1, v2, v3 = (
+                        sums[8 * p + 4],
+                        sums[8 * p + 5],
+                        sums[8 * p + 6],
+                        sums[8 * p + 7],
+                    )
+                    c = 16 * p
+                    _subtract(block, c, steep0, plain0, u0, u1, u2, u3, v0, v1, v2, v3)
+                    _subtract(block, c + 4, steep1, plain1, u0, u1, u2, u3, v0, v1, v2, v3)
+                    _subtract(block, c + 8, steep2, plain2, u0, u1, u2, u3, v0, v1, v2, v3)
+                    _subtract(block, c + 12, steep3, plain3, u0, u1, u2, u3, v0, v1, v2, v3)
+            line = begins[row, column]
+            for p in range(area):
+                if is_reached[p]:
+                    pixel = (first_row + p // wide - guard) * width
+                    pixels[line] = pixel + first_column + p % wide - guard
+                    for c in range(16):
+                        of_splines[line, c] = block[16 * p + c]
+                    for c in range(others):
+                        of_others[line, c] = other[p, c]
+                    line += 1
+            used[row, column] = line - begins[row, column]
+
+
+@njit(nogil=True, error_model="numpy")
+def merge(
+    begins: IntArray,
+    used: IntArray,
+    pixels: IntArray,
+    of_splines: FloatArray,
+    of_others: FloatArray,
+    has_beam: bool,
+    rows: IntArray,
+    columns: IntArray,
+    values: FloatArray,
+) -> None:
+    """Add the lines of `collect` up in a sparse matrix: begins of its rows, columns and values."""
+    cells, others = begins.shape, of_others.shape[1]
+    coefficients, beam = cells[1] + 3, KNOT * cells[1]
+    first_of_beam = (cells[0] + 3) * coefficients
+    first_of_frame = first_of_beam + KNOT * cells[0] * beam
+    # Lines in the order of their pixels.
+    rows[:] = 0
+    for row in range(cells[0]):
+        for column in range(cells[1]):
+            for line in range(begins[row, column], begins[row, column] + used[row, column]):
+                rows[pixels[line] + 1] += 1
+    ends = np.cumsum(rows)
+    order = np.empty((ends[-1], 3), np.int64)
+    for row in range(cells[0]):
+        for column in range(cells[1]):
+            for line in range(begins[row, column], begins[row, column] + used[row, column]):
+                place = ends[pixels[line]]
+                order[place, 0], order[place, 1], order[place, 2] = line, row, column
+                ends[pixels[line]] += 1
+    places = np.full(first_of_frame + 6, -1, np.int64)
+    entry = place = 0
+    for pixel in range(len(rows) - 1):
+        first = entry
+        while place < ends[pixel]:
+            line, row, column = order[place]
+            place += 1
+            for c in range(16):
+                number = (row + c // 4) * coefficients + column + c % 4
+                entry = _add_entry(
+                    number, of_splines[line, c], first, entry, places, columns, values
+                )
+            for c in range(4 * has_beam):
+                number = first_of_beam + (KNOT * row + c // 2) * beam + KNOT * column + c % 2
+                entry = _add_entry(
+                    number, of_others[line, c], first, entry, places, columns, values
+                )
+            for c in range(4 * has_beam, others):
+                number = first_of_frame + c - 4 * has_beam
+                entry = _add_entry(
+                    number, of_others[line, c], first, entry, places, columns, values
+                )
+        rows[pixel + 1] = entry
+    rows[0] = 0
+
+
+@njit(**_PART)
+def _add_entry(
+    number: int,
+    value: float,
+    first: int,
+    entry: int,
+    places: IntArray,
+    columns: IntArray,
+    values: FloatArray,
+) -> int:
+    """Add a value to a column of the row that begins at `first`; return where the next begins."""
+    place = places[number]
+    if place >= first:
+        values[place] += value
+        return entry
+    places[number], columns[entry], values[entry] = entry, number, value
+    return entry + 1
 
 
 @njit(nogil=True, error_model="numpy")

@@ -24,9 +24,11 @@ __all__ = ["ensure_compiled", "is_compiled"]
 
 _KERNELS: tuple[Any, ...] = (
     _ray_kernels.deposit,
+    _ray_kernels.add_corners,
     _ray_kernels.gather,
     _ray_kernels.boxes,
     _ray_kernels.collect,
+    _ray_kernels.merge,
     _ray_kernels.rows_times,
     _ray_kernels.transpose_times,
 )

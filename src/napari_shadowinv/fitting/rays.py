@@ -15,7 +15,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray, IntArray
@@ -27,7 +27,7 @@ __all__ = ["KNOT", "Pulls", "RayModel", "at_rest"]
 _SHARED = 2.0  # spacings at rest: width of an edge where rays count in both pixels, evenly then
 _BANDS = 8  # of cells; each has an image of its own, so that threads do not change a sum
 _GUARD = 2  # px around the detector, for rays that miss it
-_WORTH_A_THREAD = 20_000  # rays
+_WORTH_A_THREAD, _WORTH_A_THREAD_ROWS = 20_000, 200  # rays; rows of an image
 
 
 class Pulls(NamedTuple):
@@ -144,9 +144,26 @@ class RayModel:
         -------
         ndarray, with the shape `seen`
         """
-        images = self._blank()
-        self._in_bands(kernels.deposit, potential, counts, beam, frame, images)
-        return self._of_detector(images)
+        size = self._guarded
+        corners = np.zeros((_BANDS, 4 * math.prod(size)))
+        reached = np.zeros((_BANDS, 2), np.int64)
+        self._in_ranges(
+            kernels.deposit, _BANDS, potential, counts, beam, frame, size, corners, reached
+        )
+        image = np.zeros(self.seen)
+        threads = available_threads(self.threads)
+        in_ranges(
+            kernels.add_corners,
+            len(image),
+            threads,
+            corners,
+            reached,
+            size[1],
+            _GUARD,
+            image,
+            smallest=_WORTH_A_THREAD_ROWS,
+        )
+        return image
 
     def gradient(
         self,
@@ -171,9 +188,21 @@ class RayModel:
             Whether to compute the derivatives by the beam and by the frame; else they are zero.
         """
         pulls = Pulls(np.zeros((_BANDS, *self.shape)), np.zeros(beam.shape), np.zeros((_BANDS, 6)))
-        outputs = pulls.potential, pulls.beam, of_beam, pulls.frame, of_frame
-        self._in_bands(
-            kernels.gather, potential, counts, beam, frame, np.pad(pull, _GUARD), *outputs
+        size, slopes = self._guarded, _slopes_between_pixels(np.pad(pull, _GUARD))
+        self._in_ranges(
+            kernels.gather,
+            _BANDS,
+            potential,
+            counts,
+            beam,
+            frame,
+            size,
+            slopes,
+            pulls.potential,
+            pulls.beam,
+            of_beam,
+            pulls.frame,
+            of_frame,
         )
         about_middle = self._about_middle(pulls.frame.sum(axis=0))
         return Pulls(pulls.potential.sum(axis=0), pulls.beam, about_middle)
@@ -198,9 +227,10 @@ class RayModel:
         Returns
         -------
         csr_array
-            A row for each pixel; columns for the coefficients, the beam's pixels and the frame.
+            A row for each pixel; columns, in no order, for the coefficients, the beam's pixels and
+            the frame.
         """
-        size = self.seen[0] + 2 * _GUARD, self.seen[1] + 2 * _GUARD
+        size = self._guarded
         model = potential, counts, beam, frame
         reached = np.empty((*self.cells, 4), np.int64)
         self._in_ranges(kernels.boxes, len(reached), *model, size, reached)
@@ -208,24 +238,31 @@ class RayModel:
         first = np.maximum(reached[..., :2], _GUARD)
         behind = np.minimum(reached[..., 2:], np.array(self.seen) + _GUARD)
         reached = np.concatenate([first, behind], axis=2)
-        columns = 16 + 4 * of_beam + 6 * of_frame
-        entries = columns * np.maximum(behind - first, 0).prod(axis=2)
-        ends = np.cumsum(entries).reshape(entries.shape)
-        places = np.empty((2, ends[-1, -1]), np.int32)
-        values = np.empty(ends[-1, -1])
-        outputs = (
+        lines = np.maximum(behind - first, 0).prod(axis=2)
+        ends = np.cumsum(lines).reshape(lines.shape)
+        others, most = 4 * of_beam + 6 * of_frame, ends[-1, -1]
+        used, pixels = np.zeros_like(ends), np.empty(most, np.int32)
+        of_splines, of_others = np.empty((most, 16)), np.empty((most, others))
+        lines = ends - lines, used, pixels, of_splines, of_others
+        free = of_beam, of_frame
+        self._in_ranges(
+            kernels.collect,
+            len(reached),
+            *model,
+            size,
             reached,
-            ends - entries,
-            size[1],
+            lines[0],
+            _GUARD,
             self._middle,
-            (of_beam, of_frame),
-            places,
-            values,
+            free,
+            *lines[1:],
         )
-        self._in_ranges(kernels.collect, len(reached), *model, size, *outputs)
-        shape = (size[0] * size[1], potential.size + beam.size + 6)
-        inner = np.arange(shape[0]).reshape(size)[_GUARD:-_GUARD, _GUARD:-_GUARD].ravel()
-        return csr_array(coo_array((values, tuple(places)), shape=shape))[inner]
+        rows = np.empty(math.prod(self.seen) + 1, np.int32)
+        entries = (16 + others) * int(used.sum())
+        columns, values = np.empty(entries, np.int32), np.empty(entries)
+        kernels.merge(*lines, of_beam, rows, columns, values)
+        shape = (len(rows) - 1, potential.size + beam.size + 6)
+        return csr_array((values[: rows[-1]], columns[: rows[-1]], rows), shape=shape)
 
     def push(self, jacobian: csr_array, change: FloatArray) -> FloatArray:
         """Return a Jacobian times a change of its columns, (n,), with the shape `seen`."""
@@ -256,23 +293,10 @@ class RayModel:
         along_y = _at_pixels(potential, values, self.pad, height)
         return _at_pixels(along_y.T, values, self.pad, width).T
 
-    def _blank(self) -> FloatArray:
-        height, width = (side + 2 * _GUARD for side in self.seen)
-        return np.zeros((_BANDS, height, width))
-
-    def _of_detector(self, images: FloatArray) -> FloatArray:
-        return np.asarray(images[:, _GUARD:-_GUARD, _GUARD:-_GUARD].sum(axis=0))
-
-    def _in_bands(
-        self,
-        kernel: Callable[..., Any],
-        potential: FloatArray,
-        counts: IntArray,
-        beam: FloatArray,
-        frame: FloatArray | None,
-        *rest: FloatArray | bool,
-    ) -> None:
-        self._in_ranges(kernel, _BANDS, potential, counts, beam, frame, *rest)
+    @property
+    def _guarded(self) -> tuple[int, int]:
+        """Shape of an image with the strip and the guard."""
+        return self.seen[0] + 2 * _GUARD, self.seen[1] + 2 * _GUARD
 
     def _in_ranges(
         self,
@@ -321,6 +345,16 @@ class RayModel:
         return about_middle
 
 
+def _slopes_between_pixels(pull: FloatArray) -> FloatArray:
+    """Values at pixels, how much more they are to the right, and below, and in turn there; flat."""
+    slopes = np.zeros((*pull.shape, 4))
+    slopes[..., 0] = pull
+    slopes[:, :-1, 1] = pull[:, 1:] - pull[:, :-1]
+    slopes[:-1, :, 2] = pull[1:] - pull[:-1]
+    slopes[:-1, :, 3] = slopes[1:, :, 1] - slopes[:-1, :, 1]
+    return slopes.reshape(-1)
+
+
 def _entries(matrix: csr_array) -> tuple[IntArray, IntArray, FloatArray]:
     """Begins of rows, columns and values; unsigned, for which no index counts from the end."""
     unsigned = _UNSIGNED[matrix.indices.itemsize]
@@ -337,11 +371,11 @@ def at_rest() -> FloatArray:
 
 @cache
 def _tables() -> FloatArray:
-    """B-splines and their slopes at the rays of cells with n of them, [n, which, spline, ray]."""
+    """B-splines and slopes at the rays of cells with n of them: [n, which, spline, ray], flat."""
     tables = np.zeros((MOST_RAYS + 1, 2, 4, MOST_RAYS))
     for n in range(1, MOST_RAYS + 1):
         tables[n, :, :, :n] = kernels.spline_tables((np.arange(n) + 0.5) / n)
-    return tables
+    return tables.reshape(-1)
 
 
 def _at_pixels(coefficients: FloatArray, table: FloatArray, pad: int, count: int) -> FloatArray:
