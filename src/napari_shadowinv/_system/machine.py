@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -93,6 +93,23 @@ def in_ranges(
     futures = [pool.submit(kernel, bounds[k], bounds[k + 1], *args) for k in range(1, ranges)]
     try:
         kernel(bounds[0], bounds[1], *args)
+    finally:
+        wait(futures)
+    for future in futures:
+        future.result()
+
+
+def run_together(works: Sequence[Callable[[], Any]], threads: int) -> None:
+    """Call functions that release the GIL and write nothing in common, in threads."""
+    threads = max(1, min(threads, len(works)))
+
+    def run(first: int) -> None:
+        for work in works[first::threads]:
+            work()
+
+    futures = [_kernel_pool().submit(run, first) for first in range(1, threads)]
+    try:
+        run(0)
     finally:
         wait(futures)
     for future in futures:

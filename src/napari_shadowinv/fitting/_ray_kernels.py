@@ -20,6 +20,7 @@ __all__ = [
     "deposit",
     "gather",
     "merge",
+    "normal_times",
     "rows_times",
     "spline_tables",
     "transpose_times",
@@ -676,6 +677,29 @@ def rows_times(
         for entry in range(begins[row], begins[row + 1]):
             total += values[entry] * vector[columns[entry]]
         out[row] = total
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST)
+def normal_times(
+    begins: IntArray,
+    columns: IntArray,
+    values: FloatArray,
+    vector: FloatArray,
+    weights: FloatArray,
+    slopes: FloatArray,
+    light: FloatArray,
+    pulls: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Add Jᵀ s w (s J v + l) for a sparse matrix J; `pulls` are w (s J v + l)."""
+    for row in range(len(begins) - 1):
+        total = 0.0
+        for entry in range(begins[row], begins[row + 1]):
+            total += values[entry] * vector[columns[entry]]
+        pulls[row] = weights[row] * (slopes[row] * total + light[row])
+        pull = slopes[row] * pulls[row]
+        for entry in range(begins[row], begins[row + 1]):
+            out[columns[entry]] += values[entry] * pull
 
 
 @njit(nogil=True, error_model="numpy")

@@ -29,6 +29,7 @@ _KERNELS: tuple[Any, ...] = (
     _ray_kernels.boxes,
     _ray_kernels.collect,
     _ray_kernels.merge,
+    _ray_kernels.normal_times,
     _ray_kernels.rows_times,
     _ray_kernels.transpose_times,
 )
@@ -68,7 +69,8 @@ def _compile_rays(report: Reporter) -> None:
 
     def use_jacobian() -> None:
         jacobian = rays.jacobian(potential, counts, beam)
-        rays.pull(jacobian, rays.push(jacobian, np.zeros(jacobian.shape[1])))
+        columns = rays.pull(jacobian, rays.push(jacobian, np.zeros(jacobian.shape[1])))
+        rays.normal_times([jacobian], [columns], [weights], [weights], [weights])
 
     works: tuple[Callable[[], object], ...] = (
         lambda: rays.image(potential, counts, beam),

@@ -222,7 +222,7 @@ class Preconditioner:
         waves = self._potentials_times(scaled.potentials)
         products = map(np.multiply, self._diagonals, scaled.blocks[1:])
         change = Unknowns.from_blocks([idctn(waves, axes=(1, 2), norm="ortho"), *products])
-        slope = linear.pull(linear.push(change))
+        slope = linear.normal_times(change)
         slope = slope.plus(linear.scene.prior.times_without_roughness(change))
         of_data = dctn(slope.potentials, axes=(1, 2), norm="ortho")
         of_data += linear.scene.prior.roughness * waves
@@ -231,9 +231,13 @@ class Preconditioner:
 
     def _potentials_times(self, scaled: FloatArray) -> FloatArray:
         """Cosines of the potentials by scaled ones."""
+        if len(scaled) == 1:  # ten times as fast
+            return self._potentials[None, :, :, 0, 0] * scaled
         return np.asarray(np.einsum("yxnm,nyx->myx", self._potentials, scaled))
 
     def _transpose_of_potentials_times(self, waves: FloatArray) -> FloatArray:
+        if len(waves) == 1:
+            return self._potentials[None, :, :, 0, 0] * waves
         return np.asarray(np.einsum("yxnm,myx->nyx", self._potentials, waves))
 
     def log_size(self) -> float:

@@ -281,6 +281,12 @@ class Scene:
         return Linear(self, unknowns, jacobians, [self._seen(unknowns, shot) for shot in shots])
 
     @property
+    def _is_sharp(self) -> bool:
+        """Whether rays count where they land."""
+        widths = [isinstance(width, float) and width <= 0 for width in self.psf]
+        return all(widths) and not self.imperfect.blur
+
+    @property
     def has_free_numbers(self) -> bool:
         """Whether numbers of the instrument may change."""
         return bool(self.imperfect.keys - self.held)
@@ -572,8 +578,26 @@ class Linear:
     def hessian_times(self, change: Unknowns) -> Unknowns:
         """Return the Gauss-Newton Hessian times a change of the unknowns."""
         free = self.scene._only_free(change)
-        pulled = self.pull(self.push(free))
-        return self.scene._only_free(self.scene.prior.times(free)).plus(pulled)
+        return self.scene._only_free(self.scene.prior.times(free)).plus(self.normal_times(free))
+
+    def normal_times(self, change: Unknowns) -> Unknowns:
+        """Return `pull` of `push` of a change."""
+        scene = self.scene
+        if not scene._is_sharp:
+            return self.pull(self.push(change))
+        count, potentials = len(self.jacobians), self._potential_changes(change)
+        totals, pulls = scene.rays.normal_times(
+            self.jacobians,
+            [self._columns(change, potentials, k) for k in range(count)],
+            self._weights,
+            self._slopes,
+            [self._light_change(change, k) for k in range(count)],
+        )
+        slope, of_shape = self.unknowns.zeros(), np.zeros(scene.beams.shape[1:])
+        for k in range(count):
+            self._add_light_pulls(slope, k, pulls[k])
+            self._add_columns(slope, of_shape, k, totals[k])
+        return self._complete(slope, of_shape)
 
     def push(self, change: Unknowns) -> FloatArray:
         """Return the change of all residuals (f - I) / σ, to first order, shape (L, H, W)."""
@@ -581,42 +605,61 @@ class Linear:
         potentials = self._potential_changes(change)
         changes = np.empty_like(scene.images)
         for k, (jacobian, seen) in enumerate(zip(self.jacobians, self.seen, strict=True)):
-            columns = potentials[k].ravel()
-            if self._has_others:
-                of_beam = self._entering[k].light * (
-                    self._beam_shape * self._beam_change(change, k)
-                )
-                columns = np.concatenate([columns, of_beam.ravel(), change.frames[k]])
-            landed = scene.rays.push(jacobian, columns)
+            landed = scene.rays.push(jacobian, self._columns(change, potentials, k))
             spread = scene._inner(scene._spread(k, landed, self.unknowns))
-            image = seen.slope * spread + change.brightness[k] * seen.image
-            image = image + seen.push(change.common, change.separate[k])
-            image = scene._with_added(change, k, image)
+            image = seen.slope * spread + self._light_change(change, k)
             np.multiply(self._roots[k], image, out=changes[k])
         return changes
 
     def pull(self, residuals: FloatArray) -> Unknowns:
         """Return the transpose of `push` times residuals."""
         scene = self.scene
-        slope = self.unknowns.zeros()
-        of_shape = np.zeros(scene.beams.shape[1:])
+        slope, of_shape = self.unknowns.zeros(), np.zeros(scene.beams.shape[1:])
         for k, (jacobian, seen) in enumerate(zip(self.jacobians, self.seen, strict=True)):
             pull = self._roots[k] * residuals[k]
-            slope.brightness[k] = np.einsum("yx,yx", pull, seen.image)
-            scene._add_light_pulls(slope, k, pull)
-            seen.add_pulls(slope, k, pull)
+            self._add_light_pulls(slope, k, pull)
             back = scene._spread_back(k, seen.slope * pull, self.unknowns)
-            columns = scene.rays.pull(jacobian, back)
-            of_potential, of_instrument = np.split(columns, [math.prod(scene.rays.shape)])
-            psi = of_potential.reshape(scene.rays.shape)
-            scene._add_potential_pulls(slope, self.unknowns, k, psi)
-            if self._has_others:
-                of_beam = of_instrument[:-6].reshape(of_shape.shape)
-                of_shape += scene._add_beam_pulls(slope, k, of_beam, self._entering[k])
-                slope.frames[k] = of_instrument[-6:]
-        if scene.beam_modes:
-            slope.beam[:] = scene._of_modes(of_shape * self._beam_shape)
-        return scene._only_free(slope)
+            self._add_columns(slope, of_shape, k, scene.rays.pull(jacobian, back))
+        return self._complete(slope, of_shape)
+
+    def _columns(self, change: Unknowns, potentials: FloatArray, k: int) -> FloatArray:
+        """Changes of the columns of an image's Jacobian."""
+        columns = potentials[k].ravel()
+        if not self._has_others:
+            return columns
+        of_beam = self._entering[k].light * (self._beam_shape * self._beam_change(change, k))
+        return np.concatenate([columns, of_beam.ravel(), change.frames[k]])
+
+    def _add_columns(
+        self, slope: Unknowns, of_shape: FloatArray, k: int, columns: FloatArray
+    ) -> None:
+        """Add derivatives by the columns of an image's Jacobian; of the beam to `of_shape`."""
+        scene = self.scene
+        of_potential, of_instrument = np.split(columns, [math.prod(scene.rays.shape)])
+        psi = of_potential.reshape(scene.rays.shape)
+        scene._add_potential_pulls(slope, self.unknowns, k, psi)
+        if self._has_others:
+            of_beam = of_instrument[:-6].reshape(of_shape.shape)
+            of_shape += scene._add_beam_pulls(slope, k, of_beam, self._entering[k])
+            slope.frames[k] = of_instrument[-6:]
+
+    def _light_change(self, change: Unknowns, k: int) -> FloatArray:
+        """The change of an image by numbers that act where it is seen."""
+        image = change.brightness[k] * self.seen[k].image
+        image = image + self.seen[k].push(change.common, change.separate[k])
+        return self.scene._with_added(change, k, image)
+
+    def _add_light_pulls(self, slope: Unknowns, k: int, pull: FloatArray) -> None:
+        """Add derivatives by numbers that act where an image is seen."""
+        slope.brightness[k] = np.einsum("yx,yx", pull, self.seen[k].image)
+        self.scene._add_light_pulls(slope, k, pull)
+        self.seen[k].add_pulls(slope, k, pull)
+
+    def _complete(self, slope: Unknowns, of_shape: FloatArray) -> Unknowns:
+        """Derivatives with those by the beam's modes, of unknowns that are free."""
+        if self.scene.beam_modes:
+            slope.beam[:] = self.scene._of_modes(of_shape * self._beam_shape)
+        return self.scene._only_free(slope)
 
     def _potential_changes(self, change: Unknowns) -> FloatArray:
         scene, imperfect = self.scene, self.scene.imperfect
@@ -650,6 +693,14 @@ class Linear:
     @cached_property
     def _entering(self) -> list[_Entering]:
         return [self.scene._entering(self.unknowns, k) for k in range(len(self.jacobians))]
+
+    @cached_property
+    def _weights(self) -> FloatArray:
+        return self._roots**2
+
+    @cached_property
+    def _slopes(self) -> list[FloatArray]:
+        return [np.full(self.scene.rays.seen, seen.slope) for seen in self.seen]
 
     @cached_property
     def _roots(self) -> FloatArray:

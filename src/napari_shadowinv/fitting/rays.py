@@ -9,15 +9,15 @@ image follows exactly, ray by ray.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from napari_shadowinv._system.machine import available_threads, in_ranges
+from napari_shadowinv._system.machine import available_threads, in_ranges, run_together
 from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.fitting import _ray_kernels as kernels
 from napari_shadowinv.fitting._ray_kernels import KNOT, MOST_RAYS
@@ -27,7 +27,8 @@ __all__ = ["KNOT", "Pulls", "RayModel", "at_rest"]
 _SHARED = 2.0  # spacings at rest: width of an edge where rays count in both pixels, evenly then
 _BANDS = 8  # of cells; each has an image of its own, so that threads do not change a sum
 _GUARD = 2  # px around the detector, for rays that miss it
-_WORTH_A_THREAD, _WORTH_A_THREAD_ROWS = 20_000, 200  # rays; rows of an image
+# Rays, rows of an image, and entries of a Jacobian that are worth a thread.
+_WORTH_A_THREAD, _WORTH_A_THREAD_ROWS, _WORTH_A_PRODUCT = 20_000, 200, 100_000
 
 
 class Pulls(NamedTuple):
@@ -276,6 +277,41 @@ class RayModel:
         out = np.zeros(jacobian.shape[1])
         kernels.transpose_times(*_entries(jacobian), image.ravel(), out)
         return out
+
+    def normal_times(
+        self,
+        jacobians: Sequence[csr_array],
+        changes: Sequence[FloatArray],
+        weights: Sequence[FloatArray],
+        slopes: Sequence[FloatArray],
+        lights: Sequence[FloatArray],
+    ) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Return Jᵀ s w (s J v + l) and w (s J v + l) of each image, in one pass over J.
+
+        Parameters
+        ----------
+        jacobians, changes : sequence
+            J and v, changes of its columns.
+        weights, slopes, lights : sequence of ndarray
+            w, s and l: images with the shape `seen`.
+        """
+        pulls = [np.empty(self.seen) for _ in jacobians]
+        totals = [np.zeros(each.shape[1]) for each in jacobians]
+        works = [
+            partial(
+                kernels.normal_times,
+                *_entries(jacobian),
+                change,
+                *(each.reshape(-1) for each in (weight, slope, light, pull)),
+                total,
+            )
+            for jacobian, change, weight, slope, light, pull, total in zip(
+                jacobians, changes, weights, slopes, lights, pulls, totals, strict=True
+            )
+        ]
+        threads = available_threads(self.threads)
+        run_together(works, threads if jacobians[0].nnz > _WORTH_A_PRODUCT else 1)
+        return totals, pulls
 
     def displacement(self, potential: FloatArray) -> FloatArray:
         """Return -∇ψ in px at the pixels' centres, shape (2, H, W), in axis order (y, x)."""
