@@ -23,6 +23,9 @@ CORE_TESTS := tests/geometry tests/transport tests/fitting tests/physics tests/i
 	tests/cli/test_shot_commands.py tests/plotting tests/stack/test_lazy.py tests/stack/test_run.py \
 	tests/stack/test_statistics.py
 
+# Two tests run at a time: threads of linear algebra beside them would wait for each other.
+test coverage test-oldest test-newest: export OPENBLAS_NUM_THREADS := 1
+
 # Keep byte code, though a container may say otherwise: the tests start hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 

@@ -100,27 +100,25 @@ def test_shots_are_chosen_and_numbered_without_times(form: Any, qtbot: Any) -> N
     np.testing.assert_array_equal(ticks, np.round(ticks))
 
 
-@pytest.mark.parametrize(
-    ("kind", "shots", "times", "message"),
-    [
-        ("region", "", "1,2", "Times is '1,2', expected the time between two shots in s, or a"),
-        ("region", "", "soon", "Times is 'soon', expected times separated by commas"),
-        ("region", "", "-1 ns", "The times do not increase"),
-        ("region", "2,1", "", "The numbers of the shots do not increase"),
-        ("region", "9", "", "Shots are '9': expected numbers from 0 to 3"),
-        ("region", "2", "", "1 of 1 shots have a field, expected at least two"),
-        ("current-density", "", "", "The current density has no single number to follow"),
-    ],
-)
-def test_mistake_with_a_store_is_a_sentence(
-    form: Any, qtbot: Any, messages: list[str], kind: str, shots: str, times: str, message: str
-) -> None:
-    form.product.setCurrentIndex(form.product.findData(kind))
-    form.shots.setText(shots)
-    form.times.setText(times)
-    assert message in press(form, qtbot)
-    assert message in messages[-1]
-    assert form.results == []
+MISTAKES = [  # product, shots, times, message
+    ("region", "", "1,2", "Times is '1,2', expected the time between two shots in s, or a"),
+    ("region", "", "soon", "Times is 'soon', expected times separated by commas"),
+    ("region", "", "-1 ns", "The times do not increase"),
+    ("region", "2,1", "", "The numbers of the shots do not increase"),
+    ("region", "9", "", "Shots are '9': expected numbers from 0 to 3"),
+    ("region", "2", "", "1 of 1 shots have a field, expected at least two"),
+    ("current-density", "", "", "The current density has no single number to follow"),
+]
+
+
+def test_mistake_with_a_store_is_a_sentence(form: Any, qtbot: Any, messages: list[str]) -> None:
+    for product, shots, times, message in MISTAKES:
+        form.product.setCurrentIndex(form.product.findData(product))
+        form.shots.setText(shots)
+        form.times.setText(times)
+        assert message in press(form, qtbot)
+        assert message in messages[-1]
+        assert form.results == []
 
 
 def test_series_is_saved_as_a_table_and_a_figure(
