@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,6 +33,17 @@ def _no_preferences(tmp_path_factory: pytest.TempPathFactory) -> None:
     if hasattr(settings, "get_plugin_settings"):
         settings._clear_plugin_settings_cache()
         settings._CFG_PATH = str(tmp_path_factory.mktemp("napari") / "settings.yaml")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _manifests_parsed_once() -> None:
+    """Keep the content of manifests, which each new window parses anew: a third of its time."""
+    from npe2.manifest import _bases
+
+    if not hasattr(_bases, "_load_yaml_no_duplicates"):
+        return
+    parse = functools.cache(_bases._load_yaml_no_duplicates)
+    _bases._load_yaml_no_duplicates = lambda stream: copy.deepcopy(parse(stream.read()))
 
 
 @pytest.fixture

@@ -152,6 +152,7 @@ _NEXT_GAIN = 0.3  # of the least gain; a step gains up to twice what is expected
 _NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 2e-3, 400, 0.1
 # Numbers of rays are renewed after steps that gain more; other numbers change the objective by 1.
 _RENEWING_GAIN = 5.0
+_TRIED_STEPS = 3  # before a search may be hopeless
 _MOST_PIXELS = 2_000_000  # of all images
 
 
@@ -307,6 +308,7 @@ def settle(
     after_step: Callable[[float], None] | None = None,
     modes: SoftModes | None = None,
     linear: Linear | None = None,
+    to_beat: float | None = None,
 ) -> tuple[Unknowns, float, int, bool]:
     """Minimise a scene's objective from nearby: Gauss-Newton steps, and a descent if they fail.
 
@@ -326,6 +328,9 @@ def settle(
         Of the Hessians of this scene, from scenes of the same pixels and priors.
     linear : Linear, optional
         The scene to first order near the start: used for all steps while these succeed.
+    to_beat : float, optional
+        An objective to compare with. Then only the objective matters, not the unknowns along a flat
+        valley, and a hopeless search ends: a third of the first distance is left after three steps.
 
     Returns
     -------
@@ -340,15 +345,16 @@ def settle(
     has_valley = scene.has_free_numbers or scene.beam_modes > 0
     # Scales of frames and of added light are rough.
     is_scaled = not (has_valley or scene.added or scene.free_frames.any())
-    if has_valley:
+    if has_valley and to_beat is None:
         tolerance, solving = _NEWTON_IN_VALLEY, _MOST_IN_VALLEY
-    if scene.has_free_numbers:
+    if scene.has_free_numbers and to_beat is None:
         least_gain *= _GAIN_IN_VALLEY
     modes = SoftModes() if modes is None else modes
     scales = Preconditioner(scene)
     now = start
     counts = scene.ray_counts(now)
     value, slope = scene.value_and_gradient(now, counts)
+    hopeless = np.inf if to_beat is None else to_beat + max(value - to_beat, 0.0) / 3
     # Jacobians of many pixels would fill the memory.
     newton = min(_MOST_NEWTON, steps) if scene.images.size <= _MOST_PIXELS else 0
     taken = shortened = 0
@@ -383,11 +389,13 @@ def settle(
         next_gain = product(after, modes.precondition(after)) / 2
         if gain < least_gain or (next_gain < _NEXT_GAIN * least_gain and is_scaled):
             return now, _value_afresh(scene, now), taken, True
+        if taken == _TRIED_STEPS and value > hopeless:
+            break
         if gain > _RENEWING_GAIN:
             counts = scene.ray_counts(now)
             value, slope = scene.value_and_gradient(now, counts)
     remaining_steps = steps - taken
-    if remaining_steps > 0:
+    if remaining_steps > 0 and value <= hopeless:
         now, value, more = descend(
             scene, now, iterations=remaining_steps, least_gain=least_gain, after_step=after_step
         )

@@ -348,7 +348,9 @@ def name_cause(
     gains = []
     for rival in _rivals(scene, best, names, setups):
         start = replace(best, unknowns=rival.unknowns, modes=SoftModes())
-        end = settle_minimum(rival.scene, start, on_step, "rivals", steps=_STEPS)
+        end = settle_minimum(
+            rival.scene, start, on_step, "rivals", steps=_STEPS, to_beat=best.value
+        )
         gains.append((2 * (best.value - end.value) - rival.free_numbers, rival.cause))
     gains.sort(reverse=True)
     if not gains or gains[0][0] < _MIN_GAIN:

@@ -315,6 +315,7 @@ def settle_minimum(
     name: str = "smoothness",
     least_gain: float = COARSE_GAIN,
     steps: int = _ROUND_STEPS,
+    to_beat: float | None = None,
 ) -> Minimum:
     """Return where a descent ends with other λ and κ, in the minimum's pixels, without blur."""
     middle = replace(coarser(scene, minimum.bin), spacing=MIDDLE_SPACING)
@@ -325,6 +326,7 @@ def settle_minimum(
         least_gain=least_gain,
         after_step=lambda now: on_step(name, now),
         modes=minimum.modes,
+        to_beat=to_beat,
     )
     return replace(
         minimum, unknowns=unknowns, value=value, displacement=_displacement(middle, unknowns)

@@ -371,25 +371,39 @@ def test_light_has_wavelengths_and_its_own_fields(window: Any, open_widget: Any)
     assert inputs.setups == (green, red)
 
 
-@pytest.mark.parametrize(
-    ("spoil", "sentence"),
-    [
-        (lambda tool: type_in(tool, 1, BEAM, "fast"), "'6.0 MeV': 'fast' is not a number"),
-        (lambda tool: type_in(tool, 1, BEAM, "-2"), "the setup of '6.0 MeV': 'Energy' is -2"),
-        (lambda tool: tool.images.table.item(1, 0).setCheckState(Qt.CheckState.Unchecked),
-         "1 image is checked, expected two or more"),
-        (lambda tool: tool.source.picker.set_kind("layer"), "no source layer is selected"),
-    ],
-)  # fmt: skip
-def test_a_mistake_is_one_sentence(
-    tool: Any, messages: list[str], spoil: Callable[[Any], None], sentence: str
-) -> None:
-    spoil(tool)
-    tool.panel.button.click()
-    assert not tool.panel.runner.running
-    (text,) = messages
-    assert text[1:].startswith(sentence[1:])  # apart from its capital
-    assert tool.panel.status.text() == text
+def test_a_mistake_is_one_sentence(tool: Any, messages: list[str]) -> None:
+    second = tool.images.table.item(1, 0)
+    mistakes: list[tuple[Callable[[], None], Callable[[], None], str]] = [
+        (
+            lambda: type_in(tool, 1, BEAM, "fast"),
+            lambda: type_in(tool, 1, BEAM, "6"),
+            "'6.0 MeV': 'fast' is not a number",
+        ),
+        (
+            lambda: type_in(tool, 1, BEAM, "-2"),
+            lambda: type_in(tool, 1, BEAM, "6"),
+            "the setup of '6.0 MeV': 'Energy' is -2",
+        ),
+        (
+            lambda: second.setCheckState(Qt.CheckState.Unchecked),
+            lambda: second.setCheckState(Qt.CheckState.Checked),
+            "1 image is checked, expected two or more",
+        ),
+        (
+            lambda: tool.source.picker.set_kind("layer"),
+            lambda: tool.source.picker.set_kind("uniform"),
+            "no source layer is selected",
+        ),
+    ]
+    for spoil, mend, sentence in mistakes:
+        messages.clear()
+        spoil()
+        tool.panel.button.click()
+        assert not tool.panel.runner.running
+        (text,) = messages
+        assert text[1:].startswith(sentence[1:])  # apart from its capital
+        assert tool.panel.status.text() == text
+        mend()
 
 
 def test_without_images_it_says_what_is_needed(
@@ -498,31 +512,43 @@ def traced_images(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return traced
 
 
-@pytest.mark.parametrize("stage", ["transport", "from near", "smoothness", "full size", "samples"])
+@pytest.mark.parametrize(
+    ("times", "stages"),
+    [(4, ["transport"]), (3, ["from near", "smoothness", "full size", "samples"])],
+)
 def test_each_stage_ends_soon_after_cancel(
-    window: Any, tool: Any, qtbot: Any, messages: list[str], stage: str, traced_images: list[int]
+    window: Any,
+    tool: Any,
+    qtbot: Any,
+    messages: list[str],
+    times: int,
+    stages: list[str],
+    traced_images: list[int],
 ) -> None:
     tool.panel.runner._patience = math.inf  # the fit has to end by itself
-    enlarged(window, 4 if stage == "transport" else 3)
+    enlarged(window, times)
     tool.view._redraw_timer.setInterval(REDRAW_MS)
-    tool.options.set_values({"samples": 1000, "max_iterations": 100} | BEFORE.get(stage, {}))
+    usual = {**QUICK, "samples": 1000, "max_iterations": 100}
     before = list(window.layers)
-    tool.panel.button.click()
-    course = tool.panel.runner.tag.progress
-    qtbot.waitUntil(
-        lambda: any(reached == stage for reached, _ in course.history), timeout=PATIENCE
-    )
-    assert course.history[-1][0] == stage
-    traced_images.clear()
-    cancel(tool, qtbot)
-    assert len(traced_images) <= 8 * len(before)  # a line search of the step under way
-    assert tool.panel.status.text() == "Cancelled."
-    assert not threads()
-    qtbot.wait(50)
-    assert list(window.layers) == before
-    assert messages == []
-    height, width = window.layers[0].data.shape
-    assert tool.cost.text().startswith(f"2 images of {height} × {width} px: about ")
+    for stage in stages:
+        tool.options.set_values(usual | BEFORE.get(stage, {}))
+        tool.panel.button.click()
+        course = tool.panel.runner.tag.progress
+        qtbot.waitUntil(
+            lambda: any(reached == stage for reached, _ in course.history),  # noqa: B023
+            timeout=PATIENCE,
+        )
+        assert course.history[-1][0] == stage
+        traced_images.clear()
+        cancel(tool, qtbot)
+        assert len(traced_images) <= 8 * len(before)  # a line search of the step under way
+        assert tool.panel.status.text() == "Cancelled."
+        assert not threads()
+        qtbot.wait(50)
+        assert list(window.layers) == before
+        assert messages == []
+        height, width = window.layers[0].data.shape
+        assert tool.cost.text().startswith(f"2 images of {height} × {width} px: about ")
 
 
 def test_the_compiler_is_told_and_does_not_hold_up_cancelling(
@@ -1061,22 +1087,19 @@ def test_a_recipe_tells_noise_and_point_spread(
     assert messages[-1].endswith("select the setup first, or give the point spread in px")
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
+def test_a_recipe_that_cannot_be_shown_changes_nothing(
+    tool: Any, messages: list[str], tmp_path: Path
+) -> None:
+    path, before = tmp_path / "recipe.toml", tool.state()
+    for text, sentence in (
         ('[source]\nmethod = "polynomial"\n', "estimates the source"),
         ('[[steps]]\nstep = "high-pass"\nwidth = 9\n', "changes what the forward model is fitted"),
         ('[fit]\nfields = ["plasma"]\n', "fits the fields plasma: with this setup expected"),
         ('[fit]\nbeam = "dark"\n', "beam"),
-    ],
-)
-def test_a_recipe_that_cannot_be_shown_changes_nothing(
-    tool: Any, messages: list[str], tmp_path: Path, text: str, sentence: str
-) -> None:
-    path = tmp_path / "recipe.toml"
-    path.write_text(text)
-    before = tool.state()
-    tool.recipes.load(path)
-    assert sentence in messages[0]
-    assert tool.panel.status.text() == messages[0]
-    assert tool.state() == before
+    ):
+        messages.clear()
+        path.write_text(text)
+        tool.recipes.load(path)
+        assert sentence in messages[0]
+        assert tool.panel.status.text() == messages[0]
+        assert tool.state() == before
