@@ -9,6 +9,7 @@ import sys
 import textwrap
 from functools import cache
 from pathlib import Path
+from unittest.mock import patch
 
 import typer.testing
 from typer.main import get_command
@@ -23,6 +24,12 @@ typer.testing._get_command = cache(get_command)  # type: ignore[attr-defined]
 def shadowinv(*arguments: object) -> Result:
     """Run the command in this process."""
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def undrawn(*arguments: object) -> Result:
+    """Run the command in this process, and leave the pages of its figures blank."""
+    with patch("matplotlib.figure.Figure.draw", lambda figure, renderer: None):
+        return shadowinv(*arguments)
 
 
 def flat(text: str) -> str:

@@ -145,7 +145,7 @@ def opened_netcdf(path: Path) -> Iterator[Any]:
 
     with (
         _remembering_file()(path.absolute(), "r") as content,
-        h5netcdf.File(content, "r") as file,
+        h5netcdf.File(content, "r", decode_vlen_strings=True) as file,
     ):
         yield H5NetCDFStore(file)
 

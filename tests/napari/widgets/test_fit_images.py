@@ -15,8 +15,8 @@ import pytest
 import tifffile
 from qtpy.QtCore import Qt
 from scipy.ndimage import zoom
-from typer.testing import CliRunner
 
+from helpers.command_line import undrawn
 from helpers.fit_images import of_each
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read, write
 from napari_shadowinv._napari.fit_layers import fit_layers
@@ -33,7 +33,6 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.widgets import _fitting
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.cli import app
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Fit, FitOptions, FitShot, compilation, fit
@@ -778,7 +777,7 @@ def test_choices_are_kept_between_sessions(window: Any, tool: Any, open_widget: 
 
 
 def command(*words: Any) -> str:
-    done = CliRunner().invoke(app, [str(word) for word in words])
+    done = undrawn(*words)
     assert done.exit_code in (0, 3), done.output
     return " ".join(done.output.split())
 
@@ -895,7 +894,7 @@ def test_what_was_no_file_is_asked_for(
     assert [image.file for image in result.provenance.images] == ["", ""]
     assert [image.setup for image in result.provenance.images] == list(SETUPS)
     save(window, result, tmp_path / "window.shadowinv")
-    refused = CliRunner().invoke(app, ["rerun", "window.shadowinv"])
+    refused = undrawn("rerun", "window.shadowinv")
     assert refused.exit_code == 2
     assert "image 1 was not made from a file: name the file" in " ".join(refused.output.split())
     for number, layer in enumerate(list(window.layers)[:2]):

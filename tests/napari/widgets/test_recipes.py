@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from napari.components import ViewerModel
 from qtpy.QtWidgets import QFileDialog
-from typer.testing import CliRunner
 
+from helpers.command_line import undrawn
 from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
 from napari_shadowinv._napari.layer_metadata import (
     Frame,
@@ -25,7 +25,6 @@ from napari_shadowinv._napari.widgets import _files
 from napari_shadowinv._napari.widgets._forms import StepsSection
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
-from napari_shadowinv.cli import app
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.store import read_stack
 from napari_shadowinv.pipeline import read_recipe, write_recipe
@@ -88,7 +87,7 @@ def run(qtbot: Any) -> Any:
 
 
 def by_command(*arguments: Any) -> None:
-    done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    done = undrawn(*arguments)
     assert done.exit_code == 0, done.output
 
 
