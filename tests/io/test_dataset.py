@@ -74,6 +74,16 @@ def test_not_a_number_and_infinity_survive(tmp_path: Path, inversion: Inversion)
     assert_same(changed, Inversion.from_dataset(dataset))
 
 
+def test_a_result_is_read_as_xarray_reads_it(tmp_path: Path, inversion: Inversion) -> None:
+    names = xr.Variable("name", np.array(["Größe", "µm", ""], dtype=object), {"why": "nötig"})
+    written = inversion.to_dataset().assign_attrs(note="grün").assign(names=names)
+    path = write(tmp_path / "a.shadowinv", written)
+    expected = xr.load_dataset(path, engine="h5netcdf", decode_times=False)
+    again = read(path)
+    xr.testing.assert_identical(again, expected)
+    assert list(again["names"].values) == ["Größe", "µm", ""]
+
+
 def test_every_variable_has_units_and_a_name(
     inversion: Inversion, proton_setup: ProtonSetup, optical_setup: OpticalSetup
 ) -> None:
