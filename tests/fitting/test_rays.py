@@ -266,6 +266,22 @@ def test_what_is_not_wanted_of_a_gradient_is_zero_and_the_rest_the_same() -> Non
     np.testing.assert_allclose(less.potential, complete.potential, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])
+def test_a_potential_of_no_numbers_ends_in_no_other_memory(value: float) -> None:
+    """Its rays count in no pixel, or in the wrong ones; those of other cells where they land."""
+    model = model_of()
+    potential, beam = wavy(model, WEAK), model.around(uneven())
+    counts = model.ray_counts(potential)
+    sound = model.image(potential, counts, beam)
+    potential[3:6, 4] = value
+    image = model.image(potential, counts, beam)
+    assert np.isfinite(image).all()
+    np.testing.assert_allclose(image[20:], sound[20:], rtol=1e-12)
+    model.gradient(potential, counts, beam, np.ones(SIZE))
+    jacobian = model.jacobian(potential, counts, beam)
+    assert jacobian.indices.max() < jacobian.shape[1]
+
+
 def test_threads_do_not_change_a_bit() -> None:
     alone = model_of((80, 96), threads=1)
     potential = wavy(alone, FOLDED)

@@ -131,9 +131,10 @@ def _land(
         down = y - (at[b] * s0 + at[64 + b] * s1 + at[128 + b] * s2 + at[192 + b] * s3)
         right = at[256 + b] * p0 + at[320 + b] * p1 + at[384 + b] * p2 + at[448 + b] * p3
         right = x + (b + 0.5) * step - right
-        # Rays that miss land in the outermost pixels, which nobody looks at.
-        v = min(max(f0 + f1 * down + f2 * right, 0.0), last_row)
-        u = min(max(f3 + f4 * down + f5 * right, 0.0), last_column)
+        # Rays that miss land in the outermost pixels, which nobody looks at; NaN in the first.
+        v, u = f0 + f1 * down + f2 * right, f3 + f4 * down + f5 * right
+        v, u = v if v > 0.0 else 0.0, u if u > 0.0 else 0.0
+        v, u = v if v < last_row else last_row, u if u < last_column else last_column
         i, j = np.floor(v), np.floor(u)
         out[_V + b], out[_U + b] = i, j
         # Between two pixels' centres the share rises from 0 to 1 as two parabolas.
