@@ -30,6 +30,7 @@ class Solver:
 
 
 OURS = "napari-shadowinv"
+KASIM = "power diagrams by L-BFGS (Kasim et al.)"
 STAND_IN = "grid Monge–Ampère (stand-in for PROBLEM)"
 
 ENVIRONMENTS = {
@@ -46,9 +47,9 @@ ENVIRONMENTS = {
 SOLVERS = (
     Solver(OURS, "ours", "ours", "default options"),
     Solver(f"{OURS}, 4 sites a pixel", "ours", "ours_fine", "`n_sites` four times the pixels"),
-    Solver(f"{OURS}, free boundary", "ours", "ours_free", "`boundary='free'`"),
+    Solver(f"{OURS}, free boundary", "ours", "ours_free", "`boundary='free'`, `flux='known'`"),
     Solver(
-        "power diagrams by L-BFGS (Kasim et al.)",
+        KASIM,
         "ours",
         "ours_lbfgs",
         "the algorithm of 2017 with this package's compiled geometry, so not the time of its "

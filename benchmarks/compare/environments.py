@@ -43,7 +43,7 @@ def _install(environment: Environment, place: Path) -> Prepared:
         return Prepared("", f"needs Python 3.{environment.python} or later, which is not here")
     subprocess.run([base, "-m", "venv", "--clear", str(place)], check=True)
     python = str(place / ("Scripts" if os.name == "nt" else "bin") / "python")
-    failures = []
+    failures: list[str] = []
     for requirements in environment.alternatives:
         done = subprocess.run(
             [python, "-m", "pip", "install", "--quiet", *requirements],

@@ -20,13 +20,13 @@ import tracing
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.phantoms import Phantom
 from napari_shadowinv.physics.setup import ProtonSetup
-from napari_shadowinv.physics.tracing import traced_displacement
+from napari_shadowinv.physics.tracing import FieldGrid, traced_displacement
 
 Array = NDArray[np.float64]
 Field = Callable[[int], Array]
 Structure = Callable[[tuple[int, int], ProtonSetup], Phantom]
 
-PAPER_PIXELS = 200  # of the setup's pixels, a side has as many
+PIXELS_OF_SETUP = 200  # each way: 0.3 mm of the paper, 1 mm of the traced fields
 
 
 def centres(n: int) -> tuple[Array, Array]:
@@ -35,13 +35,17 @@ def centres(n: int) -> tuple[Array, Array]:
     return axis[:, None], axis[None, :]
 
 
+def with_pixels(setup: ProtonSetup, n: int) -> ProtonSetup:
+    """Setup whose images have n pixels each way and the same field of view."""
+    assert setup.pixel_size is not None
+    return setup.model_copy(update={"pixel_size": setup.pixel_size * PIXELS_OF_SETUP / n})
+
+
 def of_phantom(structure: Structure) -> Field:
     """Field of a phantom on a square of the paper's size."""
 
     def field(n: int) -> Array:
-        setup = phantoms.paper_setup()
-        pixel = setup.pixel_size * PAPER_PIXELS / n
-        return structure((n, n), setup.model_copy(update={"pixel_size": pixel})).displacement / n
+        return structure((n, n), with_pixels(phantoms.paper_setup(), n)).displacement / n
 
     return field
 
@@ -66,9 +70,7 @@ def paper_fields() -> dict[str, Field]:
 
 def coaxial_source(n: int) -> Array:
     """Beam that the conductors of the coaxial line stop."""
-    setup = phantoms.paper_setup()
-    setup = setup.model_copy(update={"pixel_size": setup.pixel_size * PAPER_PIXELS / n})
-    _, obstructed = phantoms.coaxial_line((n, n), setup)
+    _, obstructed = phantoms.coaxial_line((n, n), with_pixels(phantoms.paper_setup(), n))
     return np.where(obstructed, 0.0, 1.0)
 
 
@@ -149,11 +151,9 @@ def traced_fields() -> dict[str, Field]:
         "traced turbulence": partial(tracing.turbulence, 2.0),
     }
 
-    def field_of(make: Callable[[], object]) -> Field:
+    def field_of(make: Callable[[], FieldGrid]) -> Field:
         def field(n: int) -> Array:
-            pixel = tracing.SETUP.pixel_size * PAPER_PIXELS / n
-            setup = tracing.SETUP.model_copy(update={"pixel_size": pixel})
-            return np.asarray(traced_displacement(make(), setup, (n, n))) / n
+            return traced_displacement(make(), with_pixels(tracing.SETUP, n), (n, n)) / n
 
         return field
 

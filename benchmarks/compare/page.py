@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
 from compare import summary
-from compare.catalogue import LEFT_OUT, OURS, PUBLISHED, SOLVERS
+from compare.catalogue import KASIM, LEFT_OUT, OURS, PUBLISHED, SOLVERS, STAND_IN
 from compare.densities import CLASSES
 from compare.images import GROUPS
 from compare.plots import draw_scaling, draw_trade_off
@@ -132,6 +133,20 @@ def peaks(results: Results) -> str:
     )
 
 
+def verdict(results: Results) -> str:
+    """Sentences on the time of the solver of 2017 and of the stand-in, on common images."""
+    sentences = []
+    for name in (KASIM, STAND_IN):
+        if name in results["solvers"] and (rival := summary.rival(results, name)):
+            failed = sum(len(images) for images in summary.failures(results, name).values())
+            sentences.append(
+                f"- {name}: {short(rival.time)} times the time, {short(rival.memory)} times the "
+                f"memory and {short(rival.error)} times the error of this package, as medians over "
+                f"the {rival.images} images that both solved; {failed} failures."
+            )
+    return "\n".join(sentences)
+
+
 def rival_table(results: Results) -> str:
     rivals = [summary.rival(results, name) for name in installed(results) if name != OURS]
     rows = [
@@ -153,21 +168,41 @@ def rival_table(results: Results) -> str:
 
 
 def better(results: Results) -> str:
-    """Name the solver with the smallest error for the number of images."""
-    counts: dict[str, int] = {}
-    names = installed(results)
+    """Sentences on the solvers that are better on most images, and on the smallest errors."""
+    lines = []
+    for name in installed(results):
+        rival = summary.rival(results, name) if name != OURS else None
+        if rival is None:
+            continue
+        counts = {
+            "a smaller error": rival.smaller_error,
+            "less time": rival.faster,
+            "less memory": rival.less_memory,
+        }
+        merits = [
+            f"{merit} on {count}" for merit, count in counts.items() if 2 * count > rival.images
+        ]
+        if merits:
+            lines.append(f"- {name}: {', '.join(merits)} of {rival.images} images.")
+    smallest = Counter[str]()
     for key in summary.keys(results):
         errors = {
-            name: summary.error(one[key])
-            for name in names
-            if (one := summary.solved(results, name, [key]))
+            name: summary.error(solved[key])
+            for name in installed(results)
+            if (solved := summary.solved(results, name, [key]))
         }
         if errors:
-            best = min(errors, key=lambda name: errors[name])
-            counts[best] = counts.get(best, 0) + 1
-    ranked = sorted(counts.items(), key=lambda item: -item[1])
-    text = ", ".join(f"{name} {count}" for name, count in ranked)
-    return f"Images on which each solver has the smallest error of all: {text}."
+            smallest[min(errors, key=lambda name: errors[name])] += 1
+    ranks = ", ".join(f"{name} {count}" for name, count in smallest.most_common())
+    return "\n".join(
+        [
+            "Better than the default options of this package on most images:",
+            "",
+            *lines,
+            "",
+            f"The smallest error of all solvers, by the number of images: {ranks}.",
+        ]
+    )
 
 
 def failure_list(results: Results) -> str:
@@ -215,6 +250,7 @@ def render(results: Results) -> str:
         flags=flags,
         budget=f", and {budget:g} s for all images of a size" if budget else "",
         summary=summary_table(results),
+        verdict=verdict(results),
         peaks=peaks(results),
         hard=error_table(results, summary.keys(results, groups=["hard"])),
         rivals=rival_table(results),

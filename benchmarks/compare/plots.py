@@ -66,12 +66,10 @@ def _draw_solvers(
             [summary.error(result) for result in successes],
         )
         axes.plot(x, y, marker, color=colour, alpha=0.25, markersize=4, markeredgewidth=0)
-        middle_x, middle_y = (
-            summary.median(value, successes) for value in (measure, summary.error)
-        )
-        position = ([], []) if middle_x is None else ([middle_x], [middle_y])
+        medians = [summary.median(value, successes) for value in (measure, summary.error)]
+        x, y = ([] if median is None else [median] for median in medians)
         axes.plot(
-            *position, marker, color=colour, label=name, markeredgecolor="white",
+            x, y, marker, color=colour, label=name, markeredgecolor="white",
             markersize=17 if name == OURS else 11, zorder=3 if name == OURS else 2,
         )  # fmt: skip
 

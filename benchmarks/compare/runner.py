@@ -10,10 +10,11 @@ import contextlib
 import json
 import os
 import queue
+import re
 import subprocess
 import threading
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ OUT_OF_TIME, OUT_OF_MEMORY = "out of time", "out of memory"
 _POLL_S = 0.05
 _START_S = 300.0  # to import and compile
 _LARGEST_ERROR = 100.0  # per cent; beyond it, no displacement at all would be better
+_OBJECT = re.compile(r"<\S+ object at 0x[0-9a-f]+>")  # in messages
 _MOST_EXHAUSTED = 3  # of a size, before a solver leaves it and larger ones
 _ONE_THREAD = {
     f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA", "VECLIB")
@@ -136,7 +138,7 @@ def relative_error(displacement: Array, truth: Array, source: Array) -> float:
 def judge(reply: Result, output: Path, image: Path) -> Result:
     """Result of a reply: its measurements, with the error or the name of the failure."""
     if "error" in reply:
-        return {"failure": reply["error"]}
+        return {"failure": _OBJECT.sub("", reply["error"]).rstrip(": ")}
     with np.load(image) as file:
         error = relative_error(np.load(output), file["displacement"], file["source"])
     if not np.isfinite(error):
@@ -152,7 +154,7 @@ class Effort:
 
     budget: float
     exhausted: Counter[int] = field(default_factory=Counter)
-    seconds: Counter[int] = field(default_factory=Counter)
+    seconds: dict[int, float] = field(default_factory=lambda: defaultdict(float))
     images: Counter[int] = field(default_factory=Counter)
     left: Counter[int] = field(default_factory=Counter)
 

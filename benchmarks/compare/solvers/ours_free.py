@@ -1,4 +1,4 @@
-"""The package with a free boundary: flux may cross the border of the image."""
+"""The package with a free boundary, which flux may cross, and the exposure of the source."""
 
 import numpy as np
 
@@ -9,4 +9,5 @@ VERSION = napari_shadowinv.__version__
 
 
 def solve(source: np.ndarray, image: np.ndarray) -> np.ndarray:
-    return invert(image, source=source, options=InversionOptions(boundary="free")).displacement
+    options = InversionOptions(boundary="free", flux="known")
+    return invert(image, source=source, options=options).displacement
