@@ -61,6 +61,7 @@ def measure(chosen: argparse.Namespace, cases: list[Case], path: Path) -> Result
         "date": datetime.date.today().isoformat(),
         "processor": platform.machine(),
         "python": platform.python_version(),
+        "runs": results.get("runs", 0) + 1,
         "limit_s": chosen.limit,
         "budget_s": chosen.budget if math.isfinite(chosen.budget) else None,
         "memory_gib": chosen.memory,

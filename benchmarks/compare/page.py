@@ -51,7 +51,7 @@ def short(value: float | None, digits: int = 2) -> str:
     """Value with some significant digits, without an exponent."""
     if value is None:
         return "–"
-    if value >= 10**digits:
+    if float(f"{value:.{digits}g}") >= 10**digits:
         return f"{value:,.0f}"
     return f"{value:#.{digits}g}".rstrip(".")
 
@@ -142,7 +142,7 @@ def verdict(results: Results) -> str:
             sentences.append(
                 f"- {name}: {short(rival.time)} times the time, {short(rival.memory)} times the "
                 f"memory and {short(rival.error)} times the error of this package, as medians over "
-                f"the {rival.images} images that both solved; {failed} failures."
+                f"the {rival.images} images that both solved; failures: {failed}."
             )
     return "\n".join(sentences)
 
@@ -248,7 +248,9 @@ def render(results: Results) -> str:
     return TEMPLATE.read_text(encoding="utf-8").format(
         **{name: results[name] for name in ("date", "processor", "limit_s", "memory_gib")},
         flags=flags,
-        budget=f", and {budget:g} s for all images of a size" if budget else "",
+        budget=f", and {budget:g} s for all images of a size in a run" if budget else "",
+        runs=results["runs"],
+        remarks="".join(f"{remark}\n" for remark in results.get("remarks", [])),
         summary=summary_table(results),
         verdict=verdict(results),
         peaks=peaks(results),
