@@ -211,7 +211,7 @@ class Scene:
     ) -> tuple[float, Unknowns]:
         """Return the objective at fixed numbers of rays, and its derivatives."""
         value, slope = self._priors(unknowns)
-        of_shape = np.zeros(self.beams.shape[1:])
+        of_shape, strengths = np.zeros(self.beams.shape[1:]), self.strengths_with(unknowns)
         for shot in self._shots(unknowns, counts):
             k = shot.number
             seen, model, residual = self._misfit(unknowns, shot)
@@ -230,7 +230,7 @@ class Scene:
                 of_beam=self._has_beam,
                 of_frame=k > 0 and bool(self.free_frames.any()),
             )
-            self._add_potential_pulls(slope, unknowns, k, pulls.potential)
+            self._add_potential_pulls(slope, unknowns, strengths[k], k, pulls.potential)
             entering = self._entering(unknowns, k)
             of_shape += self._add_beam_pulls(slope, k, pulls.beam, entering)
             slope.frames[k] += pulls.frame
@@ -280,7 +280,7 @@ class Scene:
                 jacobian.resize(jacobian.shape[0], columns)
         return Linear(self, unknowns, jacobians, [self._seen(unknowns, shot) for shot in shots])
 
-    @property
+    @cached_property
     def _is_sharp(self) -> bool:
         """Whether rays count where they land."""
         widths = [isinstance(width, float) and width <= 0 for width in self.psf]
@@ -414,10 +414,10 @@ class Scene:
             derivatives[k] += block.pull(pull)
 
     def _add_potential_pulls(
-        self, slope: Unknowns, unknowns: Unknowns, k: int, pull: FloatArray
+        self, slope: Unknowns, unknowns: Unknowns, strengths: FloatArray, k: int, pull: FloatArray
     ) -> None:
-        """Add derivatives by the potentials of an image's own."""
-        slope.potentials[:] += self.strengths_with(unknowns)[k][:, None, None] * pull
+        """Add derivatives by the potentials of an image's own, which have `strengths` in it."""
+        slope.potentials[:] += strengths[:, None, None] * pull
         if (other := self.imperfect.other_strengths) is not None:
             along = np.einsum("m,myx,yx->", other[k], unknowns.potentials, pull)
             slope.common[self.imperfect.place("other_field")] += along
@@ -591,11 +591,14 @@ class Linear:
             [self._columns(change, potentials, k) for k in range(count)],
             self._weights,
             self._slopes,
-            [self._light_change(change, k) for k in range(count)],
+            [self._light_change(change, k) for k in range(count)]
+            if self._has_light
+            else self._dark,
         )
         slope, of_shape = self.unknowns.zeros(), np.zeros(scene.beams.shape[1:])
         for k in range(count):
-            self._add_light_pulls(slope, k, pulls[k])
+            if self._has_light:
+                self._add_light_pulls(slope, k, pulls[k])
             self._add_columns(slope, of_shape, k, totals[k])
         return self._complete(slope, of_shape)
 
@@ -635,13 +638,13 @@ class Linear:
     ) -> None:
         """Add derivatives by the columns of an image's Jacobian; of the beam to `of_shape`."""
         scene = self.scene
-        of_potential, of_instrument = np.split(columns, [math.prod(scene.rays.shape)])
-        psi = of_potential.reshape(scene.rays.shape)
-        scene._add_potential_pulls(slope, self.unknowns, k, psi)
+        size = math.prod(scene.rays.shape)
+        psi = columns[:size].reshape(scene.rays.shape)
+        scene._add_potential_pulls(slope, self.unknowns, self._strengths[k], k, psi)
         if self._has_others:
-            of_beam = of_instrument[:-6].reshape(of_shape.shape)
+            of_beam = columns[size:-6].reshape(of_shape.shape)
             of_shape += scene._add_beam_pulls(slope, k, of_beam, self._entering[k])
-            slope.frames[k] = of_instrument[-6:]
+            slope.frames[k] = columns[-6:]
 
     def _light_change(self, change: Unknowns, k: int) -> FloatArray:
         """The change of an image by numbers that act where it is seen."""
@@ -662,9 +665,8 @@ class Linear:
         return self.scene._only_free(slope)
 
     def _potential_changes(self, change: Unknowns) -> FloatArray:
-        scene, imperfect = self.scene, self.scene.imperfect
-        strengths = scene.strengths_with(self.unknowns)
-        changes = np.einsum("lm,myx->lyx", strengths, change.potentials)
+        imperfect = self.scene.imperfect
+        changes = np.einsum("lm,myx->lyx", self._strengths, change.potentials)
         if imperfect.other_strengths is not None:
             other = change.common[imperfect.place("other_field")] * imperfect.other_strengths
             changes += np.einsum("lm,myx->lyx", other, self.unknowns.potentials)
@@ -693,6 +695,20 @@ class Linear:
     @cached_property
     def _entering(self) -> list[_Entering]:
         return [self.scene._entering(self.unknowns, k) for k in range(len(self.jacobians))]
+
+    @cached_property
+    def _strengths(self) -> FloatArray:
+        return self.scene.strengths_with(self.unknowns)
+
+    @cached_property
+    def _has_light(self) -> bool:
+        """Whether numbers may change that act where an image is seen."""
+        has_effects = any(seen.effects for seen in self.seen)
+        return self.scene.free_brightness or has_effects or bool(self.scene.added)
+
+    @cached_property
+    def _dark(self) -> list[FloatArray]:
+        return [np.zeros(self.scene.rays.seen)] * len(self.jacobians)
 
     @cached_property
     def _weights(self) -> FloatArray:

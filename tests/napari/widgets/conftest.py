@@ -52,7 +52,7 @@ def _compiled(shot: np.ndarray[Any, Any]) -> None:
 def window(make_napari_viewer: Any, qtbot: Any, _compiled: None) -> Iterator[Any]:
     """A viewer in a visible window; at the end none of the plugin's threads runs."""
     viewer = make_napari_viewer(show=True)
-    viewer.window._qt_window.resize(1280, 800)
+    viewer.window._qt_window.resize(700, 400)  # a large canvas takes long to draw without a card
     yield viewer
     qtbot.waitUntil(lambda: not running_threads(), timeout=20_000)
 
