@@ -460,6 +460,25 @@ def test_without_its_package_mp4_is_refused_in_one_sentence(store, monkeypatch):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals to a process group")
+@pytest.mark.parametrize("source", ["reference.npy", "reference.h5"])
+def test_the_variable_of_the_shots_is_not_asked_of_a_source_without_names(
+    make_night, tmp_path, monkeypatch, source
+):
+    monkeypatch.chdir(tmp_path)
+    night = make_night(2)
+    np.save("reference.npy", night.source)
+    shots = sorted(tmp_path.glob("shots/shot_*.npy"))
+    for path in (*shots, tmp_path / "reference.npy"):
+        with h5py.File(path.with_suffix(".h5"), "w") as file:
+            file["plane"], file["other"] = np.load(path), np.zeros((2, 2))
+    result = shadowinv(
+        "batch", "shots/shot_*.h5", "--variable", "plane", "--source", source, "--n-sites", "100",
+        "--out", "n.shadowinv.zarr", "--scheduler", "threads", "--quiet",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert (StackStore(tmp_path / "n.shadowinv.zarr").statuses() == DONE).all()
+
+
 def test_ctrl_c_leaves_a_store_that_is_resumed(make_night, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     night = make_night(60)

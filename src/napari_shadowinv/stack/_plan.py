@@ -31,6 +31,7 @@ from napari_shadowinv.inversion import count_sites
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, check_source, number_of_sites
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import sha256, text_of
+from napari_shadowinv.io.formats import format_of
 from napari_shadowinv.io.frames import split_address
 from napari_shadowinv.io.shot_columns import JOINED, ShotTable, describe_columns
 from napari_shadowinv.io.store import FORMAT, OWN_SETUPS
@@ -382,9 +383,7 @@ def _describe_inputs(
     """Return the shots, the recipe with its masks, and the common source or one for each."""
     measured = recipe.source if isinstance(recipe.source, MeasuredSource) else MeasuredSource()
     source = measured.file if source is None else source
-    source_reader = reader
-    if measured.variable is not None:
-        source_reader = partial(reader, variable=measured.variable)
+    source_reader = _reader_of_source(source, measured, reader)
     lit = None
     if getattr(source, "ndim", None) == 2:
         source, lit = unpack_array(source, "source")
@@ -440,6 +439,16 @@ def _describe_inputs(
         provenance = inputs.provenance.with_image(source=origin)
         inputs = replace(inputs, provenance=provenance)
     return stack_shots, replace(inputs, shot=replace(inputs.shot, source=None)), sources
+
+
+def _reader_of_source(source: Any, measured: MeasuredSource, reader: Reader) -> Reader:
+    """The reader with the source's variable; a file without names has none of the shots' either."""
+    if measured.variable is not None:
+        return partial(reader, variable=measured.variable)
+    is_file = isinstance(source, (str, Path)) and os.path.isfile(source)
+    if is_file and getattr(reader, "func", reader) is read_shot:
+        return reader if format_of(Path(source)).named_reader else partial(reader, variable=None)
+    return reader
 
 
 def _find_table(shots: Any) -> Path | Sequence[ShotRow] | None:
