@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from napari_shadowinv._typing import FloatArray, IntArray
+from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.geometry.compiler import njit
 
 __all__ = [
@@ -82,7 +82,7 @@ def _misses(
     of_v = abs(frame[1]) * tall + abs(frame[2]) * wide
     of_u = abs(frame[4]) * tall + abs(frame[5]) * wide
     misses_v = v + of_v < 0.5 or v - of_v > size[0] - 1.5
-    return misses_v or u + of_u < 0.5 or u - of_u > size[1] - 1.5
+    return bool(misses_v or u + of_u < 0.5 or u - of_u > size[1] - 1.5)
 
 
 # Arrays of the parts below are flat, and each part writes one, so that the compiler need not
@@ -590,12 +590,12 @@ def collect(
 def merge(
     begins: IntArray,
     used: IntArray,
-    pixels: IntArray,
+    pixels: AnyArray,
     of_splines: FloatArray,
     of_others: FloatArray,
     has_beam: bool,
-    rows: IntArray,
-    columns: IntArray,
+    rows: AnyArray,
+    columns: AnyArray,
     values: FloatArray,
 ) -> None:
     """Add the lines of `collect` up in a sparse matrix: begins of its rows, columns and values."""
@@ -650,7 +650,7 @@ def _add_entry(
     first: int,
     entry: int,
     places: IntArray,
-    columns: IntArray,
+    columns: AnyArray,
     values: FloatArray,
 ) -> int:
     """Add a value to a column of the row that begins at `first`; return where the next begins."""

@@ -589,7 +589,7 @@ class Linear:
         totals, pulls = scene.rays.normal_times(
             self.jacobians,
             [self._columns(change, potentials, k) for k in range(count)],
-            self._weights,
+            list(self._weights),
             self._slopes,
             [self._light_change(change, k) for k in range(count)]
             if self._has_light
@@ -627,9 +627,9 @@ class Linear:
 
     def _columns(self, change: Unknowns, potentials: FloatArray, k: int) -> FloatArray:
         """Changes of the columns of an image's Jacobian."""
-        columns = potentials[k].ravel()
+        columns = potentials[k].reshape(-1)
         if not self._has_others:
-            return columns
+            return np.asarray(columns)
         of_beam = self._entering[k].light * (self._beam_shape * self._beam_change(change, k))
         return np.concatenate([columns, of_beam.ravel(), change.frames[k]])
 

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from napari_shadowinv._system.machine import available_threads, in_ranges, run_together
-from napari_shadowinv._typing import FloatArray, IntArray
+from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.fitting import _ray_kernels as kernels
 from napari_shadowinv.fitting._ray_kernels import KNOT, MOST_RAYS
 
@@ -239,12 +239,12 @@ class RayModel:
         first = np.maximum(reached[..., :2], _GUARD)
         behind = np.minimum(reached[..., 2:], np.array(self.seen) + _GUARD)
         reached = np.concatenate([first, behind], axis=2)
-        lines = np.maximum(behind - first, 0).prod(axis=2)
-        ends = np.cumsum(lines).reshape(lines.shape)
+        areas = np.maximum(behind - first, 0).prod(axis=2)
+        ends = np.cumsum(areas).reshape(areas.shape)
         others, most = 4 * of_beam + 6 * of_frame, ends[-1, -1]
         used, pixels = np.zeros_like(ends), np.empty(most, np.int32)
         of_splines, of_others = np.empty((most, 16)), np.empty((most, others))
-        lines = ends - lines, used, pixels, of_splines, of_others
+        begins, lines = ends - areas, (used, pixels, of_splines, of_others)
         free = of_beam, of_frame
         self._in_ranges(
             kernels.collect,
@@ -252,16 +252,16 @@ class RayModel:
             *model,
             size,
             reached,
-            lines[0],
+            begins,
             _GUARD,
             self._middle,
             free,
-            *lines[1:],
+            *lines,
         )
         rows = np.empty(math.prod(self.seen) + 1, np.int32)
         entries = (16 + others) * int(used.sum())
         columns, values = np.empty(entries, np.int32), np.empty(entries)
-        kernels.merge(*lines, of_beam, rows, columns, values)
+        kernels.merge(begins, *lines, of_beam, rows, columns, values)
         shape = (len(rows) - 1, potential.size + beam.size + 6)
         return csr_array((values[: rows[-1]], columns[: rows[-1]], rows), shape=shape)
 
@@ -297,18 +297,11 @@ class RayModel:
         """
         pulls = [np.empty(self.seen) for _ in jacobians]
         totals = [np.zeros(each.shape[1]) for each in jacobians]
-        works = [
-            partial(
-                kernels.normal_times,
-                *_entries(jacobian),
-                change,
-                *(each.reshape(-1) for each in (weight, slope, light, pull)),
-                total,
-            )
-            for jacobian, change, weight, slope, light, pull, total in zip(
-                jacobians, changes, weights, slopes, lights, pulls, totals, strict=True
-            )
-        ]
+        works = []
+        for k, (jacobian, change) in enumerate(zip(jacobians, changes, strict=True)):
+            images = [each[k].reshape(-1) for each in (weights, slopes, lights, pulls)]
+            arguments: tuple[AnyArray, ...] = *_entries(jacobian), change, *images, totals[k]
+            works.append(partial(kernels.normal_times, *arguments))
         threads = available_threads(self.threads)
         run_together(works, threads if jacobians[0].nnz > _WORTH_A_PRODUCT else 1)
         return totals, pulls

@@ -223,7 +223,7 @@ def _share_beyond(rows: FloatArray, noise: float) -> float:
     if len(rows) == 2:
         return 1.0
     # In the space of the rows, which has few dimensions.
-    rows = np.linalg.qr(rows.T, mode="r").T
+    rows = np.asarray(np.linalg.qr(rows.T, mode="r")).T
     before = after = 0.0
     for index, row in enumerate(rows):
         others = np.delete(rows, index, axis=0)
