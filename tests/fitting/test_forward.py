@@ -231,6 +231,31 @@ def test_the_hessian_is_symmetric_and_positive(scene: Scene) -> None:
     assert along(first, of_one) > 0
 
 
+@pytest.mark.parametrize("everything", [True, False])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_normal_products_of_sharp_images_are_pulled_pushes(
+    scene: Scene, everything: bool, threads: int
+) -> None:
+    """With all that may be unknown, and with the fields alone."""
+    sharp = replace(
+        scene, psf=[0.0, 0.0], imperfect=replace(scene.imperfect, blur=0.0), threads=threads
+    )
+    if not everything:
+        fixed = {"beam_modes": 0, "free_brightness": False, "free_frames": np.zeros(6, bool)}
+        sharp = replace(sharp, **fixed, added=(), imperfect=EXACT)
+    assert sharp.rays.seen == SIZE
+    unknowns = sharp.nothing()
+    unknowns.potentials[:] = some(scene).potentials
+    unknowns = unknowns.plus(unknowns.like(0.1 * random_like(unknowns, 6).flat()))
+    unknowns.frames[0] = at_rest()
+    linear = sharp.linear(unknowns, sharp.ray_counts(unknowns))
+    change = sharp._only_free(random_like(unknowns, 7))
+    expected = linear.pull(linear.push(change)).flat()
+    largest = np.abs(expected).max()
+    assert largest > 0
+    np.testing.assert_allclose(linear.normal_times(change).flat(), expected, atol=1e-11 * largest)
+
+
 def test_the_hessian_is_the_change_of_the_gradient_where_images_are_explained(
     scene: Scene,
 ) -> None:
@@ -238,7 +263,7 @@ def test_the_hessian_is_the_change_of_the_gradient_where_images_are_explained(
     unknowns = some(sharp)
     counts = sharp.ray_counts(unknowns)
     explained = replace(sharp, images=sharp.model(unknowns, counts))
-    change = random_like(unknowns, 7)
+    change = sharp._only_free(random_like(unknowns, 7))
     change.frames[0] = 0
     change.beam[scene.prior.beam_weights == 0] = 0
     step = 1e-6

@@ -466,7 +466,7 @@ def collect(
     used: IntArray,
     pixels: IntArray,
     of_splines: FloatArray,
-    of_others: FloatArray,
+    of_instrument: FloatArray,
 ) -> None:
     """Derivatives of the pixels that each cell reaches by its coefficients, its beam and the frame.
 
@@ -478,7 +478,7 @@ def collect(
     rows, landed = np.zeros(_ROWS), np.zeros(_LANDED)
     flux = np.zeros(MOST_RAYS)
     beam_is_free, frame_is_free = free
-    others = of_others.shape[1]
+    instrument_columns = of_instrument.shape[1]
     width = size[1] - 2 * guard
     for row in range(start, stop):
         for column in range(cells[1]):
@@ -488,7 +488,7 @@ def collect(
             area = max(last_row - first_row, 0) * max(wide, 0)
             if area == 0:
                 continue
-            block, other = np.zeros(16 * area), np.zeros((area, others))
+            block, instrument = np.zeros(16 * area), np.zeros((area, instrument_columns))
             is_reached, sums = np.zeros(area, np.bool_), np.zeros(8 * area)
             last_seen, touched = np.full(area, -1), np.empty(area, np.int64)
             of_y = tables[_TABLE * n : _TABLE * (n + 1)]
@@ -522,10 +522,10 @@ def collect(
                         to_u *= landed[_SLOPE_U + b] if q % 2 else -landed[_SLOPE_U + b]
                         if beam_is_free and in_v * in_u > 0:
                             is_reached[p] = True
-                            other[p, 0] += in_v * in_u * upper * part
-                            other[p, 1] += in_v * in_u * upper * (1 - part)
-                            other[p, 2] += in_v * in_u * lower * part
-                            other[p, 3] += in_v * in_u * lower * (1 - part)
+                            instrument[p, 0] += in_v * in_u * upper * part
+                            instrument[p, 1] += in_v * in_u * upper * (1 - part)
+                            instrument[p, 2] += in_v * in_u * lower * part
+                            instrument[p, 3] += in_v * in_u * lower * (1 - part)
                         if to_v == 0 and to_u == 0:  # half of the pairs of a ray and a pixel
                             continue
                         is_reached[p] = True
@@ -553,12 +553,12 @@ def collect(
                         sums[8 * p + 4], sums[8 * p + 5] = t4 + across * s0, t5 + across * s1
                         sums[8 * p + 6], sums[8 * p + 7] = t6 + across * s2, t7 + across * s3
                         if frame_is_free:
-                            other[p, -6] += to_v
-                            other[p, -5] += to_v * landed_y
-                            other[p, -4] += to_v * landed_x
-                            other[p, -3] += to_u
-                            other[p, -2] += to_u * landed_y
-                            other[p, -1] += to_u * landed_x
+                            instrument[p, -6] += to_v
+                            instrument[p, -5] += to_v * landed_y
+                            instrument[p, -4] += to_v * landed_x
+                            instrument[p, -3] += to_u
+                            instrument[p, -2] += to_u * landed_y
+                            instrument[p, -1] += to_u * landed_x
                 for k in range(n_touched):
                     p = touched[k]
                     u0, u1, u2, u3 = sums[8 * p], sums[8 * p + 1], sums[8 * p + 2], sums[8 * p + 3]
@@ -580,8 +580,8 @@ def collect(
                     pixels[line] = pixel + first_column + p % wide - guard
                     for c in range(16):
                         of_splines[line, c] = block[16 * p + c]
-                    for c in range(others):
-                        of_others[line, c] = other[p, c]
+                    for c in range(instrument_columns):
+                        of_instrument[line, c] = instrument[p, c]
                     line += 1
             used[row, column] = line - begins[row, column]
 
@@ -592,14 +592,14 @@ def merge(
     used: IntArray,
     pixels: AnyArray,
     of_splines: FloatArray,
-    of_others: FloatArray,
+    of_instrument: FloatArray,
     has_beam: bool,
     rows: AnyArray,
     columns: AnyArray,
     values: FloatArray,
 ) -> None:
     """Add the lines of `collect` up in a sparse matrix: begins of its rows, columns and values."""
-    cells, others = begins.shape, of_others.shape[1]
+    cells, instrument_columns = begins.shape, of_instrument.shape[1]
     coefficients, beam = cells[1] + 3, KNOT * cells[1]
     first_of_beam = (cells[0] + 3) * coefficients
     first_of_frame = first_of_beam + KNOT * cells[0] * beam
@@ -632,12 +632,12 @@ def merge(
             for c in range(4 * has_beam):
                 number = first_of_beam + (KNOT * row + c // 2) * beam + KNOT * column + c % 2
                 entry = _add_entry(
-                    number, of_others[line, c], first, entry, places, columns, values
+                    number, of_instrument[line, c], first, entry, places, columns, values
                 )
-            for c in range(4 * has_beam, others):
+            for c in range(4 * has_beam, instrument_columns):
                 number = first_of_frame + c - 4 * has_beam
                 entry = _add_entry(
-                    number, of_others[line, c], first, entry, places, columns, values
+                    number, of_instrument[line, c], first, entry, places, columns, values
                 )
         rows[pixel + 1] = entry
     rows[0] = 0

@@ -232,7 +232,7 @@ class Preconditioner:
 
     def _potentials_times(self, scaled: FloatArray) -> FloatArray:
         """Cosines of the potentials by scaled ones."""
-        if len(scaled) == 1:  # ten times as fast
+        if len(scaled) == 1:  # a product is faster than a sum over one field
             return self._potentials[None, :, :, 0, 0] * scaled
         return np.asarray(np.einsum("yxnm,nyx->myx", self._potentials, scaled))
 
@@ -330,7 +330,8 @@ def settle(
         The scene to first order near the start: used for all steps while these succeed.
     to_beat : float, optional
         An objective to compare with. Then only the objective matters, not the unknowns along a flat
-        valley, and a hopeless search ends: a third of the first distance is left after three steps.
+        valley. A search is hopeless, and ends, if more than a third of its first distance is left
+        after three Gauss-Newton steps, or where these fail.
 
     Returns
     -------

@@ -581,7 +581,7 @@ class Linear:
         return self.scene._only_free(self.scene.prior.times(free)).plus(self.normal_times(free))
 
     def normal_times(self, change: Unknowns) -> Unknowns:
-        """Return `pull` of `push` of a change."""
+        """Return `pull` of `push` of a change of what is free."""
         scene = self.scene
         if not scene._is_sharp:
             return self.pull(self.push(change))

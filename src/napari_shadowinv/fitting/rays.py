@@ -241,10 +241,10 @@ class RayModel:
         reached = np.concatenate([first, behind], axis=2)
         areas = np.maximum(behind - first, 0).prod(axis=2)
         ends = np.cumsum(areas).reshape(areas.shape)
-        others, most = 4 * of_beam + 6 * of_frame, ends[-1, -1]
+        instrument_columns, most = 4 * of_beam + 6 * of_frame, ends[-1, -1]
         used, pixels = np.zeros_like(ends), np.empty(most, np.int32)
-        of_splines, of_others = np.empty((most, 16)), np.empty((most, others))
-        begins, lines = ends - areas, (used, pixels, of_splines, of_others)
+        of_splines, of_instrument = np.empty((most, 16)), np.empty((most, instrument_columns))
+        begins, lines = ends - areas, (used, pixels, of_splines, of_instrument)
         free = of_beam, of_frame
         self._in_ranges(
             kernels.collect,
@@ -259,7 +259,7 @@ class RayModel:
             *lines,
         )
         rows = np.empty(math.prod(self.seen) + 1, np.int32)
-        entries = (16 + others) * int(used.sum())
+        entries = (16 + instrument_columns) * int(used.sum())
         columns, values = np.empty(entries, np.int32), np.empty(entries)
         kernels.merge(begins, *lines, of_beam, rows, columns, values)
         shape = (len(rows) - 1, potential.size + beam.size + 6)

@@ -139,7 +139,7 @@ def _iterate_datasets(path: Path, group: Any) -> Iterator[Any]:
 
 @contextmanager
 def opened_netcdf(path: Path) -> Iterator[Any]:
-    """Open a NetCDF4 file as a store that xarray loads from, in a third of the usual time."""
+    """Open a NetCDF4 file as a store from which xarray loads in less than half of its time."""
     import h5netcdf
     from xarray.backends import H5NetCDFStore
 
