@@ -416,6 +416,8 @@ def test_files_that_are_no_image_are_refused(
     refused("invert", "cut.npy", names=("cut.npy", "truncated"))
     for place in (folder, "", "."):
         refused("invert", place, names="is a folder")
+    for place in (".", "/"):
+        refused("invert", shot, "--out", place, names=(place, "is a folder", "--out"))
     refused("info", "missing.tif", names="missing.tif")
     refused("forward", "missing.tif", names="missing.tif")
 

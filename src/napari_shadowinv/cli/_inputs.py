@@ -29,10 +29,17 @@ def result_and_figure(image: Path, out: Path | None, report: Path | None) -> tup
     result = Path(f"{image.stem}{RESULT.suffix}") if out is None else out
     if report is not None:
         return result, report
-    figure = result.with_suffix(PNG.suffix)
+    figure = figure_beside(result)
     if resolved_path(figure) == resolved_path(image):
         figure = result.with_name(f"{result.stem}_report{PNG.suffix}")
     return result, figure
+
+
+def figure_beside(result: Path) -> Path:
+    """Name a figure after a result, which must have a name itself."""
+    if not result.name:
+        raise InputError(f"{result} is a folder: expected the name of a file; add it to --out")
+    return result.with_suffix(PNG.suffix)
 
 
 def check_outputs(outputs: Mapping[Path, tuple[str, ...]], overwrite: bool) -> None:

@@ -97,7 +97,7 @@ def plan(
     """
     from napari_shadowinv.cli._summary import fact_rows, headline_row, two_columns, written_rows
     from napari_shadowinv.io.files import replacing
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, SITES
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, SITES
     from napari_shadowinv.pipeline.experiment import plan_experiment, sweep_experiment
     from napari_shadowinv.pipeline.experiment_object import shape_of_text
     from napari_shadowinv.pipeline.experiment_result import ExperimentSweep, table_text
@@ -105,7 +105,7 @@ def plan(
     from napari_shadowinv.plotting import plan_figure, sweep_figure
     from napari_shadowinv.plotting.figures import save_figure
 
-    page = figure or out.with_suffix(PNG.suffix)
+    page = figure or _inputs.figure_beside(out)
     _inputs.check_outputs({out: SITES.suffixes, page: FIGURE_SUFFIXES}, overwrite)
     _inputs.protect([out, page], [setup, recorded_with, _file_of(object)])
     view = {name: flags.pop(name) for name in GridView.model_fields if name in flags}
