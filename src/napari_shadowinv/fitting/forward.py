@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, laplace
-from scipy.signal import oaconvolve
 from scipy.sparse import csr_array
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
@@ -734,6 +733,8 @@ def blurred(image: FloatArray, width: float) -> FloatArray:
 def _spread(image: FloatArray, width: float | FloatArray) -> FloatArray:
     if isinstance(width, float):
         return blurred(image, width)
+    from scipy.signal import oaconvolve  # brings scipy.stats: a third of a second
+
     return np.asarray(oaconvolve(image, width, mode="same"))
 
 
