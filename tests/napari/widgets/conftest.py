@@ -6,6 +6,7 @@ import gc
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,15 @@ def _lasting() -> None:
     import_module("napari._qt.qt_main_window")
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_collection_for_each_layer() -> None:
+    """Collect garbage once a window, not with each layer that it closes, as drivers may need."""
+    from napari._vispy import canvas
+
+    if hasattr(canvas, "gc"):
+        canvas.gc = SimpleNamespace(collect=lambda: 0)
 
 
 @pytest.fixture(scope="session")
