@@ -163,8 +163,11 @@ def check_size(path: str | Path, promised: int) -> None:
 
 def check_memory(shape: Sequence[int], bytes_per_pixel: float, work: str) -> None:
     """Refuse an image of `shape` for which `work` needs more memory than there is."""
-    limit = physical_memory() if os.environ.get(LIMIT_VARIABLE) is None else size_limit()
     needed = bytes_per_pixel * math.prod(shape)
+    is_limited = LIMIT_VARIABLE in os.environ
+    if needed <= _ALWAYS_FITS and not is_limited:
+        return
+    limit = size_limit() if is_limited else physical_memory()
     if limit is not None and needed > limit:
         raise InputError(
             f"{work} of {' × '.join(map(str, shape))} pixels needs about {needed / 1e9:.3g} GB of "
