@@ -34,6 +34,8 @@ these those such same planned named shown placed drawn wanted meant
 """
 VAGUE_NAMES = frozenset(VAGUE_WORDS.split())
 MAX_VAGUE_SHARE = 0.005
+# In 1,000 words of docstrings: nouns say more than clauses and pronouns.
+MAX_RATES = {r"\bwhat\b": 1.0, r"\b(?:that|those) of\b": 0.5}
 # Idioms that no experimenter writes, and what to write instead.
 IDIOMS = {
     r"(?<!cannot )\b(?:tells?|told|telling)\b": "report, show, say, depend on, contain",
@@ -108,6 +110,14 @@ def test_docstrings_begin_with_a_verb_or_a_noun():
 def test_docstrings_use_no_idiom(idiom):
     wrong = [place for place, text in docstrings(SOURCES) if re.search(idiom, text)]
     assert not wrong, f"write {IDIOMS[idiom]}"
+
+
+@pytest.mark.parametrize("words", MAX_RATES)
+def test_docstrings_name_things_by_nouns(words):
+    texts = {place: text.lower() for place, text in docstrings(SOURCES)}
+    counts = Counter({place: len(re.findall(words, text)) for place, text in texts.items()})
+    total = sum(len(re.findall(r"[a-z]+", text)) for text in texts.values())
+    assert 1000 * counts.total() / total < MAX_RATES[words], counts.most_common(8)
 
 
 @pytest.mark.parametrize("idiom", IDIOMS)

@@ -148,7 +148,7 @@ def bin_pixels(
 def align_source(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
-    """Shift a source so that its borders fit those of the selected image."""
+    """Shift a source so that its borders fit the borders of the selected image."""
     layer, viewer = without_proxy(layer), without_proxy(viewer)
     selection = _select_image(layer, viewer)
     source, name = _source_for(selection, layer, viewer)

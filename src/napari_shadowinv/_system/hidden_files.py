@@ -88,9 +88,9 @@ def sweep(folder: Path) -> None:
 
 
 def remove_drafts(path: Path, ending: str = "") -> None:
-    """Remove all drafts of a path under hidden names, also those of processes on other machines.
+    """Remove all drafts of a path under hidden names, also if left by other machines.
 
-    No process may be writing it. The ending is that of `hidden_name`.
+    No process may be writing it. The ending is as in `hidden_name`.
     """
     stem = f".{path.name.removesuffix(ending)}"
     with suppress(OSError), os.scandir(path.parent) as entries:

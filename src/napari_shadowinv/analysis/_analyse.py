@@ -68,7 +68,7 @@ def analyse(
     deflector : str, optional
         Key of what deflects, such as "E". Of a fit with several fields only this one is analysed.
     setup : Setup, optional
-        The experiment, for SI units. Default: that of the result.
+        The experiment, for SI units. Default: the result's.
     seed : int
         For the signs of errors that are the same in all samples, such as the discretisation's.
     on_progress, should_stop

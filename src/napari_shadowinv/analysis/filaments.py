@@ -1,6 +1,6 @@
 """Size, spacing and strength of filaments, from the autocorrelation of the field: `Filaments`.
 
-The autocorrelation is that of the field, not of the image: bright lines of an image are where rays
+The autocorrelation belongs to the field, not to the image: bright lines of an image are where rays
 are gathered, so their spacing is the size of filaments rather than the spacing of these [1]_.
 
 A filament whose potential is a Gaussian of radius a across it has a displacement across with the

@@ -102,7 +102,7 @@ class RingSpectrum:
     power : ndarray, shape (n,)
         Ring-summed spectrum P, px² for each rad/px.
     modes : ndarray, shape (n,)
-        Number of independent modes in each ring, less than those of the grid by the window.
+        Number of independent modes in each ring: fewer than grid modes because of the window.
     """
 
     k: FloatArray
@@ -241,7 +241,7 @@ def random_displacement(
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Spectrum of an inversion relative to that of the field, in the rings of a spectrum.
+    """Spectrum of an inversion relative to the field's, in the rings of a spectrum.
 
     Attributes
     ----------

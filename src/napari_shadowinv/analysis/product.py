@@ -51,7 +51,7 @@ class Variable:
     Attributes
     ----------
     dims : tuple of str
-        Names of the axes of its values; empty for a number. Those of a map are "y" and "x".
+        Names of the axes of its values; empty for a number, "y" and "x" for a map.
     unit : str
         Unit of its values. Values in the frame's `si_unit` are shown in its `unit`.
     long_name : str
@@ -186,7 +186,7 @@ class Product(Choice):
         return {}
 
     def refine(self, quantities: dict[str, Quantity]) -> dict[str, Quantity]:
-        """Return the quantities with errors that follow from those of others. Default: as they are.
+        """Return the quantities with errors derived from other quantities. Default: as they are.
 
         Parameters
         ----------

@@ -114,12 +114,12 @@ class ProductResult:
 
     @property
     def is_series(self) -> bool:
-        """Whether its axis is that of successive shots."""
+        """Whether its axis runs over successive shots."""
         return not self.coordinates.keys().isdisjoint(SERIES_AXES)
 
     @property
     def curve_groups(self) -> tuple[tuple[str, ...], ...]:
-        """Variables that figures draw, those of one panel together.
+        """Variables that figures draw, grouped by panel.
 
         Of a series these are all variables; lengths are apart from a displacement in pixels.
         """

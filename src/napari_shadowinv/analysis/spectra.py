@@ -74,7 +74,7 @@ class TurbulenceSpectrum(Product):
     """Power spectrum of the field, its slope, and energy spectrum and r.m.s. field of turbulence.
 
     The mean power of the noise is subtracted, and the loss by the inversion, measured on random
-    fields with the same spectrum, is corrected. Slope and r.m.s. field are those of the range of
+    fields with the same spectrum, is corrected. Slope and r.m.s. field belong to the range of
     wavenumbers that can be trusted.
     """
 
@@ -318,7 +318,7 @@ class TurbulenceSpectrum(Product):
         return float(np.abs(frame.setup.field_in_si(field, np.ones((2, 1)))).max())
 
     def _in_si(self, spectrum: RingSpectrum, power: FloatArray, frame: FieldFrame) -> FloatArray:
-        """Return a power of the displacement, for rad/px, as that of the field, for rad/m."""
+        """Convert the power of the displacement, for rad/px, to the field's, for rad/m."""
         in_si = self._scale(frame) ** 2 * frame.pixel * power
         if frame.unit.field in _PLANES:  # of the potential instead of its gradient
             in_si = in_si / (spectrum.k / frame.pixel) ** 2

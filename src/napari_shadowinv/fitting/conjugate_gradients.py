@@ -146,7 +146,7 @@ def solve(
     after_step : callable, optional
         Receives the number of steps.
     modes : SoftModes, optional
-        Of nearly the same matrix; those of this solution are added.
+        Of nearly the same matrix; modes of this solution are added.
     """
     modes = SoftModes() if modes is None else modes
     history = _History(right.size)

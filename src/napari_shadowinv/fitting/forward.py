@@ -66,9 +66,9 @@ class Scene:
     held : frozenset of str
         Imperfections whose numbers do not change.
     spread : ndarray, shape (n, n), or None
-        Root of the covariance of those of `response_units`. Default: as before the images.
+        Root of the covariance of the numbers of `response_units`. Default: as before the images.
     force : Unknowns or None
-        Derivatives that are subtracted from those of the objective: a random one makes its least
+        Derivatives that are subtracted from the objective's: a random one makes its least
         a sample of the prior.
     """
 
@@ -190,7 +190,7 @@ class Scene:
         return value
 
     def _priors(self, unknowns: Unknowns) -> tuple[float, Unknowns]:
-        """The prior's part of the objective, less that of the force, and its derivatives."""
+        """The prior's part of the objective, less the force's, and its derivatives."""
         value, slope = self.prior.value_and_slope(unknowns)
         if self.force is None:
             return value, slope

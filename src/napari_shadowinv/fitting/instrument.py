@@ -42,7 +42,7 @@ Around = tuple[tuple[int, int], tuple[int, int]]
 
 
 class Part(NamedTuple):
-    """Numbers of one imperfection: their places among the common ones or those of each image."""
+    """Numbers of one imperfection: their places among the common or each image's numbers."""
 
     key: str
     is_common: bool
@@ -51,7 +51,7 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ProductShapes:
-    """Patterns (a_i(y) b_j(x) - c) e(y, x): those of a smooth field, without a plane for each.
+    """Patterns (a_i(y) b_j(x) - c) e(y, x) of a smooth field, without a plane for each.
 
     `modes` are the functions a (n, H) and b (m, W), `places` (2, k) their numbers i and j for each
     pattern, `means` (k,) the constants c, and e the `envelope` (H, W).

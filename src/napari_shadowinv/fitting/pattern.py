@@ -222,7 +222,7 @@ class Pattern:
     blur_score : float
         See `blur_score`.
     missing_counts : float
-        Share by which the noise is smaller than that of the counts, as a dark level of that share
+        Share by which the noise is smaller than counts imply, as a dark level of that share
         makes it.
     counts_deviation : float
         Standard deviation of `missing_counts`.

@@ -1,7 +1,7 @@
 """Images of a fit, each with all that is known of it: `FitShot`.
 
 - a field near which a fit is to end: `NearField`
-- values for all images, from those of each: `join_shots`
+- values for all images, from the values of each: `join_shots`
 - width of the point spread in px, from the beam's source and the detector: `point_spread`
 """
 

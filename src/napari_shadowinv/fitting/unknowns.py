@@ -4,7 +4,7 @@
 - light that adds to each image, such as a background: `AdditiveBlock`, listed in `ADDITIVE`
 - the prior of potentials, beam, brightness, frames and light: `Prior`
 
-The prior is quadratic. That of the potentials and of the beam is
+The prior is quadratic; for the potentials and the beam it is
 
     ½ Σ_m (λ_m |∇⁴φ_m|² + κ_m |∇⁶φ_m|²) + ½ µ Σ_pad (|∇φ|² + φ²/ℓ²)
     + ½ Σ (θ_ij / s_ij)² + ½ Σ |d(x_k) - d_k|² / σ_k²
@@ -91,7 +91,7 @@ class Unknowns(NamedTuple):
         return self.from_blocks([*self.blocks[:_COMMON], *separate])
 
     def with_images(self, numbers: Sequence[int], part: Unknowns) -> Unknowns:
-        """Return the unknowns with those of some images replaced."""
+        """Return the unknowns with the numbers of some images replaced."""
         blocks = [block.copy() for block in self.blocks[_COMMON:]]
         for block, new in zip(blocks, part.blocks[_COMMON:], strict=True):
             block[list(numbers)] = new

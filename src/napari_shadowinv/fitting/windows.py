@@ -161,7 +161,7 @@ class LeaveOneOut:
         return Fact(f"left_out_{k + 1}", f"Left out {k + 1}", text, level, short=short)
 
     def to_dataset(self) -> xarray.Dataset:
-        """Return everything as one labelled dataset, whose variables can join those of a fit."""
+        """Return everything as one labelled dataset, whose variables can join a fit's."""
         import xarray as xr
 
         variables: dict[str, Any] = {

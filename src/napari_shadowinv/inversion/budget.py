@@ -383,7 +383,7 @@ def discretisation_share(times: float, rate: float = _USUAL_RATE) -> float:
     Parameters
     ----------
     times : float
-        Number of sites over that of the coarser solution, from which it changed; above 1.
+        Ratio of the numbers of sites, finer to coarser solution; above 1.
     rate : float
         Ratio of the changes by two successive fourfold increases of the number of sites.
     """

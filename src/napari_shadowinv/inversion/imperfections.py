@@ -220,7 +220,7 @@ class Imperfection:
         Standard deviation whose effect every budget states; 0 if it takes too long.
     pattern : callable
         Returns k independent changes of the cells' flux, (k, n), for a solved shot and a standard
-        deviation; their mean square is that of the imperfection.
+        deviation, with the mean square of the imperfection.
     change : callable
         Returns a recorded shot with the imperfection of a standard deviation, drawn by independent
         normal numbers.

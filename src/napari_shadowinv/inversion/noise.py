@@ -194,7 +194,7 @@ _GRAIN_PER_BLUR = 3.51 / math.exp(-0.5772 / 2)
 class ImageNoise:
     """Noise of an image, and of its source, as shares of the source's mean.
 
-    Its correlation is that of a Gaussian blur of a stated width, px, or measured.
+    It is correlated as by a Gaussian blur of a stated width, px, or as measured.
 
     Attributes
     ----------

@@ -87,7 +87,7 @@ def fitted_field(attributes: Mapping[Any, Any]) -> str | None:
 
 
 def columns_of_store(attributes: Mapping[Any, Any]) -> tuple[Column, ...]:
-    """Return the columns of a store, by its attributes; those of a shot table last."""
+    """Return the columns of a store, by its attributes; columns of a shot table last."""
     joined = joined_columns(attributes)
     if fitted_field(attributes) is not None:
         return *columns_of(FITS), *joined

@@ -308,7 +308,7 @@ def create_store(
 ) -> StackStore:
     """Create a store with all its shots pending; it appears completely or not at all.
 
-    Where several processes create a `shared` store at the same moment, all use that of the first.
+    If several processes create a `shared` store at the same moment, all use the first one's.
     """
     if path.exists() and not (overwrite or shared):
         raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")

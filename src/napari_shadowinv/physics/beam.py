@@ -342,7 +342,7 @@ class BeamSetup(CheckedModel):
         return value
 
     def sensitivity_to_beam(self, name: str) -> float:
-        """Return the relative change of one of `si_fields` by that of the `beam_field`."""
+        """Return the relative change of one of `si_fields` by a relative change of `beam_field`."""
         low, high = (
             math.log(np.abs(setup.field_in_si(name, np.ones((2, 1, 1)))).max())
             for setup in (self._with_beam(1 - _BEAM_STEP), self._with_beam(1 + _BEAM_STEP))

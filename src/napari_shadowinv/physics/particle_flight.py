@@ -102,7 +102,7 @@ def trace_particles(
     shape : tuple of int, default (1, 1)
         Height and width of the image whose middle lies on the axis; pixels are counted in it.
     energy : array_like, shape (N,), optional
-        Kinetic energies in MeV. Default: that of the setup.
+        Kinetic energies in MeV. Default: the setup's energy.
     start : array_like, shape (2, N), optional
         Points of the source in m from its middle, axis order (y, x). Default: its middle.
 

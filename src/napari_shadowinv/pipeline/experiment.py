@@ -609,7 +609,7 @@ def _scales_of(result: Fit, inputs: _Inputs) -> dict[str, float]:
 
 
 def _with_error_bars(shots: Sequence[PlannedShot]) -> tuple[PlannedShot, ...]:
-    """Give fits without error bars those of the fits that have them, and what follows of them."""
+    """Copy error bars, and what follows from them, to the fits that have none."""
     searched = [shot for shot in shots if shot.is_searched]
     if len(searched) == len(shots):
         return tuple(shots)

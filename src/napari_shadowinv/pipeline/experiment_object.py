@@ -125,7 +125,7 @@ class PlannedObject:
     def displacement(self, setup: Setup | None, grid: Grid) -> FloatArray:
         """Return the displacement in px of a setup at the samples of a grid, (2, h, w).
 
-        Beyond the samples it is that of the nearest one.
+        Beyond the samples the nearest one is used.
 
         Raises
         ------
@@ -222,7 +222,7 @@ def object_of_field(
 ) -> TracedObject:
     """Return an object through which particles are traced.
 
-    The displacement of a fit of several energies is that of its first image: what the energies do
+    A fit of several energies has the displacement of its first image: what the energies do
     not share, because the object is thick or E and B act together, is in the error.
 
     Parameters

@@ -92,7 +92,7 @@ class RerunInputs:
     files : tuple of Path
         All files that were read, the images first.
     masks : tuple of MaskOrigin
-        The origins of all masks; those of files as they are now.
+        The origins of all masks; files as they are now.
     changes : tuple of str
         Changes of the version and of masks and tables.
     """

@@ -350,7 +350,7 @@ class _Fit:
 
 
 def _evidence_of_trend(terms: FloatArray, trend: FloatArray) -> float:
-    """Return the logarithm of the density of a trend's data, less that of the constant."""
+    """Return the log-density of the data under a trend, relative to the constant."""
     constant, slopes = terms[:, :1], terms[:, 1:]
     slopes = slopes - constant @ (constant.T @ slopes) / (constant**2).sum()
     _, log_volume = np.linalg.slogdet(_TREND**2 * slopes.T @ slopes)

@@ -143,7 +143,7 @@ class Arrivals:
             self._settle_later(name)
 
     def matches(self, name: str) -> bool:
-        """Return whether a name is that of a shot."""
+        """Return whether a name belongs to a shot."""
         return not name.startswith(".") and fnmatch.fnmatch(name, self._pattern)
 
     def check(self) -> None:

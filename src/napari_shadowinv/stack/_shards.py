@@ -111,7 +111,7 @@ def check_shard(store: StackStore, shard: Shard | None) -> None:
 
 
 def check_shots(store: StackStore, shard: Shard, shots: int) -> None:
-    """Refuse shots that are not those of the other shards; those of the store are among them."""
+    """Refuse shots that differ from the shots of the other shards, among them the store's."""
     if shots > len(store.names):
         raise InputError(
             f"{store.path} was started with {len(store.names)} shots, received {shots}: use the "

@@ -136,7 +136,7 @@ class FileReference(ImageReference):
         return image, {**stamp(self.path), "sha256": sha256(self.path), **metadata}
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
-        """Compare a file like those of a table's rows, and a page by its checksum."""
+        """Compare a file as in a table's rows, and a page by its checksum."""
         return super().unchanged(origin) if self.page is not None else _agrees(self.path, origin)
 
     def identity(self, folder: Path) -> str:

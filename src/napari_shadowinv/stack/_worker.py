@@ -222,7 +222,7 @@ class InvertTask(Task):
         workers: int | None = None,
         should_stop: ShouldStop | None = None,
     ) -> Inversion:
-        """Apply the recipe to a shot as recorded, with `source`, or else that of the beam."""
+        """Apply the recipe to a shot as recorded, with `source` or else with the beam's."""
         (image,) = images
         assert isinstance(image.image, Radiograph)
         shape, expected = np.shape(image.image.image), self.inputs.shot.shape

@@ -490,7 +490,7 @@ def watch_stack(
         As for `run_stack`; one source for all shots. Without a number of sites, the first shots
         decide it for all: up to three that exist at the start, or the first that arrives.
     watch : WatchOptions, optional
-        Choices of the watch: names of the files, when to stop, and those of a store. A mapping
+        Choices of the watch: names of the files, when to stop, and the store. A mapping
         is converted.
     on_progress : callable, optional
         Receives a `RunStatus` at the start, after each shot, and at the end.

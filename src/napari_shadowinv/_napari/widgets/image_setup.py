@@ -61,7 +61,7 @@ class ImageSetup(qt.Docked):
 
     @qt.notify_errors
     def apply(self) -> None:
-        """Store the setup with the image, and place the image and those of its size."""
+        """Store the setup with the image; place all images of its size."""
         layer: Any = self.image.layer
         if layer is None:
             raise InputError("there is no image: open one (File → Open), or a sample")
