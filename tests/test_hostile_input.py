@@ -159,7 +159,7 @@ HUGE = np.broadcast_to(np.float64(1), (300_000, 300_000))
     [
         lambda: invert(HUGE),
         lambda: plan_sites(HUGE),
-        lambda: uncertainty(HUGE, units_per_quantum=1.0),
+        lambda: uncertainty(HUGE, options={"units_per_quantum": 1.0}),
         lambda: fit(HUGE),
         lambda: fit([HUGE, HUGE], strengths=[1, 0.6]),
         lambda: run(Recipe(), HUGE),

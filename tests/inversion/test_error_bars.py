@@ -30,6 +30,7 @@ from napari_shadowinv.physics.poisson import border_mean
 SHAPE = (40, 48)
 COUNTS = 20.0
 OPTIONS = InversionOptions(negative="clip")
+IN_COUNTS = InversionOptions(units_per_quantum=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +121,9 @@ def test_small_noise_twice_as_large_gives_error_bars_twice_as_large(clean, plan)
 
 def test_gain_says_how_many_units_a_quantum_makes(counts, plan):
     as_counts = uncertainty(counts, 3, plan=plan)
-    as_units = uncertainty(8.0 * counts, 3, plan=plan, units_per_quantum=8.0)
+    as_units = uncertainty(
+        8.0 * counts, 3, plan=plan, options=InversionOptions(units_per_quantum=8.0)
+    )
     np.testing.assert_allclose(as_units.displacement_std, as_counts.displacement_std, rtol=1e-6)
     mistaken = uncertainty(8.0 * counts, 3, plan=plan)
     ratio = mistaken.displacement_std / as_counts.displacement_std
@@ -203,7 +206,7 @@ def test_values_of_masked_pixels_do_not_matter(counts):
     mask = np.ones(SHAPE, bool)
     mask[:8, :9] = False
     first, second = (
-        uncertainty(np.where(mask, counts, value), 2, mask=mask, units_per_quantum=1.0)
+        uncertainty(np.where(mask, counts, value), 2, mask=mask, options=IN_COUNTS)
         for value in (np.nan, 1e30)
     )
     np.testing.assert_array_equal(first.potential_std, second.potential_std)
@@ -281,9 +284,9 @@ def test_cancelling_while_samples_are_prepared_waits_for_nothing(monkeypatch, co
         ({"noise": -1.0}, "negative or not finite"),
         ({"noise": np.full(SHAPE, np.nan)}, "negative or not finite"),
         ({"noise": np.ones((3, 4))}, r"noise has shape \(3, 4\), image \(40, 48\)"),
-        ({"noise": 1.0, "units_per_quantum": 2.0}, "they belong to Poisson noise"),
-        ({"units_per_quantum": 0.0}, "units per quantum are 0.0, expected a positive number"),
-        ({"units_per_quantum": 1e-30}, "more than 1e\\+18 quanta in a pixel"),
+        ({"noise": 1.0, "options": IN_COUNTS}, "1 units per quantum and noise is a standard"),
+        ({"options": {"units_per_quantum": 0.0}}, "greater than 0"),
+        ({"options": {"units_per_quantum": 1e-30}}, "more than 1e\\+18 quanta in a pixel"),
     ],
 )
 def test_bad_arguments_are_one_clear_sentence(counts, arguments, says):

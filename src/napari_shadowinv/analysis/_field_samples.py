@@ -151,7 +151,7 @@ class ResampledInversion:
 
     def evaluate(self, choose: Choose, samples: int, report: Callbacks) -> Evaluation:
         inversion = self.inversion
-        options, recorded = recorded_shot(inversion)
+        options, noise = recorded_shot(inversion)
         mask = None if inversion.mask.all() else inversion.mask
         plan = plan_sites(
             inversion.source, options, mask=mask, measured=has_measured_source(inversion),
@@ -171,8 +171,7 @@ class ResampledInversion:
         scatter = uncertainty(
             inversion.image,
             samples,
-            noise=recorded.noise,
-            units_per_quantum=recorded.units_per_quantum,
+            noise=noise,
             options=options,
             instrument=inversion.instrument,
             quantities=quantities,
@@ -240,16 +239,8 @@ class CoarseField:
     share: float
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedNoise:
-    """Arguments of `uncertainty` for the noise of an image."""
-
-    noise: Any
-    units_per_quantum: float | None = None
-
-
-def recorded_shot(inversion: Inversion) -> tuple[Any, RecordedNoise]:
-    """Return options that repeat an inversion of its own image, and the noise of that image.
+def recorded_shot(inversion: Inversion) -> tuple[Any, Any]:
+    """Return options that repeat an inversion of its own image, and its noise for `uncertainty`.
 
     The image of a result is scaled to the flux of its source, and so are the noise level and the
     units per quantum here.
@@ -263,14 +254,14 @@ def recorded_shot(inversion: Inversion) -> tuple[Any, RecordedNoise]:
         changes["flux"] = "known"
     options = options.model_copy(update=changes)
     if options.units_per_quantum is not None:
-        return options, RecordedNoise("poisson", options.units_per_quantum)
+        return options, "poisson"
     mask = None if inversion.mask.all() else inversion.mask
     prepared = prepare(inversion.image, inversion.source, options, mask)
     noise = ImageNoise(prepared.in_units(), options, inversion.instrument.noise_correlation)
     mean = inversion.source[inversion.mask].mean()
     deviation = mean * np.sqrt(noise.variance(inversion.image / mean))
     least = _LEAST_NOISE * float(inversion.image.max())
-    return options, RecordedNoise(np.maximum(deviation, least))
+    return options, np.maximum(deviation, least)
 
 
 def number_of_inner_sites(inversion: Inversion) -> int:

@@ -320,7 +320,6 @@ def uncertainty(
     source: ArrayLike | None = None,
     mask: ArrayLike | None = None,
     noise: Literal["poisson"] | float | ArrayLike = "poisson",
-    units_per_quantum: float | None = None,
     method: Literal["linear", "resolve"] = "linear",
     options: InversionOptions | None = None,
     instrument: Instrument | None = None,
@@ -349,14 +348,12 @@ def uncertainty(
         by side in its `threads`, as far as memory has room, which does not change the result.
     noise : "poisson" or float or array_like of shape (H, W)
         ``"poisson"``: each pixel counts quanta (photons, protons), whose number scatters by
-        its square root. Else the standard deviation of Gaussian noise, in the image's units.
+        its square root: a pixel of value v by √(u · v), with the options' `units_per_quantum` u.
+        Default of u: 1 for an image of whole numbers, which are taken as counts; any other
+        image needs it. Else the standard deviation of Gaussian noise, in the image's units.
         Gaussian noise is correlated between pixels as measured in the image.
         Samples that it drives below zero are clipped there, whatever `options.negative` says of
         the image.
-    units_per_quantum : float, optional
-        Of Poisson noise only: the image's units that one detected quantum makes; a pixel of
-        value v then scatters by √(units_per_quantum · v). Default: 1 for an image of
-        whole numbers, which are taken as counts; any other image needs it.
     method : {"linear", "resolve"}
         ``"linear"``: by the linear response of the transport. Three samples that are solved as well
         check it; with an instrument, 24 correct the mean and the deviation. ``"resolve"``: solve
@@ -378,8 +375,8 @@ def uncertainty(
     Raises
     ------
     InputError
-        If the image cannot be inverted, or `n`, `noise`, `units_per_quantum`, `method`,
-        `instrument` or `quantities` make no sense.
+        If the image cannot be inverted, or `n`, `noise`, `method`, `instrument` or `quantities`
+        make no sense.
     InversionCancelled
         If `should_stop` returned true.
 
@@ -410,7 +407,7 @@ def uncertainty(
         image, source, mask = unpack_shot(image, source, mask)
     check_memory(np.shape(image), bytes_per_pixel(options), "an inversion")
     draw_noise, noise_text = noise_of(
-        image, noise, units_per_quantum, mask if plan is None else plan.mask
+        image, noise, options.units_per_quantum, mask if plan is None else plan.mask
     )
     if plan is None:
         beam = prepare(image, source, options, mask).source

@@ -76,8 +76,8 @@ def noise_of(
         return _poisson(values, units_per_quantum)
     if units_per_quantum is not None:
         raise InputError(
-            f"units per quantum are {units_per_quantum!r} and noise a standard deviation: "
-            "they belong to Poisson noise"
+            f"options state {units_per_quantum:g} units per quantum and noise is a standard "
+            "deviation, expected one of them: units per quantum imply Poisson noise"
         )
     return _gaussian(values, np.asarray(plain_array(noise, "noise")), usable)
 
@@ -90,10 +90,6 @@ def _poisson(values: FloatArray, units_per_quantum: float | None) -> tuple[Draw,
                 "image units per detected quantum, or the noise as a standard deviation"
             )
         units_per_quantum = 1.0
-    if not (np.isreal(units_per_quantum) and 0 < units_per_quantum < np.inf):
-        raise InputError(
-            f"units per quantum are {units_per_quantum!r}, expected a positive number: image units"
-        )
     quanta = np.maximum(values, 0) / units_per_quantum
     if quanta.max(initial=0) > _MOST_QUANTA:
         raise InputError(
