@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from queue import SimpleQueue
+from threading import Event
+from typing import TypeVar
 
 from napari_shadowinv.errors import InversionCancelled
 
@@ -28,7 +32,11 @@ class Progress:
 
 
 OnProgress = Callable[[Progress], None]
+OnStep = Callable[[str, float], None]
+"""Receives the stage and the objective after each step of a fit; ends it by an exception."""
 ShouldStop = Callable[[], bool]
+
+_T = TypeVar("_T")
 
 
 class Reporter:
@@ -52,3 +60,47 @@ class Reporter:
             raise InversionCancelled(f"stopped on request during {stage}")
         if self._on_progress is not None:
             self._on_progress(Progress(stage, step, total, message, objective))
+
+
+def run_in_parallel(
+    works: Sequence[Callable[[OnStep], _T]], threads: int, on_step: OnStep
+) -> list[_T]:
+    """Call functions in threads and return their results, in the order of the functions.
+
+    Their steps are reported by the thread that calls, so that an exception of `on_step`, or
+    Ctrl-C, ends all of them at their next step.
+    """
+    if min(threads, len(works)) < 2:
+        return [work(on_step) for work in works]
+    steps: SimpleQueue[tuple[str, float] | None] = SimpleQueue()
+    is_over = Event()
+
+    def report(stage: str, objective: float) -> None:
+        if is_over.is_set():
+            raise InversionCancelled(f"stopped on request during {stage}")
+        steps.put((stage, objective))
+
+    def end(future: Future[_T]) -> None:
+        if future.exception() is not None:
+            is_over.set()
+        steps.put(None)
+
+    with ThreadPoolExecutor(threads, thread_name_prefix="fits of shadowinv") as pool:
+        futures = [pool.submit(work, report) for work in works]
+        for future in futures:
+            future.add_done_callback(end)
+        try:
+            running = len(works)
+            while running:
+                step = steps.get()
+                if step is None:
+                    running -= 1
+                else:
+                    on_step(*step)
+        finally:
+            is_over.set()
+    # Of several exceptions, the others follow from the first.
+    errors = [error for future in futures if (error := future.exception()) is not None]
+    for error in sorted(errors, key=lambda each: isinstance(each, InversionCancelled)):
+        raise error
+    return [future.result() for future in futures]

@@ -72,7 +72,7 @@ from napari_shadowinv.physics.setup import Setup
 __all__ = ["collect_starts", "compare", "fit", "reweight_counts"]
 
 _FROM_FAR = ((4, 2.0), (4, 1.0), (2, 1.0))
-_FROM_NEAR = ((2, 4.0), (2, 2.0), (2, 1.0))
+_FROM_NEAR = ((4, 2.0), (2, 2.0), (2, 1.0))
 _FROM_FIELD = ((4, 1.0), (2, 1.0))
 _SHARES_OF_TRANSPORT = (1.0, 1.4, 1.9, 2.4)  # past caustics, transport is too weak
 _ROUNDED = 8.0  # px

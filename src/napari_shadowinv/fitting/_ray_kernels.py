@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray, IntArray
 from napari_shadowinv.geometry.compiler import njit
 
 __all__ = [
     "KNOT",
     "MOST_RAYS",
     "add_corners",
+    "add_ties",
     "boxes",
     "collect",
     "deposit",
@@ -715,3 +716,25 @@ def transpose_times(
     for row in range(len(begins) - 1):
         for entry in range(begins[row], begins[row + 1]):
             out[columns[entry]] += values[entry] * vector[row]
+
+
+@njit(nogil=True, error_model="numpy")
+def add_ties(
+    potentials: FloatArray, is_inside: BoolArray, tie: float, fading: float, slope: FloatArray
+) -> None:
+    """Add the pull by which the strip's `potentials` (M, …) are tied to neighbours and to zero."""
+    fields, height, width = potentials.shape
+    for m in range(fields):
+        for row in range(height):
+            for column in range(width):
+                inside, here = is_inside[row, column], potentials[m, row, column]
+                if not inside:
+                    slope[m, row, column] += fading * here
+                if row + 1 < height and not (inside and is_inside[row + 1, column]):
+                    pull = tie * (potentials[m, row + 1, column] - here)
+                    slope[m, row, column] -= pull
+                    slope[m, row + 1, column] += pull
+                if column + 1 < width and not (inside and is_inside[row, column + 1]):
+                    pull = tie * (potentials[m, row, column + 1] - here)
+                    slope[m, row, column] -= pull
+                    slope[m, row, column + 1] += pull

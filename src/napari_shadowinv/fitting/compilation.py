@@ -32,6 +32,7 @@ _KERNELS: tuple[Any, ...] = (
     _ray_kernels.normal_times,
     _ray_kernels.rows_times,
     _ray_kernels.transpose_times,
+    _ray_kernels.add_ties,
 )
 _SIZE = (8, 8)
 
@@ -71,6 +72,8 @@ def _compile_rays(report: Reporter) -> None:
         jacobian = rays.jacobian(potential, counts, beam)
         columns = rays.pull(jacobian, rays.push(jacobian, np.zeros(jacobian.shape[1])))
         rays.normal_times([jacobian], [columns], [weights], [weights], [weights])
+        potentials = potential[None]
+        _ray_kernels.add_ties(potentials, potential > 0, 1.0, 1.0, np.zeros(potentials.shape))
 
     works: tuple[Callable[[], object], ...] = (
         lambda: rays.image(potential, counts, beam),

@@ -176,7 +176,8 @@ class Preconditioner:
         self._kept = np.divide(of_data, of_data + rough, out=np.ones_like(rough), where=rough > 0)
         of_prior = np.moveaxis(prior.of_potentials(), 0, -1)
         matrix = data + of_prior[..., None] * np.eye(of_prior.shape[-1])
-        self._potentials = np.linalg.inv(np.linalg.cholesky(matrix))
+        roots = np.linalg.inv(np.linalg.cholesky(matrix))
+        self._potentials = np.ascontiguousarray(np.moveaxis(roots, (2, 3), (0, 1)))
         self._log_ratio = 0.5 * float(np.linalg.slogdet(matrix)[1].sum())
         self._log_ratio -= 0.5 * float(np.log(of_prior).sum())
         pixels = scene.weights.sum(axis=(1, 2))
@@ -218,32 +219,43 @@ class Preconditioner:
         products = map(np.multiply, self._diagonals, slope.blocks[1:])
         return Unknowns.from_blocks([potentials, *products])
 
-    def hessian_times(self, linear: Linear, scaled: Unknowns) -> Unknowns:
-        """Return Sᵀ H S times scaled unknowns, with half of the transforms that each would take."""
-        waves = self._potentials_times(scaled.potentials)
-        products = map(np.multiply, self._diagonals, scaled.blocks[1:])
-        change = Unknowns.from_blocks([idctn(waves, axes=(1, 2), norm="ortho"), *products])
+    def hessian_times(self, linear: Linear, scaled: FloatArray) -> FloatArray:
+        """Return Sᵀ H S times scaled unknowns, both flat, by half of the transforms of each."""
+        unknowns, prior = linear.unknowns, linear.scene.prior
+        shape = unknowns.potentials.shape
+        size = unknowns.potentials.size
+        waves = self._potentials_times(scaled[:size].reshape(shape))
+        potentials = idctn(waves, axes=(1, 2), norm="ortho")
+        others = self._flat_diagonals * scaled[size:]
+        change = unknowns.like(np.concatenate([potentials.ravel(), others]))
         slope = linear.normal_times(change)
-        slope = slope.plus(linear.scene.prior.times_without_roughness(change))
+        prior.add_ties(change.potentials, slope.potentials)
         of_data = dctn(slope.potentials, axes=(1, 2), norm="ortho")
-        of_data += linear.scene.prior.roughness * waves
-        products = map(np.multiply, self._diagonals, slope.blocks[1:])
-        return Unknowns.from_blocks([self._transpose_of_potentials_times(of_data), *products])
+        of_data += prior.roughness * waves
+        result = slope.flat()
+        result[:size] = self._transpose_of_potentials_times(of_data).ravel()
+        result[size:] += linear.weights_of_others * others
+        result[size:] *= self._flat_diagonals
+        return result
+
+    @property
+    def _flat_diagonals(self) -> FloatArray:
+        return np.concatenate([part.ravel() for part in self._diagonals])
 
     def _potentials_times(self, scaled: FloatArray) -> FloatArray:
         """Cosines of the potentials by scaled ones."""
         if len(scaled) == 1:  # a product is faster than a sum over one field
-            return self._potentials[None, :, :, 0, 0] * scaled
-        return np.asarray(np.einsum("yxnm,nyx->myx", self._potentials, scaled))
+            return np.asarray(self._potentials[0] * scaled)
+        return np.asarray(np.einsum("nmyx,nyx->myx", self._potentials, scaled))
 
     def _transpose_of_potentials_times(self, waves: FloatArray) -> FloatArray:
         if len(waves) == 1:
-            return self._potentials[None, :, :, 0, 0] * waves
-        return np.asarray(np.einsum("yxnm,myx->nyx", self._potentials, waves))
+            return np.asarray(self._potentials[0] * waves)
+        return np.asarray(np.einsum("nmyx,myx->nyx", self._potentials, waves))
 
     def log_size(self) -> float:
         """Return log |det S| plus about half the log-determinant of the prior."""
-        scales = np.concatenate([part.ravel() for part in self._diagonals])
+        scales = self._flat_diagonals
         return -self._log_ratio + float(np.log(scales[scales > 0]).sum())
 
 
@@ -365,7 +377,7 @@ def settle(
         def times(flat: FloatArray) -> FloatArray:
             if after_step is not None:
                 after_step(value)  # noqa: B023
-            return scales.hessian_times(here, now.like(flat)).flat()  # noqa: B023
+            return scales.hessian_times(here, flat)  # noqa: B023
 
         down = -scales.transpose_times(slope).flat()
         step = solve(times, down, tolerance=tolerance, iterations=solving, modes=modes)

@@ -688,6 +688,11 @@ class Linear:
         return bool(self.jacobians[0].shape[1] > math.prod(self.scene.rays.shape))
 
     @cached_property
+    def weights_of_others(self) -> FloatArray:
+        """1 / s² by the prior of all values but the potentials."""
+        return self.scene.prior.flat_weights(self.unknowns)
+
+    @cached_property
     def _beam_shape(self) -> FloatArray:
         return self.scene._beam_shape(self.unknowns)
 

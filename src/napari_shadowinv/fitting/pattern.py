@@ -20,6 +20,8 @@ from zlib import crc32
 import numpy as np
 from scipy.ndimage import gaussian_filter, laplace
 
+from napari_shadowinv._system.machine import available_threads
+from napari_shadowinv._system.progress import OnStep, run_in_parallel
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes
 from napari_shadowinv.fitting.descent import coarser
@@ -30,7 +32,6 @@ from napari_shadowinv.fitting.search import (
     MIDDLE_SPACING,
     SMOOTHNESS_RATIO,
     Minimum,
-    OnStep,
     settle_minimum,
 )
 from napari_shadowinv.fitting.unknowns import Unknowns
@@ -345,13 +346,18 @@ def name_cause(
     pixels = replace(coarser(scene, best.bin), spacing=MIDDLE_SPACING)
     misfit = pixels.chi2(best.unknowns, pixels.ray_counts(best.unknowns)) - 1
     excess = float((misfit * (pixels.weights > 0).sum(axis=(1, 2))).sum())
-    gains = []
-    for rival in _rivals(scene, best, names, setups):
+    rivals = list(_rivals(scene, best, names, setups))
+    threads = available_threads(scene.threads)
+
+    def gain(rival: _Rival, on_step: OnStep) -> float:
         start = replace(best, unknowns=rival.unknowns, modes=SoftModes())
-        end = settle_minimum(
-            rival.scene, start, on_step, "rivals", steps=_STEPS, to_beat=best.value
-        )
-        gains.append((2 * (best.value - end.value) - rival.free_numbers, rival.cause))
+        alone = replace(rival.scene, threads=max(1, threads // len(rivals)))
+        end = settle_minimum(alone, start, on_step, "rivals", steps=_STEPS, to_beat=best.value)
+        return 2 * (best.value - end.value) - rival.free_numbers
+
+    works = [partial(gain, rival) for rival in rivals]
+    causes = [rival.cause for rival in rivals]
+    gains = list(zip(run_in_parallel(works, threads, on_step), causes, strict=True))
     gains.sort(reverse=True)
     if not gains or gains[0][0] < _MIN_GAIN:
         return ""

@@ -415,7 +415,7 @@ class Posterior:
 
     def _times(self, flat: FloatArray) -> FloatArray:
         self._after_step()
-        return self._scales.hessian_times(self._linear, self._unknowns.like(flat)).flat()
+        return self._scales.hessian_times(self._linear, flat)
 
     def _change(self, slope: Unknowns, tolerance: float) -> Unknowns:
         """The change of the unknowns that undoes a slope."""

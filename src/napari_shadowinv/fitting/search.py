@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from napari_shadowinv._system.machine import available_threads
+from napari_shadowinv._system.progress import OnStep, run_in_parallel
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
 from napari_shadowinv.fitting.descent import (
@@ -40,8 +44,6 @@ __all__ = [
     "search",
     "settle_minimum",
 ]
-
-OnStep = Callable[[str, float], None]
 
 MIDDLE = 2  # pixels in which starts are compared and λ is found
 FIRST_SMOOTHNESS = np.array([50.0, 2000.0])  # λ and κ
@@ -118,32 +120,71 @@ def _splines_of(scene: Scene, potential: FloatArray) -> FloatArray:
     return np.asarray(values) / scene.bin**2
 
 
+class _Descent(NamedTuple):
+    """Stages of a start that lie before it, and where it is."""
+
+    start: Start
+    minimum: Minimum
+    stages: Sequence[tuple[int, float]]
+
+    def run(self, scene: Scene, on_step: OnStep) -> Minimum:
+        """Return where the stages end."""
+        end = replace(self.minimum, start=self.start.name)
+        for stage in self.stages:
+            end = _descend_stage(scene, end, stage, on_step)
+        return end
+
+
 def search(scene: Scene, starts: Sequence[Start], on_step: OnStep) -> list[Minimum]:
     """Descend from each start to pixels of two; return the distinct minima, best first.
 
-    Of the starts that have come to the same stage before the last, those go on that are best.
+    Starts without a field share their first stage if it is the same. Of those that have come to the
+    same stage before the last, the best go on.
     """
     rough = replace(
         scene,
         smoothness=_COARSE_SMOOTHNESS * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1)),
         spacing=_COARSE_SPACING,
     )
-    halfway: dict[tuple[int, float], list[Minimum]] = {}
-    ends = []
+
+    def begin(start: Start) -> Minimum:
+        return _start_minimum(coarser(rough, start.stages[0][0]), start)
+
+    firsts = {(start.stages[0], start.beam_held): start for start in starts if _is_shared(start)}
+    descents = [_Descent(start, begin(start), start.stages[:1]) for start in firsts.values()]
+    shared = dict(zip(firsts, _descend_together(rough, descents, on_step), strict=True))
+    descents = []
     for start in starts:
-        *before, last = start.stages
-        end = _start_minimum(coarser(rough, start.stages[0][0]), start)
-        first = replace(rough, beam_spread=_HELD_BEAM) if start.beam_held else rough
-        for stage in before:
-            end = _descend_stage(first, end, stage, on_step)
-        if before:
-            halfway.setdefault(before[-1], []).append(end)
+        if _is_shared(start):
+            minimum = shared[start.stages[0], start.beam_held]
+            descents.append(_Descent(start, minimum, start.stages[1:-1]))
         else:
-            ends.append(_descend_stage(rough, end, last, on_step))
-    for rivals in halfway.values():
-        for end in _distinct_minima(rivals)[:_CONTINUED]:
-            ends.append(_descend_stage(rough, end, starts[0].stages[-1], on_step))
-    return _distinct_minima(ends)
+            descents.append(_Descent(start, begin(start), start.stages[:-1]))
+    halfway: dict[object, list[Minimum]] = {}
+    for start, minimum in zip(starts, _descend_together(rough, descents, on_step), strict=True):
+        # A start with one stage has no rivals yet.
+        stage = start.stages[-2] if len(start.stages) > 1 else start.name
+        halfway.setdefault(stage, []).append(minimum)
+    by_name = {start.name: start for start in starts}
+    descents = [
+        _Descent(replace(by_name[end.start], beam_held=False), end, starts[0].stages[-1:])
+        for rivals in halfway.values()
+        for end in (_distinct_minima(rivals)[:_CONTINUED] if len(rivals) > 1 else rivals)
+    ]
+    return _distinct_minima(_descend_together(rough, descents, on_step))
+
+
+def _is_shared(start: Start) -> bool:
+    """Whether the first stage of a start may be that of others."""
+    return start.potential is None and len(start.stages) > 1
+
+
+def _descend_together(scene: Scene, descents: Sequence[_Descent], on_step: OnStep) -> list[Minimum]:
+    threads = available_threads(scene.threads)
+    alone = replace(scene, threads=max(1, threads // max(len(descents), 1)))
+    held = replace(alone, beam_spread=_HELD_BEAM)
+    works = [partial(each.run, held if each.start.beam_held else alone) for each in descents]
+    return run_in_parallel(works, threads, on_step)
 
 
 def _distinct_minima(minima: list[Minimum]) -> list[Minimum]:

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.fft import dctn, idctn
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
-from napari_shadowinv.fitting._ray_kernels import spline_tables
+from napari_shadowinv.fitting._ray_kernels import add_ties, spline_tables
 from napari_shadowinv.fitting.rays import KNOT, RayModel, at_rest
 from napari_shadowinv.options import FitOptions
 
@@ -239,20 +239,22 @@ class Prior:
         """Return the terms' Hessian times a change."""
         waves = dctn(change.potentials, axes=(1, 2), norm="ortho")
         waves *= self.roughness
-        slope = self.times_without_roughness(change)
-        slope.potentials[:] += idctn(waves, axes=(1, 2), norm="ortho")
-        return slope
-
-    def times_without_roughness(self, change: Unknowns) -> Unknowns:
-        """Return the same without λ and κ, whose terms are diagonal in the cosines."""
-        slope = self.tie * self._fading * change.potentials
-        for axis, steps in enumerate(self._steps(change.potentials), 1):
-            slope -= self.tie * _differences(steps, axis)
-        if self.fiducials is not None:
-            weights = 1 / self.fiducials.errors[:, None] ** 2
-            self._add_there(slope, weights * self._displacements_there(change.potentials))
+        slope = idctn(waves, axes=(1, 2), norm="ortho")
+        self.add_ties(change.potentials, slope)
         products = map(np.multiply, self._weights, change.blocks[1:])
         return Unknowns.from_blocks([slope, *products])
+
+    def add_ties(self, potentials: FloatArray, slope: FloatArray) -> None:
+        """Add the Hessian of potentials, but for λ and κ, times their change."""
+        add_ties(potentials, self._within, self.tie, self.tie * (KNOT / self.decay) ** 2, slope)
+        if self.fiducials is not None:
+            weights = 1 / self.fiducials.errors[:, None] ** 2
+            self._add_there(slope, weights * self._displacements_there(potentials))
+
+    def flat_weights(self, unknowns: Unknowns) -> FloatArray:
+        """Return 1 / s² of all values but the potentials, as one array."""
+        pairs = zip(self._weights, unknowns.blocks[1:], strict=True)
+        return np.concatenate([np.broadcast_to(w, block.shape).ravel() for w, block in pairs])
 
     def draw(self, like: Unknowns, rng: np.random.Generator) -> Unknowns:
         """Return a random slope whose covariance is the terms' Hessian."""
