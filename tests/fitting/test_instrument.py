@@ -235,7 +235,7 @@ def test_effects_of_noise_and_instrument_add_to_each_sample() -> None:
     )
     scene = coarser(data.scene_with(100.0), 2)
     posterior = Posterior(scene, scene.nothing(), np.random.default_rng(0))
-    sample = posterior.draw_sample()
+    sample = posterior.draw_samples(1)[0]
     effects = posterior.effects(sample)
     assert effects.keys() == {"noise", "gamma", "background", "beam"}
     total = sum(effect.potentials for effect in effects.values())

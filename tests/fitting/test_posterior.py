@@ -82,7 +82,7 @@ def test_held_numbers_are_drawn_as_uncertain_as_they_are_said_to_be() -> None:
     tolerance = 4 * np.sqrt(2 / DRAWS)
     for spread, expected in ((None, np.eye(3)), (root, root @ root.T)):
         posterior = Posterior(replace(scene, spread=spread), unknowns, np.random.default_rng(0))
-        draws = [numbers_of(scene, posterior.draw_sample(0.1).change) for _ in range(DRAWS)]
+        draws = [numbers_of(scene, each.change) for each in posterior.draw_samples(DRAWS, 0.1)]
         scales = np.sqrt(np.diag(expected))
         difference = np.cov(np.array(draws).T) - expected
         assert np.abs(difference / np.outer(scales, scales)).max() < tolerance
@@ -138,7 +138,7 @@ def test_samples_have_the_inverse_hessian_as_covariance(
     """Along any way v, v·sample is normal with the variance v·H⁻¹v."""
     scene, unknowns, matrix, free = tiny
     posterior = Posterior(scene, unknowns, np.random.default_rng(0))
-    samples = np.stack([posterior.draw_sample().change.flat() for _ in range(DRAWS)])
+    samples = np.stack([each.change.flat() for each in posterior.draw_samples(DRAWS)])
     covariance = np.linalg.pinv(matrix[np.ix_(free, free)], rcond=1e-10, hermitian=True)
     tolerance = 4 * np.sqrt(2 / DRAWS)
     # Observables: displacements, brightness, frames; not the potential's free constant.
@@ -167,7 +167,7 @@ def test_a_solved_sample_explains_its_noise_and_its_force_in_full() -> None:
     scene = replace(scene, images=scene.model(unknowns, scene.ray_counts(unknowns)))
     unknowns, *_ = settle(scene, unknowns, steps=40, least_gain=1e-6)
     posterior = Posterior(scene, unknowns, np.random.default_rng(3))
-    linear = [posterior.draw_sample() for _ in range(4)]
+    linear = posterior.draw_samples(4)
     solved = posterior.solve(linear)
     pairs = compare_samples(scene, linear, solved)
     assert 0.01 < pairs.nonlinearity < 0.5
@@ -192,7 +192,7 @@ def test_what_is_known_does_not_vary(
     tiny: tuple[Scene, Unknowns, FloatArray, FloatArray],
 ) -> None:
     scene, unknowns, _, _ = tiny
-    sample = Posterior(scene, unknowns, np.random.default_rng(1)).draw_sample().change
+    sample = Posterior(scene, unknowns, np.random.default_rng(1)).draw_samples(1)[0].change
     assert not sample.frames[0].any()
     np.testing.assert_array_equal(sample.frames[1] != 0, scene.free_frames)
     assert sample.beam[0, 0] == 0
@@ -203,7 +203,7 @@ def test_the_same_seed_draws_the_same_samples(
 ) -> None:
     scene, unknowns, _, _ = tiny
     first, second, third = (
-        Posterior(scene, unknowns, np.random.default_rng(seed)).draw_sample().change.flat()
+        Posterior(scene, unknowns, np.random.default_rng(seed)).draw_samples(1)[0].change.flat()
         for seed in (2, 2, 3)
     )
     np.testing.assert_array_equal(first, second)
@@ -282,7 +282,7 @@ def test_moved_by_beams_is_the_response_of_the_best_field() -> None:
     expected = unknowns.flat() * 0
     expected[free] = np.linalg.pinv(matrix[np.ix_(free, free)], rcond=1e-10, hermitian=True) @ slope
     posterior = Posterior(scene, unknowns, np.random.default_rng(0))
-    moved = posterior.moved_by_beams(0.01 * wave)
+    moved = posterior.moved_by_beams([0.01 * wave])[0]
     shift, dense = (
         scene.rays.displacement(each.potentials[0]) for each in (moved, unknowns.like(expected))
     )
@@ -313,7 +313,7 @@ def test_open_beams_are_those_that_several_energies_cannot_exclude() -> None:
             scene, strengths=np.array(strengths)[:, None], weights=np.full((2, 24, 32), 1e6)
         )
         posterior = Posterior(shots, unknowns, np.random.default_rng(0))
-        samples = [posterior.draw_sample() for _ in range(4)]
+        samples = posterior.draw_samples(4)
         changes = posterior.open_beams(0.05, samples, np.random.default_rng(2))
         freed = shots.with_free_beam(*changes[0].beam.shape[:1], 0.05)
         beams = [freed.beam_changes(change)[0] for change in changes]
@@ -331,7 +331,7 @@ def test_open_beams_have_the_joint_posterior_and_move_the_fields() -> None:
     y, x = np.indices(scene.rays.shape)
     unknowns.potentials[0] = 2 * np.exp(-((y - 6) ** 2 + (x - 7) ** 2) / 6)
     posterior = Posterior(scene, unknowns, np.random.default_rng(0))
-    samples = [posterior.draw_sample(1e-4) for _ in range(DRAWS)]
+    samples = posterior.draw_samples(DRAWS, 1e-4)
     changes = posterior.open_beams(0.05, samples, np.random.default_rng(2))
     freed = scene.with_free_beam(*changes[0].beam.shape[:1], 0.05)
     matrix, free = dense_hessian(freed, unknowns._replace(beam=0 * changes[0].beam))
@@ -345,7 +345,7 @@ def test_open_beams_have_the_joint_posterior_and_move_the_fields() -> None:
         assert variance == pytest.approx(way @ covariance @ way, rel=4 * np.sqrt(2 / DRAWS))
     # The fields follow the beams as those of a fixed, different beam do.
     for change in changes[:3]:
-        moved = posterior.moved_by_beams(freed.beam_changes(change))
+        moved = posterior.moved_by_beams([freed.beam_changes(change)])[0]
         response, expected = (
             scene.rays.displacement(each.potentials[0]) for each in (change, moved)
         )

@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from queue import SimpleQueue
 from threading import Event
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
 from napari_shadowinv.errors import InversionCancelled
 
@@ -36,6 +37,7 @@ OnStep = Callable[[str, float], None]
 """Receives the stage and the objective after each step of a fit; ends it by an exception."""
 ShouldStop = Callable[[], bool]
 
+_P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
@@ -63,7 +65,7 @@ class Reporter:
 
 
 def run_in_parallel(
-    works: Sequence[Callable[[OnStep], _T]], threads: int, on_step: OnStep
+    works: Sequence[Callable[[Callable[_P, None]], _T]], threads: int, on_step: Callable[_P, None]
 ) -> list[_T]:
     """Call functions in threads and return their results, in the order of the functions.
 
@@ -72,13 +74,13 @@ def run_in_parallel(
     """
     if min(threads, len(works)) < 2:
         return [work(on_step) for work in works]
-    steps: SimpleQueue[tuple[str, float] | None] = SimpleQueue()
+    steps: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
     is_over = Event()
 
-    def report(stage: str, objective: float) -> None:
+    def report(*args: _P.args, **kwargs: _P.kwargs) -> None:
         if is_over.is_set():
-            raise InversionCancelled(f"stopped on request during {stage}")
-        steps.put((stage, objective))
+            raise InversionCancelled("stopped on request")
+        steps.put(partial(on_step, *args, **kwargs))
 
     def end(future: Future[_T]) -> None:
         if future.exception() is not None:
@@ -96,7 +98,7 @@ def run_in_parallel(
                 if step is None:
                     running -= 1
                 else:
-                    on_step(*step)
+                    step()
         finally:
             is_over.set()
     # Of several exceptions, the others follow from the first.

@@ -244,7 +244,7 @@ def fit(
             pattern = replace(pattern, cause=cause)
     with _timed("samples", seconds):
         count = options.samples if options.samples > 1 else 0
-        samples = [posterior.draw_sample() for _ in range(count)]
+        samples = posterior.draw_samples(count)
         is_solved = options.sampling == "resolve"
         if is_solved:
             checked, solved = samples, posterior.solve(samples)

@@ -313,7 +313,8 @@ class _Work:
         posterior = Posterior(
             *sampled, rng, lambda: self._on_step(_name(members), value), linear=linear
         )
-        changes = [posterior.draw_sample(_SAMPLE_TOLERANCE).change for _ in range(_SAMPLES)]
+        samples = posterior.draw_samples(_SAMPLES, _SAMPLE_TOLERANCE)
+        changes = [sample.change for sample in samples]
         if large:
             changes = [finer(change) for change in changes]
         return _SampledFit(fine, start.with_images(members, unknowns), changes)

@@ -683,6 +683,8 @@ def rows_times(
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
 def normal_times(
+    start: int,
+    stop: int,
     begins: IntArray,
     columns: IntArray,
     values: FloatArray,
@@ -693,8 +695,8 @@ def normal_times(
     pulls: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Add Jᵀ s w (s J v + l) for a sparse matrix J; `pulls` are w (s J v + l)."""
-    for row in range(len(begins) - 1):
+    """Add Jᵀ s w (s J v + l) for rows of a sparse matrix J; `pulls` are w (s J v + l)."""
+    for row in range(start, stop):
         total = 0.0
         for entry in range(begins[row], begins[row + 1]):
             total += values[entry] * vector[columns[entry]]

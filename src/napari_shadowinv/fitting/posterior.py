@@ -17,15 +17,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import partial, reduce
 from operator import add
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.fft import dctn, idctn
 from scipy.linalg import eigh_tridiagonal
 from scipy.ndimage import gaussian_filter
 
+from napari_shadowinv._system.machine import available_threads
+from napari_shadowinv._system.progress import run_in_parallel
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
 from napari_shadowinv.fitting.descent import Preconditioner, finer, settle
@@ -49,6 +51,9 @@ __all__ = [
     "sampled_potentials",
     "shifts_by_beam",
 ]
+
+_S = TypeVar("_S")
+_T = TypeVar("_T")
 
 _ROUGHLY, _CLOSELY = 0.05, 0.002  # the longest waves, which noise moves most, are found last
 # Fields and numbers of an instrument that explain an image alike are found last of all.
@@ -78,6 +83,15 @@ class Sample:
     change: Unknowns
     noise: FloatArray
     force: Unknowns
+
+
+class _Draw(NamedTuple):
+    """Noise, the force of the prior and held numbers, drawn for a sample, and their slope."""
+
+    noise: FloatArray
+    force: Unknowns
+    numbers: Unknowns
+    slope: Unknowns
 
 
 class Response(NamedTuple):
@@ -165,21 +179,47 @@ class Posterior:
         weights = determined / determined.sum(axis=1, keepdims=True)
         return smoothness * np.exp(change), float((np.abs(change) * weights).sum(axis=1).max())
 
-    def draw_sample(self, tolerance: float | None = None) -> Sample:
-        """Return a random change of the unknowns, as large as the data leave possible.
+    def draw_samples(self, count: int, tolerance: float | None = None) -> list[Sample]:
+        """Return random changes of the unknowns, as large as the data leave possible.
 
         Numbers of the instrument that are held are drawn first; all other unknowns respond to them.
         """
         if tolerance is None:
             tolerance = _IN_VALLEY if self._scene.has_free_numbers else _CLOSELY
+        drawn = [self._draw() for _ in range(count)]
+
+        def sample(posterior: Posterior, draw: _Draw) -> Sample:
+            change = posterior._change(draw.slope, tolerance)
+            return Sample(change.plus(draw.numbers), draw.noise, draw.force)
+
+        return self._solve_each(sample, drawn)
+
+    def _draw(self) -> _Draw:
         noise = self._rng.normal(size=self._scene.images.shape)
         numbers, residuals = self._unknowns.zeros(), noise
         if self._scene.held:
             numbers = self._draw_held()
             residuals = noise - self._linear.push(numbers)
         force = self._scene.prior.draw(self._unknowns, self._rng)
-        slope = self._linear.pull(residuals).plus(force)
-        return Sample(self._change(slope, tolerance).plus(numbers), noise, force)
+        return _Draw(noise, force, numbers, self._linear.pull(residuals).plus(force))
+
+    def _solve_each(self, work: Callable[[Posterior, _S], _T], items: Sequence[_S]) -> list[_T]:
+        """Call a function for each item, in threads with posteriors of their own.
+
+        The first one comes before all others, which know the modes that it has found.
+        """
+        threads = available_threads(self._scene.threads)
+        alone = replace(self._scene, threads=max(1, threads // max(len(items) - 1, 1)))
+
+        def solve_alone(item: _S, after_step: Callable[[], None]) -> _T:
+            posterior = copy(self)
+            posterior._scene, posterior._linear = alone, replace(self._linear, scene=alone)
+            posterior._after_step, posterior._modes = after_step, copy(self._modes)
+            return work(posterior, item)
+
+        first = [work(self, item) for item in items[:1]]
+        works = [partial(solve_alone, item) for item in items[1:]]
+        return first + run_in_parallel(works, threads, self._after_step)
 
     def solve(self, samples: Sequence[Sample], steps: int = _SOLVING_STEPS) -> list[Sample]:
         """Return samples with the change that explains their images and prior in full.
@@ -295,17 +335,20 @@ class Posterior:
 
         By one standard deviation; of smooth fields by a random one.
         """
-        held, shares = self._held, {}
         displacements = self._displacements(self._unknowns)
+        keys, pulls = [], []
         for part in self._scene.imperfect.parts:
             numbers = self._unknowns.zeros()
             values = numbers.common if part.is_common else numbers.separate
             size = part.places.stop - part.places.start
             values[..., part.places] = rng.normal(size=size) if size > 1 else 1.0
-            pull = self._linear.pull(-self._linear.push(numbers))
-            moved = self._displacements(held._change(pull, _ROUGHLY))
-            shares[part.key] = largest_share(moved, displacements)
-        return shares
+            keys.append(part.key)
+            pulls.append(self._linear.pull(-self._linear.push(numbers)))
+
+        def share(held: Posterior, pull: Unknowns) -> float:
+            return largest_share(self._displacements(held._change(pull, _ROUGHLY)), displacements)
+
+        return dict(zip(keys, self._held._solve_each(share, pulls), strict=True))
 
     def _displacements(self, unknowns: Unknowns) -> FloatArray:
         """Displacement of each field, (M, 2, H, W), px of the scene."""
@@ -323,16 +366,23 @@ class Posterior:
         slope = self._linear.pull(rng.normal(size=self._scene.images.shape))
         return product(slope.flat(), self._change(slope, _ROUGHLY).flat())
 
-    def moved_by_beams(self, variations: FloatArray) -> Unknowns:
-        """Return the change of the unknowns if the beams differ from their sources.
+    def moved_by_beams(self, variations: Sequence[FloatArray]) -> list[Unknowns]:
+        """Return the changes of the unknowns if the beams differ from their sources.
 
         Parameters
         ----------
-        variations : ndarray, shape (L, …)
+        variations : sequence of ndarray, shape (L, …)
             Differences as shares of the beams, of the shape of the scene's beams.
         """
-        changes = self._scene.changed_by_beams(self._unknowns, self._counts, variations)
-        return self._change(self._linear.pull(changes), _MOVED_BY_BEAMS)
+        slopes = [
+            self._linear.pull(self._scene.changed_by_beams(self._unknowns, self._counts, each))
+            for each in variations
+        ]
+
+        def change(posterior: Posterior, slope: Unknowns) -> Unknowns:
+            return posterior._change(slope, _MOVED_BY_BEAMS)
+
+        return self._solve_each(change, slopes)
 
     def open_beams(
         self, variation: float, samples: Sequence[Sample], rng: np.random.Generator
@@ -368,14 +418,17 @@ class Posterior:
         weights = freed.prior.beam_weights
         unknowns = self._unknowns._replace(beam=np.zeros(weights.shape))
         posterior = Posterior(freed, unknowns, rng, self._after_step)
-        changes = []
+        slopes = []
         for sample in samples:
             residuals = sample.noise - self._linear.push(sample.change)
             pull = posterior._linear.pull(residuals).beam
             pull += np.sqrt(weights) * rng.normal(size=weights.shape)
-            slope = unknowns.zeros()._replace(beam=pull)
-            changes.append(posterior._change(slope, _OPEN_BEAMS))
-        return changes
+            slopes.append(unknowns.zeros()._replace(beam=pull))
+
+        def change(posterior: Posterior, slope: Unknowns) -> Unknowns:
+            return posterior._change(slope, _OPEN_BEAMS)
+
+        return posterior._solve_each(change, slopes)
 
     def log_volume(self, chances: Sequence[np.random.Generator]) -> float:
         """Return half the log-determinant of the Hessian relative to the prior of potentials.
@@ -646,7 +699,7 @@ def shifts_by_beam(
         )
         for _ in range(_BEAM_SAMPLES if has_open_beam else max(_BEAM_SAMPLES, enough))
     ]
-    changes = [posterior.moved_by_beams(0.01 * each) for each in variations]
+    changes = posterior.moved_by_beams([0.01 * each for each in variations])
     by_percent = _spread(scene, changes, data.size, length / 3)
     if not variation:
         return BeamShifts(variation, by_percent, 0 * by_percent)

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from napari_shadowinv._system.machine import available_threads, in_ranges, run_together
-from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
+from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.fitting import _ray_kernels as kernels
 from napari_shadowinv.fitting._ray_kernels import KNOT, MOST_RAYS
 
@@ -26,6 +26,7 @@ __all__ = ["KNOT", "Pulls", "RayModel", "at_rest"]
 
 _SHARED = 2.0  # spacings at rest: width of an edge where rays count in both pixels, evenly then
 _BANDS = 8  # of cells; each has an image of its own, so that threads do not change a sum
+_PARTS = 2  # of a Jacobian's rows, each with sums of its own
 _GUARD = 2  # px around the detector, for rays that miss it
 # Rays, rows of an image, and entries of a Jacobian that are worth a thread.
 _WORTH_A_THREAD, _WORTH_A_THREAD_ROWS, _WORTH_A_PRODUCT = 20_000, 200, 100_000
@@ -296,15 +297,18 @@ class RayModel:
             w, s and l: images with the shape `seen`.
         """
         pulls = [np.empty(self.seen) for _ in jacobians]
-        totals = [np.zeros(each.shape[1]) for each in jacobians]
+        totals = [np.zeros((_PARTS, each.shape[1])) for each in jacobians]
         works = []
         for k, (jacobian, change) in enumerate(zip(jacobians, changes, strict=True)):
             images = [each[k].reshape(-1) for each in (weights, slopes, lights, pulls)]
-            arguments: tuple[AnyArray, ...] = *_entries(jacobian), change, *images, totals[k]
-            works.append(partial(kernels.normal_times, *arguments))
+            rows = jacobian.shape[0]
+            for part in range(_PARTS):
+                bounds = rows * part // _PARTS, rows * (part + 1) // _PARTS
+                arguments = *bounds, *_entries(jacobian), change, *images, totals[k][part]
+                works.append(partial(kernels.normal_times, *arguments))
         threads = available_threads(self.threads)
         run_together(works, threads if jacobians[0].nnz > _WORTH_A_PRODUCT else 1)
-        return totals, pulls
+        return [total.sum(axis=0) for total in totals], pulls
 
     def displacement(self, potential: FloatArray) -> FloatArray:
         """Return -∇ψ in px at the pixels' centres, shape (2, H, W), in axis order (y, x)."""

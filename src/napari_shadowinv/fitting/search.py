@@ -53,6 +53,7 @@ _LAST_GAIN = 0.5  # in pixels of two, where it costs little
 _HELD_BEAM = 0.01  # spread of an unknown beam's cosines before the field has been found
 _HOPELESS, _CONTINUED = 3.0, 3  # times the best objective; at most so many go on
 _COARSE_SPACING, MIDDLE_SPACING = 1 / 3, 0.25
+_BLURRED, _SPACING_OF_BLURRED = 2.0, 0.5  # px: so wide a blur hides how far apart rays are
 _SPACINGS, _EXPLAINED = (0.2, 0.14), 1.05  # px, and the χ² for which the first is dense enough
 # With an instrument's numbers, an error of the model far below the noise changes the field.
 _SPACING_WITH_NUMBERS = 0.1  # px
@@ -144,7 +145,6 @@ def search(scene: Scene, starts: Sequence[Start], on_step: OnStep) -> list[Minim
     rough = replace(
         scene,
         smoothness=_COARSE_SMOOTHNESS * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1)),
-        spacing=_COARSE_SPACING,
     )
 
     def begin(start: Start) -> Minimum:
@@ -207,7 +207,8 @@ def _descend_stage(
     scene: Scene, minimum: Minimum, stage: tuple[int, float], on_step: OnStep
 ) -> Minimum:
     factor, blur = stage
-    now = replace(coarser(scene, factor), blur=blur)
+    spacing = _COARSE_SPACING if blur < _BLURRED else _SPACING_OF_BLURRED
+    now = replace(coarser(scene, factor), blur=blur, spacing=spacing)
     unknowns, value, _ = descend(
         now,
         Preconditioner(now).damp(minimum.in_pixels(factor)),
