@@ -153,6 +153,7 @@ _NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 2e-3, 400, 0.1
 # Numbers of rays are renewed after steps that gain more; other numbers change the objective by 1.
 _RENEWING_GAIN = 5.0
 _TRIED_STEPS = 3  # before a search may be hopeless
+_AS_EXPECTED = 0.1  # of a gain
 _MOST_PIXELS = 2_000_000  # of all images
 
 
@@ -321,6 +322,7 @@ def settle(
     modes: SoftModes | None = None,
     linear: Linear | None = None,
     to_beat: float | None = None,
+    is_rough: bool = False,
 ) -> tuple[Unknowns, float, int, bool]:
     """Minimise a scene's objective from nearby: Gauss-Newton steps, and a descent if they fail.
 
@@ -343,7 +345,10 @@ def settle(
     to_beat : float, optional
         An objective to compare with. Then only the objective matters, not the unknowns along a flat
         valley. A search is hopeless, and ends, if more than a third of its first distance is left
-        after three Gauss-Newton steps, or where these fail.
+        after three Gauss-Newton steps, if as much is expected to be left after the next, or where
+        these fail.
+    is_rough : bool, default False
+        Whether a Gauss-Newton step that gains what it was expected to is the last.
 
     Returns
     -------
@@ -381,6 +386,9 @@ def settle(
 
         down = -scales.transpose_times(slope).flat()
         step = solve(times, down, tolerance=tolerance, iterations=solving, modes=modes)
+        expected_gain = product(down, step) / 2
+        if value - expected_gain > hopeless:
+            break
         change = scales.times(now.like(step))
         for share in _SHARES_OF_STEP:
             trial = now.plus(now.like(share * change.flat()))
@@ -397,6 +405,9 @@ def settle(
         taken, shortened = taken + 1, shortened + (share < 1)
         gain = value - trial_value
         now, value, slope = trial, trial_value, trial_slope
+        is_as_expected = abs(gain - expected_gain) < _AS_EXPECTED * expected_gain
+        if is_rough and is_as_expected:
+            return now, _value_afresh(scene, now), taken, True
         # What the next step would gain is about the preconditioned square of the slope.
         after = scales.transpose_times(slope).flat()
         next_gain = product(after, modes.precondition(after)) / 2

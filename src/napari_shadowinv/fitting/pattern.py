@@ -352,7 +352,9 @@ def name_cause(
     def gain(rival: _Rival, on_step: OnStep) -> float:
         start = replace(best, unknowns=rival.unknowns, modes=SoftModes())
         alone = replace(rival.scene, threads=max(1, threads // len(rivals)))
-        end = settle_minimum(alone, start, on_step, "rivals", steps=_STEPS, to_beat=best.value)
+        end = settle_minimum(
+            alone, start, on_step, "rivals", steps=_STEPS, to_beat=best.value, is_rough=True
+        )
         return 2 * (best.value - end.value) - rival.free_numbers
 
     works = [partial(gain, rival) for rival in rivals]

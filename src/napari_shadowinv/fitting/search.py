@@ -257,7 +257,8 @@ def estimate_smoothness(
         smoothness = np.tile(FIRST_SMOOTHNESS, (len(smoothness), 1))
     response = scene.imperfect.of_response
     scene = replace(scene, smoothness=smoothness, held=scene.held | response)
-    end = settle_minimum(scene, _with_likely_numbers(scene, end), on_step)
+    likely = _with_likely_numbers(scene, end)
+    end = settle_minimum(scene, likely, on_step, is_rough=not is_fixed)
     if is_fixed and not response:
         return scene, end
     if not is_fixed:
@@ -284,7 +285,7 @@ def _settle_smoothness(
         if change < _SETTLED:
             break
         scene = replace(scene, smoothness=smoothness)
-        end = settle_minimum(scene, end, on_step)
+        end = settle_minimum(scene, end, on_step, is_rough=True)
     return smoothness, scene, end
 
 
@@ -358,6 +359,7 @@ def settle_minimum(
     least_gain: float = COARSE_GAIN,
     steps: int = _ROUND_STEPS,
     to_beat: float | None = None,
+    is_rough: bool = False,
 ) -> Minimum:
     """Return where a descent ends with other λ and κ, in the minimum's pixels, without blur."""
     middle = replace(coarser(scene, minimum.bin), spacing=MIDDLE_SPACING)
@@ -369,6 +371,7 @@ def settle_minimum(
         after_step=lambda now: on_step(name, now),
         modes=minimum.modes,
         to_beat=to_beat,
+        is_rough=is_rough,
     )
     return replace(
         minimum, unknowns=unknowns, value=value, displacement=_displacement(middle, unknowns)
