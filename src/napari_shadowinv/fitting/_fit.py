@@ -265,7 +265,8 @@ def fit(
             )
             ends = _with_numbers(tested, replace(best, unknowns=plain)).unknowns
             response = Posterior(middle, ends, rng, lambda: on_step("samples", value))
-            sensitivities = response.sensitivities(np.random.default_rng(options.seed))
+            exact = None if unsure.imperfect.parts else posterior
+            sensitivities = response.sensitivities(np.random.default_rng(options.seed), exact)
         evidence = float("nan")
         if options.evidence:
             evidence = log_evidence(scene, best, fields, options, on_step)

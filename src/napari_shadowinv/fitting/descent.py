@@ -147,7 +147,7 @@ _DESCENTS = 3  # with fixed numbers of rays each
 _FEW = 10  # steps, after which the numbers of rays still fit
 _MOST_NEWTON, _MOST_SHORTENED, _SHARES_OF_STEP = 8, 2, (1.0, 0.5, 0.25)  # of Gauss and Newton
 _NEWTON, _MOST_SOLVING = 0.02, 200  # how exactly each is found, and in how many steps
-_NEXT_GAIN = 0.3  # of the least gain; a step gains up to twice what is expected
+_NEXT_GAIN = 0.7  # of the least gain; a step gains up to twice what is expected
 # Fields and numbers of an instrument that explain an image alike lie along a flat valley.
 _NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 2e-3, 400, 0.1
 # Numbers of rays are renewed after steps that gain more; other numbers change the objective by 1.

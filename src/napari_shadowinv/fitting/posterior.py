@@ -330,11 +330,16 @@ class Posterior:
             rest = rest.plus(moved.like(-effects[key].flat()))
         return {"noise": rest, **effects}
 
-    def sensitivities(self, rng: np.random.Generator) -> dict[str, float]:
+    def sensitivities(
+        self, rng: np.random.Generator, exact: Posterior | None = None
+    ) -> dict[str, float]:
         """Return how far each imperfection would move the displacement, as a share of it (r.m.s.).
 
-        By one standard deviation; of smooth fields by a random one.
+        By one standard deviation; of smooth fields by a random one. `exact` has the same scene and
+        unknowns without the instrument, whose numbers are 0 here.
         """
+        respond = exact or self._held
+        none = respond._unknowns.zeros()
         displacements = self._displacements(self._unknowns)
         keys, pulls = [], []
         for part in self._scene.imperfect.parts:
@@ -343,12 +348,14 @@ class Posterior:
             size = part.places.stop - part.places.start
             values[..., part.places] = rng.normal(size=size) if size > 1 else 1.0
             keys.append(part.key)
-            pulls.append(self._linear.pull(-self._linear.push(numbers)))
+            pull = self._linear.pull(-self._linear.push(numbers))
+            pulls.append(pull._replace(common=none.common, separate=none.separate))
 
-        def share(held: Posterior, pull: Unknowns) -> float:
-            return largest_share(self._displacements(held._change(pull, _ROUGHLY)), displacements)
+        def share(respond: Posterior, pull: Unknowns) -> float:
+            moved = self._displacements(respond._change(pull, _ROUGHLY))
+            return largest_share(moved, displacements)
 
-        return dict(zip(keys, self._held._solve_each(share, pulls), strict=True))
+        return dict(zip(keys, respond._solve_each(share, pulls), strict=True))
 
     def _displacements(self, unknowns: Unknowns) -> FloatArray:
         """Displacement of each field, (M, 2, H, W), px of the scene."""
