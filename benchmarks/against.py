@@ -6,7 +6,8 @@ OLD_PYTHON is the interpreter of an environment with the other version. Both run
 after the other in turn, each in one process that has done it once before. A row for each work: the
 median seconds of both, how many times as fast this version is (median of the ratios of
 neighbouring runs, and their range), and the displacement's L2 error in both, in per cent: against
-the truth, or for real frames against this version's with one site a pixel.
+the truth, or for real frames against this version's with one site a pixel; and the most memory of
+each process so far.
 
 Images are those of the reference toroid, and of the burner's frames where they are present. Those
 of fits are rays counted as in fit.py, for minutes; `--only "fit, three"` counts those of one fit.
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import resource
 import subprocess
 import sys
 import tempfile
@@ -26,7 +28,8 @@ from typing import Any
 
 import numpy as np
 
-from fit import Case, blobs, cases, pixels
+from fit import SIDE, Case, FloatArray, blobs, cases, counted
+from fit_large import BLOBS, RAYS
 
 FRAMES = 6  # of the stream
 Work = dict[str, Any]
@@ -50,14 +53,16 @@ def works(folder: Path, only: str) -> dict[str, Work]:
         found[name] = {"image": name, "truth": f"{name} truth"}
         if noise:
             found[f"{name}, 40,000 sites"] = {**found[name], "n_sites": 40_000}
-    for title, case, noise in fits():
+    for title, case, noise, size in fits():
         name = f"fit, {title}"
         if only not in name:
             continue
-        images = case.images()
+        strengths = case.strengths()
+        images = case.images() if size == (SIDE, SIDE) else large_images(case, size)
         images += noise * np.random.default_rng(0).normal(size=images.shape)
-        np.savez(folder / name, images=images, strengths=case.strengths())
-        np.save(folder / f"{name} truth.npy", [field(*pixels()) for field in case.fields])
+        np.savez(folder / name, images=images, strengths=strengths)
+        places = np.indices(size, dtype=np.float64)
+        np.save(folder / f"{name} truth.npy", [field(*places) for field in case.fields])
         found[name] = {"fit": name, "noise": noise, "keywords": case.keywords}
     files = sorted((DATA / "burner").rglob("*.bmp"))
     if not files:
@@ -78,13 +83,20 @@ def works(folder: Path, only: str) -> dict[str, Work]:
     return found
 
 
-def fits() -> Iterator[tuple[str, Case, float]]:
-    """Images of fits, with their noise."""
+def fits() -> Iterator[tuple[str, Case, float, tuple[int, int]]]:
+    """Images of fits, with their noise and shape."""
     folded = [(700, 14, 24, 0.35, 80, 70), (650, 22, 13, 0.2, 125, 130)]
-    yield "three energies", Case("", [blobs(folded)], (14.7, 30.0, 60.0)), 0.1
+    small, three = (SIDE, SIDE), (14.7, 30.0, 60.0)
+    yield "three energies", Case("", [blobs(folded)], three), 0.1, small
+    # The first object reaches the edge of the image, the second does not.
+    inside = [(500, 14, 20, 0.35, 85, 85), (450, 20, 13, 0.2, 115, 115)]
+    yield "three energies, object inside", Case("", [blobs(inside)], three), 0.1, small
     by_name = {case.name: case for case in cases()}
-    yield "unknown beam", by_name["toroid 97, beam unknown, 2 energies"], 0.03
-    yield "B and E", by_name["B and E × 1, four energies"], 0.03
+    yield "unknown beam", by_name["toroid 97, beam unknown, 2 energies"], 0.03, small
+    yield "B and E", by_name["B and E × 1, four energies"], 0.03, small
+    yield "576×464, two energies", Case("", [blobs(BLOBS)], (14.7, 30.0)), 0.05, (464, 576)
+    mild = [(1500, 90, 90, 0, 450, 500), (-1200, 70, 80, 0, 600, 620)]
+    yield "1024², two energies", Case("", [blobs(mild)], (14.7, 30.0)), 0.05, (1024, 1024)
 
 
 def worker() -> None:
@@ -139,7 +151,13 @@ def worker() -> None:
     for line in sys.stdin:
         work = json.loads(line)
         done = streamed if "stream" in work else fitted if "fit" in work else inverted
-        print(json.dumps(done(work, Path(work["folder"]))), flush=True)
+        gigabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+        print(json.dumps([*done(work, Path(work["folder"])), gigabytes]), flush=True)
+
+
+def large_images(case: Case, size: tuple[int, int]) -> FloatArray:
+    lines = case.strengths()
+    return np.stack([counted(case.fields, line, case.beam, size, RAYS) for line in lines])
 
 
 class Version:
@@ -151,7 +169,7 @@ class Version:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
 
-    def does(self, work: Work) -> tuple[float, float]:
+    def does(self, work: Work) -> tuple[float, float, float]:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps(work) + "\n")
@@ -159,21 +177,22 @@ class Version:
         answer = self._process.stdout.readline()
         if not answer:
             sys.exit(f"the worker of {self._process.args} has ended: see its message above")
-        seconds, error = json.loads(answer)
-        return seconds, error
+        seconds, error, gigabytes = json.loads(answer)
+        return seconds, error, gigabytes
 
     def close(self) -> None:
         self._process.communicate()
 
 
 def row(name: str, work: Work, old: Version, new: Version, repeat: int) -> str:
-    error = new.does(work)[1], old.does(work)[1]
-    pairs = [(old.does(work)[0], new.does(work)[0]) for _ in range(repeat)]
-    before, now = np.median(pairs, axis=0)
-    ratios = np.array([one / other for one, other in pairs])
-    errors = " | ".join("" if np.isnan(one) else f"{100 * one:.2f}" for one in (error[1], error[0]))
+    _, *errors = zip(new.does(work), old.does(work), strict=True)
+    pairs = [(old.does(work), new.does(work)) for _ in range(repeat)]
+    (before, *_, of_before), (now, *_, of_now) = np.median(pairs, axis=0)
+    ratios = np.array([one[0] / other[0] for one, other in pairs])
+    shares = ("" if np.isnan(one) else f"{100 * one:.2f}" for one in reversed(errors[0]))
     times = f"{np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})"
-    return f"| {name} | {before:.3f} | {now:.3f} | {times} | {errors} |"
+    memory = f"{of_before:.2f} | {of_now:.2f}"
+    return f"| {name} | {before:.3f} | {now:.3f} | {times} | {' | '.join(shares)} | {memory} |"
 
 
 def main() -> None:
@@ -197,8 +216,11 @@ def main() -> None:
         if any(work.get("truth") == "finest" for work in chosen.values()):
             finest = {"image": "frame", "source": "beam", "truth": "finest", "n_sites": 1_069_056}
             new.does({**finest, **common})
-        print("| work | s before | s now | times as fast | error before, % | error now, % |")
-        print(f"|{'---|' * 6}")
+        print(
+            "| work | s before | s now | times as fast | error before, % | error now, % "
+            "| GB before | GB now |"
+        )
+        print(f"|{'---|' * 8}")
         for name, work in chosen.items():
             print(row(name, {**work, **common}, old, new, given.repeat), flush=True)
         old.close()
