@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import solveh_banded
 
 from napari_shadowinv._system.arrays import PIXELS, VECTOR, check_finite, plain_array
-from napari_shadowinv._system.machine import available_threads
+from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import FloatArray, IntArray
@@ -348,6 +348,7 @@ def _edge_integral(row: int, cut: float, ya: float, xa: float, yb: float, xb: fl
 MIN_SIDE_PX = 4
 # Fixed, so that sums are formed in the same order whatever the number of threads.
 _N_BANDS = 32
+_MIN_PIXELS_PER_THREAD = 1 << 15
 _BYTES_PER_PIXEL = 72  # displacement, its spline, source and image
 
 
@@ -438,7 +439,7 @@ def synthetic_image(
     return image
 
 
-def jacobian_determinant(displacement: ArrayLike) -> FloatArray:
+def jacobian_determinant(displacement: ArrayLike, *, threads: int | None = None) -> FloatArray:
     """Area, in the image, of each pixel of the source: det(1 + ∇d), Eq. 4 of the paper.
 
     Negative where the map has folded the pixel over; small where rays crowd. Made of
@@ -449,6 +450,8 @@ def jacobian_determinant(displacement: ArrayLike) -> FloatArray:
     ----------
     displacement : array_like, shape (2, H, W)
         Displacement at the pixels' centres in px, axis order (y, x).
+    threads : int, optional
+        Threads to use. Default: all cores. The result does not depend on it.
 
     Returns
     -------
@@ -461,10 +464,39 @@ def jacobian_determinant(displacement: ArrayLike) -> FloatArray:
     >>> float(jacobian_determinant([0.5 * y, 1.0 * x])[2, 2])
     3.0
     """
-    field = _finite_displacement(displacement)
-    (dy_dy, dy_dx), (dx_dy, dx_dx) = (np.gradient(component, edge_order=2) for component in field)
-    determinant: FloatArray = (1 + dy_dy) * (1 + dx_dx) - dy_dx * dx_dy
+    field = np.ascontiguousarray(_finite_displacement(displacement))
+    if not field.flags.writeable:  # the kernel is compiled for one type
+        field = field.copy()
+    determinant = np.empty((field.shape[1], field.shape[2]))
+    rows = max(1, _MIN_PIXELS_PER_THREAD // determinant.shape[1])
+    threads = available_threads(threads)
+    in_ranges(_fill_determinant, len(determinant), threads, field, determinant, smallest=rows)
     return determinant
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _neighbors_in_line(i: int, size: int) -> tuple[int, int, int, float, float, float]:
+    """Return three places along a line, and their weights for the derivative at i."""
+    if i == 0:
+        return 0, 1, 2, -1.5, 2.0, -0.5
+    if i == size - 1:
+        return i, i - 1, i - 2, 1.5, -2.0, 0.5
+    return i + 1, i - 1, i, 0.5, -0.5, 0.0
+
+
+@njit(nogil=True, cache=True)
+def _fill_determinant(start: int, stop: int, field: FloatArray, determinant: FloatArray) -> None:
+    """Compute the determinant in rows `start` to `stop`."""
+    height, width = determinant.shape
+    for y in range(start, stop):
+        y0, y1, y2, of_y0, of_y1, of_y2 = _neighbors_in_line(y, height)
+        for x in range(width):
+            x0, x1, x2, of_x0, of_x1, of_x2 = _neighbors_in_line(x, width)
+            dy_dy = of_y0 * field[0, y0, x] + of_y1 * field[0, y1, x] + of_y2 * field[0, y2, x]
+            dx_dy = of_y0 * field[1, y0, x] + of_y1 * field[1, y1, x] + of_y2 * field[1, y2, x]
+            dy_dx = of_x0 * field[0, y, x0] + of_x1 * field[0, y, x1] + of_x2 * field[0, y, x2]
+            dx_dx = of_x0 * field[1, y, x0] + of_x1 * field[1, y, x1] + of_x2 * field[1, y, x2]
+            determinant[y, x] = (1 + dy_dy) * (1 + dx_dx) - dy_dx * dx_dy
 
 
 def checked_displacement(displacement: ArrayLike) -> FloatArray:
