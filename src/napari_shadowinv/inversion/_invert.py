@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -44,6 +45,11 @@ __all__ = ["count_sites", "invert", "plan_sites"]
 # Steps of the read-out: up to the first number the potential, then the re-projection.
 _READ_STEPS = 30
 _STEPS = 100
+
+# Of the re-projection, along one axis. The map is smooth over the spacing of the sites; with these
+# the re-projection changes by less than 0.1 % (r.m.s.) if their number is doubled.
+_TILES_PER_SPACING = 5.5
+_MOST_TILES = 4  # per pixel
 
 
 def plan_sites(
@@ -401,11 +407,12 @@ class _Fields:
     reprojection: FloatArray  # in units of the source's `power_of_two`
     flux_left: dict[str, float]
     flux_entered: dict[str, float]
+    threads: int | None
 
     @cached_property
     def jacobian(self) -> FloatArray:
         """Determinant of the map's Jacobian."""
-        return jacobian_determinant(self.displacement)
+        return jacobian_determinant(self.displacement, threads=self.threads)
 
 
 def _read_fields(
@@ -422,11 +429,13 @@ def _read_fields(
         return synthetic_image(
             displacement,
             source,
+            rays_per_pixel=tiles**2,
             threads=options.threads,
             on_progress=lambda news: report_share(news.step / (news.total or 1), first, last),
         )
 
     report_share(0, 0, _READ_STEPS)
+    tiles = int(np.clip(math.ceil(_TILES_PER_SPACING / solution.level.spacing), 2, _MOST_TILES))
     potential, displacement = read_out(
         solution, options, lambda share: report_share(share, 0, _READ_STEPS)
     )
@@ -449,6 +458,7 @@ def _read_fields(
         np.ascontiguousarray(reprojection),
         flux_left,
         flux_entered,
+        options.threads,
     )
 
 
