@@ -33,6 +33,7 @@ PARTS = {  # function, or file of functions, that belong to a part of the work
     "relocate": "repair of the triangulation",
     "hilbert_permutation": "triangulations from scratch",
     "_integrate_edges": "integrals along borders",
+    "_integrate_moments": "integrals along borders",
     "_power_centres": "integrals along borders",
     "_list_edges": "integrals along borders",
     "_sum_over_cells": "integrals along borders",

@@ -131,8 +131,8 @@ def _moments_in_pixel(
     return _moments(f, g, k, y0, y1)
 
 
-@njit(nogil=True, cache=True)
-def _walk_inside(
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+def walk_inside(
     image: FloatArray,
     sums: FloatArray,
     ya: float,
@@ -142,28 +142,24 @@ def _walk_inside(
     with_moments: bool,
 ) -> tuple[float, float, float, float, float]:
     """Integrate along a segment inside the image, as `walk_edge` does."""
-    height, width = image.shape
-    row, column = min(int(ya), height - 1), min(int(xa), width - 1)
-    last_row, last_column = min(int(yb), height - 1), min(int(xb), width - 1)
+    last_y, last_x = image.shape[0] - 1, image.shape[1] - 1
+    row, column = min(int(ya), last_y), min(int(xa), last_x)
+    last_row, last_column = min(int(yb), last_y), min(int(xb), last_x)
     dy, dx = yb - ya, xb - xa
-    length = math.sqrt(dy * dy + dx * dx)
     down, right = 1 if last_row > row else 0, 1 if last_column > column else 0
-    per_y = 1.0 / dy if last_row != row else 0.0
-    per_x = 1.0 / dx if last_column != column else 0.0
-    crossings = abs(last_row - row) + abs(last_column - column)
+    # shares of the segment where it next leaves its row and its column of pixels
+    per_y, per_x = 1.0 / dy, 1.0 / dx
+    t_y = (row + down - ya) * per_y if row != last_row else 2.0
+    t_x = (column + right - xa) * per_x if column != last_column else 2.0
     flux = mass = moment_y = moment_x = inertia = 0.0
     t, y, x = 0.0, ya, xa
-    for crossing in range(crossings + 1):
-        # where the segment leaves this pixel, and whether by its upper or lower side
-        t_y = (row + down - ya) * per_y if row != last_row else 2.0
-        t_x = (column + right - xa) * per_x if column != last_column else 2.0
+    for _ in range(abs(last_row - row) + abs(last_column - column)):
         t_next = min(t_y, t_x)
         y_next, x_next = ya + t_next * dy, xa + t_next * dx
-        if crossing == crossings:
-            t_next, y_next, x_next = 1.0, yb, xb
-        value = image[row, column]
+        i, j = np.uint64(row), np.uint64(column)  # without a test for negative indices
+        value = image[i, j]
         flux += value * (t_next - t)
-        mass += (sums[0, row, column] + value * (0.5 * (x + x_next) - column)) * (y_next - y)
+        mass += (sums[0, i, j] + value * (0.5 * (x + x_next) - column)) * (y_next - y)
         if with_moments:
             of_y, of_x, of_both = _moments_in_pixel(sums, value, row, column, y, x, y_next, x_next)
             moment_y += of_y
@@ -171,10 +167,21 @@ def _walk_inside(
             inertia += of_both
         if t_x <= t_y:
             column += 2 * right - 1
+            t_x = (column + right - xa) * per_x if column != last_column else 2.0
         else:
             row += 2 * down - 1
+            t_y = (row + down - ya) * per_y if row != last_row else 2.0
         t, y, x = t_next, y_next, x_next
-    return flux * length, mass, moment_y, moment_x, inertia
+    i, j = np.uint64(row), np.uint64(column)
+    value = image[i, j]
+    flux += value * (1.0 - t)
+    mass += (sums[0, i, j] + value * (0.5 * (x + xb) - column)) * (yb - y)
+    if with_moments:
+        of_y, of_x, of_both = _moments_in_pixel(sums, value, row, column, y, x, yb, xb)
+        moment_y += of_y
+        moment_x += of_x
+        inertia += of_both
+    return flux * math.sqrt(dy * dy + dx * dx), mass, moment_y, moment_x, inertia
 
 
 @njit(nogil=True, cache=True)
@@ -197,7 +204,7 @@ def _walk_right_of_image(
     return mass, moment_y, moment_x, inertia
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def walk_edge(
     image: FloatArray,
     sums: FloatArray,
@@ -213,7 +220,7 @@ def walk_edge(
     """
     height, width = image.shape
     if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
-        return _walk_inside(image, sums, ya, xa, yb, xb, with_moments)
+        return walk_inside(image, sums, ya, xa, yb, xb, with_moments)
 
     start, end = _inside_share(ya, yb - ya, height)
     if start >= end:
@@ -225,7 +232,7 @@ def walk_edge(
     if t_leave > t_enter:
         y0, x0 = _point(ya, xa, yb, xb, t_enter, height, width)
         y1, x1 = _point(ya, xa, yb, xb, t_leave, height, width)
-        flux, mass, moment_y, moment_x, inertia = _walk_inside(
+        flux, mass, moment_y, moment_x, inertia = walk_inside(
             image, sums, y0, x0, y1, x1, with_moments
         )
     # the parts before and after the image count where they are to its right

@@ -26,7 +26,7 @@ from scipy.sparse import csr_array
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.compiler import njit
-from napari_shadowinv.geometry.density import Density, walk_edge
+from napari_shadowinv.geometry.density import Density, walk_edge, walk_inside
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
@@ -75,7 +75,7 @@ def _list_edges(vertices: Indices, neighbors: Indices, pairs: Indices, sides: In
     return count
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _integrate_edges(
     start: int,
     stop: int,
@@ -83,22 +83,43 @@ def _integrate_edges(
     centres: FloatArray,
     image: FloatArray,
     sums: FloatArray,
-    with_moments: bool,
+    integrals: FloatArray,
+) -> None:
+    """Walk each border; columns of `integrals`: flux and mass."""
+    height, width = float(image.shape[0]), float(image.shape[1])
+    for e in range(start, stop):
+        left, right = np.uint32(sides[e, 0]), np.uint32(sides[e, 1])
+        ya, xa = centres[left, 0] + 0.5, centres[left, 1] + 0.5
+        yb, xb = centres[right, 0] + 0.5, centres[right, 1] + 0.5
+        if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
+            flux, mass, _, _, _ = walk_inside(image, sums, ya, xa, yb, xb, False)
+        else:
+            flux, mass, _, _, _ = walk_edge(image, sums, ya, xa, yb, xb, False)
+        integrals[e, 0], integrals[e, 1] = flux, mass
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _integrate_moments(
+    start: int,
+    stop: int,
+    sides: Indices,
+    centres: FloatArray,
+    image: FloatArray,
+    sums: FloatArray,
     integrals: FloatArray,
 ) -> None:
     """Walk each border; columns of `integrals`: flux, mass, moments y and x, inertia."""
+    height, width = float(image.shape[0]), float(image.shape[1])
     for e in range(start, stop):
-        t_left, t_right = sides[e, 0], sides[e, 1]
-        ya, xa = centres[t_left, 0] + 0.5, centres[t_left, 1] + 0.5
-        yb, xb = centres[t_right, 0] + 0.5, centres[t_right, 1] + 0.5
-        walk = walk_edge(image, sums, ya, xa, yb, xb, with_moments)
-        integrals[e, 0], integrals[e, 1] = walk[0], walk[1]
-        if with_moments:
-            integrals[e, 2], integrals[e, 3], integrals[e, 4] = (
-                walk[2],
-                walk[3],
-                walk[4],
-            )
+        left, right = np.uint32(sides[e, 0]), np.uint32(sides[e, 1])
+        ya, xa = centres[left, 0] + 0.5, centres[left, 1] + 0.5
+        yb, xb = centres[right, 0] + 0.5, centres[right, 1] + 0.5
+        if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
+            walk = walk_inside(image, sums, ya, xa, yb, xb, True)
+        else:
+            walk = walk_edge(image, sums, ya, xa, yb, xb, True)
+        integrals[e, 0], integrals[e, 1], integrals[e, 2] = walk[0], walk[1], walk[2]
+        integrals[e, 3], integrals[e, 4] = walk[3], walk[4]
 
 
 @njit(nogil=True, cache=True)
@@ -179,8 +200,9 @@ class PowerDiagram:
         # pairs of neighbouring sites, shape (e, 2); indices ≥ n are ghosts outside
         self.edges, sides = _edges_of(triangulation)
         self._integrals = np.empty((len(sides), 5 if with_moments else 2))
-        borders = sides, self.vertices, density.image, density.sums, with_moments
-        in_ranges(_integrate_edges, len(sides), threads, *borders, self._integrals)
+        integrate = _integrate_moments if with_moments else _integrate_edges
+        borders = sides, self.vertices, density.image, density.sums, self._integrals
+        in_ranges(integrate, len(sides), threads, *borders)
 
     def _cell_sums(self, column: int) -> FloatArray:
         sums = np.zeros(self.n_sites)
