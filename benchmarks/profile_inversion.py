@@ -35,7 +35,7 @@ PARTS = {  # function, or file of functions, that belong to a part of the work
     "_integrate_edges": "integrals along borders",
     "_integrate_moments": "integrals along borders",
     "_power_centres": "integrals along borders",
-    "_list_edges": "integrals along borders",
+    "list_edges": "integrals along borders",
     "_sum_over_cells": "integrals along borders",
     "_laplacian": "Hessian",
     "_coarsening.py": "multigrid: set-up",

@@ -60,21 +60,6 @@ def _power_centres(
         centres[t, 1] = points[a, 1] + (c_lift * by - b_lift * cy) / double_area
 
 
-@njit(nogil=True, cache=True)
-def _list_edges(vertices: Indices, neighbors: Indices, pairs: Indices, sides: Indices) -> int:
-    """List each inner edge once as (site a, site b, triangle left of ab, the other)."""
-    count = 0
-    for t in range(vertices.shape[0]):
-        for k in range(3):
-            neighbour = neighbors[t, k]
-            if neighbour > t:
-                pairs[count, 0] = vertices[t, (k + 1) % 3]
-                pairs[count, 1] = vertices[t, (k + 2) % 3]
-                sides[count, 0], sides[count, 1] = t, neighbour
-                count += 1
-    return count
-
-
 @njit(nogil=True, cache=True, error_model="numpy")
 def _integrate_edges(
     start: int,
@@ -198,7 +183,7 @@ class PowerDiagram:
         dual = triangulation.points, triangulation.weights, self.n_sites, triangulation.vertices
         in_ranges(_power_centres, len(self.vertices), threads, *dual, self.vertices)
         # pairs of neighbouring sites, shape (e, 2); indices ≥ n are ghosts outside
-        self.edges, sides = _edges_of(triangulation)
+        self.edges, sides = triangulation.edges
         self._integrals = np.empty((len(sides), 5 if with_moments else 2))
         integrate = _integrate_moments if with_moments else _integrate_edges
         borders = sides, self.vertices, density.image, density.sums, self._integrals
@@ -256,7 +241,7 @@ class PowerDiagram:
 
         The first of the pair lies to its left. Read it before the triangulation is updated.
         """
-        _, sides = _edges_of(self._triangulation)
+        _, sides = self._triangulation.edges
         return np.asarray(self.vertices[sides])
 
     def cell(self, site: int) -> FloatArray:
@@ -265,7 +250,7 @@ class PowerDiagram:
         Cells at the rim reach far beyond the image. An empty cell has no corners. Call it before
         the triangulation is updated.
         """
-        pairs, sides = _edges_of(self._triangulation)
+        pairs, sides = self._triangulation.edges
         around = {}
         for k in np.flatnonzero((pairs == site).any(axis=1)):
             t_left, t_right = sides[k]
@@ -279,14 +264,6 @@ class PowerDiagram:
             triangle = around[triangle]
             if triangle == first:
                 return np.array(corners)
-
-
-def _edges_of(triangulation: RegularTriangulation) -> tuple[Indices, Indices]:
-    """Return the two sites of each inner edge, and the triangles left and right of it."""
-    most = 3 * len(triangulation.vertices) // 2 + 3
-    pairs, sides = np.empty((most, 2), np.int32), np.empty((most, 2), np.int32)
-    count = _list_edges(triangulation.vertices, triangulation.neighbors, pairs, sides)
-    return pairs[:count], sides[:count]
 
 
 @njit(nogil=True, cache=True)

@@ -579,3 +579,20 @@ def compact(mesh: Mesh) -> None:
     counters[SIZE] = size
     counters[FREE] = -1
     counters[LAST] = min(counters[LAST], size - 1)
+
+
+@kernel_that_allocates
+def list_edges(corners: Indices, twins: Indices) -> tuple[Indices, Indices]:
+    """List each inner edge once: its two sites a and b; the triangle left of ab and the other."""
+    most = corners.size // 2 + 3
+    pairs, sides = np.empty((most, 2), np.int32), np.empty((most, 2), np.int32)
+    count = 0
+    for t in range(corners.size // 3):
+        e = 3 * t
+        for h in range(e, e + 3):
+            if twins[h] > h:
+                pairs[count, 0] = corners[after(h)]
+                pairs[count, 1] = corners[before(h)]
+                sides[count, 0], sides[count, 1] = t, twins[h] // 3
+                count += 1
+    return pairs[:count], sides[:count]

@@ -53,9 +53,15 @@ def compile_rest() -> None:
         "vertices": mesh.simplices.astype(np.int32),
         "neighbors": mesh.neighbors.astype(np.int32),
     }
-    for array in arrays.values():
+    t, k = np.nonzero(arrays["neighbors"] > np.arange(len(mesh.neighbors))[:, None])
+    ends = [arrays["vertices"][t, (k + shift) % 3] for shift in (1, 2)]
+    edges = (
+        np.stack(ends, axis=1),
+        np.stack([t, arrays["neighbors"][t, k]], axis=1).astype(np.int32),
+    )
+    for array in (*arrays.values(), *edges):
         array.flags.writeable = False  # as those of a triangulation, which is another type
-    triangulation: Any = SimpleNamespace(sites=arrays["points"][:-4], **arrays)
+    triangulation: Any = SimpleNamespace(sites=arrays["points"][:-4], edges=edges, **arrays)
     values = sites.sum(axis=1)
     gradients = fit_gradients(triangulation, values, np.ones_like(sites))
     surface = CloughTocher(triangulation, values, gradients)

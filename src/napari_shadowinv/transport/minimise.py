@@ -205,6 +205,8 @@ def newton(
     else:
         diagram = objective.diagram(weights)
     weights, diagram = _even_out(objective, weights, diagram)
+    # Steps keep this gauge. The triangulation belongs to the weights after any step.
+    weights = objective.in_gauge(weights)
     residual = objective.residual(diagram)
     keep = 0.5 * min(float(diagram.masses.min() / mass.mean()), float(mass.min() / mass.mean()))
     errors = [_length(mass - diagram.masses)]
@@ -239,7 +241,7 @@ def newton(
             break
     converged = residual <= tolerance
     reason = "" if converged else reason
-    return Solution(objective.in_gauge(weights), residual, len(errors) - 1, converged, reason)
+    return Solution(weights, residual, len(errors) - 1, converged, reason)
 
 
 def _even_out(
