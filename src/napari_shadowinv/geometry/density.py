@@ -11,7 +11,7 @@ pixel the integrands are polynomials of degree 3 at most, for which Simpson's ru
 exact. Beyond the image the density is zero, so polygons need no clipping.
 
 - make a density of an image: `Density`
-- the same density on smaller pixels: `split_pixels`
+- the same density on smaller pixels: `split_pixels`; a coarser one: `merge_pixels`
 - integrals along one edge: `walk_edge` (a numba kernel)
 """
 
@@ -39,27 +39,28 @@ class Density:
     # Kernels use corner coordinates: pixel (i, j) covers [i, i+1] × [j, j+1], half a
     # pixel more than the image's own coordinates, in which pixel centres are integers.
 
-    image: FloatArray  # (H, W)
-    # (3, H, W + 1): ∫ I, ∫ s I and ∫ s² I over each row, from 0 to the left edge of each pixel;
+    image: FloatArray  # (h, w): flux of each pixel, or of each square of pixels
+    # (3, h, w + 1): ∫ I, ∫ s I and ∫ s² I over each row, from 0 to the left edge of each pixel;
     # the last column holds the whole row's.
     sums: FloatArray
+    side: int = 1  # of the squares, in px
 
     @classmethod
-    def from_image(cls, image: ArrayLike, *, threads: int | None = 1) -> Density:
-        """Make a density of an image of shape (H, W)."""
+    def from_image(cls, image: ArrayLike, *, side: int = 1, threads: int | None = 1) -> Density:
+        """Make a density of an image, shape (H / side, W / side), of squares with a side in px."""
         values = np.ascontiguousarray(image, dtype=np.float64)
         if not values.flags.writeable:  # the kernel is compiled for one type
             values = values.copy()
         height, width = values.shape
-        sums = np.zeros((3, height, width + 1))
+        sums = np.empty((3, height, width + 1))
         rows = max(1, _MIN_PIXELS_PER_THREAD // max(1, width))
         in_ranges(_sum_rows, height, available_threads(threads), values, sums, smallest=rows)
-        return cls(values, sums)
+        return cls(values, sums, side)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Shape (H, W) of the image."""
-        return self.image.shape[0], self.image.shape[1]
+        """Shape (H, W) of the image in pixels."""
+        return self.side * self.image.shape[0], self.side * self.image.shape[1]
 
     @property
     def region(self) -> FloatArray:
@@ -75,6 +76,8 @@ class Density:
 @njit(nogil=True, cache=True)
 def _sum_rows(start: int, stop: int, image: FloatArray, sums: FloatArray) -> None:
     for row in range(start, stop):
+        for k in range(3):
+            sums[k, row, 0] = 0.0
         for column in range(image.shape[1]):
             value = image[row, column]
             right = column + 1
@@ -82,6 +85,23 @@ def _sum_rows(start: int, stop: int, image: FloatArray, sums: FloatArray) -> Non
             sums[0, row, right] = sums[0, row, column] + value
             sums[1, row, right] = sums[1, row, column] + value * (column + 0.5)
             sums[2, row, right] = sums[2, row, column] + value * (column * right + 1 / 3)
+
+
+def side_of_squares(shape: tuple[int, int], largest: float) -> int:
+    """Return the largest power of two, up to a side in px, whose squares tile an image."""
+    side = 1
+    while 2 * side <= largest and shape[0] % (2 * side) == shape[1] % (2 * side) == 0:
+        side *= 2
+    return side
+
+
+def merge_pixels(image: FloatArray, side: int) -> FloatArray:
+    """Return the flux of the squares that tile an image, shape (H / side, W / side)."""
+    if side == 1:
+        return image
+    height, width = image.shape
+    rows = image.reshape(height // side, side, width).sum(axis=1)
+    return np.asarray(rows.reshape(len(rows), width // side, side).sum(axis=2))
 
 
 def split_pixels(image: FloatArray, factor: int) -> FloatArray:

@@ -186,8 +186,14 @@ class PowerDiagram:
         self.edges, sides = triangulation.edges
         self._integrals = np.empty((len(sides), 5 if with_moments else 2))
         integrate = _integrate_moments if with_moments else _integrate_edges
-        borders = sides, self.vertices, density.image, density.sums, self._integrals
+        # seen in units of the density's squares
+        side = density.side
+        ends = self.vertices if side == 1 else (self.vertices + 0.5) / side - 0.5
+        borders = sides, ends, density.image, density.sums, self._integrals
         in_ranges(integrate, len(sides), threads, *borders)
+        if side > 1:
+            units = np.array([1 / side, 1.0, side, side, side**2])
+            self._integrals *= units[: self._integrals.shape[1]]
 
     def _cell_sums(self, column: int) -> FloatArray:
         sums = np.zeros(self.n_sites)

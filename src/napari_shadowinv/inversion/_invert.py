@@ -297,6 +297,7 @@ def invert(
                 margin=plan.margin,
                 needed=budget.needed if adaptive else None,
                 solved=solutions,
+                target=budget.target,
             )
         answer = solutions[-1]
         with _measure_time("read-out", seconds):

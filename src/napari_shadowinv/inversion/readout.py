@@ -29,7 +29,7 @@ from scipy.sparse import csr_array
 from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.geometry.compiler import njit
-from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.density import Density, merge_pixels, side_of_squares
 from napari_shadowinv.geometry.interpolation import (
     WIDTH,
     CloughTocher,
@@ -151,6 +151,7 @@ class LinearReadout:
         return np.stack([padded, *-np.array(np.gradient(padded))])[:, 1:-1, 1:-1]
 
 
+_SQUARES_PER_SPACING = 8
 _RESOLUTION = 2.5  # spacing over the finest wave that a level resolves within 5 %
 _DIMMEST = 1e-3  # of the mean, for a logarithm
 _MIN_ROUNDNESS = 0.3  # double area by the longest side's square; of an equilateral triangle 0.87
@@ -176,6 +177,7 @@ class LinearResponse:
         diagram = objective.diagram(solution.weights)
         self.flux = diagram.masses
         self._triangulation, self._threads = objective.triangulation, solution.threads
+        self._side = side_of_squares(solution.level.shape, self.spacing / _SQUARES_PER_SPACING)
         self.area = self._masses(np.ones(solution.level.shape), self._triangulation)
         ground = objective.ground(solution.weights)
         self._network = diagram.laplacian()
@@ -211,7 +213,8 @@ class LinearResponse:
         return (self.area if mask.all() else self._masses(used, self._triangulation)), of_source
 
     def _masses(self, image: FloatArray, triangulation: RegularTriangulation) -> FloatArray:
-        density = Density.from_image(image, threads=self._threads)
+        squares = merge_pixels(image, self._side)
+        density = Density.from_image(squares, side=self._side, threads=self._threads)
         return PowerDiagram(triangulation, density, threads=self._threads).masses
 
     def to(self, changes: FloatArray) -> FloatArray:
