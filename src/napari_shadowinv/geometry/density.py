@@ -106,6 +106,8 @@ def merge_pixels(image: FloatArray, side: int) -> FloatArray:
 
 def split_pixels(image: FloatArray, factor: int) -> FloatArray:
     """Split each pixel of an image into factor × factor that share its flux evenly."""
+    if factor == 1:
+        return image
     return np.repeat(np.repeat(image / factor**2, factor, axis=0), factor, axis=1)
 
 
