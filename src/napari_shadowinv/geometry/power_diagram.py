@@ -25,13 +25,13 @@ from scipy.sparse import csr_array
 
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.geometry.compiler import njit
+from napari_shadowinv.geometry.compiler import kernel, njit
 from napari_shadowinv.geometry.density import Density, walk_edge, walk_inside
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _power_centres(
     start: int,
     stop: int,
@@ -42,8 +42,11 @@ def _power_centres(
     centres: FloatArray,
 ) -> None:
     """Find the point of equal power distance to the three sites of each triangle."""
-    for t in range(start, stop):
-        a, b, c = vertices[t]
+    # Indices without a sign need no test for negative ones.
+    n = np.uint32(n)
+    for t in range(np.uint32(start), np.uint32(stop)):
+        a, b = np.uint32(vertices[t, 0]), np.uint32(vertices[t, 1])
+        c = np.uint32(vertices[t, 2])
         # Seen from a ghost far away, two sites that are close together differ in few digits.
         if a >= n:
             a, b, c = b, c, a
@@ -107,12 +110,12 @@ def _integrate_moments(
         integrals[e, 3], integrals[e, 4] = walk[3], walk[4]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _sum_over_cells(edges: Indices, integrals: FloatArray, column: int, sums: FloatArray) -> None:
     """Add one column of the edges' integrals to the two cells of each edge."""
-    n = sums.shape[0]
+    n = np.uint32(sums.shape[0])
     for e in range(edges.shape[0]):
-        a, b = edges[e, 0], edges[e, 1]
+        a, b = np.uint32(edges[e, 0]), np.uint32(edges[e, 1])
         value = integrals[e, column]
         if a < n:
             sums[a] += value
@@ -127,11 +130,7 @@ def _laplacian(
     """Assemble the graph Laplacian with conductance flux / (2 |r_i - r_j|) as CSR."""
     starts = np.ones(n + 1, np.int32)
     starts[0] = 0
-    for e in range(edges.shape[0]):
-        a, b = edges[e, 0], edges[e, 1]
-        if a < n and b < n and integrals[e, 0] > 0:
-            starts[a + 1] += 1
-            starts[b + 1] += 1
+    _count_ties(edges, integrals, starts[1:])
     for i in range(n):
         starts[i + 1] += starts[i]
     filled = starts[:-1] + 1
@@ -139,17 +138,43 @@ def _laplacian(
     values = np.zeros(starts[n])
     for i in range(n):
         columns[starts[i]] = i
+    _fill_laplacian(points, edges, integrals, starts, filled, columns, values)
+    return values, columns, starts
+
+
+@kernel
+def _count_ties(edges: Indices, integrals: FloatArray, counts: Indices) -> None:
+    n = np.uint32(counts.size)
     for e in range(edges.shape[0]):
-        a, b = edges[e, 0], edges[e, 1]
+        a, b = np.uint32(edges[e, 0]), np.uint32(edges[e, 1])
+        if a < n and b < n and integrals[e, 0] > 0:
+            counts[a] += 1
+            counts[b] += 1
+
+
+@kernel
+def _fill_laplacian(
+    points: FloatArray,
+    edges: Indices,
+    integrals: FloatArray,
+    starts: Indices,
+    filled: Indices,
+    columns: Indices,
+    values: FloatArray,
+) -> None:
+    n = np.uint32(filled.size)
+    for e in range(edges.shape[0]):
+        a, b = np.uint32(edges[e, 0]), np.uint32(edges[e, 1])
         if a < n and b < n and integrals[e, 0] > 0:
             dy, dx = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1]
             conductance = integrals[e, 0] / (2 * np.sqrt(dy * dy + dx * dx))
-            for i, j in ((a, b), (b, a)):
-                columns[filled[i]] = j
-                values[filled[i]] = -conductance
-                filled[i] += 1
-                values[starts[i]] += conductance
-    return values, columns, starts
+            of_a, of_b = np.uint32(filled[a]), np.uint32(filled[b])
+            columns[of_a], values[of_a] = b, -conductance
+            columns[of_b], values[of_b] = a, -conductance
+            filled[a] += 1
+            filled[b] += 1
+            values[np.uint32(starts[a])] += conductance
+            values[np.uint32(starts[b])] += conductance
 
 
 class PowerDiagram:

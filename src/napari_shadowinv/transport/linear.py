@@ -80,44 +80,45 @@ def _empty_network(nodes: int, entries: int) -> Network:
     )
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _put_lower_first(
     neighbors: Indices, conductances: NDArray[np.float32], begin: int, end: int, node: int
 ) -> tuple[int, float]:
     """Sort a row to lower and upper neighbours; return where the upper begin, and the sum."""
-    middle = begin
+    middle = np.uint32(begin)
     degree = 0.0
-    for k in range(begin, end):
+    for k in range(np.uint32(begin), np.uint32(end)):
         neighbor, conductance = neighbors[k], conductances[k]
         degree += conductance
         neighbors[k], conductances[k] = neighbors[middle], conductances[middle]
         neighbors[middle], conductances[middle] = neighbor, conductance
-        middle += 1 if neighbor < node else 0
-    return middle, degree
+        middle += np.uint32(1) if neighbor < node else np.uint32(0)
+    return int(middle), degree
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _read_laplacian(
     starts: Indices, columns: Indices, values: FloatArray, network: Network
 ) -> None:
     """Take the conductors out of a sparse matrix, in any order of columns."""
-    neighbors, conductances = network.neighbors, network.conductances
-    end = 0
-    for i in range(starts.shape[0] - 1):
+    row_starts, middles, neighbors, conductances, degrees, inverse_degrees = network
+    one = np.uint32(1)
+    end = np.uint32(0)
+    for i in range(np.uint32(starts.shape[0] - 1)):
         begin = end
-        for k in range(starts[i], starts[i + 1]):
+        for k in range(np.uint32(starts[i]), np.uint32(starts[i + one])):
             if columns[k] != i and values[k] < 0.0:
                 neighbors[end] = columns[k]
                 conductances[end] = -values[k]
-                end += 1
-        network.starts[i + 1] = end
+                end += one
+        row_starts[i + one] = end
         middle, degree = _put_lower_first(neighbors, conductances, begin, end, i)
-        network.middles[i] = middle
-        network.degrees[i] = degree
-        network.inverse_degrees[i] = 1.0 / degree
+        middles[i] = middle
+        degrees[i] = degree
+        inverse_degrees[i] = 1.0 / degree if degree != 0.0 else np.inf
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _pair(
     network: Network,
     start: int,
@@ -140,20 +141,20 @@ def _pair(
     for i in range(start, stop):
         groups[i] = -1
     count = first
-    for i in range(start, stop):
+    for i in range(np.uint32(start), np.uint32(stop)):
         if groups[i] >= 0:
             continue
         free = taken = -1
         free_tie = taken_tie = weakest
-        for k in range(starts[i], starts[i + 1]):
-            neighbour = neighbors[k]
+        for k in range(np.uint32(starts[i]), np.uint32(starts[i + 1])):
+            neighbour = np.uint32(neighbors[k])
             group = groups[neighbour]
             if group < 0:
                 tie = conductances[k] * (inverses[i] + inverses[neighbour])
                 if tie > free_tie:
                     free, free_tie = neighbour, tie
             else:
-                tie = conductances[k] * (inverses[i] + group_inverses[group - first])
+                tie = conductances[k] * (inverses[i] + group_inverses[np.uint32(group - first)])
                 if tie > taken_tie:
                     taken, taken_tie = group, tie
         if free >= 0:
@@ -172,7 +173,7 @@ def _pair(
     return count
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _join_inverses(a: float, b: float) -> float:
     """Return the inverse of the sum of two numbers from their inverses."""
     return a * b / (a + b)
@@ -203,30 +204,47 @@ def _contract(
 ) -> None:
     """Make each group one node, with the sums of the conductances between groups."""
     begins, members = _list_members(start, stop, groups, first, last)
-    starts, _, neighbors, conductances, _, _ = fine
-    coarse_neighbors, coarse_conductances = coarse.neighbors, coarse.conductances
     place = np.full(last - first, -1, np.int32)
-    end = int(coarse.starts[first])
-    for g in range(first, last):
+    _sum_conductances(fine, groups, begins, members, place, coarse, first)
+
+
+@kernel
+def _sum_conductances(
+    fine: Network,
+    groups: Indices,
+    begins: Indices,
+    members: Indices,
+    place: Indices,
+    coarse: Network,
+    first: int,
+) -> None:
+    """Fill the rows of the coarse network; `place` is -1 for each group."""
+    starts, _, neighbors, conductances, _, _ = fine
+    rows, middles, coarse_neighbors, coarse_conductances, degrees, inverse_degrees = coarse
+    one, offset = np.uint32(1), np.uint32(first)
+    end = rows[first]
+    for group in range(np.uint32(place.size)):
         begin = end
-        for m in range(begins[g - first], begins[g - first + 1]):
-            node = members[m]
-            for k in range(starts[node], starts[node + 1]):
-                adjacent = groups[neighbors[k]]
+        g = group + offset
+        for m in range(np.uint32(begins[group]), np.uint32(begins[group + one])):
+            node = np.uint32(members[m])
+            for k in range(np.uint32(starts[node]), np.uint32(starts[node + one])):
+                adjacent = np.uint32(groups[np.uint32(neighbors[k])])
                 if adjacent == g:
                     continue
-                at = place[adjacent - first]
+                at = place[adjacent - offset]
                 if at < begin:
-                    place[adjacent - first] = end
-                    coarse_neighbors[end], coarse_conductances[end] = adjacent, conductances[k]
+                    place[adjacent - offset] = end
+                    coarse_neighbors[np.uint32(end)] = adjacent
+                    coarse_conductances[np.uint32(end)] = conductances[k]
                     end += 1
                 else:
-                    coarse_conductances[at] += conductances[k]
-        coarse.starts[g + 1] = end
+                    coarse_conductances[np.uint32(at)] += conductances[k]
+        rows[g + one] = end
         middle, degree = _put_lower_first(coarse_neighbors, coarse_conductances, begin, end, g)
-        coarse.middles[g] = middle
-        coarse.degrees[g] = degree
-        coarse.inverse_degrees[g] = 1.0 / degree
+        middles[g] = middle
+        degrees[g] = degree
+        inverse_degrees[g] = 1.0 / degree if degree != 0.0 else np.inf
 
 
 def build_hierarchy(laplacian: csr_array, ground: FloatArray | None = None) -> Hierarchy:
