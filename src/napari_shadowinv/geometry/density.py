@@ -112,6 +112,13 @@ def split_pixels(image: FloatArray, factor: int) -> FloatArray:
 
 
 @njit(nogil=True, cache=True, inline="always")
+def _first_moments(f: Triple, g: float, y0: float, y1: float) -> tuple[float, float]:
+    """Return ∫ y F dy and ∫ G dy by Simpson's rule; g is the sum for G."""
+    y_mid, sixth = 0.5 * (y0 + y1), (y1 - y0) / 6
+    return sixth * (y0 * f[0] + 4 * y_mid * f[1] + y1 * f[2]), sixth * g
+
+
+@njit(nogil=True, cache=True, inline="always")
 def _moments(f: Triple, g: float, k: Triple, y0: float, y1: float) -> Triple:
     """Return ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy by Simpson's rule; g is the sum for G."""
     (f0, f_mid, f1), (k0, k_mid, k1) = f, k
@@ -133,18 +140,22 @@ def _moments_in_pixel(
     x0: float,
     y1: float,
     x1: float,
+    with_inertia: bool,
 ) -> Triple:
-    """Return ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy over a segment inside one pixel."""
+    """Return ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy, if wanted, over a segment inside one pixel."""
     x_left = float(column)
     x_left2 = x_left * x_left
-    x_left3 = x_left2 * x_left
     x_mid = 0.5 * (x0 + x1)
-    f_base = sums[0, row, column] - value * x_left
-    g_base = sums[1, row, column] - value * x_left2 / 2
-    k_base = sums[2, row, column] - value * x_left3 / 3
+    i, j = np.uint64(row), np.uint64(column)
+    f_base = sums[0, i, j] - value * x_left
+    g_base = sums[1, i, j] - value * x_left2 / 2
     g = 6 * g_base + value * (x0 * x0 + 4 * x_mid * x_mid + x1 * x1) / 2
-    third = value / 3
     f = f_base + value * x0, f_base + value * x_mid, f_base + value * x1
+    if not with_inertia:
+        of_y, of_x = _first_moments(f, g, y0, y1)
+        return of_y, of_x, 0.0
+    k_base = sums[2, i, j] - value * (x_left2 * x_left) / 3
+    third = value / 3
     k = (
         k_base + third * x0 * x0 * x0,
         k_base + third * x_mid * x_mid * x_mid,
@@ -162,6 +173,7 @@ def walk_inside(
     yb: float,
     xb: float,
     with_moments: bool,
+    with_inertia: bool,
 ) -> tuple[float, float, float, float, float]:
     """Integrate along a segment inside the image, as `walk_edge` does."""
     last_y, last_x = image.shape[0] - 1, image.shape[1] - 1
@@ -183,7 +195,9 @@ def walk_inside(
         flux += value * (t_next - t)
         mass += (sums[0, i, j] + value * (0.5 * (x + x_next) - column)) * (y_next - y)
         if with_moments:
-            of_y, of_x, of_both = _moments_in_pixel(sums, value, row, column, y, x, y_next, x_next)
+            of_y, of_x, of_both = _moments_in_pixel(
+                sums, value, row, column, y, x, y_next, x_next, with_inertia
+            )
             moment_y += of_y
             moment_x += of_x
             inertia += of_both
@@ -199,7 +213,9 @@ def walk_inside(
     flux += value * (1.0 - t)
     mass += (sums[0, i, j] + value * (0.5 * (x + xb) - column)) * (yb - y)
     if with_moments:
-        of_y, of_x, of_both = _moments_in_pixel(sums, value, row, column, y, x, yb, xb)
+        of_y, of_x, of_both = _moments_in_pixel(
+            sums, value, row, column, y, x, yb, xb, with_inertia
+        )
         moment_y += of_y
         moment_x += of_x
         inertia += of_both
@@ -242,7 +258,7 @@ def walk_edge(
     """
     height, width = image.shape
     if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
-        return walk_inside(image, sums, ya, xa, yb, xb, with_moments)
+        return walk_inside(image, sums, ya, xa, yb, xb, with_moments, with_moments)
 
     start, end = _inside_share(ya, yb - ya, height)
     if start >= end:
@@ -255,7 +271,7 @@ def walk_edge(
         y0, x0 = _point(ya, xa, yb, xb, t_enter, height, width)
         y1, x1 = _point(ya, xa, yb, xb, t_leave, height, width)
         flux, mass, moment_y, moment_x, inertia = walk_inside(
-            image, sums, y0, x0, y1, x1, with_moments
+            image, sums, y0, x0, y1, x1, with_moments, with_moments
         )
     # the parts before and after the image count where they are to its right
     for t0, t1 in ((start, t_enter), (t_leave, end)):

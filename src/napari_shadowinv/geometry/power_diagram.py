@@ -18,9 +18,11 @@ cells, so the cells tile the image to rounding.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from napari_shadowinv._system.machine import available_threads, in_ranges
@@ -43,14 +45,14 @@ def _power_centres(
 ) -> None:
     """Find the point of equal power distance to the three sites of each triangle."""
     # Indices without a sign need no test for negative ones.
-    n = np.uint32(n)
+    first_ghost = np.uint32(n)
     for t in range(np.uint32(start), np.uint32(stop)):
         a, b = np.uint32(vertices[t, 0]), np.uint32(vertices[t, 1])
         c = np.uint32(vertices[t, 2])
         # Seen from a ghost far away, two sites that are close together differ in few digits.
-        if a >= n:
+        if a >= first_ghost:
             a, b, c = b, c, a
-        if a >= n:
+        if a >= first_ghost:
             a, b, c = b, c, a
         by, bx = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
         cy, cx = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1]
@@ -80,7 +82,7 @@ def _integrate_edges(
         ya, xa = centres[left, 0] + 0.5, centres[left, 1] + 0.5
         yb, xb = centres[right, 0] + 0.5, centres[right, 1] + 0.5
         if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
-            flux, mass, _, _, _ = walk_inside(image, sums, ya, xa, yb, xb, False)
+            flux, mass, _, _, _ = walk_inside(image, sums, ya, xa, yb, xb, False, False)
         else:
             flux, mass, _, _, _ = walk_edge(image, sums, ya, xa, yb, xb, False)
         integrals[e, 0], integrals[e, 1] = flux, mass
@@ -96,18 +98,35 @@ def _integrate_moments(
     sums: FloatArray,
     integrals: FloatArray,
 ) -> None:
-    """Walk each border; columns of `integrals`: flux, mass, moments y and x, inertia."""
+    """Walk each border; columns of `integrals`: flux, mass, moments y and x."""
     height, width = float(image.shape[0]), float(image.shape[1])
     for e in range(start, stop):
         left, right = np.uint32(sides[e, 0]), np.uint32(sides[e, 1])
         ya, xa = centres[left, 0] + 0.5, centres[left, 1] + 0.5
         yb, xb = centres[right, 0] + 0.5, centres[right, 1] + 0.5
         if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
-            walk = walk_inside(image, sums, ya, xa, yb, xb, True)
+            walk = walk_inside(image, sums, ya, xa, yb, xb, True, False)
         else:
             walk = walk_edge(image, sums, ya, xa, yb, xb, True)
-        integrals[e, 0], integrals[e, 1], integrals[e, 2] = walk[0], walk[1], walk[2]
-        integrals[e, 3], integrals[e, 4] = walk[3], walk[4]
+        integrals[e, 0], integrals[e, 1] = walk[0], walk[1]
+        integrals[e, 2], integrals[e, 3] = walk[2], walk[3]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _integrate_inertia(
+    start: int,
+    stop: int,
+    sides: Indices,
+    centres: FloatArray,
+    image: FloatArray,
+    sums: FloatArray,
+    integrals: FloatArray,
+) -> None:
+    """Walk each border for the moment of inertia, the only column of `integrals`."""
+    for e in range(start, stop):
+        ya, xa = centres[sides[e, 0], 0] + 0.5, centres[sides[e, 0], 1] + 0.5
+        yb, xb = centres[sides[e, 1], 0] + 0.5, centres[sides[e, 1], 1] + 0.5
+        integrals[e, 0] = walk_edge(image, sums, ya, xa, yb, xb, True)[4]
 
 
 @kernel
@@ -209,32 +228,39 @@ class PowerDiagram:
         in_ranges(_power_centres, len(self.vertices), threads, *dual, self.vertices)
         # pairs of neighbouring sites, shape (e, 2); indices ≥ n are ghosts outside
         self.edges, sides = triangulation.edges
-        self._integrals = np.empty((len(sides), 5 if with_moments else 2))
+        self._sides, self._density, self._threads = sides, density, threads
         integrate = _integrate_moments if with_moments else _integrate_edges
-        # seen in units of the density's squares
-        side = density.side
-        ends = self.vertices if side == 1 else (self.vertices + 0.5) / side - 0.5
-        borders = sides, ends, density.image, density.sums, self._integrals
-        in_ranges(integrate, len(sides), threads, *borders)
-        if side > 1:
-            units = np.array([1 / side, 1.0, side, side, side**2])
-            self._integrals *= units[: self._integrals.shape[1]]
+        powers = np.array([-1, 0, 1, 1] if with_moments else [-1, 0])
+        self._integrals = self._integrate(integrate, powers)
 
-    def _cell_sums(self, column: int) -> FloatArray:
+    def _integrate(self, walk: Callable[..., None], powers: NDArray[np.int64]) -> FloatArray:
+        """Integrate along the borders; each column has a power of the length in its unit."""
+        density, sides = self._density, self._sides
+        side = float(density.side)
+        integrals = np.empty((len(sides), len(powers)))
+        # seen in units of the density's squares
+        ends = self.vertices if side == 1 else (self.vertices + 0.5) / side - 0.5
+        borders = sides, ends, density.image, density.sums, integrals
+        in_ranges(walk, len(sides), self._threads, *borders)
+        if side > 1:
+            integrals *= side**powers
+        return integrals
+
+    def _cell_sums(self, integrals: FloatArray, column: int) -> FloatArray:
         sums = np.zeros(self.n_sites)
-        _sum_over_cells(self.edges, self._integrals, column, sums)
+        _sum_over_cells(self.edges, integrals, column, sums)
         return sums
 
     @cached_property
     def masses(self) -> FloatArray:
         """Flux in each cell, shape (n,): S(V_i) or T(P_i) of the paper."""
-        return self._cell_sums(1)
+        return self._cell_sums(self._integrals, 1)
 
     @cached_property
     def _first_moments(self) -> FloatArray:
         if not self._with_moments:
             raise ValueError("this diagram was made without moments: pass with_moments=True")
-        corner = np.stack([self._cell_sums(2), self._cell_sums(3)], axis=1)
+        corner = np.stack([self._cell_sums(self._integrals, column) for column in (2, 3)], axis=1)
         return corner - 0.5 * self.masses[:, None]
 
     @cached_property
@@ -252,7 +278,8 @@ class PowerDiagram:
         site = self.sites + 0.5
         corner = self._first_moments + 0.5 * self.masses[:, None]
         shifted = (site**2).sum(axis=1) * self.masses - 2 * (site * corner).sum(axis=1)
-        inertia: FloatArray = self._cell_sums(4) + shifted
+        integrals = self._integrate(_integrate_inertia, np.array([2]))
+        inertia: FloatArray = self._cell_sums(integrals, 0) + shifted
         return inertia
 
     def laplacian(self) -> csr_array:

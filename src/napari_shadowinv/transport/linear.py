@@ -82,7 +82,11 @@ def _empty_network(nodes: int, entries: int) -> Network:
 
 @kernel
 def _put_lower_first(
-    neighbors: Indices, conductances: NDArray[np.float32], begin: int, end: int, node: int
+    neighbors: Indices,
+    conductances: NDArray[np.float32],
+    begin: int | np.uint32,
+    end: int | np.uint32,
+    node: int | np.uint32,
 ) -> tuple[int, float]:
     """Sort a row to lower and upper neighbours; return where the upper begin, and the sum."""
     middle = np.uint32(begin)
@@ -152,7 +156,7 @@ def _pair(
             if group < 0:
                 tie = conductances[k] * (inverses[i] + inverses[neighbour])
                 if tie > free_tie:
-                    free, free_tie = neighbour, tie
+                    free, free_tie = int(neighbour), tie
             else:
                 tie = conductances[k] * (inverses[i] + group_inverses[np.uint32(group - first)])
                 if tie > taken_tie:
@@ -489,8 +493,8 @@ def _ascend(start: int, stop: int, network: Network, parents: Indices, vectors: 
     """Add the next level's correction and sweep backward."""
     starts, _, neighbors, conductances, _, inverse_degrees = network
     residual, x = vectors.residual, vectors.correction
-    for i in range(np.uint32(start), np.uint32(stop)):
-        x[i] += x[np.uint32(parents[i])]
+    for j in range(np.uint32(start), np.uint32(stop)):
+        x[j] += x[np.uint32(parents[j])]
     for node in range(stop - 1, start - 1, -1):
         i = np.uint32(node)
         total = residual[i]
