@@ -30,7 +30,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
-from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
@@ -356,8 +355,32 @@ def _invert_coarsest(network: Network, start: int, stop: int, *, grounded: bool)
 
 def require_connected(graph: csr_array) -> None:
     """Raise a RuntimeError if a symmetric matrix falls into several blocks."""
-    if connected_components(graph, directed=False, return_labels=False) > 1:
+    starts, columns = (
+        indices.astype(np.int32, copy=False) for indices in (graph.indptr, graph.indices)
+    )
+    if _count_reached(starts, columns) < graph.shape[0]:
         raise RuntimeError(_NOT_CONNECTED)
+
+
+@njit(nogil=True, cache=True)
+def _count_reached(starts: Indices, columns: Indices) -> int:
+    """Count the nodes that are connected with the first."""
+    n = starts.size - 1
+    is_reached = np.zeros(n, np.bool_)
+    queue = np.zeros(n, np.int32)
+    count = min(n, 1)
+    is_reached[:count] = True
+    done = 0
+    while done < count:
+        node = queue[done]
+        done += 1
+        for k in range(starts[node], starts[node + 1]):
+            neighbor = columns[k]
+            if not is_reached[neighbor]:
+                is_reached[neighbor] = True
+                queue[count] = neighbor
+                count += 1
+    return count
 
 
 @njit(nogil=True, cache=True)
