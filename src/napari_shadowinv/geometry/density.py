@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,9 +41,9 @@ class Density:
     # pixel more than the image's own coordinates, in which pixel centres are integers.
 
     image: FloatArray  # (h, w): flux of each pixel, or of each square of pixels
-    # (3, h, w + 1): ∫ I, ∫ s I and ∫ s² I over each row, from 0 to the left edge of each pixel;
-    # the last column holds the whole row's.
-    sums: FloatArray
+    # (2, h, w + 1): ∫ I and ∫ s I over each row, from 0 to the left edge of each pixel; the last
+    # column holds the whole row's.
+    first_sums: FloatArray
     side: int = 1  # of the squares, in px
 
     @classmethod
@@ -52,10 +53,18 @@ class Density:
         if not values.flags.writeable:  # the kernel is compiled for one type
             values = values.copy()
         height, width = values.shape
-        sums = np.empty((3, height, width + 1))
+        sums = np.empty((2, height, width + 1))
         rows = max(1, _MIN_PIXELS_PER_THREAD // max(1, width))
         in_ranges(_sum_rows, height, available_threads(threads), values, sums, smallest=rows)
         return cls(values, sums, side)
+
+    @cached_property
+    def sums(self) -> FloatArray:
+        """The same with ∫ s² I for moments of inertia, shape (3, h, w + 1)."""
+        height, width = self.image.shape
+        sums = np.empty((3, height, width + 1))
+        _sum_rows(0, height, self.image, sums)
+        return sums
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -70,13 +79,13 @@ class Density:
     @property
     def total(self) -> float:
         """The image's flux."""
-        return float(self.sums[0, :, -1].sum())
+        return float(self.first_sums[0, :, -1].sum())
 
 
 @njit(nogil=True, cache=True)
 def _sum_rows(start: int, stop: int, image: FloatArray, sums: FloatArray) -> None:
     for row in range(start, stop):
-        for k in range(3):
+        for k in range(sums.shape[0]):
             sums[k, row, 0] = 0.0
         for column in range(image.shape[1]):
             value = image[row, column]
@@ -84,7 +93,8 @@ def _sum_rows(start: int, stop: int, image: FloatArray, sums: FloatArray) -> Non
             # ∫ s ds and ∫ s² ds over the pixel
             sums[0, row, right] = sums[0, row, column] + value
             sums[1, row, right] = sums[1, row, column] + value * (column + 0.5)
-            sums[2, row, right] = sums[2, row, column] + value * (column * right + 1 / 3)
+            if sums.shape[0] > 2:
+                sums[2, row, right] = sums[2, row, column] + value * (column * right + 1 / 3)
 
 
 def side_of_squares(shape: tuple[int, int], largest: float) -> int:
@@ -224,7 +234,7 @@ def walk_inside(
 
 @njit(nogil=True, cache=True)
 def _walk_right_of_image(
-    image: FloatArray, sums: FloatArray, ya: float, yb: float
+    image: FloatArray, sums: FloatArray, ya: float, yb: float, with_inertia: bool
 ) -> tuple[float, float, float, float]:
     """Integrate from row position ya to yb beyond the right edge, where F is the row's sum."""
     height, width = image.shape
@@ -233,7 +243,8 @@ def _walk_right_of_image(
     mass = moment_y = moment_x = inertia = 0.0
     for row in range(min(int(low), height - 1), min(int(high), height - 1) + 1):
         y0, y1 = max(low, float(row)), min(high, row + 1.0)
-        f, g, k = sums[0, row, width], sums[1, row, width], sums[2, row, width]
+        f, g = sums[0, row, width], sums[1, row, width]
+        k = sums[2, row, width] if with_inertia else 0.0
         of_y, of_x, of_both = _moments((f, f, f), 6 * g, (k, k, k), y0, y1)
         mass += sign * f * (y1 - y0)
         moment_y += sign * of_y
@@ -254,11 +265,27 @@ def walk_edge(
 ) -> tuple[float, float, float, float, float]:
     """Integrate along the segment from (ya, xa) to (yb, xb), in corner coordinates.
 
-    Returns ∫ I ds, ∫ F dy, and if `with_moments`, else 0, ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy.
+    The moments need all three sums. Returns ∫ I ds, ∫ F dy, and if `with_moments`, else 0,
+    ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy.
     """
+    return walk_clipped(image, sums, ya, xa, yb, xb, with_moments, with_moments)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def walk_clipped(
+    image: FloatArray,
+    sums: FloatArray,
+    ya: float,
+    xa: float,
+    yb: float,
+    xb: float,
+    with_moments: bool,
+    with_inertia: bool,
+) -> tuple[float, float, float, float, float]:
+    """Integrate as `walk_edge` does; only the inertia, else 0, needs the third of the sums."""
     height, width = image.shape
     if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
-        return walk_inside(image, sums, ya, xa, yb, xb, with_moments, with_moments)
+        return walk_inside(image, sums, ya, xa, yb, xb, with_moments, with_inertia)
 
     start, end = _inside_share(ya, yb - ya, height)
     if start >= end:
@@ -271,14 +298,14 @@ def walk_edge(
         y0, x0 = _point(ya, xa, yb, xb, t_enter, height, width)
         y1, x1 = _point(ya, xa, yb, xb, t_leave, height, width)
         flux, mass, moment_y, moment_x, inertia = walk_inside(
-            image, sums, y0, x0, y1, x1, with_moments, with_moments
+            image, sums, y0, x0, y1, x1, with_moments, with_inertia
         )
     # the parts before and after the image count where they are to its right
     for t0, t1 in ((start, t_enter), (t_leave, end)):
         if t1 > t0 and xa + 0.5 * (t0 + t1) * (xb - xa) > 0.5 * width:
             y0, _ = _point(ya, xa, yb, xb, t0, height, width)
             y1, _ = _point(ya, xa, yb, xb, t1, height, width)
-            of_mass, of_y, of_x, of_both = _walk_right_of_image(image, sums, y0, y1)
+            of_mass, of_y, of_x, of_both = _walk_right_of_image(image, sums, y0, y1, with_inertia)
             mass += of_mass
             if with_moments:
                 moment_y += of_y

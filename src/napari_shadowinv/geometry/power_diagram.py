@@ -28,7 +28,12 @@ from scipy.sparse import csr_array
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.compiler import kernel, njit
-from napari_shadowinv.geometry.density import Density, walk_edge, walk_inside
+from napari_shadowinv.geometry.density import (
+    Density,
+    walk_clipped,
+    walk_edge,
+    walk_inside,
+)
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
@@ -84,7 +89,7 @@ def _integrate_edges(
         if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
             flux, mass, _, _, _ = walk_inside(image, sums, ya, xa, yb, xb, False, False)
         else:
-            flux, mass, _, _, _ = walk_edge(image, sums, ya, xa, yb, xb, False)
+            flux, mass, _, _, _ = walk_clipped(image, sums, ya, xa, yb, xb, False, False)
         integrals[e, 0], integrals[e, 1] = flux, mass
 
 
@@ -107,7 +112,7 @@ def _integrate_moments(
         if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
             walk = walk_inside(image, sums, ya, xa, yb, xb, True, False)
         else:
-            walk = walk_edge(image, sums, ya, xa, yb, xb, True)
+            walk = walk_clipped(image, sums, ya, xa, yb, xb, True, False)
         integrals[e, 0], integrals[e, 1] = walk[0], walk[1]
         integrals[e, 2], integrals[e, 3] = walk[2], walk[3]
 
@@ -231,16 +236,18 @@ class PowerDiagram:
         self._sides, self._density, self._threads = sides, density, threads
         integrate = _integrate_moments if with_moments else _integrate_edges
         powers = np.array([-1, 0, 1, 1] if with_moments else [-1, 0])
-        self._integrals = self._integrate(integrate, powers)
+        self._integrals = self._integrate(integrate, density.first_sums, powers)
 
-    def _integrate(self, walk: Callable[..., None], powers: NDArray[np.int64]) -> FloatArray:
+    def _integrate(
+        self, walk: Callable[..., None], sums: FloatArray, powers: NDArray[np.int64]
+    ) -> FloatArray:
         """Integrate along the borders; each column has a power of the length in its unit."""
         density, sides = self._density, self._sides
         side = float(density.side)
         integrals = np.empty((len(sides), len(powers)))
         # seen in units of the density's squares
         ends = self.vertices if side == 1 else (self.vertices + 0.5) / side - 0.5
-        borders = sides, ends, density.image, density.sums, integrals
+        borders = sides, ends, density.image, sums, integrals
         in_ranges(walk, len(sides), self._threads, *borders)
         if side > 1:
             integrals *= side**powers
@@ -278,7 +285,7 @@ class PowerDiagram:
         site = self.sites + 0.5
         corner = self._first_moments + 0.5 * self.masses[:, None]
         shifted = (site**2).sum(axis=1) * self.masses - 2 * (site * corner).sum(axis=1)
-        integrals = self._integrate(_integrate_inertia, np.array([2]))
+        integrals = self._integrate(_integrate_inertia, self._density.sums, np.array([2]))
         inertia: FloatArray = self._cell_sums(integrals, 0) + shifted
         return inertia
 
