@@ -300,6 +300,9 @@ def invert(
                 target=budget.target,
             )
         answer = solutions[-1]
+        if answer.converged:
+            with _measure_time("errors", seconds):
+                budget.free_target(solutions)
         with _measure_time("read-out", seconds):
             fields = _read_fields(plan, prepared, answer, options, report)
         more = adaptive and answer.converged and len(answer.weights) < levels.counts[-1]

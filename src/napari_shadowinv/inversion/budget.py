@@ -422,6 +422,11 @@ class Budget:
         """The image that the transport solves."""
         return Target.of(self._prepared.floored_image, self._plan.margin, self.options)
 
+    def free_target(self, solutions: Sequence[LevelSolution]) -> None:
+        """Compute the linear response, which needs the target, and free the target's memory."""
+        self._response(_usable_levels(solutions))
+        vars(self).pop("target", None)
+
     def needed(self, solutions: Sequence[LevelSolution]) -> float:
         """Return the factor by which more sites are needed.
 
