@@ -46,8 +46,8 @@ __all__ = ["count_sites", "invert", "plan_sites"]
 _READ_STEPS = 30
 _STEPS = 100
 
-# Of the re-projection, along one axis. The map is smooth over the spacing of the sites; with these
-# the re-projection changes by less than 0.1 % (r.m.s.) if their number is doubled.
+# Of the re-projection, along one axis. Against 64 rays per pixel it is off by 0.03 to 0.07 % of the
+# mean (r.m.s.) without folds, by 0.3 % with folds and noise, for sites 2 px apart.
 _TILES_PER_SPACING = 5.5
 _MOST_TILES = 4  # per pixel
 
