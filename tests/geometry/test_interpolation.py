@@ -132,3 +132,20 @@ def test_one_and_many_threads_agree_bit_for_bit():
         for threads in (1, 3)
     )
     np.testing.assert_array_equal(single, parallel)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_pixels_equal_points_for_any_number_of_threads(threads):
+    """Also beyond the hull, and on sites and edges that lie on pixels."""
+    rng = np.random.default_rng(3)
+    shape = 150, 400
+    sites = np.concatenate(
+        [rng.random((700, 2)) * (120, 380) + 10, np.indices((5, 5)).reshape(2, -1).T * 4.0 + 40]
+    )
+    values, gradients = rng.normal(size=len(sites)), rng.normal(size=(len(sites), 2))
+    surface = CloughTocher(RegularTriangulation(sites), values, gradients, threads=threads)
+    pixels = np.indices(shape, dtype=float).reshape(2, -1).T
+    expected = surface(pixels).reshape(shape)
+    np.testing.assert_allclose(surface.at_pixels(shape), expected, rtol=1e-7, atol=1e-7)
+    alone = CloughTocher(RegularTriangulation(sites), values, gradients, threads=1)
+    np.testing.assert_array_equal(surface.at_pixels(shape), alone.at_pixels(shape))

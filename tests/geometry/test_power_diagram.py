@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.polygons import clipped_to_rectangle, over_pixels, power_cell, power_diagram, shoelace
-from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.density import Density, merge_pixels, split_pixels
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
@@ -167,3 +167,19 @@ def test_hidden_site_has_an_empty_cell():
     assert len(diagram.cell(4)) == 0
     np.testing.assert_array_equal(diagram.centroids[4], sites[4])
     assert diagram.masses[:4].sum() == pytest.approx(49)
+
+
+def test_squares_of_pixels_equal_the_pixels_that_share_their_flux():
+    rng = np.random.default_rng(5)
+    few = rng.random((6, 9))
+    sites = rng.random((50, 2)) * (24, 36) - 0.5
+    weights = 4 * rng.random(50)
+    merged = Density.from_image(few, side=4)
+    pixels = Density.from_image(split_pixels(few, 4))
+    assert merged.shape == pixels.shape
+    expected, diagram = (power_diagram(sites, density, weights) for density in (pixels, merged))
+    for quantity in ("masses", "centroids", "inertia"):
+        actual, desired = getattr(diagram, quantity), getattr(expected, quantity)
+        np.testing.assert_allclose(actual, desired, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(diagram.laplacian().toarray(), expected.laplacian().toarray())
+    np.testing.assert_allclose(merge_pixels(pixels.image, 4), few)

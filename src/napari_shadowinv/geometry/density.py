@@ -11,7 +11,7 @@ pixel the integrands are polynomials of degree 3 at most, for which Simpson's ru
 exact. Beyond the image the density is zero, so polygons need no clipping.
 
 - make a density of an image: `Density`
-- the same density on smaller pixels: `split_pixels`
+- the same density on smaller pixels: `split_pixels`; a coarser one: `merge_pixels`
 - integrals along one edge: `walk_edge` (a numba kernel)
 """
 
@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,27 +40,36 @@ class Density:
     # Kernels use corner coordinates: pixel (i, j) covers [i, i+1] × [j, j+1], half a
     # pixel more than the image's own coordinates, in which pixel centres are integers.
 
-    image: FloatArray  # (H, W)
-    # (3, H, W + 1): ∫ I, ∫ s I and ∫ s² I over each row, from 0 to the left edge of each pixel;
-    # the last column holds the whole row's.
-    sums: FloatArray
+    image: FloatArray  # (h, w): flux of each pixel, or of each square of pixels
+    # (2, h, w + 1): ∫ I and ∫ s I over each row, from 0 to the left edge of each pixel; the last
+    # column holds the whole row's.
+    first_sums: FloatArray
+    side: int = 1  # of the squares, in px
 
     @classmethod
-    def from_image(cls, image: ArrayLike, *, threads: int | None = 1) -> Density:
-        """Make a density of an image of shape (H, W)."""
+    def from_image(cls, image: ArrayLike, *, side: int = 1, threads: int | None = 1) -> Density:
+        """Make a density of an image, shape (H / side, W / side), of squares with a side in px."""
         values = np.ascontiguousarray(image, dtype=np.float64)
         if not values.flags.writeable:  # the kernel is compiled for one type
             values = values.copy()
         height, width = values.shape
-        sums = np.zeros((3, height, width + 1))
+        sums = np.empty((2, height, width + 1))
         rows = max(1, _MIN_PIXELS_PER_THREAD // max(1, width))
         in_ranges(_sum_rows, height, available_threads(threads), values, sums, smallest=rows)
-        return cls(values, sums)
+        return cls(values, sums, side)
+
+    @cached_property
+    def sums(self) -> FloatArray:
+        """The same with ∫ s² I for moments of inertia, shape (3, h, w + 1)."""
+        height, width = self.image.shape
+        sums = np.empty((3, height, width + 1))
+        _sum_rows(0, height, self.image, sums)
+        return sums
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Shape (H, W) of the image."""
-        return self.image.shape[0], self.image.shape[1]
+        """Shape (H, W) of the image in pixels."""
+        return self.side * self.image.shape[0], self.side * self.image.shape[1]
 
     @property
     def region(self) -> FloatArray:
@@ -69,24 +79,53 @@ class Density:
     @property
     def total(self) -> float:
         """The image's flux."""
-        return float(self.sums[0, :, -1].sum())
+        return float(self.first_sums[0, :, -1].sum())
 
 
 @njit(nogil=True, cache=True)
 def _sum_rows(start: int, stop: int, image: FloatArray, sums: FloatArray) -> None:
     for row in range(start, stop):
+        for k in range(sums.shape[0]):
+            sums[k, row, 0] = 0.0
         for column in range(image.shape[1]):
             value = image[row, column]
             right = column + 1
             # ∫ s ds and ∫ s² ds over the pixel
             sums[0, row, right] = sums[0, row, column] + value
             sums[1, row, right] = sums[1, row, column] + value * (column + 0.5)
-            sums[2, row, right] = sums[2, row, column] + value * (column * right + 1 / 3)
+            if sums.shape[0] > 2:
+                sums[2, row, right] = sums[2, row, column] + value * (column * right + 1 / 3)
+
+
+def side_of_squares(shape: tuple[int, int], largest: float) -> int:
+    """Return the largest power of two, up to a side in px, whose squares tile an image."""
+    side = 1
+    while 2 * side <= largest and shape[0] % (2 * side) == shape[1] % (2 * side) == 0:
+        side *= 2
+    return side
+
+
+def merge_pixels(image: FloatArray, side: int) -> FloatArray:
+    """Return the flux of the squares that tile an image, shape (H / side, W / side)."""
+    if side == 1:
+        return image
+    height, width = image.shape
+    rows = image.reshape(height // side, side, width).sum(axis=1)
+    return np.asarray(rows.reshape(len(rows), width // side, side).sum(axis=2))
 
 
 def split_pixels(image: FloatArray, factor: int) -> FloatArray:
     """Split each pixel of an image into factor × factor that share its flux evenly."""
+    if factor == 1:
+        return image
     return np.repeat(np.repeat(image / factor**2, factor, axis=0), factor, axis=1)
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _first_moments(f: Triple, g: float, y0: float, y1: float) -> tuple[float, float]:
+    """Return ∫ y F dy and ∫ G dy by Simpson's rule; g is the sum for G."""
+    y_mid, sixth = 0.5 * (y0 + y1), (y1 - y0) / 6
+    return sixth * (y0 * f[0] + 4 * y_mid * f[1] + y1 * f[2]), sixth * g
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -111,18 +150,22 @@ def _moments_in_pixel(
     x0: float,
     y1: float,
     x1: float,
+    with_inertia: bool,
 ) -> Triple:
-    """Return ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy over a segment inside one pixel."""
+    """Return ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy, if wanted, over a segment inside one pixel."""
     x_left = float(column)
     x_left2 = x_left * x_left
-    x_left3 = x_left2 * x_left
     x_mid = 0.5 * (x0 + x1)
-    f_base = sums[0, row, column] - value * x_left
-    g_base = sums[1, row, column] - value * x_left2 / 2
-    k_base = sums[2, row, column] - value * x_left3 / 3
+    i, j = np.uint64(row), np.uint64(column)
+    f_base = sums[0, i, j] - value * x_left
+    g_base = sums[1, i, j] - value * x_left2 / 2
     g = 6 * g_base + value * (x0 * x0 + 4 * x_mid * x_mid + x1 * x1) / 2
-    third = value / 3
     f = f_base + value * x0, f_base + value * x_mid, f_base + value * x1
+    if not with_inertia:
+        of_y, of_x = _first_moments(f, g, y0, y1)
+        return of_y, of_x, 0.0
+    k_base = sums[2, i, j] - value * (x_left2 * x_left) / 3
+    third = value / 3
     k = (
         k_base + third * x0 * x0 * x0,
         k_base + third * x_mid * x_mid * x_mid,
@@ -131,8 +174,8 @@ def _moments_in_pixel(
     return _moments(f, g, k, y0, y1)
 
 
-@njit(nogil=True, cache=True)
-def _walk_inside(
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+def walk_inside(
     image: FloatArray,
     sums: FloatArray,
     ya: float,
@@ -140,46 +183,58 @@ def _walk_inside(
     yb: float,
     xb: float,
     with_moments: bool,
+    with_inertia: bool,
 ) -> tuple[float, float, float, float, float]:
     """Integrate along a segment inside the image, as `walk_edge` does."""
-    height, width = image.shape
-    row, column = min(int(ya), height - 1), min(int(xa), width - 1)
-    last_row, last_column = min(int(yb), height - 1), min(int(xb), width - 1)
+    last_y, last_x = image.shape[0] - 1, image.shape[1] - 1
+    row, column = min(int(ya), last_y), min(int(xa), last_x)
+    last_row, last_column = min(int(yb), last_y), min(int(xb), last_x)
     dy, dx = yb - ya, xb - xa
-    length = math.sqrt(dy * dy + dx * dx)
     down, right = 1 if last_row > row else 0, 1 if last_column > column else 0
-    per_y = 1.0 / dy if last_row != row else 0.0
-    per_x = 1.0 / dx if last_column != column else 0.0
-    crossings = abs(last_row - row) + abs(last_column - column)
+    # shares of the segment where it next leaves its row and its column of pixels
+    per_y, per_x = 1.0 / dy, 1.0 / dx
+    t_y = (row + down - ya) * per_y if row != last_row else 2.0
+    t_x = (column + right - xa) * per_x if column != last_column else 2.0
     flux = mass = moment_y = moment_x = inertia = 0.0
     t, y, x = 0.0, ya, xa
-    for crossing in range(crossings + 1):
-        # where the segment leaves this pixel, and whether by its upper or lower side
-        t_y = (row + down - ya) * per_y if row != last_row else 2.0
-        t_x = (column + right - xa) * per_x if column != last_column else 2.0
+    for _ in range(abs(last_row - row) + abs(last_column - column)):
         t_next = min(t_y, t_x)
         y_next, x_next = ya + t_next * dy, xa + t_next * dx
-        if crossing == crossings:
-            t_next, y_next, x_next = 1.0, yb, xb
-        value = image[row, column]
+        i, j = np.uint64(row), np.uint64(column)  # without a test for negative indices
+        value = image[i, j]
         flux += value * (t_next - t)
-        mass += (sums[0, row, column] + value * (0.5 * (x + x_next) - column)) * (y_next - y)
+        mass += (sums[0, i, j] + value * (0.5 * (x + x_next) - column)) * (y_next - y)
         if with_moments:
-            of_y, of_x, of_both = _moments_in_pixel(sums, value, row, column, y, x, y_next, x_next)
+            of_y, of_x, of_both = _moments_in_pixel(
+                sums, value, row, column, y, x, y_next, x_next, with_inertia
+            )
             moment_y += of_y
             moment_x += of_x
             inertia += of_both
         if t_x <= t_y:
             column += 2 * right - 1
+            t_x = (column + right - xa) * per_x if column != last_column else 2.0
         else:
             row += 2 * down - 1
+            t_y = (row + down - ya) * per_y if row != last_row else 2.0
         t, y, x = t_next, y_next, x_next
-    return flux * length, mass, moment_y, moment_x, inertia
+    i, j = np.uint64(row), np.uint64(column)
+    value = image[i, j]
+    flux += value * (1.0 - t)
+    mass += (sums[0, i, j] + value * (0.5 * (x + xb) - column)) * (yb - y)
+    if with_moments:
+        of_y, of_x, of_both = _moments_in_pixel(
+            sums, value, row, column, y, x, yb, xb, with_inertia
+        )
+        moment_y += of_y
+        moment_x += of_x
+        inertia += of_both
+    return flux * math.sqrt(dy * dy + dx * dx), mass, moment_y, moment_x, inertia
 
 
 @njit(nogil=True, cache=True)
 def _walk_right_of_image(
-    image: FloatArray, sums: FloatArray, ya: float, yb: float
+    image: FloatArray, sums: FloatArray, ya: float, yb: float, with_inertia: bool
 ) -> tuple[float, float, float, float]:
     """Integrate from row position ya to yb beyond the right edge, where F is the row's sum."""
     height, width = image.shape
@@ -188,7 +243,8 @@ def _walk_right_of_image(
     mass = moment_y = moment_x = inertia = 0.0
     for row in range(min(int(low), height - 1), min(int(high), height - 1) + 1):
         y0, y1 = max(low, float(row)), min(high, row + 1.0)
-        f, g, k = sums[0, row, width], sums[1, row, width], sums[2, row, width]
+        f, g = sums[0, row, width], sums[1, row, width]
+        k = sums[2, row, width] if with_inertia else 0.0
         of_y, of_x, of_both = _moments((f, f, f), 6 * g, (k, k, k), y0, y1)
         mass += sign * f * (y1 - y0)
         moment_y += sign * of_y
@@ -197,7 +253,7 @@ def _walk_right_of_image(
     return mass, moment_y, moment_x, inertia
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def walk_edge(
     image: FloatArray,
     sums: FloatArray,
@@ -209,11 +265,27 @@ def walk_edge(
 ) -> tuple[float, float, float, float, float]:
     """Integrate along the segment from (ya, xa) to (yb, xb), in corner coordinates.
 
-    Returns ∫ I ds, ∫ F dy, and if `with_moments`, else 0, ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy.
+    The moments need all three sums. Returns ∫ I ds, ∫ F dy, and if `with_moments`, else 0,
+    ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy.
     """
+    return walk_clipped(image, sums, ya, xa, yb, xb, with_moments, with_moments)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def walk_clipped(
+    image: FloatArray,
+    sums: FloatArray,
+    ya: float,
+    xa: float,
+    yb: float,
+    xb: float,
+    with_moments: bool,
+    with_inertia: bool,
+) -> tuple[float, float, float, float, float]:
+    """Integrate as `walk_edge` does; only the inertia, else 0, needs the third of the sums."""
     height, width = image.shape
     if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
-        return _walk_inside(image, sums, ya, xa, yb, xb, with_moments)
+        return walk_inside(image, sums, ya, xa, yb, xb, with_moments, with_inertia)
 
     start, end = _inside_share(ya, yb - ya, height)
     if start >= end:
@@ -225,15 +297,15 @@ def walk_edge(
     if t_leave > t_enter:
         y0, x0 = _point(ya, xa, yb, xb, t_enter, height, width)
         y1, x1 = _point(ya, xa, yb, xb, t_leave, height, width)
-        flux, mass, moment_y, moment_x, inertia = _walk_inside(
-            image, sums, y0, x0, y1, x1, with_moments
+        flux, mass, moment_y, moment_x, inertia = walk_inside(
+            image, sums, y0, x0, y1, x1, with_moments, with_inertia
         )
     # the parts before and after the image count where they are to its right
     for t0, t1 in ((start, t_enter), (t_leave, end)):
         if t1 > t0 and xa + 0.5 * (t0 + t1) * (xb - xa) > 0.5 * width:
             y0, _ = _point(ya, xa, yb, xb, t0, height, width)
             y1, _ = _point(ya, xa, yb, xb, t1, height, width)
-            of_mass, of_y, of_x, of_both = _walk_right_of_image(image, sums, y0, y1)
+            of_mass, of_y, of_x, of_both = _walk_right_of_image(image, sums, y0, y1, with_inertia)
             mass += of_mass
             if with_moments:
                 moment_y += of_y

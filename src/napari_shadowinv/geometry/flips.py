@@ -140,8 +140,9 @@ def _irregular_edges(mesh: Mesh, t: int) -> int:
     # Edges that the neighbour has to look at are left out. The triangle's own part of the
     # determinant serves for its three edges.
     corners, twins, points, weights = mesh.corners, mesh.twins, mesh.points, mesh.weights
-    e = 3 * t
-    i, j, k = corners[e], corners[e + 1], corners[e + 2]
+    e = np.uint32(3 * t)
+    one, two = np.uint32(1), np.uint32(2)
+    i, j, k = np.uint32(corners[e]), np.uint32(corners[e + one]), np.uint32(corners[e + two])
     irregular = 0
     x0, y0, w0 = points[i, 0], points[i, 1], weights[i]
     ax, ay, a_gain = points[j, 0] - x0, points[j, 1] - y0, weights[j] - w0
@@ -150,10 +151,11 @@ def _irregular_edges(mesh: Mesh, t: int) -> int:
     a_lift, b_lift = a_square - a_gain, b_square - b_gain
     a_size, b_size = a_square + abs(a_gain), b_square + abs(b_gain)
     area, area_size = ax * by - ay * bx, abs(ax * by) + abs(ay * bx)
-    for h in range(e, e + 3):
+    for side in range(3):
+        h = e + np.uint32(side)
         g = twins[h]
         if g > h:
-            q = corners[g]
+            q = np.uint32(corners[np.uint32(g)])
             qx, qy, q_gain = points[q, 0] - x0, points[q, 1] - y0, weights[q] - w0
             q_square = qx * qx + qy * qy
             height = (
@@ -167,7 +169,7 @@ def _irregular_edges(mesh: Mesh, t: int) -> int:
                 + b_size * (abs(ax * qy) + abs(ay * qx))
             )
             if height < LIFT_BOUND * size:
-                irregular |= 1 << (h - e)
+                irregular |= 1 << side
     return irregular
 
 

@@ -25,6 +25,7 @@ of natural neighbour interpolation" (1981); paper, section III.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -42,6 +43,9 @@ WIDTH = 8  # numbers in a cache line
 _LARGEST_CAVITY = 256
 _PATCH = 31  # numbers that describe the surface over a triangle
 _CACHED_PATCHES = 512  # triangles whose patches are remembered
+_EDGE_PX, _EDGE_SHARE = 1e-6, 1e-9  # beyond a triangle's edges that still belongs to it
+STRIP_PX = 32  # rows between two reports of progress
+_MIN_PIXELS_PER_THREAD = 1 << 13
 
 
 def _in_blocks(
@@ -484,15 +488,23 @@ def _fill_patch(p: FloatArray, f: FloatArray, g: FloatArray, patch: FloatArray) 
     patch[30] = (patch[27] + patch[28] + patch[29]) / 3
 
 
+@njit(nogil=True, cache=True, inline="always")
+def _patch_coordinates(patch: FloatArray, y: float, x: float) -> tuple[float, float, float]:
+    """Return the barycentric coordinates of (y, x) in the triangle of a patch."""
+    return (
+        patch[0] * (y - patch[6]) + patch[3] * (x - patch[9]),
+        patch[1] * (y - patch[7]) + patch[4] * (x - patch[10]),
+        patch[2] * (y - patch[8]) + patch[5] * (x - patch[11]),
+    )
+
+
 @njit(nogil=True, cache=True)
 def _value_on_patch(patch: FloatArray, y: float, x: float) -> tuple[float, float]:
     """Return the value at (y, x) of the surface over a triangle, and the point's least coordinate.
 
     That is negative where the triangle does not hold the point.
     """
-    b0 = patch[0] * (y - patch[6]) + patch[3] * (x - patch[9])
-    b1 = patch[1] * (y - patch[7]) + patch[4] * (x - patch[10])
-    b2 = patch[2] * (y - patch[8]) + patch[5] * (x - patch[11])
+    b0, b1, b2 = _patch_coordinates(patch, y, x)
     # k is the part that holds the point.
     if b0 <= b1 and b0 <= b2:
         i, j, k, least, u, v = 1, 2, 0, b0, b1 - b0, b2 - b0
@@ -548,26 +560,136 @@ def _evaluate_blocks(
             if triangle_of_slot[slot] == t:
                 out[q], _ = _value_on_patch(patch, y, x)
                 continue
-            outside = False
-            for k in range(3):
-                a = vertices[t, k]
-                if a >= n:
-                    outside = True
-                    break
-                f[k] = values[a]
-                for axis in range(2):
-                    p[k, axis], g[k, axis] = points[a, axis], gradients[a, axis]
-            if not outside:
+            if max(vertices[t, 0], vertices[t, 1], vertices[t, 2]) < n:
+                _gather_corners(vertices, t, points, values, gradients, p, f, g)
                 _fill_patch(p, f, g, patch)
                 triangle_of_slot[slot] = t
                 out[q], _ = _value_on_patch(patch, y, x)
+            else:
+                out[q] = _value_beyond(vertices[t], points, values, gradients, y, x)
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _gather_corners(
+    vertices: Indices,
+    t: int,
+    points: FloatArray,
+    values: FloatArray,
+    gradients: FloatArray,
+    p: FloatArray,
+    f: FloatArray,
+    g: FloatArray,
+) -> None:
+    """Copy positions, values and gradients at the corners of a triangle."""
+    for k in range(3):
+        a = vertices[t, k]
+        f[k] = values[a]
+        for axis in range(2):
+            p[k, axis], g[k, axis] = points[a, axis], gradients[a, axis]
+
+
+@njit(nogil=True, cache=True)
+def _value_beyond(
+    corners: Indices,
+    points: FloatArray,
+    values: FloatArray,
+    gradients: FloatArray,
+    y: float,
+    x: float,
+) -> float:
+    """Return the value outside the sites' hull, by the gradient at the nearest corner."""
+    nearest = _nearest_corner(corners, points, values.shape[0], y, x)
+    if nearest < 0:
+        return 0.0
+    rise_y = gradients[nearest, 0] * (y - points[nearest, 0])
+    rise_x = gradients[nearest, 1] * (x - points[nearest, 1])
+    return float(values[nearest] + rise_y + rise_x)
+
+
+@njit(nogil=True, cache=True)
+def _triangles_by_strip(
+    vertices: Indices, points: FloatArray, n: int, shape: tuple[int, int]
+) -> tuple[Indices, Indices]:
+    """Sort triangles by the strips of rows that they reach: where each strip begins, and them."""
+    height, width = shape
+    strips = -(-height // STRIP_PX)
+    starts = np.zeros(strips + 1, np.int32)
+    members = np.empty(0, np.int32)
+    for listing in range(2):
+        for t in range(vertices.shape[0]):
+            a, b, c = vertices[t, 0], vertices[t, 1], vertices[t, 2]
+            if a >= n or b >= n or c >= n:
                 continue
-            nearest = _nearest_corner(vertices[t], points, n, y, x)
-            if nearest >= 0:
-                out[q] = (
-                    values[nearest]
-                    + gradients[nearest, 0] * (y - points[nearest, 0])
-                    + gradients[nearest, 1] * (x - points[nearest, 1])
+            xa, xb, xc = points[a, 1], points[b, 1], points[c, 1]
+            if max(xa, xb, xc) < -_EDGE_PX or min(xa, xb, xc) > width - 1 + _EDGE_PX:
+                continue
+            ya, yb, yc = points[a, 0], points[b, 0], points[c, 0]
+            top = math.ceil(max(min(ya, yb, yc) - _EDGE_PX, 0.0))
+            bottom = math.floor(min(max(ya, yb, yc) + _EDGE_PX, height - 1.0))
+            if top > bottom:
+                continue
+            for strip in range(top // STRIP_PX, bottom // STRIP_PX + 1):
+                if listing:
+                    members[starts[strip]] = t
+                starts[strip] += 1
+        total = 0
+        for strip in range(strips + 1):
+            # Listing moves each start to the next strip's.
+            if listing:
+                total, starts[strip] = starts[strip], total
+            else:
+                total, starts[strip] = total + starts[strip], total
+        if not listing:
+            members = np.empty(total, np.int32)
+    return starts, members
+
+
+@njit(nogil=True, cache=True)
+def _evaluate_rows(
+    start: int,
+    stop: int,
+    strip_top: int,
+    members: Indices,
+    vertices: Indices,
+    neighbors: Indices,
+    points: FloatArray,
+    values: FloatArray,
+    gradients: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Evaluate rows of a strip on its triangles."""
+    # A pixel on an edge takes the value of the last triangle that holds it, whichever rows are
+    # evaluated together.
+    width = out.shape[1]
+    p, f, g, patch = np.empty((3, 2)), np.empty(3), np.empty((3, 2)), np.empty(_PATCH)
+    begin, end = strip_top + start, strip_top + stop
+    for row in range(begin, end):
+        for column in range(width):
+            out[row, column] = np.nan
+    for t in members:
+        a, b, c = vertices[t, 0], vertices[t, 1], vertices[t, 2]
+        ya, yb, yc = points[a, 0], points[b, 0], points[c, 0]
+        top = math.ceil(max(min(ya, yb, yc) - _EDGE_PX, float(begin)))
+        bottom = math.floor(min(max(ya, yb, yc) + _EDGE_PX, end - 1.0))
+        xa, xb, xc = points[a, 1], points[b, 1], points[c, 1]
+        left = math.ceil(max(min(xa, xb, xc) - _EDGE_PX, 0.0))
+        right = math.floor(min(max(xa, xb, xc) + _EDGE_PX, width - 1.0))
+        if top > bottom or left > right:
+            continue
+        _gather_corners(vertices, t, points, values, gradients, p, f, g)
+        _fill_patch(p, f, g, patch)
+        for row in range(top, bottom + 1):
+            for column in range(left, right + 1):
+                b0, b1, b2 = _patch_coordinates(patch, row, column)
+                if min(b0, b1, b2) >= -_EDGE_SHARE:
+                    out[row, column], _ = _value_on_patch(patch, row, column)
+    t = 0
+    for row in range(begin, end):
+        for column in range(width):
+            if np.isnan(out[row, column]):
+                t = _locate(vertices, neighbors, points, t, row, column)
+                out[row, column] = _value_beyond(
+                    vertices[t], points, values, gradients, row, column
                 )
 
 
@@ -606,7 +728,7 @@ class CloughTocher:
         self._triangulation = triangulation
         self._values = np.ascontiguousarray(values, dtype=np.float64)
         self._gradients = np.ascontiguousarray(gradients, dtype=np.float64)
-        self._threads = available_threads(threads)
+        self.threads = available_threads(threads)
 
     def __call__(self, queries: FloatArray) -> FloatArray:
         """Return values, shape (m,), at points (y, x).
@@ -618,6 +740,31 @@ class CloughTocher:
         if not queries.flags.writeable:  # the kernel is compiled for one type
             queries = queries.copy()
         out = np.zeros(len(queries))
-        surface = (*_mesh_arrays(self._triangulation), self._values, self._gradients)
-        _in_blocks(_evaluate_blocks, queries, self._threads, *surface, out)
+        _in_blocks(_evaluate_blocks, queries, self.threads, *self._arrays, out)
         return out
+
+    def at_pixels(
+        self, shape: tuple[int, int], on_share: Callable[[float], None] | None = None
+    ) -> FloatArray:
+        """Return values at the pixels (0, 0) to (H - 1, W - 1), shape (H, W).
+
+        It is faster than a call with all pixels. `on_share` receives the progress, 0 to 1, and may
+        raise to end the work.
+        """
+        height, width = shape
+        out = np.empty(shape)
+        vertices, _, points, values, _ = self._arrays
+        starts, members = _triangles_by_strip(vertices, points, len(values), shape)
+        smallest = max(1, _MIN_PIXELS_PER_THREAD // width)
+        for strip, top in enumerate(range(0, height, STRIP_PX)):
+            rows = min(STRIP_PX, height - top)
+            here = members[starts[strip] : starts[strip + 1]]
+            operands = top, here, *self._arrays, out
+            in_ranges(_evaluate_rows, rows, self.threads, *operands, smallest=smallest)
+            if on_share is not None:
+                on_share((top + rows) / height)
+        return out
+
+    @property
+    def _arrays(self) -> tuple[Indices, Indices, FloatArray, FloatArray, FloatArray]:
+        return (*_mesh_arrays(self._triangulation), self._values, self._gradients)

@@ -18,20 +18,27 @@ cells, so the cells tile the image to rounding.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.geometry.compiler import njit
-from napari_shadowinv.geometry.density import Density, walk_edge
+from napari_shadowinv.geometry.compiler import kernel, njit
+from napari_shadowinv.geometry.density import (
+    Density,
+    walk_clipped,
+    walk_edge,
+    walk_inside,
+)
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _power_centres(
     start: int,
     stop: int,
@@ -42,12 +49,15 @@ def _power_centres(
     centres: FloatArray,
 ) -> None:
     """Find the point of equal power distance to the three sites of each triangle."""
-    for t in range(start, stop):
-        a, b, c = vertices[t]
+    # Indices without a sign need no test for negative ones.
+    first_ghost = np.uint32(n)
+    for t in range(np.uint32(start), np.uint32(stop)):
+        a, b = np.uint32(vertices[t, 0]), np.uint32(vertices[t, 1])
+        c = np.uint32(vertices[t, 2])
         # Seen from a ghost far away, two sites that are close together differ in few digits.
-        if a >= n:
+        if a >= first_ghost:
             a, b, c = b, c, a
-        if a >= n:
+        if a >= first_ghost:
             a, b, c = b, c, a
         by, bx = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
         cy, cx = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1]
@@ -60,22 +70,7 @@ def _power_centres(
         centres[t, 1] = points[a, 1] + (c_lift * by - b_lift * cy) / double_area
 
 
-@njit(nogil=True, cache=True)
-def _list_edges(vertices: Indices, neighbors: Indices, pairs: Indices, sides: Indices) -> int:
-    """List each inner edge once as (site a, site b, triangle left of ab, the other)."""
-    count = 0
-    for t in range(vertices.shape[0]):
-        for k in range(3):
-            neighbour = neighbors[t, k]
-            if neighbour > t:
-                pairs[count, 0] = vertices[t, (k + 1) % 3]
-                pairs[count, 1] = vertices[t, (k + 2) % 3]
-                sides[count, 0], sides[count, 1] = t, neighbour
-                count += 1
-    return count
-
-
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _integrate_edges(
     start: int,
     stop: int,
@@ -83,30 +78,68 @@ def _integrate_edges(
     centres: FloatArray,
     image: FloatArray,
     sums: FloatArray,
-    with_moments: bool,
     integrals: FloatArray,
 ) -> None:
-    """Walk each border; columns of `integrals`: flux, mass, moments y and x, inertia."""
+    """Walk each border; columns of `integrals`: flux and mass."""
+    height, width = float(image.shape[0]), float(image.shape[1])
     for e in range(start, stop):
-        t_left, t_right = sides[e, 0], sides[e, 1]
-        ya, xa = centres[t_left, 0] + 0.5, centres[t_left, 1] + 0.5
-        yb, xb = centres[t_right, 0] + 0.5, centres[t_right, 1] + 0.5
-        walk = walk_edge(image, sums, ya, xa, yb, xb, with_moments)
+        left, right = np.uint32(sides[e, 0]), np.uint32(sides[e, 1])
+        ya, xa = centres[left, 0] + 0.5, centres[left, 1] + 0.5
+        yb, xb = centres[right, 0] + 0.5, centres[right, 1] + 0.5
+        if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
+            flux, mass, _, _, _ = walk_inside(image, sums, ya, xa, yb, xb, False, False)
+        else:
+            flux, mass, _, _, _ = walk_clipped(image, sums, ya, xa, yb, xb, False, False)
+        integrals[e, 0], integrals[e, 1] = flux, mass
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _integrate_moments(
+    start: int,
+    stop: int,
+    sides: Indices,
+    centres: FloatArray,
+    image: FloatArray,
+    sums: FloatArray,
+    integrals: FloatArray,
+) -> None:
+    """Walk each border; columns of `integrals`: flux, mass, moments y and x."""
+    height, width = float(image.shape[0]), float(image.shape[1])
+    for e in range(start, stop):
+        left, right = np.uint32(sides[e, 0]), np.uint32(sides[e, 1])
+        ya, xa = centres[left, 0] + 0.5, centres[left, 1] + 0.5
+        yb, xb = centres[right, 0] + 0.5, centres[right, 1] + 0.5
+        if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
+            walk = walk_inside(image, sums, ya, xa, yb, xb, True, False)
+        else:
+            walk = walk_clipped(image, sums, ya, xa, yb, xb, True, False)
         integrals[e, 0], integrals[e, 1] = walk[0], walk[1]
-        if with_moments:
-            integrals[e, 2], integrals[e, 3], integrals[e, 4] = (
-                walk[2],
-                walk[3],
-                walk[4],
-            )
+        integrals[e, 2], integrals[e, 3] = walk[2], walk[3]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
+def _integrate_inertia(
+    start: int,
+    stop: int,
+    sides: Indices,
+    centres: FloatArray,
+    image: FloatArray,
+    sums: FloatArray,
+    integrals: FloatArray,
+) -> None:
+    """Walk each border for the moment of inertia, the only column of `integrals`."""
+    for e in range(start, stop):
+        ya, xa = centres[sides[e, 0], 0] + 0.5, centres[sides[e, 0], 1] + 0.5
+        yb, xb = centres[sides[e, 1], 0] + 0.5, centres[sides[e, 1], 1] + 0.5
+        integrals[e, 0] = walk_edge(image, sums, ya, xa, yb, xb, True)[4]
+
+
+@kernel
 def _sum_over_cells(edges: Indices, integrals: FloatArray, column: int, sums: FloatArray) -> None:
     """Add one column of the edges' integrals to the two cells of each edge."""
-    n = sums.shape[0]
+    n = np.uint32(sums.shape[0])
     for e in range(edges.shape[0]):
-        a, b = edges[e, 0], edges[e, 1]
+        a, b = np.uint32(edges[e, 0]), np.uint32(edges[e, 1])
         value = integrals[e, column]
         if a < n:
             sums[a] += value
@@ -121,11 +154,7 @@ def _laplacian(
     """Assemble the graph Laplacian with conductance flux / (2 |r_i - r_j|) as CSR."""
     starts = np.ones(n + 1, np.int32)
     starts[0] = 0
-    for e in range(edges.shape[0]):
-        a, b = edges[e, 0], edges[e, 1]
-        if a < n and b < n and integrals[e, 0] > 0:
-            starts[a + 1] += 1
-            starts[b + 1] += 1
+    _count_ties(edges, integrals, starts[1:])
     for i in range(n):
         starts[i + 1] += starts[i]
     filled = starts[:-1] + 1
@@ -133,17 +162,43 @@ def _laplacian(
     values = np.zeros(starts[n])
     for i in range(n):
         columns[starts[i]] = i
+    _fill_laplacian(points, edges, integrals, starts, filled, columns, values)
+    return values, columns, starts
+
+
+@kernel
+def _count_ties(edges: Indices, integrals: FloatArray, counts: Indices) -> None:
+    n = np.uint32(counts.size)
     for e in range(edges.shape[0]):
-        a, b = edges[e, 0], edges[e, 1]
+        a, b = np.uint32(edges[e, 0]), np.uint32(edges[e, 1])
+        if a < n and b < n and integrals[e, 0] > 0:
+            counts[a] += 1
+            counts[b] += 1
+
+
+@kernel
+def _fill_laplacian(
+    points: FloatArray,
+    edges: Indices,
+    integrals: FloatArray,
+    starts: Indices,
+    filled: Indices,
+    columns: Indices,
+    values: FloatArray,
+) -> None:
+    n = np.uint32(filled.size)
+    for e in range(edges.shape[0]):
+        a, b = np.uint32(edges[e, 0]), np.uint32(edges[e, 1])
         if a < n and b < n and integrals[e, 0] > 0:
             dy, dx = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1]
             conductance = integrals[e, 0] / (2 * np.sqrt(dy * dy + dx * dx))
-            for i, j in ((a, b), (b, a)):
-                columns[filled[i]] = j
-                values[filled[i]] = -conductance
-                filled[i] += 1
-                values[starts[i]] += conductance
-    return values, columns, starts
+            of_a, of_b = np.uint32(filled[a]), np.uint32(filled[b])
+            columns[of_a], values[of_a] = b, -conductance
+            columns[of_b], values[of_b] = a, -conductance
+            filled[a] += 1
+            filled[b] += 1
+            values[np.uint32(starts[a])] += conductance
+            values[np.uint32(starts[b])] += conductance
 
 
 class PowerDiagram:
@@ -177,26 +232,42 @@ class PowerDiagram:
         dual = triangulation.points, triangulation.weights, self.n_sites, triangulation.vertices
         in_ranges(_power_centres, len(self.vertices), threads, *dual, self.vertices)
         # pairs of neighbouring sites, shape (e, 2); indices ≥ n are ghosts outside
-        self.edges, sides = _edges_of(triangulation)
-        self._integrals = np.empty((len(sides), 5 if with_moments else 2))
-        borders = sides, self.vertices, density.image, density.sums, with_moments
-        in_ranges(_integrate_edges, len(sides), threads, *borders, self._integrals)
+        self.edges, sides = triangulation.edges
+        self._sides, self._density, self._threads = sides, density, threads
+        integrate = _integrate_moments if with_moments else _integrate_edges
+        powers = np.array([-1, 0, 1, 1] if with_moments else [-1, 0])
+        self._integrals = self._integrate(integrate, density.first_sums, powers)
 
-    def _cell_sums(self, column: int) -> FloatArray:
+    def _integrate(
+        self, walk: Callable[..., None], sums: FloatArray, powers: NDArray[np.int64]
+    ) -> FloatArray:
+        """Integrate along the borders; each column has a power of the length in its unit."""
+        density, sides = self._density, self._sides
+        side = float(density.side)
+        integrals = np.empty((len(sides), len(powers)))
+        # seen in units of the density's squares
+        ends = self.vertices if side == 1 else (self.vertices + 0.5) / side - 0.5
+        borders = sides, ends, density.image, sums, integrals
+        in_ranges(walk, len(sides), self._threads, *borders)
+        if side > 1:
+            integrals *= side**powers
+        return integrals
+
+    def _cell_sums(self, integrals: FloatArray, column: int) -> FloatArray:
         sums = np.zeros(self.n_sites)
-        _sum_over_cells(self.edges, self._integrals, column, sums)
+        _sum_over_cells(self.edges, integrals, column, sums)
         return sums
 
     @cached_property
     def masses(self) -> FloatArray:
         """Flux in each cell, shape (n,): S(V_i) or T(P_i) of the paper."""
-        return self._cell_sums(1)
+        return self._cell_sums(self._integrals, 1)
 
     @cached_property
     def _first_moments(self) -> FloatArray:
         if not self._with_moments:
             raise ValueError("this diagram was made without moments: pass with_moments=True")
-        corner = np.stack([self._cell_sums(2), self._cell_sums(3)], axis=1)
+        corner = np.stack([self._cell_sums(self._integrals, column) for column in (2, 3)], axis=1)
         return corner - 0.5 * self.masses[:, None]
 
     @cached_property
@@ -214,7 +285,8 @@ class PowerDiagram:
         site = self.sites + 0.5
         corner = self._first_moments + 0.5 * self.masses[:, None]
         shifted = (site**2).sum(axis=1) * self.masses - 2 * (site * corner).sum(axis=1)
-        inertia: FloatArray = self._cell_sums(4) + shifted
+        integrals = self._integrate(_integrate_inertia, self._density.sums, np.array([2]))
+        inertia: FloatArray = self._cell_sums(integrals, 0) + shifted
         return inertia
 
     def laplacian(self) -> csr_array:
@@ -234,7 +306,7 @@ class PowerDiagram:
 
         The first of the pair lies to its left. Read it before the triangulation is updated.
         """
-        _, sides = _edges_of(self._triangulation)
+        _, sides = self._triangulation.edges
         return np.asarray(self.vertices[sides])
 
     def cell(self, site: int) -> FloatArray:
@@ -243,7 +315,7 @@ class PowerDiagram:
         Cells at the rim reach far beyond the image. An empty cell has no corners. Call it before
         the triangulation is updated.
         """
-        pairs, sides = _edges_of(self._triangulation)
+        pairs, sides = self._triangulation.edges
         around = {}
         for k in np.flatnonzero((pairs == site).any(axis=1)):
             t_left, t_right = sides[k]
@@ -257,14 +329,6 @@ class PowerDiagram:
             triangle = around[triangle]
             if triangle == first:
                 return np.array(corners)
-
-
-def _edges_of(triangulation: RegularTriangulation) -> tuple[Indices, Indices]:
-    """Return the two sites of each inner edge, and the triangles left and right of it."""
-    most = 3 * len(triangulation.vertices) // 2 + 3
-    pairs, sides = np.empty((most, 2), np.int32), np.empty((most, 2), np.int32)
-    count = _list_edges(triangulation.vertices, triangulation.neighbors, pairs, sides)
-    return pairs[:count], sides[:count]
 
 
 @njit(nogil=True, cache=True)

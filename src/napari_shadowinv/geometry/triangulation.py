@@ -39,6 +39,7 @@ from napari_shadowinv.geometry.triangle_mesh import (
     Mesh,
     hilbert_permutation,
     insertion_order,
+    list_edges,
 )
 
 # Distance of the ghosts from the centre of the sites, in extents of the sites. From 3.5 on a ghost
@@ -154,6 +155,7 @@ class RegularTriangulation:
             counters=np.zeros(N_COUNTERS, np.int64),
             scratch=np.empty(16),
         )
+        self._is_regular = False  # for the weights of the mesh
         self._set_weights(np.zeros(n) if weights is None else _checked_weights(weights, n))
         self._build(alive)
 
@@ -195,6 +197,16 @@ class RegularTriangulation:
         twins = self._mesh.twins[: 3 * self._mesh.counters[SIZE]]
         return _read_only((twins // 3).reshape(-1, 3))  # -1 stays -1
 
+    @cached_property
+    def edges(self) -> tuple[Indices, Indices]:
+        """Rows of `points` at the ends of each inner edge ab, and its triangles, shape (k, 2) each.
+
+        Of the triangles the first lies to the left of ab.
+        """
+        twins = self._mesh.twins[: self.vertices.size]
+        pairs, sides = list_edges(self.vertices.reshape(-1), twins)
+        return _read_only(pairs), _read_only(sides)
+
     def update(
         self, weights: ArrayLike, *, stop_when_hidden: bool = False, threads: int = 1
     ) -> bool:
@@ -204,19 +216,24 @@ class RegularTriangulation:
         The triangulation is then valid and contains the same sites, but is irregular until the
         next update. Irregular edges are searched for in parallel; flips run in one thread.
         """
-        self._set_weights(_checked_weights(weights, self._mesh.hidden.size))
+        checked = _checked_weights(weights, self._mesh.hidden.size)
+        if self._is_regular and np.array_equal(checked, self.weights[:-4]):
+            return True
+        self._set_weights(checked)
+        self._is_regular = False
         self.forget()
         suspects = np.empty(self._mesh.counters[SIZE], np.bool_)
         in_ranges(flips.look_for_irregular, suspects.size, threads, self._mesh, suspects)
         policy = flips.STOP if stop_when_hidden else flips.REMOVE
         status = flips.repair(self._mesh, policy, suspects)
         if status != flips.EXHAUSTED:
-            return bool(status == flips.DONE)
+            self._is_regular = bool(status == flips.DONE)
+            return self._is_regular
         fresh = self.copy()
         fresh._build()
         if stop_when_hidden and np.any(fresh._mesh.hidden & ~self._mesh.hidden):
             return False
-        self._mesh = fresh._mesh
+        self._mesh, self._is_regular = fresh._mesh, True
         return True
 
     def move(self, sites: ArrayLike) -> None:
@@ -233,6 +250,7 @@ class RegularTriangulation:
         targets = positions if self._order is None else positions[self._order]
         points, self._ghost_distance = _with_ghosts(targets, self._region)
         same_ghosts = np.array_equal(points[n:], self._mesh.points[n:])
+        self._is_regular = False
         self.forget()
         if same_ghosts:
             self._mesh = self._mesh._replace(points=self._mesh.points.copy())
@@ -258,6 +276,7 @@ class RegularTriangulation:
             ghosts = self._mesh.weights[-1]
             if flips.raise_hidden(self._mesh) == flips.EXHAUSTED:
                 raise RuntimeError(self._exhaustion_text())
+            self._is_regular = False
             self.forget()
             # The ghosts follow if the lightest sites were raised; then a site may hide again.
             self._weigh_ghosts()
@@ -269,7 +288,7 @@ class RegularTriangulation:
         """Return an independent copy."""
         twin = object.__new__(RegularTriangulation)
         twin._order, twin._region = self._order, self._region
-        twin._ghost_distance = self._ghost_distance
+        twin._ghost_distance, twin._is_regular = self._ghost_distance, self._is_regular
         # `move` copies the points before it changes them
         twin._mesh = Mesh._make([self._mesh.points, *(array.copy() for array in self._mesh[1:])])
         return twin
@@ -295,6 +314,7 @@ class RegularTriangulation:
 
         twin = object.__new__(RegularTriangulation)
         twin._region, twin._ghost_distance = self._region, self._ghost_distance
+        twin._is_regular = False
         old_order = np.arange(n, dtype=np.int32) if self._order is None else self._order
         twin._order = np.append(old_order, n + order).astype(np.int32)
         counters = old.counters.copy()
@@ -348,5 +368,5 @@ class RegularTriangulation:
 
     def forget(self) -> None:
         """Drop the cached arrays, which are computed on demand."""
-        for name in ("points", "weights", "hidden", "vertices", "neighbors"):
+        for name in ("points", "weights", "hidden", "vertices", "neighbors", "edges"):
             self.__dict__.pop(name, None)

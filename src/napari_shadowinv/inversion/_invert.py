@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -44,6 +45,11 @@ __all__ = ["count_sites", "invert", "plan_sites"]
 # Steps of the read-out: up to the first number the potential, then the re-projection.
 _READ_STEPS = 30
 _STEPS = 100
+
+# Of the re-projection, along one axis. Against 64 rays per pixel it is off by 0.03 to 0.07 % of the
+# mean (r.m.s.) without folds, by 0.3 % with folds and noise, for sites 2 px apart.
+_TILES_PER_SPACING = 5.5
+_MOST_TILES = 4  # per pixel
 
 
 def plan_sites(
@@ -291,8 +297,12 @@ def invert(
                 margin=plan.margin,
                 needed=budget.needed if adaptive else None,
                 solved=solutions,
+                target=budget.target,
             )
         answer = solutions[-1]
+        if answer.converged:
+            with _measure_time("errors", seconds):
+                budget.free_target(solutions)
         with _measure_time("read-out", seconds):
             fields = _read_fields(plan, prepared, answer, options, report)
         more = adaptive and answer.converged and len(answer.weights) < levels.counts[-1]
@@ -401,11 +411,12 @@ class _Fields:
     reprojection: FloatArray  # in units of the source's `power_of_two`
     flux_left: dict[str, float]
     flux_entered: dict[str, float]
+    threads: int | None
 
     @cached_property
     def jacobian(self) -> FloatArray:
         """Determinant of the map's Jacobian."""
-        return jacobian_determinant(self.displacement)
+        return jacobian_determinant(self.displacement, threads=self.threads)
 
 
 def _read_fields(
@@ -422,11 +433,13 @@ def _read_fields(
         return synthetic_image(
             displacement,
             source,
+            rays_per_pixel=tiles**2,
             threads=options.threads,
             on_progress=lambda news: report_share(news.step / (news.total or 1), first, last),
         )
 
     report_share(0, 0, _READ_STEPS)
+    tiles = int(np.clip(math.ceil(_TILES_PER_SPACING / solution.level.spacing), 2, _MOST_TILES))
     potential, displacement = read_out(
         solution, options, lambda share: report_share(share, 0, _READ_STEPS)
     )
@@ -449,6 +462,7 @@ def _read_fields(
         np.ascontiguousarray(reprojection),
         flux_left,
         flux_entered,
+        options.threads,
     )
 
 

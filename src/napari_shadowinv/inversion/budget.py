@@ -418,8 +418,14 @@ class Budget:
         self.reason = ""
 
     @cached_property
-    def _target(self) -> Target:
+    def target(self) -> Target:
+        """The image that the transport solves."""
         return Target.of(self._prepared.floored_image, self._plan.margin, self.options)
+
+    def free_target(self, solutions: Sequence[LevelSolution]) -> None:
+        """Compute the linear response, which needs the target, and free the target's memory."""
+        self._response(_usable_levels(solutions))
+        vars(self).pop("target", None)
 
     def needed(self, solutions: Sequence[LevelSolution]) -> float:
         """Return the factor by which more sites are needed.
@@ -575,7 +581,7 @@ class Budget:
         few = [candidate for candidate in solved if len(candidate.weights) <= _MAX_RESPONSE_SITES]
         solution = few[-1] if few else self._coarser(solved[-1])
         if solution not in self._responses:
-            self._responses[solution] = LinearResponse(solution, self._target, self._plan)
+            self._responses[solution] = LinearResponse(solution, self.target, self._plan)
         return self._responses[solution]
 
     def _coarser(self, solution: LevelSolution) -> LevelSolution:
@@ -585,7 +591,7 @@ class Budget:
         levels = self._plan.levels
         few = sum(count <= _MAX_RESPONSE_SITES for count in levels.counts)
         level = levels[max(few - 1, 0)]
-        objective = self._target.objective(level)
+        objective = self.target.objective(level)
         weights, _ = with_full_cells(objective, 2 * solution.surface(level.sites))
         return LevelSolution.of_level(level, objective, Solution(weights, math.nan, 0, False))
 

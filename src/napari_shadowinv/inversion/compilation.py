@@ -38,10 +38,11 @@ def compile_rest() -> None:
     from napari_shadowinv.geometry.density import Density
     from napari_shadowinv.geometry.interpolation import CloughTocher, fit_gradients
     from napari_shadowinv.geometry.power_diagram import PowerDiagram
-    from napari_shadowinv.physics.forward import synthetic_image
+    from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
     from napari_shadowinv.transport.linear import FactorisedLaplacian, LaplacianSolver
 
     synthetic_image(np.zeros((2, 8, 8)), np.ones((8, 8)))
+    jacobian_determinant(np.zeros((2, 8, 8)))
     sites = np.random.default_rng(0).uniform(0, 19, (_NODES, 2))
     ghosts = 1e3 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     points = np.concatenate([sites, ghosts])
@@ -52,12 +53,20 @@ def compile_rest() -> None:
         "vertices": mesh.simplices.astype(np.int32),
         "neighbors": mesh.neighbors.astype(np.int32),
     }
-    for array in arrays.values():
+    t, k = np.nonzero(arrays["neighbors"] > np.arange(len(mesh.neighbors))[:, None])
+    ends = [arrays["vertices"][t, (k + shift) % 3] for shift in (1, 2)]
+    edges = (
+        np.stack(ends, axis=1),
+        np.stack([t, arrays["neighbors"][t, k]], axis=1).astype(np.int32),
+    )
+    for array in (*arrays.values(), *edges):
         array.flags.writeable = False  # as those of a triangulation, which is another type
-    triangulation: Any = SimpleNamespace(sites=arrays["points"][:-4], **arrays)
+    triangulation: Any = SimpleNamespace(sites=arrays["points"][:-4], edges=edges, **arrays)
     values = sites.sum(axis=1)
     gradients = fit_gradients(triangulation, values, np.ones_like(sites))
-    CloughTocher(triangulation, values, gradients)(sites)
+    surface = CloughTocher(triangulation, values, gradients)
+    surface(sites)
+    surface.at_pixels((20, 20))
     density = Density.from_image(np.ones((20, 20)))
     for with_moments in (True, False):
         diagram = PowerDiagram(triangulation, density, with_moments=with_moments)

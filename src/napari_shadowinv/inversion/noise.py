@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import nnls
 
@@ -246,8 +247,12 @@ class ImageNoise:
             self.clumping = 1.0  # a blur leaves the counting noise of many pixels as it was
             self.is_correlated_far = False
         elif used.any():
-            bright = image[1:, 1:] + image[1:, :-1] + image[:-1, 1:] + image[:-1, :-1]
-            self._terms = inflation * _terms(bright[used] / (4 * mean), differences)
+            step = -(-len(differences) // _SAMPLES)
+            rows, columns = np.unravel_index(_every(used, step), used.shape)
+            low, right = rows + 1, columns + 1
+            bright = image[low, right] + image[low, columns] + image[rows, right]
+            bright = (bright + image[rows, columns]) / (4 * mean)
+            self._terms = inflation * _terms(bright, differences[::step])
         if (level, counts) != (None, None):  # stated for the image, not for its source
             self._terms[0] += _clipped_rms(_finest(prepared.source / mean, used)) ** 2
         self.correlation_length = 0.0
@@ -275,8 +280,19 @@ class ImageNoise:
 
 def _finest(values: FloatArray, used: BoolArray) -> FloatArray:
     """Return absolute differences of neighbouring pixels in which smooth structure cancels."""
-    finest = (values[1:, 1:] - values[1:, :-1] - values[:-1, 1:] + values[:-1, :-1]) / 2
-    return np.abs(finest[used]) if used.any() else np.zeros(1)
+    if not used.any():
+        return np.zeros(1)
+    finest = values[1:, 1:] - values[1:, :-1]
+    finest -= values[:-1, 1:]
+    finest += values[:-1, :-1]
+    finest /= 2
+    np.abs(finest, out=finest)
+    return finest.ravel() if used.all() else finest[used]
+
+
+def _every(used: BoolArray, step: int) -> NDArray[np.intp]:
+    """Return the flat indices of every n-th pixel in use."""
+    return np.arange(0, used.size, step) if used.all() else np.flatnonzero(used)[::step]
 
 
 def _rms(values: FloatArray) -> float:
@@ -409,8 +425,6 @@ def _average_neighbours(values: FloatArray) -> FloatArray:
 
 def _terms(bright: FloatArray, differences: FloatArray) -> FloatArray:
     """Fit the noise terms of detectors: read-out, counting, and uneven response."""
-    step = -(-len(bright) // _SAMPLES)
-    bright, differences = bright[::step], differences[::step]
     order = order_by_value(bright)
     parts = np.array_split(order, min(_BINS, max(1, len(order) // 20)))
     bins = [(float(bright[part].mean()), _clipped_rms(differences[part]) ** 2) for part in parts]

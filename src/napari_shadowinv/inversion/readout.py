@@ -26,11 +26,11 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from scipy.sparse import csr_array
 
+from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.geometry.compiler import njit
-from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.density import Density, merge_pixels, side_of_squares
 from napari_shadowinv.geometry.interpolation import (
-    BLOCK,
     WIDTH,
     CloughTocher,
     corner_weights,
@@ -151,6 +151,7 @@ class LinearReadout:
         return np.stack([padded, *-np.array(np.gradient(padded))])[:, 1:-1, 1:-1]
 
 
+_SQUARES_PER_SPACING = 8
 _RESOLUTION = 2.5  # spacing over the finest wave that a level resolves within 5 %
 _DIMMEST = 1e-3  # of the mean, for a logarithm
 _MIN_ROUNDNESS = 0.3  # double area by the longest side's square; of an equilateral triangle 0.87
@@ -176,6 +177,7 @@ class LinearResponse:
         diagram = objective.diagram(solution.weights)
         self.flux = diagram.masses
         self._triangulation, self._threads = objective.triangulation, solution.threads
+        self._side = side_of_squares(solution.level.shape, self.spacing / _SQUARES_PER_SPACING)
         self.area = self._masses(np.ones(solution.level.shape), self._triangulation)
         ground = objective.ground(solution.weights)
         self._network = diagram.laplacian()
@@ -211,7 +213,8 @@ class LinearResponse:
         return (self.area if mask.all() else self._masses(used, self._triangulation)), of_source
 
     def _masses(self, image: FloatArray, triangulation: RegularTriangulation) -> FloatArray:
-        density = Density.from_image(image, threads=self._threads)
+        squares = merge_pixels(image, self._side)
+        density = Density.from_image(squares, side=self._side, threads=self._threads)
         return PowerDiagram(triangulation, density, threads=self._threads).masses
 
     def to(self, changes: FloatArray) -> FloatArray:
@@ -285,7 +288,7 @@ def _within(places: FloatArray, plan: SitePlan) -> BoolArray:
 
 OnShare = Callable[[float], None]
 
-_TILE = 32, BLOCK // 32  # pixels that share one walk
+_MIN_PIXELS_PER_THREAD = 1 << 15
 
 
 def read_out(
@@ -302,28 +305,25 @@ def read_dual(
     surface: CloughTocher, shape: tuple[int, int], on_share: OnShare | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Read the potential from the surface through the sites, and differentiate it."""
-    height, width = shape
-    potential = np.empty((height, width))
-    rows = np.arange(_TILE[0], dtype=np.float64)
-    columns = np.arange(width, dtype=np.float64)
-    # Tile by tile: neighbours in both directions lie on the same few triangles.
-    cuts = np.arange(_TILE[1], width, _TILE[1])
-    for top in range(0, height, _TILE[0]):
-        strip = potential[top : top + _TILE[0]]
-        tiles = [
-            np.stack(np.meshgrid(top + rows[: len(strip)], part, indexing="ij"), axis=-1)
-            for part in np.split(columns, cuts)
-        ]
-        values = surface(np.concatenate([tile.reshape(-1, 2) for tile in tiles]))
-        ends = np.cumsum([tile[..., 0].size for tile in tiles])[:-1]
-        for part, tile in zip(np.split(values, ends), np.split(strip, cuts, axis=1), strict=True):
-            tile[:] = part.reshape(tile.shape)
-        if on_share is not None:
-            on_share((top + len(strip)) / height)
+    potential = surface.at_pixels(shape, on_share)
     potential -= border_mean(potential)
+    displacement = np.empty((2, *shape))
+    rows = max(1, _MIN_PIXELS_PER_THREAD // shape[1])
+    in_ranges(_differentiate, shape[0], surface.threads, potential, displacement, smallest=rows)
+    return potential, displacement
+
+
+@njit(nogil=True, cache=True)
+def _differentiate(start: int, stop: int, potential: FloatArray, displacement: FloatArray) -> None:
+    """Compute minus the gradient by central differences in rows `start` to `stop`."""
     # No flux crosses the border, so beyond it the potential is its mirror image.
-    gradient = np.array(np.gradient(np.pad(potential, 1, mode="symmetric")))
-    return potential, np.ascontiguousarray(-gradient[:, 1:-1, 1:-1])
+    height, width = potential.shape
+    for y in range(start, stop):
+        above, below = max(y - 1, 0), min(y + 1, height - 1)
+        for x in range(width):
+            displacement[0, y, x] = 0.5 * (potential[above, x] - potential[below, x])
+            before, after = max(x - 1, 0), min(x + 1, width - 1)
+            displacement[1, y, x] = 0.5 * (potential[y, before] - potential[y, after])
 
 
 def read_centroids(

@@ -23,10 +23,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import solveh_banded
 
 from napari_shadowinv._system.arrays import PIXELS, VECTOR, check_finite, plain_array
-from napari_shadowinv._system.machine import available_threads
+from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import FloatArray, IntArray
@@ -348,6 +347,7 @@ def _edge_integral(row: int, cut: float, ya: float, xa: float, yb: float, xb: fl
 MIN_SIDE_PX = 4
 # Fixed, so that sums are formed in the same order whatever the number of threads.
 _N_BANDS = 32
+_MIN_PIXELS_PER_THREAD, _MIN_COLUMNS = 1 << 15, 64
 _BYTES_PER_PIXEL = 72  # displacement, its spline, source and image
 
 
@@ -426,9 +426,10 @@ def synthetic_image(
     bands = _bands(shape[0])
     image = np.zeros(shape)
     report("image", 0, len(bands))
-    pool = ThreadPoolExecutor(available_threads(threads))
+    available = available_threads(threads)
+    pool = ThreadPoolExecutor(available)
     try:
-        coefficients = np.stack(list(pool.map(_spline_coefficients, field)))
+        coefficients = np.stack([_spline_coefficients(part, available) for part in field])
         for done, (top, window) in enumerate(pool.map(image_of_band, bands), start=1):
             image[top : top + len(window)] += window
             report("image", done, len(bands))
@@ -438,7 +439,7 @@ def synthetic_image(
     return image
 
 
-def jacobian_determinant(displacement: ArrayLike) -> FloatArray:
+def jacobian_determinant(displacement: ArrayLike, *, threads: int | None = None) -> FloatArray:
     """Area, in the image, of each pixel of the source: det(1 + ∇d), Eq. 4 of the paper.
 
     Negative where the map has folded the pixel over; small where rays crowd. Made of
@@ -449,6 +450,8 @@ def jacobian_determinant(displacement: ArrayLike) -> FloatArray:
     ----------
     displacement : array_like, shape (2, H, W)
         Displacement at the pixels' centres in px, axis order (y, x).
+    threads : int, optional
+        Threads to use. Default: all cores. The result does not depend on it.
 
     Returns
     -------
@@ -462,9 +465,36 @@ def jacobian_determinant(displacement: ArrayLike) -> FloatArray:
     3.0
     """
     field = _finite_displacement(displacement)
-    (dy_dy, dy_dx), (dx_dy, dx_dx) = (np.gradient(component, edge_order=2) for component in field)
-    determinant: FloatArray = (1 + dy_dy) * (1 + dx_dx) - dy_dx * dx_dy
+    determinant = np.empty((field.shape[1], field.shape[2]))
+    rows = max(1, _MIN_PIXELS_PER_THREAD // determinant.shape[1])
+    threads = available_threads(threads)
+    in_ranges(_fill_determinant, len(determinant), threads, field, determinant, smallest=rows)
     return determinant
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _neighbors_in_line(i: int, size: int) -> tuple[int, int, int, float, float, float]:
+    """Return three places along a line, and their weights for the derivative at i."""
+    if i == 0:
+        return 0, 1, 2, -1.5, 2.0, -0.5
+    if i == size - 1:
+        return i, i - 1, i - 2, 1.5, -2.0, 0.5
+    return i + 1, i - 1, i, 0.5, -0.5, 0.0
+
+
+@njit(nogil=True, cache=True)
+def _fill_determinant(start: int, stop: int, field: FloatArray, determinant: FloatArray) -> None:
+    """Compute the determinant in rows `start` to `stop`."""
+    height, width = determinant.shape
+    for y in range(start, stop):
+        y0, y1, y2, of_y0, of_y1, of_y2 = _neighbors_in_line(y, height)
+        for x in range(width):
+            x0, x1, x2, of_x0, of_x1, of_x2 = _neighbors_in_line(x, width)
+            dy_dy = of_y0 * field[0, y0, x] + of_y1 * field[0, y1, x] + of_y2 * field[0, y2, x]
+            dx_dy = of_y0 * field[1, y0, x] + of_y1 * field[1, y1, x] + of_y2 * field[1, y2, x]
+            dy_dx = of_x0 * field[0, y, x0] + of_x1 * field[0, y, x1] + of_x2 * field[0, y, x2]
+            dx_dx = of_x0 * field[1, y, x0] + of_x1 * field[1, y, x1] + of_x2 * field[1, y, x2]
+            determinant[y, x] = (1 + dy_dy) * (1 + dx_dx) - dy_dx * dx_dy
 
 
 def checked_displacement(displacement: ArrayLike) -> FloatArray:
@@ -481,9 +511,10 @@ def checked_displacement(displacement: ArrayLike) -> FloatArray:
 
 
 def _finite_displacement(displacement: ArrayLike) -> FloatArray:
-    field = checked_displacement(displacement)
+    field = np.ascontiguousarray(checked_displacement(displacement))
     check_finite("displacement", field)
-    return field
+    # The kernels are compiled for one type.
+    return field if field.flags.writeable else field.copy()
 
 
 def _checked_source(source: ArrayLike | None, shape: tuple[int, int]) -> FloatArray:
@@ -522,35 +553,80 @@ def _landing_rows(coefficients: FloatArray, first: int, last: int) -> tuple[int,
     return math.floor(top), math.ceil(bottom)
 
 
-def _spline_coefficients(values: FloatArray) -> FloatArray:
+def _spline_coefficients(values: FloatArray, threads: int = 1) -> FloatArray:
     """Coefficients of the bicubic B-spline through all values, two more on each side."""
-    along_y = _line_coefficients(values)
-    return np.ascontiguousarray(_line_coefficients(along_y.T).T)
-
-
-def _line_coefficients(values: FloatArray) -> FloatArray:
-    """B-spline coefficients along the first axis, shape (n + 4, m)."""
-    # The first and last polynomial pieces continue across one more knot ("not a knot") and on
-    # to the rim of the image, half a pixel outside the last centres.
-    n = values.shape[0]
-    coefficients = np.empty((n + 4, values.shape[1]))
-    inner = coefficients[2:-2]
-    # One polynomial on both sides of a knot: the coefficient is f - f''/6, f'' by differences.
-    inner[1] = (8 * values[1] - values[0] - values[2]) / 6
-    inner[-2] = (8 * values[-2] - values[-1] - values[-3]) / 6
-    if n > 4:
-        right = 6 * values[2:-2]
-        right[0] -= inner[1]
-        right[-1] -= inner[-2]
-        matrix = np.ones((2, n - 4))
-        matrix[1] = 4
-        inner[2:-2] = solveh_banded(matrix, right, lower=False) if n > 5 else right / 4
-    for end in (coefficients, coefficients[::-1]):
-        f = values if end is coefficients else values[::-1]
-        end[2] = 6 * f[1] - 4 * end[3] - end[4]
-        end[1] = 6 * f[0] - 4 * end[2] - end[3]
-        end[0] = 4 * end[1] - 6 * end[2] + 4 * end[3] - end[4]
+    height, width = values.shape
+    along_y = np.empty((height + 4, width))
+    coefficients = np.empty((height + 4, width + 4))
+    columns = max(_MIN_COLUMNS, _MIN_PIXELS_PER_THREAD // height)
+    rows = max(1, _MIN_PIXELS_PER_THREAD // width)
+    pivots = _pivots(height), _pivots(width)
+    in_ranges(_filter_columns, width, threads, values, pivots[0], along_y, smallest=columns)
+    in_ranges(_filter_rows, height + 4, threads, along_y, pivots[1], coefficients, smallest=rows)
     return coefficients
+
+
+def _pivots(n: int) -> FloatArray:
+    """Inverse pivots of the elimination in a matrix with 4 on the diagonal and 1 beside it."""
+    pivots = np.empty(max(n - 4, 1))
+    pivots[0] = 0.25
+    for i in range(1, len(pivots)):
+        pivots[i] = 1 / (4 - pivots[i - 1])
+    return pivots
+
+
+# The first and last polynomial pieces continue across one more knot ("not a knot") and on to the
+# rim of the image, half a pixel outside the last centres. One polynomial on both sides of a knot:
+# the coefficient is f - f''/6, f'' by differences. Between these the coefficients solve
+# c[i - 1] + 4 c[i] + c[i + 1] = 6 f[i]. Along y whole rows are combined, along x numbers.
+
+
+@njit(nogil=True, cache=True)
+def _filter_columns(
+    start: int, stop: int, values: FloatArray, pivots: FloatArray, out: FloatArray
+) -> None:
+    """Compute B-spline coefficients along y, shape (n + 4, m), in columns `start` to `stop`."""
+    n = values.shape[0]
+    for j in range(start, stop):
+        out[3, j] = (8 * values[1, j] - values[0, j] - values[2, j]) / 6
+        out[n, j] = (8 * values[n - 2, j] - values[n - 1, j] - values[n - 3, j]) / 6
+    for i in range(2, n - 2):
+        pivot = pivots[i - 2]
+        for j in range(start, stop):
+            out[i + 2, j] = pivot * (6 * values[i, j] - out[i + 1, j])
+    for i in range(n - 3, 1, -1):
+        pivot = pivots[i - 2]
+        for j in range(start, stop):
+            out[i + 2, j] -= pivot * out[i + 3, j]
+    for j in range(start, stop):
+        out[2, j] = 6 * values[1, j] - 4 * out[3, j] - out[4, j]
+        out[1, j] = 6 * values[0, j] - 4 * out[2, j] - out[3, j]
+        out[0, j] = 4 * out[1, j] - 6 * out[2, j] + 4 * out[3, j] - out[4, j]
+        out[n + 1, j] = 6 * values[n - 2, j] - 4 * out[n, j] - out[n - 1, j]
+        out[n + 2, j] = 6 * values[n - 1, j] - 4 * out[n + 1, j] - out[n, j]
+        out[n + 3, j] = 4 * out[n + 2, j] - 6 * out[n + 1, j] + 4 * out[n, j] - out[n - 1, j]
+
+
+@njit(nogil=True, cache=True)
+def _filter_rows(
+    start: int, stop: int, values: FloatArray, pivots: FloatArray, out: FloatArray
+) -> None:
+    """Compute B-spline coefficients along x, shape (m, n + 4), in rows `start` to `stop`."""
+    n = values.shape[1]
+    for row in range(start, stop):
+        f, c = values[row], out[row]
+        c[3] = (8 * f[1] - f[0] - f[2]) / 6
+        c[n] = (8 * f[n - 2] - f[n - 1] - f[n - 3]) / 6
+        for i in range(2, n - 2):
+            c[i + 2] = pivots[i - 2] * (6 * f[i] - c[i + 1])
+        for i in range(n - 3, 1, -1):
+            c[i + 2] -= pivots[i - 2] * c[i + 3]
+        c[2] = 6 * f[1] - 4 * c[3] - c[4]
+        c[1] = 6 * f[0] - 4 * c[2] - c[3]
+        c[0] = 4 * c[1] - 6 * c[2] + 4 * c[3] - c[4]
+        c[n + 1] = 6 * f[n - 2] - 4 * c[n] - c[n - 1]
+        c[n + 2] = 6 * f[n - 1] - 4 * c[n + 1] - c[n]
+        c[n + 3] = 4 * c[n + 2] - 6 * c[n + 1] + 4 * c[n] - c[n - 1]
 
 
 def _spline_samples(tiles: int) -> tuple[IntArray, FloatArray]:

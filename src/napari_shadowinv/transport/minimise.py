@@ -44,7 +44,7 @@ from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.geometry.density import Density, split_pixels
+from napari_shadowinv.geometry.density import Density, side_of_squares, split_pixels
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.transport.linear import SimilarSystems
@@ -205,6 +205,8 @@ def newton(
     else:
         diagram = objective.diagram(weights)
     weights, diagram = _even_out(objective, weights, diagram)
+    # Steps keep this gauge. The triangulation belongs to the weights after any step.
+    weights = objective.in_gauge(weights)
     residual = objective.residual(diagram)
     keep = 0.5 * min(float(diagram.masses.min() / mass.mean()), float(mass.min() / mass.mean()))
     errors = [_length(mass - diagram.masses)]
@@ -239,7 +241,7 @@ def newton(
             break
     converged = residual <= tolerance
     reason = "" if converged else reason
-    return Solution(objective.in_gauge(weights), residual, len(errors) - 1, converged, reason)
+    return Solution(weights, residual, len(errors) - 1, converged, reason)
 
 
 def _even_out(
@@ -403,6 +405,24 @@ def blur_image(image: FloatArray, width: float, threads: int | None = 1) -> Floa
     """
     height, breadth = image.shape
     parts = max(1, int(width / _MAX_BLUR_IN_PIXELS))
+    few = _blur_means(image, width, parts, threads)
+    diffused: FloatArray = split_pixels(few, parts)[:height, :breadth]
+    diffused *= image.sum() / diffused.sum()
+    return diffused
+
+
+def blur_to_density(image: FloatArray, width: float, threads: int | None = 1) -> Density:
+    """Return the density of `blur_image`, on squares of pixels where they tile the image."""
+    side = side_of_squares((image.shape[0], image.shape[1]), width / _MAX_BLUR_IN_PIXELS)
+    if side == 1:
+        return Density.from_image(blur_image(image, width, threads), threads=threads)
+    diffused = _blur_means(image, width, side, threads)
+    diffused *= image.sum() / diffused.sum()
+    return Density.from_image(diffused, side=side, threads=threads)
+
+
+def _blur_means(image: FloatArray, width: float, parts: int, threads: int | None) -> FloatArray:
+    """Blur the means of squares of pixels."""
     means = _means(image, parts)
     workers = available_threads(threads)
     spectrum = dctn(means, workers=workers)
@@ -410,10 +430,7 @@ def blur_image(image: FloatArray, width: float, threads: int | None = 1) -> Floa
         waves = np.pi * np.arange(means.shape[axis]) / means.shape[axis]
         damping = np.exp(-((width / parts) ** 2) * (1 - np.cos(waves)))
         spectrum *= np.expand_dims(damping, 1 - axis)
-    few = np.maximum(idctn(spectrum, workers=workers), means.min())
-    diffused: FloatArray = split_pixels(few, parts)[:height, :breadth]
-    diffused *= image.sum() / diffused.sum()
-    return diffused
+    return np.asarray(np.maximum(idctn(spectrum, workers=workers), means.min()))
 
 
 def _means(image: FloatArray, parts: int) -> FloatArray:
@@ -519,7 +536,8 @@ def _starts(
     """Yield the weights to start from, the most promising first."""
     if not solved:
         yield np.zeros(len(level.sites))
-        yield with_full_cells(objective, _same_moments(level, objective.image.image))[0]
+        pixels = split_pixels(objective.image.image, objective.image.side)
+        yield with_full_cells(objective, _same_moments(level, pixels))[0]
         return
     last = solved[-1]
     if len(solved) > 1:

@@ -30,6 +30,7 @@ from napari_shadowinv.transport.minimise import (
     Solution,
     TransportObjective,
     blur_image,
+    blur_to_density,
     descend,
     newton,
     sharpen,
@@ -111,6 +112,7 @@ def solve(
     margin: Margin | None = None,
     needed: Needed | None = None,
     solved: Sequence[LevelSolution] = (),
+    target: Target | None = None,
 ) -> list[LevelSolution]:
     """Solve on the coarsest level, carry the potential to the next, and so on.
 
@@ -118,12 +120,13 @@ def solve(
     is a margin. With a `start` (weights of the finest level that solve a similar image) it solves
     on the finest level alone, if that converges. After each coarser level, `needed` returns the
     factor on the number of sites that would suffice; at 1 or less the solution ends there. Levels
-    that are already `solved` are not solved again. Returns one solution for each level that was
-    tried. If a level stalls, the finest one is solved from zero weights. The last one counts.
+    that are already `solved` are not solved again. A `target` made of the image may be passed with
+    it. Returns one solution for each level that was tried. If a level stalls, the finest one is
+    solved from zero weights. The last one counts.
     """
     if options.stages == "single":
         levels = levels[-1:]
-    target = Target.of(image, margin, options)
+    target = target or Target.of(image, margin, options)
     if start is not None:
         nearby = _solve_from(start, levels[-1], target, report)
         if nearby is not None:
@@ -278,6 +281,9 @@ class Target:
         margin = self.margin and self.margin.split(factor)
         decay_length = self.options.decay_length and factor * self.options.decay_length
         options = self.options.model_copy(update={"decay_length": decay_length})
+        if margin is None:
+            density = blur_to_density(pixels, blur, options.threads)
+            return Target(density, margin, options).objective(level)
         return Target.of(blur_image(pixels, blur, options.threads), margin, options).objective(
             level
         )

@@ -1,0 +1,363 @@
+"""Levels of the multigrid: ever fewer nodes, each a group of the level before.
+
+- all levels of a Laplacian: `build_hierarchy`, which returns a `Hierarchy` over one `Network`
+- refuse a graph of several parts: `require_connected`
+
+See `napari_shadowinv.transport.linear`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
+from napari_shadowinv.geometry.compiler import kernel, njit
+from napari_shadowinv.geometry.triangle_mesh import Indices
+
+_MAX_COARSEST_NODES = 60
+_MIN_TIE = 0.2
+_MAX_PAIRED_SHARE = 0.75
+_NOT_CONNECTED = (
+    "the cells form several groups with no flux between them, so the relative weights of the "
+    "groups are undetermined"
+)
+
+
+class Network(NamedTuple):
+    """Conductors as rows of (neighbour, conductance), those to lower nodes first."""
+
+    starts: Indices
+    middles: Indices
+    neighbors: Indices
+    conductances: NDArray[np.float32]  # whose sums the degrees are, so nothing leaks
+    degrees: FloatArray
+    inverse_degrees: FloatArray
+
+
+class Hierarchy(NamedTuple):
+    """Data of one cycle: the nodes of level k are `bounds[k]` to `bounds[k + 1]`."""
+
+    bounds: IntArray
+    twice: BoolArray
+    network: Network
+    parents: Indices
+    inverse: FloatArray
+
+
+def _empty_network(nodes: int, entries: int) -> Network:
+    return Network(
+        np.zeros(nodes + 1, np.int32),
+        np.empty(nodes, np.int32),
+        np.empty(entries, np.int32),
+        np.empty(entries, np.float32),
+        np.empty(nodes),
+        np.empty(nodes),
+    )
+
+
+@kernel
+def _put_lower_first(
+    neighbors: Indices,
+    conductances: NDArray[np.float32],
+    begin: int | np.uint32,
+    end: int | np.uint32,
+    node: int | np.uint32,
+) -> tuple[int, float]:
+    """Sort a row to lower and upper neighbours; return where the upper begin, and the sum."""
+    middle = np.uint32(begin)
+    degree = 0.0
+    for k in range(np.uint32(begin), np.uint32(end)):
+        neighbor, conductance = neighbors[k], conductances[k]
+        degree += conductance
+        neighbors[k], conductances[k] = neighbors[middle], conductances[middle]
+        neighbors[middle], conductances[middle] = neighbor, conductance
+        middle += np.uint32(1) if neighbor < node else np.uint32(0)
+    return int(middle), degree
+
+
+@kernel
+def _read_laplacian(
+    starts: Indices, columns: Indices, values: FloatArray, network: Network
+) -> None:
+    """Take the conductors out of a sparse matrix, in any order of columns."""
+    row_starts, middles, neighbors, conductances, degrees, inverse_degrees = network
+    one = np.uint32(1)
+    end = np.uint32(0)
+    for i in range(np.uint32(starts.shape[0] - 1)):
+        begin = end
+        for k in range(np.uint32(starts[i]), np.uint32(starts[i + one])):
+            if columns[k] != i and values[k] < 0.0:
+                neighbors[end] = columns[k]
+                conductances[end] = -values[k]
+                end += one
+        row_starts[i + one] = end
+        middle, degree = _put_lower_first(neighbors, conductances, begin, end, i)
+        middles[i] = middle
+        degrees[i] = degree
+        inverse_degrees[i] = 1.0 / degree if degree != 0.0 else np.inf
+
+
+@kernel
+def _pair(
+    network: Network,
+    start: int,
+    stop: int,
+    weakest: float,
+    inverses: FloatArray,
+    groups: Indices,
+    first: int,
+    group_inverses: FloatArray,
+) -> int:
+    """Group each node with a free neighbour or a group; return the number after the last group."""
+    # A tie is a conductance times the sum of the inverses of the two sides' degrees, where a
+    # group's degree is the sum over the nodes of the level it stands for (Napov and Notay,
+    # Eq. 3.6, for rows that sum to zero). The inverses are given for the nodes and found for
+    # the groups. Nodes without a tie of at least `weakest` stay alone: where both sides are
+    # held much more strongly by others, the sweeps do not smooth an error that differs between
+    # them.
+    # the attributes are looked up once because each look-up counts references
+    starts, _, neighbors, conductances, _, _ = network
+    for i in range(start, stop):
+        groups[i] = -1
+    count = first
+    for i in range(np.uint32(start), np.uint32(stop)):
+        if groups[i] >= 0:
+            continue
+        free = taken = -1
+        free_tie = taken_tie = weakest
+        for k in range(np.uint32(starts[i]), np.uint32(starts[i + 1])):
+            neighbour = np.uint32(neighbors[k])
+            group = groups[neighbour]
+            if group < 0:
+                tie = conductances[k] * (inverses[i] + inverses[neighbour])
+                if tie > free_tie:
+                    free, free_tie = int(neighbour), tie
+            else:
+                tie = conductances[k] * (inverses[i] + group_inverses[np.uint32(group - first)])
+                if tie > taken_tie:
+                    taken, taken_tie = group, tie
+        if free >= 0:
+            groups[i] = groups[free] = count
+            group_inverses[count - first] = _join_inverses(inverses[i], inverses[free])
+            count += 1
+        elif taken >= 0:
+            groups[i] = taken
+            group_inverses[taken - first] = _join_inverses(
+                inverses[i], group_inverses[taken - first]
+            )
+        else:
+            groups[i] = count
+            group_inverses[count - first] = inverses[i]
+            count += 1
+    return count
+
+
+@kernel
+def _join_inverses(a: float, b: float) -> float:
+    """Return the inverse of the sum of two numbers from their inverses."""
+    return a * b / (a + b)
+
+
+@njit(nogil=True, cache=True)
+def _list_members(
+    start: int, stop: int, groups: Indices, first: int, last: int
+) -> tuple[Indices, Indices]:
+    """Sort the nodes by group: the places where each group begins, and the nodes."""
+    begins = np.zeros(last - first + 1, np.int32)
+    for i in range(start, stop):
+        begins[groups[i] - first + 1] += 1
+    for g in range(last - first):
+        begins[g + 1] += begins[g]
+    filled = begins[:-1].copy()
+    members = np.empty(stop - start, np.int32)
+    for i in range(start, stop):
+        g = groups[i] - first
+        members[filled[g]] = i
+        filled[g] += 1
+    return begins, members
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _contract(
+    fine: Network, start: int, stop: int, groups: Indices, coarse: Network, first: int, last: int
+) -> None:
+    """Make each group one node, with the sums of the conductances between groups."""
+    begins, members = _list_members(start, stop, groups, first, last)
+    place = np.full(last - first, -1, np.int32)
+    _sum_conductances(fine, groups, begins, members, place, coarse, first)
+
+
+@kernel
+def _sum_conductances(
+    fine: Network,
+    groups: Indices,
+    begins: Indices,
+    members: Indices,
+    place: Indices,
+    coarse: Network,
+    first: int,
+) -> None:
+    """Fill the rows of the coarse network; `place` is -1 for each group."""
+    starts, _, neighbors, conductances, _, _ = fine
+    rows, middles, coarse_neighbors, coarse_conductances, degrees, inverse_degrees = coarse
+    one, offset = np.uint32(1), np.uint32(first)
+    end = rows[first]
+    for group in range(np.uint32(place.size)):
+        begin = end
+        g = group + offset
+        for m in range(np.uint32(begins[group]), np.uint32(begins[group + one])):
+            node = np.uint32(members[m])
+            for k in range(np.uint32(starts[node]), np.uint32(starts[node + one])):
+                adjacent = np.uint32(groups[np.uint32(neighbors[k])])
+                if adjacent == g:
+                    continue
+                at = place[adjacent - offset]
+                if at < begin:
+                    place[adjacent - offset] = end
+                    coarse_neighbors[np.uint32(end)] = adjacent
+                    coarse_conductances[np.uint32(end)] = conductances[k]
+                    end += 1
+                else:
+                    coarse_conductances[np.uint32(at)] += conductances[k]
+        rows[g + one] = end
+        middle, degree = _put_lower_first(coarse_neighbors, coarse_conductances, begin, end, g)
+        middles[g] = middle
+        degrees[g] = degree
+        inverse_degrees[g] = 1.0 / degree if degree != 0.0 else np.inf
+
+
+def build_hierarchy(laplacian: csr_array, ground: FloatArray | None = None) -> Hierarchy:
+    """Group nodes, and groups of nodes, until few are left; see `LaplacianSolver`."""
+    n = int(laplacian.shape[0])
+    # every level has at most three quarters of the nodes of the last, so 4 n are enough;
+    # pages that are never touched take no memory
+    network = _empty_network(4 * n + _MAX_COARSEST_NODES, 2 * int(laplacian.nnz))
+    parents: Indices = np.empty(4 * n + _MAX_COARSEST_NODES, np.int32)
+    _read_laplacian(
+        laplacian.indptr.astype(np.int32, copy=False),
+        laplacian.indices.astype(np.int32, copy=False),
+        laplacian.data.astype(np.float64, copy=False),
+        network,
+    )
+    _tie_to_ground(network, 0, ground)
+    bounds = [0, n]
+    while bounds[-1] - bounds[-2] > _MAX_COARSEST_NODES:
+        network, last = _add_level(network, parents, bounds[-2], bounds[-1])
+        if ground is not None:
+            groups = parents[bounds[-2] : bounds[-1]] - bounds[-1]
+            ground = np.bincount(groups, ground, last - bounds[-1]).astype(np.float64)
+            _tie_to_ground(network, bounds[-1], ground)
+        bounds.append(last)
+    return Hierarchy(
+        np.array(bounds, np.int64),
+        _choose_second_steps(network, bounds),
+        network,
+        parents,
+        _invert_coarsest(network, bounds[-2], bounds[-1], grounded=ground is not None),
+    )
+
+
+def _tie_to_ground(network: Network, start: int, ground: FloatArray | None) -> None:
+    """Add conductances to a ground at potential 0; the nodes from `start` on have them."""
+    if ground is not None:
+        nodes = slice(start, start + len(ground))
+        network.degrees[nodes] += ground
+        network.inverse_degrees[nodes] = 1.0 / network.degrees[nodes]
+
+
+def _add_level(network: Network, parents: Indices, start: int, stop: int) -> tuple[Network, int]:
+    """Pair the last level's nodes, pair the pairs; return the network and its number of nodes."""
+    if stop - start > 1 and not network.degrees[start:stop].min() > 0.0:
+        raise RuntimeError(_NOT_CONNECTED)
+    inverses = np.empty(stop - start)
+    for weakest in (_MIN_TIE, 0.0):
+        count = _pair(network, start, stop, weakest, network.inverse_degrees, parents, 0, inverses)
+        if count <= _MAX_PAIRED_SHARE * (stop - start):
+            break
+    else:
+        raise RuntimeError("the fluxes between cells are not finite, or underflow")
+    pairs = _empty_network(count, network.starts[stop] - network.starts[start])
+    _contract(network, start, stop, parents, pairs, 0, count)
+    groups = np.empty(count, np.int32)
+    last = _pair(pairs, 0, count, _MIN_TIE, inverses, groups, stop, np.empty(count))
+    network = _grow_network(network, network.starts[stop] + pairs.starts[count])
+    _contract(pairs, 0, count, groups, network, stop, last)
+    parents[start:stop] = groups[parents[start:stop]]
+    return network, last
+
+
+def _grow_network(network: Network, entries: int) -> Network:
+    """Make room for a number of entries; a planar network comes with enough."""
+    missing = entries - len(network.neighbors)
+    if missing <= 0:
+        return network
+    return network._replace(
+        neighbors=np.concatenate([network.neighbors, np.empty(missing, np.int32)]),
+        conductances=np.concatenate([network.conductances, np.empty(missing, np.float32)]),
+    )
+
+
+def _choose_second_steps(network: Network, bounds: list[int]) -> BoolArray:
+    """Choose the levels with two steps a cycle: those whose visits cost less than level 0."""
+    entries = np.diff(network.starts[bounds])
+    twice = np.zeros(len(entries), np.bool_)
+    visits = 2
+    for level in range(1, len(entries) - 1):
+        if visits * entries[level] <= entries[0]:
+            twice[level] = True
+            visits *= 2
+    return twice
+
+
+def _invert_coarsest(network: Network, start: int, stop: int, *, grounded: bool) -> FloatArray:
+    """Invert the last level's Laplacian; without a ground, with constants made regular."""
+    entries = slice(network.starts[start], network.starts[stop])
+    graph = csr_array(
+        (
+            network.conductances[entries],
+            network.neighbors[entries] - start,
+            network.starts[start : stop + 1] - network.starts[start],
+        ),
+        shape=(stop - start, stop - start),
+    )
+    require_connected(graph)
+    degrees = network.degrees[start:stop]
+    regular = np.diag(degrees) - graph.toarray()
+    if not grounded:
+        regular += (degrees.mean() or 1.0) / (stop - start)
+    inverse: FloatArray = np.linalg.inv(regular)
+    return inverse
+
+
+def require_connected(graph: csr_array) -> None:
+    """Raise a RuntimeError if a symmetric matrix falls into several blocks."""
+    starts, columns = (
+        indices.astype(np.int32, copy=False) for indices in (graph.indptr, graph.indices)
+    )
+    if _count_reached(starts, columns) < graph.shape[0]:
+        raise RuntimeError(_NOT_CONNECTED)
+
+
+@njit(nogil=True, cache=True)
+def _count_reached(starts: Indices, columns: Indices) -> int:
+    """Count the nodes that are connected with the first."""
+    n = starts.size - 1
+    is_reached = np.zeros(n, np.bool_)
+    queue = np.zeros(n, np.int32)
+    count = min(n, 1)
+    is_reached[:count] = True
+    done = 0
+    while done < count:
+        node = queue[done]
+        done += 1
+        for k in range(starts[node], starts[node + 1]):
+            neighbor = columns[k]
+            if not is_reached[neighbor]:
+                is_reached[neighbor] = True
+                queue[count] = neighbor
+                count += 1
+    return count
