@@ -259,3 +259,32 @@ def test_settling_goes_on_by_descent_where_its_own_steps_fail(scene: Scene) -> N
     assert value < before / 3
     assert steps <= 60
     assert ended == (steps < 60)
+
+
+def test_a_rough_search_ends_at_a_step_that_gains_what_was_expected(scene: Scene) -> None:
+    truth = bump(scene, 1.0)
+    target = with_noisy_images(scene, truth)
+    near = truth._replace(potentials=0.97 * truth.potentials)
+    before, _ = target.value_and_gradient(near, target.ray_counts(near))
+    _, least, most, _ = settle(target, near, steps=8, least_gain=1e-3)
+    _, value, steps, ended = settle(target, near, steps=8, least_gain=1e-3, is_rough=True)
+    assert ended
+    assert steps < most
+    assert value - least < 0.02 * (before - least)
+
+
+def test_a_hopeless_search_ends_before_its_first_step(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Images with a constant beneath them: no field comes near the objective to beat."""
+    truth = bump(scene, 1.0)
+    target = with_noisy_images(scene, truth)
+    to_beat = settle(target, truth, steps=8, least_gain=0.1)[1]
+    brighter = replace(target, images=target.images + 0.3)
+    built: list[Scene] = []
+    original = Scene.linear
+    monkeypatch.setattr(Scene, "linear", lambda *given: built.append(given[0]) or original(*given))
+    end, value, steps, _ = settle(brighter, truth, steps=8, least_gain=0.1, to_beat=to_beat)
+    assert (steps, len(built)) == (0, 1)
+    assert end is truth
+    assert value > 3 * to_beat
