@@ -57,10 +57,9 @@ def works(folder: Path, only: str) -> dict[str, Work]:
         name = f"fit, {title}"
         if only not in name:
             continue
-        strengths = case.strengths()
         images = case.images() if size == (SIDE, SIDE) else large_images(case, size)
         images += noise * np.random.default_rng(0).normal(size=images.shape)
-        np.savez(folder / name, images=images, strengths=strengths)
+        np.savez(folder / name, images=images, strengths=case.strengths())
         places = np.indices(size, dtype=np.float64)
         np.save(folder / f"{name} truth.npy", [field(*places) for field in case.fields])
         found[name] = {"fit": name, "noise": noise, "keywords": case.keywords}
@@ -151,8 +150,9 @@ def worker() -> None:
     for line in sys.stdin:
         work = json.loads(line)
         done = streamed if "stream" in work else fitted if "fit" in work else inverted
+        measured = done(work, Path(work["folder"]))
         gigabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-        print(json.dumps([*done(work, Path(work["folder"])), gigabytes]), flush=True)
+        print(json.dumps([*measured, gigabytes]), flush=True)
 
 
 def large_images(case: Case, size: tuple[int, int]) -> FloatArray:
@@ -185,11 +185,11 @@ class Version:
 
 
 def row(name: str, work: Work, old: Version, new: Version, repeat: int) -> str:
-    _, *errors = zip(new.does(work), old.does(work), strict=True)
-    pairs = [(old.does(work), new.does(work)) for _ in range(repeat)]
+    new.does(work), old.does(work)
+    pairs = np.array([(old.does(work), new.does(work)) for _ in range(repeat)])
     (before, *_, of_before), (now, *_, of_now) = np.median(pairs, axis=0)
-    ratios = np.array([one[0] / other[0] for one, other in pairs])
-    shares = ("" if np.isnan(one) else f"{100 * one:.2f}" for one in reversed(errors[0]))
+    ratios = pairs[:, 0, 0] / pairs[:, 1, 0]
+    shares = ("" if np.isnan(error) else f"{100 * error:.2f}" for error in pairs[0, :, 1])
     times = f"{np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})"
     memory = f"{of_before:.2f} | {of_now:.2f}"
     return f"| {name} | {before:.3f} | {now:.3f} | {times} | {' | '.join(shares)} | {memory} |"

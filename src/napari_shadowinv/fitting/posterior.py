@@ -19,7 +19,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from operator import add
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from scipy.fft import dctn, idctn
@@ -51,9 +51,6 @@ __all__ = [
     "sampled_potentials",
     "shifts_by_beam",
 ]
-
-_S = TypeVar("_S")
-_T = TypeVar("_T")
 
 _ROUGHLY, _CLOSELY = 0.05, 0.002  # the longest waves, which noise moves most, are found last
 # Fields and numbers of an instrument that explain an image alike are found last of all.
@@ -186,13 +183,12 @@ class Posterior:
         """
         if tolerance is None:
             tolerance = _IN_VALLEY if self._scene.has_free_numbers else _CLOSELY
-        drawn = [self._draw() for _ in range(count)]
-
-        def sample(posterior: Posterior, draw: _Draw) -> Sample:
-            change = posterior._change(draw.slope, tolerance)
-            return Sample(change.plus(draw.numbers), draw.noise, draw.force)
-
-        return self._solve_each(sample, drawn)
+        draws = [self._draw() for _ in range(count)]
+        changes = self._changes([draw.slope for draw in draws], tolerance)
+        return [
+            Sample(change.plus(draw.numbers), draw.noise, draw.force)
+            for draw, change in zip(draws, changes, strict=True)
+        ]
 
     def _draw(self) -> _Draw:
         noise = self._rng.normal(size=self._scene.images.shape)
@@ -203,22 +199,22 @@ class Posterior:
         force = self._scene.prior.draw(self._unknowns, self._rng)
         return _Draw(noise, force, numbers, self._linear.pull(residuals).plus(force))
 
-    def _solve_each(self, work: Callable[[Posterior, _S], _T], items: Sequence[_S]) -> list[_T]:
-        """Call a function for each item, in threads with posteriors of their own.
+    def _changes(self, slopes: Sequence[Unknowns], tolerance: float) -> list[Unknowns]:
+        """Solve for the change that undoes each slope, in threads.
 
-        The first one comes before all others, which know the modes that it has found.
+        The first comes before all others, which know the modes that it has found.
         """
         threads = available_threads(self._scene.threads)
-        alone = replace(self._scene, threads=max(1, threads // max(len(items) - 1, 1)))
+        alone = replace(self._scene, threads=max(1, threads // max(len(slopes) - 1, 1)))
 
-        def solve_alone(item: _S, after_step: Callable[[], None]) -> _T:
+        def change_alone(slope: Unknowns, after_step: Callable[[], None]) -> Unknowns:
             posterior = copy(self)
             posterior._scene, posterior._linear = alone, replace(self._linear, scene=alone)
             posterior._after_step, posterior._modes = after_step, copy(self._modes)
-            return work(posterior, item)
+            return posterior._change(slope, tolerance)
 
-        first = [work(self, item) for item in items[:1]]
-        works = [partial(solve_alone, item) for item in items[1:]]
+        first = [self._change(slope, tolerance) for slope in slopes[:1]]
+        works = [partial(change_alone, slope) for slope in slopes[1:]]
         return first + run_in_parallel(works, threads, self._after_step)
 
     def solve(self, samples: Sequence[Sample], steps: int = _SOLVING_STEPS) -> list[Sample]:
@@ -351,11 +347,10 @@ class Posterior:
             pull = self._linear.pull(-self._linear.push(numbers))
             pulls.append(pull._replace(common=none.common, separate=none.separate))
 
-        def share(respond: Posterior, pull: Unknowns) -> float:
-            moved = self._displacements(respond._change(pull, _ROUGHLY))
-            return largest_share(moved, displacements)
-
-        return dict(zip(keys, respond._solve_each(share, pulls), strict=True))
+        moved = map(self._displacements, respond._changes(pulls, _ROUGHLY))
+        return {
+            key: largest_share(each, displacements) for key, each in zip(keys, moved, strict=True)
+        }
 
     def _displacements(self, unknowns: Unknowns) -> FloatArray:
         """Displacement of each field, (M, 2, H, W), px of the scene."""
@@ -385,11 +380,7 @@ class Posterior:
             self._linear.pull(self._scene.changed_by_beams(self._unknowns, self._counts, each))
             for each in variations
         ]
-
-        def change(posterior: Posterior, slope: Unknowns) -> Unknowns:
-            return posterior._change(slope, _MOVED_BY_BEAMS)
-
-        return self._solve_each(change, slopes)
+        return self._changes(slopes, _MOVED_BY_BEAMS)
 
     def open_beams(
         self, variation: float, samples: Sequence[Sample], rng: np.random.Generator
@@ -431,11 +422,7 @@ class Posterior:
             pull = posterior._linear.pull(residuals).beam
             pull += np.sqrt(weights) * rng.normal(size=weights.shape)
             slopes.append(unknowns.zeros()._replace(beam=pull))
-
-        def change(posterior: Posterior, slope: Unknowns) -> Unknowns:
-            return posterior._change(slope, _OPEN_BEAMS)
-
-        return posterior._solve_each(change, slopes)
+        return posterior._changes(slopes, _OPEN_BEAMS)
 
     def log_volume(self, chances: Sequence[np.random.Generator]) -> float:
         """Return half the log-determinant of the Hessian relative to the prior of potentials.

@@ -141,8 +141,8 @@ def _irregular_edges(mesh: Mesh, t: int) -> int:
     # determinant serves for its three edges.
     corners, twins, points, weights = mesh.corners, mesh.twins, mesh.points, mesh.weights
     e = np.uint32(3 * t)
-    one, two = np.uint32(1), np.uint32(2)
-    i, j, k = np.uint32(corners[e]), np.uint32(corners[e + one]), np.uint32(corners[e + two])
+    second, third = np.uint32(1), np.uint32(2)
+    i, j, k = np.uint32(corners[e]), np.uint32(corners[e + second]), np.uint32(corners[e + third])
     irregular = 0
     x0, y0, w0 = points[i, 0], points[i, 1], weights[i]
     ax, ay, a_gain = points[j, 0] - x0, points[j, 1] - y0, weights[j] - w0

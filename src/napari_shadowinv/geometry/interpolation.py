@@ -672,14 +672,14 @@ def _evaluate_rows(
         top = math.ceil(max(min(ya, yb, yc) - _EDGE_PX, float(begin)))
         bottom = math.floor(min(max(ya, yb, yc) + _EDGE_PX, end - 1.0))
         xa, xb, xc = points[a, 1], points[b, 1], points[c, 1]
-        left = math.ceil(max(min(xa, xb, xc) - _EDGE_PX, 0.0))
-        right = math.floor(min(max(xa, xb, xc) + _EDGE_PX, width - 1.0))
-        if top > bottom or left > right:
+        first = math.ceil(max(min(xa, xb, xc) - _EDGE_PX, 0.0))
+        last = math.floor(min(max(xa, xb, xc) + _EDGE_PX, width - 1.0))
+        if top > bottom or first > last:
             continue
         _gather_corners(vertices, t, points, values, gradients, p, f, g)
         _fill_patch(p, f, g, patch)
         for row in range(top, bottom + 1):
-            for column in range(left, right + 1):
+            for column in range(first, last + 1):
                 b0, b1, b2 = _patch_coordinates(patch, row, column)
                 if min(b0, b1, b2) >= -_EDGE_SHARE:
                     out[row, column], _ = _value_on_patch(patch, row, column)
@@ -758,8 +758,8 @@ class CloughTocher:
         smallest = max(1, _MIN_PIXELS_PER_THREAD // width)
         for strip, top in enumerate(range(0, height, STRIP_PX)):
             rows = min(STRIP_PX, height - top)
-            here = members[starts[strip] : starts[strip + 1]]
-            operands = top, here, *self._arrays, out
+            triangles = members[starts[strip] : starts[strip + 1]]
+            operands = top, triangles, *self._arrays, out
             in_ranges(_evaluate_rows, rows, self.threads, *operands, smallest=smallest)
             if on_share is not None:
                 on_share((top + rows) / height)

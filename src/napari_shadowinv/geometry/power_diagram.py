@@ -70,6 +70,27 @@ def _power_centres(
         centres[t, 1] = points[a, 1] + (c_lift * by - b_lift * cy) / double_area
 
 
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+def _walk_border(
+    e: int,
+    sides: Indices,
+    centres: FloatArray,
+    image: FloatArray,
+    sums: FloatArray,
+    with_moments: bool,
+) -> tuple[float, float, float, float, float]:
+    """Walk a border as `walk_clipped` does, without inertia; most lie inside the image."""
+    height, width = float(image.shape[0]), float(image.shape[1])
+    a, b = np.uint32(sides[e, 0]), np.uint32(sides[e, 1])
+    ya, xa = centres[a, 0] + 0.5, centres[a, 1] + 0.5
+    yb, xb = centres[b, 0] + 0.5, centres[b, 1] + 0.5
+    if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
+        walk = walk_inside(image, sums, ya, xa, yb, xb, with_moments, False)
+    else:
+        walk = walk_clipped(image, sums, ya, xa, yb, xb, with_moments, False)
+    return walk
+
+
 @njit(nogil=True, cache=True, error_model="numpy")
 def _integrate_edges(
     start: int,
@@ -81,16 +102,9 @@ def _integrate_edges(
     integrals: FloatArray,
 ) -> None:
     """Walk each border; columns of `integrals`: flux and mass."""
-    height, width = float(image.shape[0]), float(image.shape[1])
     for e in range(start, stop):
-        left, right = np.uint32(sides[e, 0]), np.uint32(sides[e, 1])
-        ya, xa = centres[left, 0] + 0.5, centres[left, 1] + 0.5
-        yb, xb = centres[right, 0] + 0.5, centres[right, 1] + 0.5
-        if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
-            flux, mass, _, _, _ = walk_inside(image, sums, ya, xa, yb, xb, False, False)
-        else:
-            flux, mass, _, _, _ = walk_clipped(image, sums, ya, xa, yb, xb, False, False)
-        integrals[e, 0], integrals[e, 1] = flux, mass
+        walk = _walk_border(e, sides, centres, image, sums, False)
+        integrals[e, 0], integrals[e, 1] = walk[0], walk[1]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -104,15 +118,8 @@ def _integrate_moments(
     integrals: FloatArray,
 ) -> None:
     """Walk each border; columns of `integrals`: flux, mass, moments y and x."""
-    height, width = float(image.shape[0]), float(image.shape[1])
     for e in range(start, stop):
-        left, right = np.uint32(sides[e, 0]), np.uint32(sides[e, 1])
-        ya, xa = centres[left, 0] + 0.5, centres[left, 1] + 0.5
-        yb, xb = centres[right, 0] + 0.5, centres[right, 1] + 0.5
-        if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
-            walk = walk_inside(image, sums, ya, xa, yb, xb, True, False)
-        else:
-            walk = walk_clipped(image, sums, ya, xa, yb, xb, True, False)
+        walk = _walk_border(e, sides, centres, image, sums, True)
         integrals[e, 0], integrals[e, 1] = walk[0], walk[1]
         integrals[e, 2], integrals[e, 3] = walk[2], walk[3]
 

@@ -594,14 +594,14 @@ def list_edges(corners: Indices, twins: Indices) -> tuple[Indices, Indices]:
 def _fill_edges(corners: Indices, twins: Indices, pairs: Indices, sides: Indices) -> int:
     # Written for each side and kept for every second: without branches to mispredict.
     count = np.uint32(0)
-    one, two, three = np.uint32(1), np.uint32(2), np.uint32(3)
+    second, third, sides_each = np.uint32(1), np.uint32(2), np.uint32(3)
     for t in range(np.uint32(corners.size // 3)):
-        e = three * t
+        e = sides_each * t
         for side in range(3):
             h = e + np.uint32(side)
             g = twins[h]
-            pairs[count, 0] = corners[e + one if side == 0 else (e + two if side == 1 else e)]
-            pairs[count, 1] = corners[e + two if side == 0 else (e if side == 1 else e + one)]
-            sides[count, 0], sides[count, 1] = t, np.uint32(g) // three
-            count += one if g > h else np.uint32(0)
+            pairs[count, 0] = corners[e + second if side == 0 else (e + third if side == 1 else e)]
+            pairs[count, 1] = corners[e + third if side == 0 else (e if side == 1 else e + second)]
+            sides[count, 0], sides[count, 1] = t, np.uint32(g) // sides_each
+            count += np.uint32(1) if g > h else np.uint32(0)
     return int(count)

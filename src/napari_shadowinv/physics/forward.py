@@ -582,14 +582,33 @@ def _pivots(n: int) -> FloatArray:
 
 
 @njit(nogil=True, cache=True)
+def _fill_next_to_ends(f: FloatArray, c: FloatArray) -> None:
+    """Compute the coefficients at the second and at the last value but one of a line."""
+    n = f.size
+    c[3] = (8 * f[1] - f[0] - f[2]) / 6
+    c[n] = (8 * f[n - 2] - f[n - 1] - f[n - 3]) / 6
+
+
+@njit(nogil=True, cache=True)
+def _fill_ends(f: FloatArray, c: FloatArray) -> None:
+    """Compute the three coefficients at each end of a line from those between them."""
+    n = f.size
+    c[2] = 6 * f[1] - 4 * c[3] - c[4]
+    c[1] = 6 * f[0] - 4 * c[2] - c[3]
+    c[0] = 4 * c[1] - 6 * c[2] + 4 * c[3] - c[4]
+    c[n + 1] = 6 * f[n - 2] - 4 * c[n] - c[n - 1]
+    c[n + 2] = 6 * f[n - 1] - 4 * c[n + 1] - c[n]
+    c[n + 3] = 4 * c[n + 2] - 6 * c[n + 1] + 4 * c[n] - c[n - 1]
+
+
+@njit(nogil=True, cache=True)
 def _filter_columns(
     start: int, stop: int, values: FloatArray, pivots: FloatArray, out: FloatArray
 ) -> None:
     """Compute B-spline coefficients along y, shape (n + 4, m), in columns `start` to `stop`."""
     n = values.shape[0]
     for j in range(start, stop):
-        out[3, j] = (8 * values[1, j] - values[0, j] - values[2, j]) / 6
-        out[n, j] = (8 * values[n - 2, j] - values[n - 1, j] - values[n - 3, j]) / 6
+        _fill_next_to_ends(values[:, j], out[:, j])
     for i in range(2, n - 2):
         pivot = pivots[i - 2]
         for j in range(start, stop):
@@ -599,12 +618,7 @@ def _filter_columns(
         for j in range(start, stop):
             out[i + 2, j] -= pivot * out[i + 3, j]
     for j in range(start, stop):
-        out[2, j] = 6 * values[1, j] - 4 * out[3, j] - out[4, j]
-        out[1, j] = 6 * values[0, j] - 4 * out[2, j] - out[3, j]
-        out[0, j] = 4 * out[1, j] - 6 * out[2, j] + 4 * out[3, j] - out[4, j]
-        out[n + 1, j] = 6 * values[n - 2, j] - 4 * out[n, j] - out[n - 1, j]
-        out[n + 2, j] = 6 * values[n - 1, j] - 4 * out[n + 1, j] - out[n, j]
-        out[n + 3, j] = 4 * out[n + 2, j] - 6 * out[n + 1, j] + 4 * out[n, j] - out[n - 1, j]
+        _fill_ends(values[:, j], out[:, j])
 
 
 @njit(nogil=True, cache=True)
@@ -615,18 +629,12 @@ def _filter_rows(
     n = values.shape[1]
     for row in range(start, stop):
         f, c = values[row], out[row]
-        c[3] = (8 * f[1] - f[0] - f[2]) / 6
-        c[n] = (8 * f[n - 2] - f[n - 1] - f[n - 3]) / 6
+        _fill_next_to_ends(f, c)
         for i in range(2, n - 2):
             c[i + 2] = pivots[i - 2] * (6 * f[i] - c[i + 1])
         for i in range(n - 3, 1, -1):
             c[i + 2] -= pivots[i - 2] * c[i + 3]
-        c[2] = 6 * f[1] - 4 * c[3] - c[4]
-        c[1] = 6 * f[0] - 4 * c[2] - c[3]
-        c[0] = 4 * c[1] - 6 * c[2] + 4 * c[3] - c[4]
-        c[n + 1] = 6 * f[n - 2] - 4 * c[n] - c[n - 1]
-        c[n + 2] = 6 * f[n - 1] - 4 * c[n + 1] - c[n]
-        c[n + 3] = 4 * c[n + 2] - 6 * c[n + 1] + 4 * c[n] - c[n - 1]
+        _fill_ends(f, c)
 
 
 def _spline_samples(tiles: int) -> tuple[IntArray, FloatArray]:

@@ -85,16 +85,16 @@ def _read_laplacian(
 ) -> None:
     """Take the conductors out of a sparse matrix, in any order of columns."""
     row_starts, middles, neighbors, conductances, degrees, inverse_degrees = network
-    one = np.uint32(1)
+    step = np.uint32(1)
     end = np.uint32(0)
     for i in range(np.uint32(starts.shape[0] - 1)):
         begin = end
-        for k in range(np.uint32(starts[i]), np.uint32(starts[i + one])):
+        for k in range(np.uint32(starts[i]), np.uint32(starts[i + step])):
             if columns[k] != i and values[k] < 0.0:
                 neighbors[end] = columns[k]
                 conductances[end] = -values[k]
-                end += one
-        row_starts[i + one] = end
+                end += step
+        row_starts[i + step] = end
         middle, degree = _put_lower_first(neighbors, conductances, begin, end, i)
         middles[i] = middle
         degrees[i] = degree
@@ -204,14 +204,14 @@ def _sum_conductances(
     """Fill the rows of the coarse network; `place` is -1 for each group."""
     starts, _, neighbors, conductances, _, _ = fine
     rows, middles, coarse_neighbors, coarse_conductances, degrees, inverse_degrees = coarse
-    one, offset = np.uint32(1), np.uint32(first)
+    step, offset = np.uint32(1), np.uint32(first)
     end = rows[first]
     for group in range(np.uint32(place.size)):
         begin = end
         g = group + offset
-        for m in range(np.uint32(begins[group]), np.uint32(begins[group + one])):
+        for m in range(np.uint32(begins[group]), np.uint32(begins[group + step])):
             node = np.uint32(members[m])
-            for k in range(np.uint32(starts[node]), np.uint32(starts[node + one])):
+            for k in range(np.uint32(starts[node]), np.uint32(starts[node + step])):
                 adjacent = np.uint32(groups[np.uint32(neighbors[k])])
                 if adjacent == g:
                     continue
@@ -223,7 +223,7 @@ def _sum_conductances(
                     end += 1
                 else:
                     coarse_conductances[np.uint32(at)] += conductances[k]
-        rows[g + one] = end
+        rows[g + step] = end
         middle, degree = _put_lower_first(coarse_neighbors, coarse_conductances, begin, end, g)
         middles[g] = middle
         degrees[g] = degree
