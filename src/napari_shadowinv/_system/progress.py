@@ -34,7 +34,7 @@ class Progress:
 
 OnProgress = Callable[[Progress], None]
 OnStep = Callable[[str, float], None]
-"""Receives the stage and the objective after each step of a fit; ends it by an exception."""
+"""Receives the stage and the objective after each step of a fit; an exception ends the fit."""
 ShouldStop = Callable[[], bool]
 
 _P = ParamSpec("_P")

@@ -122,14 +122,14 @@ def _splines_of(scene: Scene, potential: FloatArray) -> FloatArray:
 
 
 class _Descent(NamedTuple):
-    """Stages of a start that lie before it, and where it is."""
+    """A start, the minimum it has reached, and the stages it still has to pass."""
 
     start: Start
     minimum: Minimum
     stages: Sequence[tuple[int, float]]
 
     def run(self, scene: Scene, on_step: OnStep) -> Minimum:
-        """Return where the stages end."""
+        """Return the minimum at the end of the stages."""
         end = replace(self.minimum, start=self.start.name)
         for stage in self.stages:
             end = _descend_stage(scene, end, stage, on_step)
@@ -175,7 +175,7 @@ def search(scene: Scene, starts: Sequence[Start], on_step: OnStep) -> list[Minim
 
 
 def _is_shared(start: Start) -> bool:
-    """Whether the first stage of a start may be that of others."""
+    """Whether starts with the same first stage may share it: those without a field."""
     return start.potential is None and len(start.stages) > 1
 
 
