@@ -114,7 +114,7 @@ def border_mean(potential: ArrayLike) -> float:
     plane or empty.
     """
     plain = plain_array(potential, "potential", unit=SQUARE_PIXELS)
-    values = np.asarray(check_plane(plain, "potential"), dtype=np.float64)
+    values = np.ascontiguousarray(check_plane(plain, "potential"), dtype=np.float64)
     border = np.ones(values.shape, dtype=bool)
     border[1:-1, 1:-1] = False
     return float(values[border].mean())
@@ -137,7 +137,7 @@ def _solve_neumann(laplacian: FloatArray) -> FloatArray:
 def _checked(name: str, values: ArrayLike) -> FloatArray:
     plain = plain_array(values, name)
     check_memory(plain.shape, _BYTES_PER_PIXEL, "a linear inversion")
-    array = np.asarray(check_plane(plain, name), dtype=np.float64)
+    array = np.ascontiguousarray(check_plane(plain, name), dtype=np.float64)
     check_finite(name, array)
     return array
 
