@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -159,6 +163,32 @@ def test_modes_of_another_matrix_do_no_harm() -> None:
         matrix, right = with_soft_directions(size, 20, 10), rng.normal(size=size)
         solution, _ = solve_and_count(matrix, right, modes)
         assert np.linalg.norm(matrix @ solution - right) < 1.1e-6 * np.linalg.norm(right)
+
+
+def test_threads_of_linear_algebra_change_no_bit_of_a_solution() -> None:
+    script = """
+import numpy as np
+from napari_shadowinv.fitting.conjugate_gradients import SoftModes, solve
+
+rng, modes = np.random.default_rng(11), SoftModes()
+values = np.append(np.geomspace(1e-4, 0.3, 60), rng.uniform(0.6, 2, 20000))
+for right in rng.normal(size=(3, values.size)):
+    options = {"tolerance": 1e-6, "iterations": 2000, "modes": modes}
+    solution = solve(lambda v: values * v, right, **options)
+print(len(modes), solution[:60].tobytes().hex())
+"""
+    variables = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
+    outputs = [
+        subprocess.run(
+            [sys.executable, "-c", script],
+            env=os.environ | dict.fromkeys(variables, threads),
+            capture_output=True,
+            check=True,
+        ).stdout
+        for threads in ("1", "2")
+    ]
+    assert int(outputs[0].split()[0]) > 40
+    assert outputs[0] == outputs[1]
 
 
 def test_product_is_the_scalar_product() -> None:

@@ -75,7 +75,7 @@ class SoftModes:
         mixing = mixing[:, chosen]
         vectors = np.einsum("mk,mn->kn", mixing, turned[:-1])
         untouched = np.einsum("mk,mn->kn", mixing, residuals[:-1])
-        images = np.einsum("mk,mn->kn", matrix[:, :-1] @ mixing, residuals)
+        images = np.einsum("mk,mn->kn", _tridiagonal_times(matrix, mixing), residuals)
         # Eigenvectors in the space of these vectors, of which rounding makes some twice.
         overlaps = np.einsum("in,jn->ij", vectors, untouched)
         energies = np.einsum("in,jn->ij", vectors, images)
@@ -86,6 +86,15 @@ class SoftModes:
         directions = np.einsum("jk,jn->kn", turn @ inner, vectors)
         self._vectors = np.concatenate([self._vectors, directions])
         self._weights = np.append(self._weights, np.maximum(1 / values - 1, 0))
+
+
+def _tridiagonal_times(matrix: FloatArray, columns: FloatArray) -> FloatArray:
+    """Return all but the last column of a matrix times columns, without BLAS; see `product`."""
+    result = np.zeros((len(matrix), columns.shape[1]))
+    result[:-1] = np.diag(matrix)[:-1, None] * columns
+    result[1:] += np.diag(matrix, -1)[:, None] * columns
+    result[:-2] += np.diag(matrix, 1)[:-1, None] * columns[1:]
+    return result
 
 
 class _History:

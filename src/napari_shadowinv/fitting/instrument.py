@@ -353,7 +353,7 @@ def numbers_in_units(
         deviation = np.sqrt(np.mean(np.square(spread), axis=0)) if spread else values * np.nan
         if part.key in shapes:
             squares = shapes[part.key].mean_squares
-            rows = [np.sqrt(each**2 @ squares) for each in (values, deviation)]
+            rows = [np.sqrt((each**2 * squares).sum(axis=1)) for each in (values, deviation)]
         else:
             rows = [units.get(part.key, 1.0) * each[:, 0] for each in (values, deviation)]
         report[part.key] = np.stack(rows, axis=1).tolist()

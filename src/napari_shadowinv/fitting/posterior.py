@@ -743,7 +743,7 @@ def sampled_potentials(
         draws = np.random.default_rng([seed, _BEAM_SEED]).normal(size=(len(samples), len(shifts)))
         draws /= np.sqrt(len(shifts))
         changes = [
-            change + np.tensordot(drawn, moves, 1)
+            change + np.einsum("s,smyx->myx", drawn, moves)
             for change, drawn in zip(changes, draws, strict=True)
         ]
     return np.stack(changes, axis=1).astype(np.float32)
