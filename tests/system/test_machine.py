@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from napari_shadowinv._system import machine
-from napari_shadowinv._system.machine import in_ranges, physical_memory
+from napari_shadowinv._system.machine import begin, in_ranges, physical_memory
 
 
 def fill(start, stop, values):
@@ -36,6 +37,32 @@ def test_an_error_is_raised_after_all_ranges_have_ended():
     with pytest.raises(ValueError, match="first"):
         in_ranges(work, 30, 3, smallest=10)
     assert sorted(ended) == [20, 30]
+
+
+def test_work_begins_in_a_thread_of_its_own_where_there_are_two():
+    names = []
+    wait = begin(lambda: names.append(threading.current_thread()), 2)
+    assert wait() is wait() is None
+    assert len(names) == 1
+    assert names[0] is not threading.current_thread()
+
+
+def test_with_one_thread_work_is_done_when_its_result_is_asked_for():
+    calls = []
+    wait = begin(lambda: calls.append(threading.current_thread()) or len(calls), 1)
+    assert not calls
+    assert wait() == wait() == 1
+    assert calls == [threading.current_thread()]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_an_error_is_raised_where_the_result_is_asked_for(threads):
+    def fail():
+        raise ValueError("no image")
+
+    wait = begin(fail, threads)
+    with pytest.raises(ValueError, match="no image"):
+        wait()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes cannot be copied")

@@ -1,4 +1,4 @@
-"""Functions that run in threads, and how they report and end: `run_in_parallel`."""
+"""Functions that run in threads, and how they report and end."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import partial
 
 import pytest
 
-from napari_shadowinv._system.progress import run_in_parallel
+from napari_shadowinv._system.progress import run_both, run_in_parallel
 from napari_shadowinv.errors import InversionCancelled
 
 Step = Callable[[int], None]
@@ -74,3 +74,11 @@ def test_the_first_failure_is_raised_not_those_that_follow_from_it() -> None:
 
     with pytest.raises(ValueError, match="no field"):
         run_in_parallel([go_on, fail], 2, lambda number: None)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_two_functions_return_their_own_results(threads: int) -> None:
+    received: list[int] = []
+    first, second = partial(step_on, 3, 20), partial(step_on, 5, 10)
+    assert run_both(first, second, threads, received.append) == (9, 25)
+    assert sorted(received) == [3] * 20 + [5] * 10

@@ -1,6 +1,7 @@
 """Memory, threads and signals.
 
-- `physical_memory`, `available_threads`, `set_default_threads`, `in_ranges`
+- `physical_memory`, `available_threads`, `set_default_threads`
+- `in_ranges`, `run_together`, `begin`: work in threads
 - Ctrl-C, SIGTERM and SIGHUP: `defer_interrupts`, `clear_up_when_terminated`, `handling`
 """
 
@@ -14,8 +15,9 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+_T = TypeVar("_T")
 _CGROUPS = Path("/sys/fs/cgroup")
 _MEMBERSHIP = Path("/proc/self/cgroup")
 
@@ -114,6 +116,19 @@ def run_together(works: Sequence[Callable[[], Any]], threads: int) -> None:
         wait(futures)
     for future in futures:
         future.result()
+
+
+def begin(work: Callable[[], _T], threads: int | None) -> Callable[[], _T]:
+    """Call a function in a thread of its own, and return a function that waits for its result.
+
+    With one thread available it is called when its result is asked for.
+    """
+    if available_threads(threads) < 2:
+        return cache(work)
+    pool = ThreadPoolExecutor(1, thread_name_prefix="work of shadowinv")
+    future = pool.submit(work)
+    pool.shutdown(wait=False)
+    return future.result
 
 
 @cache

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from queue import SimpleQueue
 from threading import Event
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 from napari_shadowinv.errors import InversionCancelled
 
@@ -37,8 +37,24 @@ OnStep = Callable[[str, float], None]
 """Receives the stage and the objective after each step of a fit; an exception ends the fit."""
 ShouldStop = Callable[[], bool]
 
+
+class OnReport(Protocol):
+    """Receives the parts of a `Progress`; ends the work by an exception."""
+
+    def __call__(
+        self,
+        stage: str,
+        step: int,
+        total: int | None = None,
+        message: str = "",
+        objective: float | None = None,
+    ) -> None:
+        """Report a step."""
+
+
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
+_U = TypeVar("_U")
 
 
 class Reporter:
@@ -106,3 +122,15 @@ def run_in_parallel(
     for error in sorted(errors, key=lambda each: isinstance(each, InversionCancelled)):
         raise error
     return [future.result() for future in futures]
+
+
+def run_both(
+    first: Callable[[Callable[_P, None]], _T],
+    second: Callable[[Callable[_P, None]], _U],
+    threads: int,
+    on_step: Callable[_P, None],
+) -> tuple[_T, _U]:
+    """Call two functions as `run_in_parallel` does."""
+    works: list[Callable[[Callable[_P, None]], Any]] = [first, second]
+    results = run_in_parallel(works, threads, on_step)
+    return results[0], results[1]
