@@ -381,7 +381,7 @@ def test_sites_needed_follow_from_the_fall_of_the_error(monkeypatch, image, powe
     options = InversionOptions(accuracy=0.01)
     prepared = prepare(image, None, options)
     plan, noise = plan_sites(np.ones(image.shape)), ImageNoise(prepared)
-    budget = Budget(plan, prepared, noise, options, Instrument())
+    budget = Budget(plan, prepared, lambda: noise, options, Instrument())
     move = np.full((2, 9), np.sqrt(0.5))  # 1 px
     monkeypatch.setattr(budget, "_move", lambda solution: move)
     monkeypatch.setattr(budget, "_change", lambda solved: (np.full(9, 0.04**2), power))

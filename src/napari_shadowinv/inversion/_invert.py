@@ -7,21 +7,29 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import check_mask, unpack_array, unpack_shot
-from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.machine import available_threads, begin
+from napari_shadowinv._system.progress import (
+    OnProgress,
+    OnReport,
+    Progress,
+    Reporter,
+    ShouldStop,
+    run_both,
+)
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import normalise
-from napari_shadowinv.inversion.budget import Budget
+from napari_shadowinv.inversion.budget import Budget, Errors
 from napari_shadowinv.inversion.machine_code import compiling_together
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared, margin_around, prepare
@@ -276,7 +284,12 @@ def invert(
             )
             scale = prepared.flux_scale / image_flux
             prepared = prepare(image, source, options, mask, flux_scale=scale)
-        noise = ImageNoise(prepared.in_units(), options, instrument.noise_correlation)
+        # They do not depend on the transport.
+        correlation, threads = instrument.noise_correlation, options.threads
+        noise = begin(partial(ImageNoise, prepared.in_units(), options, correlation), threads)
+        recorded = prepared.image * prepared.flux_scale
+        beam = prepared.source if plan.measured else None
+        signs = begin(partial(image_warnings, recorded, beam, prepared.mask), threads)
         budget = Budget(plan, prepared, noise, options, instrument)
         if not options.is_adaptive and not levels.is_complete:
             levels = levels.up_to(_site_domain(plan.source, options, plan.mask).n_sites)
@@ -303,15 +316,12 @@ def invert(
         if answer.converged:
             with _measure_time("errors", seconds):
                 budget.free_target(solutions)
-        with _measure_time("read-out", seconds):
-            fields = _read_fields(plan, prepared, answer, options, report)
+        fields, errors = _read_fields(plan, prepared, solutions, budget, report, seconds)
         more = adaptive and answer.converged and len(answer.weights) < levels.counts[-1]
-        if not more or not is_coarse(prepared.in_units(), fields.reprojection, noise):
+        if not more or not is_coarse(prepared.in_units(), fields.reprojection, noise()):
             break
         coarse = len(answer.weights)
-    with _measure_time("errors", seconds):
-        errors = budget.errors(solutions, fields.displacement) if answer.converged else None
-    quality = _make_report(prepared.in_units(), noise, solutions, fields, seconds, budget)
+    quality = _make_report(prepared.in_units(), noise(), solutions, fields, seconds, budget)
     finest = adaptive and len(answer.weights) == levels.counts[-1]
     if finest and errors is not None and quality.warnings == prepared.warnings:
         missed = errors.accuracy_caution(
@@ -322,9 +332,7 @@ def invert(
         of_beam = filter(None, [errors.beam_caution()])
         quality = replace(quality, warnings=(*of_beam, *quality.warnings))
     with _measure_time("prepare", seconds):
-        beam = prepared.source if plan.measured else None
-        signs = image_warnings(prepared.image * prepared.flux_scale, beam, prepared.mask)
-        quality = replace(quality, warnings=(*quality.warnings, *signs))
+        quality = replace(quality, warnings=(*quality.warnings, *signs()))
     reprojection = fields.reprojection * prepared.unit
     return Inversion(
         image=prepared.image,
@@ -402,6 +410,14 @@ def _check_boundary(plan: SitePlan, options: InversionOptions) -> None:
         )
 
 
+class _Reprojection(NamedTuple):
+    """The image that the field makes, and the flux that crossed its edges."""
+
+    image: FloatArray
+    flux_left: dict[str, float]
+    flux_entered: dict[str, float]
+
+
 @dataclass(frozen=True)
 class _Fields:
     """Fields read from the weights, at the image's pixels."""
@@ -422,48 +438,71 @@ class _Fields:
 def _read_fields(
     plan: SitePlan,
     prepared: Prepared,
-    solution: LevelSolution,
-    options: InversionOptions,
+    solutions: list[LevelSolution],
+    budget: Budget,
     report: Reporter,
-) -> _Fields:
-    def report_share(share: float, first: int, last: int) -> None:
+    seconds: dict[str, float],
+) -> tuple[_Fields, Errors | None]:
+    """Read the last solution, and estimate its errors beside the re-projection."""
+    solution, options = solutions[-1], budget.options
+
+    def report_share(report: OnReport, share: float, first: int, last: int) -> None:
         report("read-out", round(first + share * (last - first)), _STEPS)
 
-    def reproject(source: FloatArray, first: int, last: int) -> FloatArray:
-        return synthetic_image(
-            displacement,
-            source,
-            rays_per_pixel=tiles**2,
-            threads=options.threads,
-            on_progress=lambda news: report_share(news.step / (news.total or 1), first, last),
+    report_share(report, 0, 0, _READ_STEPS)
+    with _measure_time("read-out", seconds):
+        potential, displacement = read_out(
+            solution, options, lambda share: report_share(report, share, 0, _READ_STEPS)
         )
-
-    report_share(0, 0, _READ_STEPS)
     tiles = int(np.clip(math.ceil(_TILES_PER_SPACING / solution.level.spacing), 2, _MOST_TILES))
-    potential, displacement = read_out(
-        solution, options, lambda share: report_share(share, 0, _READ_STEPS)
-    )
-    source = prepared.source / prepared.unit
-    flux_left: dict[str, float] = {}
-    flux_entered: dict[str, float] = {}
-    if plan.margin is None:
-        reprojection = reproject(source, _READ_STEPS, _STEPS)
-    else:
+
+    def reproject(report: OnReport) -> _Reprojection:
+        with _measure_time("read-out", seconds):
+            return make_images(report)
+
+    def make_images(report: OnReport) -> _Reprojection:
+        def image_of(source: FloatArray, first: int, last: int) -> FloatArray:
+            def on_progress(news: Progress) -> None:
+                report_share(report, news.step / (news.total or 1), first, last)
+
+            return synthetic_image(
+                displacement,
+                source,
+                rays_per_pixel=tiles**2,
+                threads=options.threads,
+                on_progress=on_progress,
+            )
+
+        source = prepared.source / prepared.unit
+        if plan.margin is None:
+            return _Reprojection(image_of(source, _READ_STEPS, _STEPS), {}, {})
         halfway = (_READ_STEPS + _STEPS) // 2
         of_image, of_margin = plan.margin.parts(source)
-        from_image = reproject(of_image, _READ_STEPS, halfway)
-        from_margin = reproject(of_margin, halfway, _STEPS)
-        reprojection = plan.within(from_image + from_margin)
-        flux_left, flux_entered = edge_flux(from_image, from_margin, plan.margin)
+        from_image = image_of(of_image, _READ_STEPS, halfway)
+        from_margin = image_of(of_margin, halfway, _STEPS)
+        edges = edge_flux(from_image, from_margin, plan.margin)
+        return _Reprojection(plan.within(from_image + from_margin), *edges)
+
     inner = plan.within(potential)
-    return _Fields(
+    moves = np.ascontiguousarray(plan.within(displacement))
+
+    def estimate(report: OnReport) -> Errors | None:
+        return budget.errors(solutions, moves) if solution.converged else None
+
+    read_s, begun = seconds["read-out"], time.perf_counter()
+    threads = available_threads(options.threads)
+    reprojection, errors = run_both(reproject, estimate, threads, report)
+    later_s = time.perf_counter() - begun - (seconds["read-out"] - read_s)
+    seconds["errors"] = seconds.get("errors", 0.0) + max(later_s, 0.0)
+    fields = _Fields(
         np.ascontiguousarray(inner - border_mean(inner)),
-        np.ascontiguousarray(plan.within(displacement)),
-        np.ascontiguousarray(reprojection),
-        flux_left,
-        flux_entered,
+        moves,
+        np.ascontiguousarray(reprojection.image),
+        reprojection.flux_left,
+        reprojection.flux_entered,
         options.threads,
     )
+    return fields, errors
 
 
 def _levels_from_start(

@@ -402,12 +402,12 @@ class Budget:
         self,
         plan: SitePlan,
         prepared: Prepared,
-        noise: ImageNoise,
+        noise: Callable[[], ImageNoise],
         options: InversionOptions,
         instrument: Instrument,
     ) -> None:
         self._plan, self._prepared = plan, prepared
-        self._noise, self.options = noise, options
+        self._wait_for_noise, self.options = noise, options
         self.instrument = instrument if plan.measured else instrument.without_reference()
         if self._beam.components is not None:
             self._beam.components.check_shape(prepared.mask.shape)
@@ -416,6 +416,10 @@ class Budget:
         self._responses: dict[LevelSolution, LinearResponse] = {}
         self._by_noise: dict[LinearResponse, tuple[FloatArray, FloatArray]] = {}
         self.reason = ""
+
+    @property
+    def _noise(self) -> ImageNoise:
+        return self._wait_for_noise()
 
     @cached_property
     def target(self) -> Target:

@@ -79,7 +79,8 @@ class Report:
     levels : tuple of (int, int, float)
         Sites, solver steps and final residual of each level, coarse to fine.
     seconds : dict of str to float
-        Time of each stage: prepare, sites, transport, read-out, errors.
+        Time of each stage: prepare, sites, transport, read-out, errors; of the errors what they
+        take longer than the re-projection, beside which they are estimated.
     warnings : tuple of Caution
         Reasons to doubt the result.
     flux_scale : float
