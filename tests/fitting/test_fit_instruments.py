@@ -238,6 +238,7 @@ def test_neither_threads_nor_a_second_time_change_a_bit(shots: list[FloatArray])
     assert first.fields[0].uncertainty is not None
     np.testing.assert_array_equal(first.fields[0].uncertainty, second.fields[0].uncertainty)
     np.testing.assert_array_equal(first.reprojection, second.reprojection)
+    assert first.report.sensitivities == second.report.sensitivities
     assert first.explanation == second.explanation
 
 

@@ -5,18 +5,21 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
-from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.machine import available_threads
+from napari_shadowinv._system.progress import OnProgress, OnStep, Reporter, ShouldStop, run_both
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.compilation import ensure_compiled
+from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
 from napari_shadowinv.fitting.descent import coarser
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import (
@@ -64,6 +67,7 @@ from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.fitting.verdict import assess_verdict, hidden_contrast
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
+from napari_shadowinv.inversion.samples import Pairs
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions, KindOfNoise
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.poisson import border_mean
@@ -214,26 +218,31 @@ def fit(
         if data.counted:
             scene = reweight_counts(data, scene, best)
             best = settle_minimum(scene, best, on_step)
+
+    unsure = scene
+    if data.single:
+        # One image does not determine its instrument.
+        unsure = replace(scene, imperfect=imperfect, held=imperfect.keys)
+
+    def refine(on_step: OnStep) -> tuple[Scene, Unknowns, float, int, bool]:
+        with _timed("full size", seconds):
+            return refine_minimum(scene, best, options, on_step, is_near=is_near)
+
+    def explore(on_step: OnStep) -> tuple[tuple[Basin, ...], _Openness]:
         basins = _basins(scene, best, minima[1:], on_step)
-    with _timed("full size", seconds):
-        fine, unknowns, value, taken, ended = refine_minimum(
-            scene, best, options, on_step, is_near=is_near
-        )
+        return basins, _find_openness(data, unsure, best, rng, options, on_step)
+
+    begun, threads = time.perf_counter(), available_threads(scene.threads)
+    refined, (basins, openness) = run_both(refine, explore, threads, on_step)
+    seconds["samples"] = max(time.perf_counter() - begun - seconds["full size"], 0.0)
+    fine, unknowns, value, taken, ended = refined
     with _timed("residual", seconds):
         # A fit of one image absorbs too much of its noise for the counts to be tested.
         is_counted = data.counted and not data.single
         stated = data.instrument.noise_correlation
         pattern = find_pattern(fine, unknowns, data.size, is_counted=is_counted, correlation=stated)
-        unsure = scene
-        if data.single:
-            # One image does not determine its instrument.
-            unsure = replace(scene, imperfect=imperfect, held=imperfect.keys)
-        middle = replace(coarser(unsure, best.bin), spacing=_SPACING_OF_SAMPLES)
-        ends = _with_numbers(unsure, best).unknowns
-        modes = None if data.single else best.modes
-        posterior = Posterior(middle, ends, rng, lambda: on_step("samples", value), modes)
         if pattern.lacks_counts:
-            absorbed = posterior.count_determined(np.random.default_rng(options.seed))
+            absorbed = openness.posterior.count_determined(np.random.default_rng(options.seed))
             share = pattern.missing_counts - absorbed / np.count_nonzero(scene.weights)
             pattern = replace(pattern, missing_counts=share)
         # With several images the fit is repeated only if the residual asks for it.
@@ -243,30 +252,8 @@ def fit(
             cause = name_cause(scene, best, fields, data.setups, on_step)
             pattern = replace(pattern, cause=cause)
     with _timed("samples", seconds):
-        count = options.samples if options.samples > 1 else 0
-        samples = posterior.draw_samples(count)
-        is_solved = options.sampling == "resolve"
-        if is_solved:
-            checked, solved = samples, posterior.solve(samples)
-        else:
-            checked = samples[: _CHECKED if unsure.imperfect.parts else 0]
-            solved = posterior.solve(checked, steps=1)
-        pairs = compare_samples(middle, checked, solved) if solved else None
-        samples = solved if is_solved else samples
-        errors = errors_by_noise(scene, samples, data.size)
-        by_part = errors_by_part(unsure, posterior, samples, data.size)
-        by_beam = shifts_by_beam(data, unsure, posterior, samples, options)
-        sensitivities = {}
-        if samples:
-            tested = replace(unsure, imperfect=_tested_instrument(data, best))
-            middle = replace(coarser(tested, best.bin), spacing=_SPACING_OF_SAMPLES)
-            plain = best.unknowns._replace(
-                common=np.zeros(0), separate=np.zeros((len(scene.images), 0))
-            )
-            ends = _with_numbers(tested, replace(best, unknowns=plain)).unknowns
-            response = Posterior(middle, ends, rng, lambda: on_step("samples", value))
-            exact = None if unsure.imperfect.parts else posterior
-            sensitivities = response.sensitivities(np.random.default_rng(options.seed), exact)
+        samples, pairs, by_part = openness.samples, openness.pairs, openness.by_part
+        errors, by_beam = openness.errors, openness.by_beam
         evidence = float("nan")
         if options.evidence:
             evidence = log_evidence(scene, best, fields, options, on_step)
@@ -275,7 +262,10 @@ def fit(
         if errors is not None:
             potentials = sampled_potentials(scene, samples, by_beam, data.size, options.seed)
             amplified = _amplify_noise(errors, by_part, amplification)
-            potentials *= np.float32(np.linalg.norm(amplified) / np.linalg.norm(errors))
+            ratio = product(amplified.ravel(), amplified.ravel()) / product(
+                errors.ravel(), errors.ravel()
+            )
+            potentials *= np.float32(np.sqrt(ratio))
             errors = amplified
     found_by = FitReport(
         objective=value,
@@ -292,7 +282,7 @@ def fit(
             _with_numbers(unsure, best).unknowns if data.single else unknowns,
             [sample.change for sample in samples],
         ),
-        sensitivities=sensitivities,
+        sensitivities=openness.sensitivities,
         sampling=options.sampling,
         nonlinearity=float("nan") if pairs is None else pairs.nonlinearity,
         spread_ratio=float("nan") if pairs is None else pairs.spread_ratio,
@@ -364,7 +354,71 @@ def compare(
 def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
     begun = time.perf_counter()
     yield
-    seconds[stage] = time.perf_counter() - begun
+    seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - begun
+
+
+@dataclass(frozen=True)
+class _Openness:
+    """How far the images leave the best unknowns open, and how far an instrument would move them.
+
+    `pairs` compares samples with those that are solved in full; `errors`, `by_part` and `by_beam`
+    are those of the displacement, `sensitivities` shares of it.
+    """
+
+    posterior: Posterior
+    samples: list[Sample]
+    pairs: Pairs | None
+    errors: FloatArray | None
+    by_part: dict[str, FloatArray]
+    by_beam: BeamShifts | None
+    sensitivities: dict[str, float]
+
+
+def _find_openness(
+    data: FitData,
+    scene: Scene,
+    best: Minimum,
+    rng: np.random.Generator,
+    options: FitOptions,
+    on_step: OnStep,
+) -> _Openness:
+    """Draw samples around the best unknowns."""
+
+    def posterior_with(scene: Scene, start: Minimum, modes: SoftModes | None = None) -> Posterior:
+        middle = replace(coarser(scene, best.bin), spacing=_SPACING_OF_SAMPLES)
+        ends = _with_numbers(scene, start).unknowns
+        return Posterior(middle, ends, rng, lambda: on_step("samples", best.value), modes)
+
+    posterior = posterior_with(scene, best, None if data.single else copy(best.modes))
+    samples = posterior.draw_samples(options.samples if options.samples > 1 else 0)
+    is_solved = options.sampling == "resolve"
+    if is_solved:
+        checked, solved = samples, posterior.solve(samples)
+    else:
+        checked = samples[: _CHECKED if scene.imperfect.parts else 0]
+        solved = posterior.solve(checked, steps=1)
+    pairs = compare_samples(posterior.scene, checked, solved) if solved else None
+    samples = solved if is_solved else samples
+    by_part = errors_by_part(scene, posterior, samples, data.size)
+    by_beam = shifts_by_beam(data, scene, posterior, samples, options)
+    sensitivities = {}
+    if samples:
+        tested = replace(scene, imperfect=_tested_instrument(data, best))
+        plain = best.unknowns._replace(
+            common=np.zeros(0), separate=np.zeros((len(scene.images), 0))
+        )
+        response = posterior_with(tested, replace(best, unknowns=plain))
+        exact = None if scene.imperfect.parts else posterior
+        sensitivities = response.sensitivities(np.random.default_rng(options.seed), exact)
+    return _Openness(
+        posterior,
+        samples,
+        pairs,
+        errors=errors_by_noise(scene, samples, data.size),
+        by_part=by_part,
+        by_beam=by_beam,
+        sensitivities=sensitivities,
+    )
 
 
 def collect_starts(data: FitData, on_step: Any, should_stop: ShouldStop | None) -> list[Start]:

@@ -180,7 +180,8 @@ class FitReport:
     converged : bool
         Whether they ended before the most that were allowed.
     seconds : dict of str to float
-        Time of each stage.
+        Time of each stage; of "samples" what they take longer than "full size", beside which they
+        are drawn.
     uncertainty : float
         R.m.s. standard deviation of the displacement by noise and by what is stated of the
         instrument, as a share of the displacement; NaN if not known.
