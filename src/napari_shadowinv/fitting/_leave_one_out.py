@@ -6,13 +6,21 @@ They are found first, in larger pixels, and take part in no prediction.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 
-from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.machine import available_threads
+from napari_shadowinv._system.progress import (
+    OnProgress,
+    OnStep,
+    Reporter,
+    ShouldStop,
+    run_in_parallel,
+)
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -56,6 +64,8 @@ _MAX_FITTED_SHARE = 0.9  # of the noise in an image with few pixels in use
 _MAX_NOISE_RATIO, _MAX_VARIANCE_RATIO = 1.15, 5.0
 _WORSE_IN_MIDDLE = 1.3  # the same in pixels of two, where a misfit counts four times
 _FRAME_STEPS = 4
+
+_T = TypeVar("_T")
 
 
 def leave_one_out(
@@ -109,7 +119,7 @@ def leave_one_out(
         steps += 1
         report("leave one out", steps, None, stage, objective)
 
-    work = _Work(data, options, on_step)
+    work = _Work(data, options, on_step, options.threads)
     first = work.search_all(should_stop)
     agreeing = work.find_agreeing(first)
     scene, common = work.estimate_smoothness(agreeing, first)
@@ -155,11 +165,12 @@ class _JointFit:
     linear: Linear
     unknowns: Unknowns  # of all images
 
-    def only(self, members: list[int]) -> Linear | None:
+    def only(self, members: list[int], threads: int | None) -> Linear | None:
         """Return some images to first order; None if there is no such joint fit of them."""
         if not set(members) <= set(self.members):
             return None
-        return self.linear.only([self.members.index(k) for k in members])
+        linear = self.linear.only([self.members.index(k) for k in members])
+        return linear and replace(linear, scene=replace(linear.scene, threads=threads))
 
 
 @dataclass(frozen=True)
@@ -171,11 +182,27 @@ class _OwnFit:
 
 
 class _Work:
-    """Context of all steps: images, options, and the callback for progress."""
+    """Context of all steps: images, options, threads, and the callback for progress."""
 
-    def __init__(self, data: FitData, options: FitOptions, on_step: Any) -> None:
+    def __init__(
+        self, data: FitData, options: FitOptions, on_step: OnStep, threads: int | None
+    ) -> None:
         self._data, self._options, self._on_step = data, options, on_step
-        self._count = len(data.units)
+        self._threads, self._count = threads, len(data.units)
+
+    def _run_for_each(self, numbers: list[int], work: Callable[[_Work, int], _T]) -> dict[int, _T]:
+        """Call `work(context, number)` for images, in threads."""
+        threads = available_threads(self._threads)
+        alone = max(1, threads // max(len(numbers), 1))
+
+        def run(k: int, on_step: OnStep) -> _T:
+            return work(_Work(self._data, self._options, on_step, alone), k)
+
+        results = run_in_parallel([partial(run, k) for k in numbers], threads, self._on_step)
+        return dict(zip(numbers, results, strict=True))
+
+    def _only(self, scene: Scene, members: list[int]) -> Scene:
+        return replace(scene.only(members), threads=self._threads)
 
     def search_all(self, should_stop: ShouldStop | None) -> Minimum:
         """Where a search in all images ends, in pixels of two."""
@@ -189,7 +216,9 @@ class _Work:
         if self._options.smoothness is None:
             usual = SMOOTHNESS_RATIO * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1))
             scene = replace(scene, smoothness=usual)
-        alone = [self._settle_members(scene, begun, [k], f"image {k + 1} alone") for k in self._all]
+        alone = self._run_for_each(
+            self._all, partial(_Work._settle_alone, scene=scene, begun=begun)
+        )
         most: list[int] = []
         remaining = self._all
         while len(remaining) > len(most):
@@ -198,8 +227,16 @@ class _Work:
             remaining = [k for k in remaining if k not in group]
         return most
 
+    def _settle_alone(self, k: int, scene: Scene, begun: Minimum) -> Minimum:
+        return self._settle_members(scene, begun, [k], f"image {k + 1} alone")
+
+    def _settle_without(self, k: int, scene: Scene, minimum: Minimum, group: list[int]) -> Minimum:
+        """Fit a group but for one image; unknowns of all are kept, so that each can come back."""
+        members = [image for image in group if image != k]
+        return self._settle_members(scene, minimum, members, f"without image {k + 1}")
+
     def _find_group(
-        self, scene: Scene, begun: Minimum, left: list[int], alone: list[Minimum]
+        self, scene: Scene, begun: Minimum, left: list[int], alone: dict[int, Minimum]
     ) -> list[int]:
         """Images that one field explains, after removing the worst one by one."""
         least = np.array([self._chi2_in_middle(scene, alone[k], [k])[0] for k in self._all])
@@ -208,11 +245,8 @@ class _Work:
             worse = self._chi2_in_middle(scene, together, left) / least[left]
             if worse.max() < _WORSE_IN_MIDDLE:
                 break
-            tried = {}
-            for k in left:
-                members = [image for image in left if image != k]
-                # Unknowns of all images are kept, so that each can come back.
-                tried[k] = self._settle_members(scene, together, members, f"without image {k + 1}")
+            without = partial(_Work._settle_without, scene=scene, minimum=together, group=left)
+            tried = self._run_for_each(left, without)
             out = min(left, key=lambda k: tried[k].value + alone[k].value)
             left = [k for k in left if k != out]
             together = tried[out]
@@ -227,7 +261,7 @@ class _Work:
         scene = self._data.scene_with(self._options.smoothness)
         rng = np.random.default_rng(self._options.seed)
         first = replace(begun, unknowns=begun.unknowns.only(members))
-        part, best = estimate_smoothness(scene.only(members), first, rng, self._on_step)
+        part, best = estimate_smoothness(self._only(scene, members), first, rng, self._on_step)
         scene = replace(scene, smoothness=part.smoothness)
         common = replace(best, unknowns=begun.unknowns.with_images(members, best.unknowns))
         if self._data.counted:
@@ -241,7 +275,8 @@ class _Work:
         Larger pixels may set aside too many: images that the others predict are added again.
         """
         joint = self._fit_jointly(scene, common, agreeing)
-        own_fits = [self._fit_alone(scene, k, common, joint) for k in self._all]
+        alone = partial(_Work._fit_alone, scene=scene, common=common, joint=joint)
+        own_fits = self._run_for_each(self._all, alone)
         predictions: dict[int, _Prediction] = {}
         while outside := [k for k in self._all if k not in agreeing]:
             fit = self._sample_fit(scene, common, agreeing, joint)
@@ -252,15 +287,18 @@ class _Work:
                 break
             agreeing = sorted([*agreeing, *back])
             joint = self._fit_jointly(scene, common, agreeing)
-        for k in agreeing:
-            members = [image for image in agreeing if image != k]
-            fit = self._sample_fit(scene, common, members, joint)
-            predictions[k] = self._predict(k, members, scene, fit, own_fits[k], joint)
+
+        def predict(work: _Work, k: int) -> _Prediction:
+            others = [image for image in agreeing if image != k]
+            fit = work._sample_fit(scene, common, others, joint)
+            return work._predict(k, others, scene, fit, own_fits[k], joint)
+
+        predictions |= self._run_for_each(agreeing, predict)
         return [predictions[k] for k in self._all]
 
     def _fit_jointly(self, scene: Scene, common: Minimum, members: list[int]) -> _JointFit | None:
         """Fit images with dense rays; None if they are too many for Jacobians."""
-        if scene.only(members).images.size > _MAX_SAMPLED_PIXELS:
+        if self._only(scene, members).images.size > _MAX_SAMPLED_PIXELS:
             return None
         _, fine, unknowns, _ = self._fit_densely(scene, common, members)
         linear = fine.linear(unknowns, fine.ray_counts(unknowns))
@@ -273,7 +311,7 @@ class _Work:
         coarse = self._settle_members(scene, common, members, _name(members), _LAST_GAIN)
         first = replace(coarse, unknowns=coarse.unknowns.only(members))
         fine, unknowns, *_ = refine_minimum(
-            scene.only(members), first, self._options, self._on_step
+            self._only(scene, members), first, self._options, self._on_step
         )
         # Folds are deeper in the image that is left out if it is displaced most.
         fine = replace(fine, spacing=_RAY_SPACING_RATIO * fine.spacing)
@@ -296,7 +334,7 @@ class _Work:
         self, scene: Scene, common: Minimum, members: list[int], joint: _JointFit | None
     ) -> _SampledFit:
         """Fit some images, from a joint fit of these and others if there is one."""
-        linear = None if joint is None else joint.only(members)
+        linear = None if joint is None else joint.only(members, self._threads)
         large = False
         if linear is not None and joint is not None:
             fine, start = linear.scene, joint.unknowns
@@ -307,7 +345,9 @@ class _Work:
             start, sampled = finer(coarse.unknowns), (fine, unknowns)
             large = fine.images.size > _MAX_SAMPLED_PIXELS
             if large:
-                middle = replace(coarser(scene.only(members), MIDDLE), spacing=MIDDLE_SPACING)
+                middle = replace(
+                    coarser(self._only(scene, members), MIDDLE), spacing=MIDDLE_SPACING
+                )
                 sampled = middle, coarse.unknowns.only(members)
         rng = np.random.default_rng(self._options.seed)
         posterior = Posterior(
@@ -334,27 +374,34 @@ class _Work:
         if scene.free_frames.any():
             unknowns = _align_image(scene, unknowns, others[0], k)
         unknowns = unknowns.only([k])._replace(brightness=np.zeros(1))
-        scene = scene.only([k])
+        scene = self._only(scene, [k])
         (rough,) = scene.model(unknowns, scene.ray_counts(unknowns))
         scene = replace(scene, spacing=_RAY_SPACING_RATIO * scene.spacing)
         (image,) = scene.model(unknowns, scene.ray_counts(unknowns))
         brightness, weights = self._match_brightness(k, image, scene)
         chi2 = _chi2(brightness * image, scene.images[0], weights)
-        variance = fit.variance_in(_linear_of(k, scene, unknowns, joint))
+        variance = fit.variance_in(self._linear_of(k, scene, unknowns, joint))
         variance += _RAY_VARIANCE_RATIO * _chi2(brightness * image, brightness * rough, weights)
         limit = _MAX_NOISE_RATIO + _MAX_VARIANCE_RATIO * variance
         return _Prediction(
             brightness * image, weights, brightness, chi2, own_fit.chi2, limit * own_fit.noise_chi2
         )
 
-    def _fit_alone(self, scene: Scene, k: int, common: Minimum, joint: _JointFit | None) -> _OwnFit:
+    def _fit_alone(self, k: int, scene: Scene, common: Minimum, joint: _JointFit | None) -> _OwnFit:
         fit = self._sample_fit(scene, common, [k], joint)
         unknowns = fit.unknowns.only([k])
         chi2 = float(fit.scene.chi2(unknowns, fit.scene.ray_counts(unknowns))[0])
         # A field of an image's own follows the noise by as much as it is left open.
-        variance = fit.variance_in(_linear_of(k, fit.scene, unknowns, joint))
+        variance = fit.variance_in(self._linear_of(k, fit.scene, unknowns, joint))
         share = min(variance, _MAX_FITTED_SHARE)
         return _OwnFit(chi2, chi2 / (1 - share))
+
+    def _linear_of(
+        self, k: int, scene: Scene, unknowns: Unknowns, joint: _JointFit | None
+    ) -> Linear:
+        """One image to first order, by a joint fit if it takes part in it."""
+        linear = None if joint is None else joint.only([k], self._threads)
+        return linear or scene.linear(unknowns, scene.ray_counts(unknowns))
 
     def _match_brightness(self, k: int, made: FloatArray, one: Scene) -> tuple[float, FloatArray]:
         """Brightness with which a prediction is nearest to an image, and the pixels' weights."""
@@ -377,21 +424,14 @@ class _Work:
     ) -> Minimum:
         """Fit some of the images; brightness and frames of the others stay."""
         first = replace(minimum, unknowns=minimum.unknowns.only(members), modes=SoftModes())
-        end = settle_minimum(scene.only(members), first, self._on_step, name, least_gain)
+        end = settle_minimum(self._only(scene, members), first, self._on_step, name, least_gain)
         unknowns = minimum.unknowns.with_images(members, end.unknowns)
         return replace(end, unknowns=unknowns, modes=SoftModes())
 
-    @staticmethod
-    def _chi2_in_middle(scene: Scene, minimum: Minimum, members: list[int]) -> FloatArray:
-        middle = replace(coarser(scene.only(members), MIDDLE), spacing=MIDDLE_SPACING)
+    def _chi2_in_middle(self, scene: Scene, minimum: Minimum, members: list[int]) -> FloatArray:
+        middle = replace(coarser(self._only(scene, members), MIDDLE), spacing=MIDDLE_SPACING)
         unknowns = minimum.unknowns.only(members)
         return middle.chi2(unknowns, middle.ray_counts(unknowns))
-
-
-def _linear_of(k: int, scene: Scene, unknowns: Unknowns, joint: _JointFit | None) -> Linear:
-    """One image to first order, by a joint fit if it takes part in it."""
-    linear = None if joint is None else joint.only([k])
-    return linear or scene.linear(unknowns, scene.ray_counts(unknowns))
 
 
 def _name(members: list[int]) -> str:
