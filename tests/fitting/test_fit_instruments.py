@@ -77,9 +77,9 @@ def unfolded() -> list[FloatArray]:
 
 def test_a_dark_level_shows_in_the_noise_of_counts(unfolded: list[FloatArray]) -> None:
     counts = np.random.default_rng(1).poisson(1000 * np.stack(unfolded)).astype(float)
-    for offset in (0.0, 120.0):
+    for offset, threads in ((0.0, 1), (120.0, 2)):
         source = np.full((64, 64), 1000.0 + offset)
-        result = fitted(counts + offset, source=source, noise="poisson")
+        result = fitted(counts + offset, source=source, noise="poisson", threads=threads)
         assert result.report.pattern < 5
         assert (result.verdict is Verdict.UNCERTAIN) == (offset > 0)
         assert ("dark level" in result.explanation) == (offset > 0)

@@ -76,6 +76,13 @@ def test_the_first_failure_is_raised_not_those_that_follow_from_it() -> None:
         run_in_parallel([go_on, fail], 2, lambda number: None)
 
 
+def test_a_step_after_the_end_of_all_functions_is_no_request_to_stop() -> None:
+    callbacks: list[Step] = []
+    run_in_parallel([callbacks.append] * 2, 2, lambda number: None)
+    for after_step in callbacks:
+        after_step(1)
+
+
 @pytest.mark.parametrize("threads", [1, 2])
 def test_two_functions_return_their_own_results(threads: int) -> None:
     received: list[int] = []

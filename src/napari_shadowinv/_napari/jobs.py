@@ -51,17 +51,13 @@ _TIME_PER_BEAM_SAMPLE, _STEPS_PER_BEAM_SAMPLE = 0.02, 50.0
 _EVIDENCE_IN_SAMPLES = 20
 _MINUTE_S, _HOUR_S = 60, 3600
 
-# Shares of the time, and approximate steps; all stages without a name belong to the starts.
+# Shares of the time, and approximate steps; all stages without a name belong to the starts. Samples
+# for the error bars are drawn beside the fit at full size.
 _WEIGHTS = {"starts": 0.4, "smoothness": 0.4, "full size": 0.2}
 _STEPS = {"starts": 140.0, "smoothness": 180.0, "full size": 20.0}
-_ERROR_BARS = "error bars"
-_STAGE_NAMES = {"smoothness": "smoothness", "other starts": "smoothness", "full size": "full size"}
-_STAGE_NAMES |= {
-    "point spread": "full size",
-    "rivals": "full size",
-    "samples": _ERROR_BARS,
-    "evidence": _ERROR_BARS,
-}
+_STAGE_NAMES = {"smoothness": "smoothness"} | dict.fromkeys(
+    ("other starts", "full size", "point spread", "rivals", "samples", "evidence"), "full size"
+)
 _BAR_LENGTH = 1000
 _PREVIEW_ROLES = ("field", "caustic")
 
@@ -139,9 +135,9 @@ class FitProgress:
     def __init__(self, estimate: TimeEstimate) -> None:
         self.history: list[tuple[str, float]] = []
         self._weights, self._expected = dict(_WEIGHTS), dict(_STEPS)
-        if estimate.samples:
-            self._weights[_ERROR_BARS] = estimate.samples_weight
-            self._expected[_ERROR_BARS] = estimate.samples_steps
+        self._weights["full size"] += estimate.samples_weight
+        self._expected["full size"] += estimate.samples_steps
+        self._last_stage = "full size and error bars" if estimate.samples else "full size"
         self._stage, self._steps, self._done = "", 0, 0.0
 
     def update(self, progress: Progress) -> Progress:
@@ -151,15 +147,13 @@ class FitProgress:
         name, value = progress.message, progress.objective
         self.history.append((name, value))
         stage = _STAGE_NAMES.get(name, "starts")
-        if stage not in self._weights:
-            return progress
         if stage != self._stage:
             self._stage, self._steps = stage, 0
         self._steps += 1
         self._done = max(self._done, self._share())
-        message = f"stage {list(self._weights).index(stage) + 1} of {len(self._weights)}, {stage}"
-        if stage == "starts":
-            message += f" ({name})"
+        words = {"starts": f"starts ({name})", "full size": self._last_stage}
+        number = list(self._weights).index(stage) + 1
+        message = f"stage {number} of {len(self._weights)}, {words.get(stage, stage)}"
         return Progress(progress.stage, int(_BAR_LENGTH * self._done), _BAR_LENGTH, message, value)
 
     def _share(self) -> float:

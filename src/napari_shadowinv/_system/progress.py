@@ -115,8 +115,9 @@ def run_in_parallel(
                     running -= 1
                 else:
                     step()
-        finally:
+        except BaseException:
             is_over.set()
+            raise
     # Of several exceptions, the others follow from the first.
     errors = [error for future in futures if (error := future.exception()) is not None]
     for error in sorted(errors, key=lambda each: isinstance(each, InversionCancelled)):

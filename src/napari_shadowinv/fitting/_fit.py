@@ -242,7 +242,8 @@ def fit(
         stated = data.instrument.noise_correlation
         pattern = find_pattern(fine, unknowns, data.size, is_counted=is_counted, correlation=stated)
         if pattern.lacks_counts:
-            absorbed = openness.posterior.count_determined(np.random.default_rng(options.seed))
+            posterior = openness.posterior.reporting(lambda: on_step("samples", value))
+            absorbed = posterior.count_determined(np.random.default_rng(options.seed))
             share = pattern.missing_counts - absorbed / np.count_nonzero(scene.weights)
             pattern = replace(pattern, missing_counts=share)
         # With several images the fit is repeated only if the residual asks for it.

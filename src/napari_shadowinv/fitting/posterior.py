@@ -144,6 +144,12 @@ class Posterior:
         """The scene that is explained."""
         return self._scene
 
+    def reporting(self, after_step: Callable[[], None]) -> Posterior:
+        """Return the same posterior with another callback after each step."""
+        posterior = copy(self)
+        posterior._after_step = after_step
+        return posterior
+
     @property
     def _deviations(self) -> FloatArray:
         """Standard deviations of the noise, 0 in pixels that are not used."""
@@ -208,9 +214,9 @@ class Posterior:
         alone = replace(self._scene, threads=max(1, threads // max(len(slopes) - 1, 1)))
 
         def change_alone(slope: Unknowns, after_step: Callable[[], None]) -> Unknowns:
-            posterior = copy(self)
+            posterior = self.reporting(after_step)
             posterior._scene, posterior._linear = alone, replace(self._linear, scene=alone)
-            posterior._after_step, posterior._modes = after_step, copy(self._modes)
+            posterior._modes = copy(self._modes)
             return posterior._change(slope, tolerance)
 
         first = [self._change(slope, tolerance) for slope in slopes[:1]]
