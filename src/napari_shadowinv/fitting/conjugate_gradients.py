@@ -20,7 +20,7 @@ from scipy.linalg import eigh_tridiagonal
 
 from napari_shadowinv._typing import FloatArray
 
-__all__ = ["SoftModes", "product", "solve"]
+__all__ = ["SoftModes", "eigensystem", "product", "solve"]
 
 _SOFT = 0.5  # eigenvalues below, where most are about 1
 _MOST_MODES = 120
@@ -63,7 +63,7 @@ class SoftModes:
         if len(history) < _WORTH_STEPS:
             return
         residuals, turned, matrix = history.lanczos()
-        values, mixing = eigh_tridiagonal(np.diag(matrix)[:-1], np.diag(matrix, -1)[:-1])
+        values, mixing = _tridiagonal_eigensystem(matrix[:-1, :-1])
         errors = np.abs(matrix[-1, -2] * mixing[-1])
         chosen = np.flatnonzero((values < _SOFT) & (errors < _FOUND * values))
         size, is_outdated = residuals.shape[1], len(history) > _OUTDATED_STEPS
@@ -79,11 +79,13 @@ class SoftModes:
         # Eigenvectors in the space of these vectors, of which rounding makes some twice.
         overlaps = np.einsum("in,jn->ij", vectors, untouched)
         energies = np.einsum("in,jn->ij", vectors, images)
-        sizes, turn = np.linalg.eigh(overlaps + overlaps.T)
+        sizes, turn = eigensystem(overlaps + overlaps.T)
         turn = turn[:, sizes > _INDEPENDENT] / np.sqrt(sizes[sizes > _INDEPENDENT] / 2)
-        values, inner = np.linalg.eigh(turn.T @ (energies + energies.T) @ turn / 2)
+        turned_energies = np.einsum("jk,ji->ki", turn, energies + energies.T)
+        values, inner = eigensystem(np.einsum("ki,ij->kj", turned_energies, turn) / 2)
         inner, values = inner[:, values > 0], values[values > 0]
-        directions = np.einsum("jk,jn->kn", turn @ inner, vectors)
+        mixing = np.einsum("jk,ki->ij", turn, inner)
+        directions = np.einsum("ij,jn->in", mixing, vectors)
         self._vectors = np.concatenate([self._vectors, directions])
         self._weights = np.append(self._weights, np.maximum(1 / values - 1, 0))
 
@@ -95,6 +97,34 @@ def _tridiagonal_times(matrix: FloatArray, columns: FloatArray) -> FloatArray:
     result[1:] += np.diag(matrix, -1)[:, None] * columns
     result[:-2] += np.diag(matrix, 1)[:-1, None] * columns[1:]
     return result
+
+
+def _tridiagonal_eigensystem(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    # The default of SciPy multiplies matrices by BLAS.
+    values, vectors = eigh_tridiagonal(np.diag(matrix), np.diag(matrix, -1), lapack_driver="stev")
+    return values, vectors
+
+
+def eigensystem(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues and eigenvectors (columns) of a symmetric matrix, without BLAS; see `product`."""
+    matrix, turns = matrix.copy(), np.eye(len(matrix))
+    for k in range(len(matrix) - 2):  # mirror each column to the next axis: tridiagonal at the end
+        column = matrix[k + 1 :, k].copy()
+        length = np.sqrt(product(column, column))
+        if length == 0:
+            continue
+        column[0] += np.copysign(length, column[0])
+        column *= np.sqrt(2 / product(column, column))
+        rest = matrix[k + 1 :, k + 1 :]
+        image = np.einsum("ij,j->i", rest, column)
+        image -= product(column, image) / 2 * column
+        rest -= np.multiply.outer(column, image) + np.multiply.outer(image, column)
+        matrix[k + 1, k] = -np.copysign(length, matrix[k + 1, k])
+        turns[:, k + 1 :] -= np.multiply.outer(
+            np.einsum("ij,j->i", turns[:, k + 1 :], column), column
+        )
+    values, vectors = _tridiagonal_eigensystem(matrix)
+    return values, np.einsum("ij,jk->ik", turns, vectors)
 
 
 class _History:
