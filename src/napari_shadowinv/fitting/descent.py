@@ -360,12 +360,12 @@ def settle(
         Whether steps were left.
     """
     tolerance, solving = _NEWTON, _MOST_SOLVING
-    has_valley = scene.has_free_numbers or scene.beam_modes > 0
-    # Scales of frames and of added light are rough.
-    is_scaled = not (has_valley or scene.added or scene.free_frames.any())
-    if has_valley and to_beat is None:
-        tolerance, solving = _NEWTON_IN_VALLEY, _MOST_IN_VALLEY
+    # Scales of numbers and beams, which fields may replace, of frames and added light are rough.
+    is_scaled = not (
+        scene.has_free_numbers or scene.beam_modes or scene.added or scene.free_frames.any()
+    )
     if scene.has_free_numbers and to_beat is None:
+        tolerance, solving = _NEWTON_IN_VALLEY, _MOST_IN_VALLEY
         least_gain *= _GAIN_IN_VALLEY
     modes = SoftModes() if modes is None else modes
     scales = Preconditioner(scene)
