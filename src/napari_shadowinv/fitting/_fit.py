@@ -241,7 +241,7 @@ def fit(
         is_counted = data.counted and not data.single
         stated = data.instrument.noise_correlation
         pattern = find_pattern(fine, unknowns, data.size, is_counted=is_counted, correlation=stated)
-        if pattern.lacks_counts:
+        if pattern.lacks_counts and openness.posterior is not None:
             posterior = openness.posterior.reporting(lambda: on_step("samples", value))
             absorbed = posterior.count_determined(np.random.default_rng(options.seed))
             share = pattern.missing_counts - absorbed / np.count_nonzero(scene.weights)
@@ -362,11 +362,11 @@ def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
 class _Openness:
     """How far the images leave the best unknowns open, and how far an instrument would move them.
 
-    `pairs` compares samples with those that are solved in full; `errors`, `by_part` and `by_beam`
-    are those of the displacement, `sensitivities` shares of it.
+    `posterior` is that of counts; `pairs` compares samples with those that are solved in full;
+    `errors`, `by_part` and `by_beam` are those of the displacement, `sensitivities` shares of it.
     """
 
-    posterior: Posterior
+    posterior: Posterior | None
     samples: list[Sample]
     pairs: Pairs | None
     errors: FloatArray | None
@@ -412,7 +412,7 @@ def _find_openness(
         exact = None if scene.imperfect.parts else posterior
         sensitivities = response.sensitivities(np.random.default_rng(options.seed), exact)
     return _Openness(
-        posterior,
+        posterior if data.counted else None,  # its Jacobians are large
         samples,
         pairs,
         errors=errors_by_noise(scene, samples, data.size),

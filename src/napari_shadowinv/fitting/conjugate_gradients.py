@@ -18,7 +18,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.linalg import eigh_tridiagonal
 
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import AnyArray, FloatArray
 
 __all__ = ["SoftModes", "eigensystem", "product", "solve"]
 
@@ -62,18 +62,19 @@ class SoftModes:
         """Add the modes that a solution has met; begin anew if others are of no use."""
         if len(history) < _WORTH_STEPS:
             return
-        residuals, turned, matrix = history.lanczos()
+        matrix = history.matrix()
         values, mixing = _tridiagonal_eigensystem(matrix[:-1, :-1])
         errors = np.abs(matrix[-1, -2] * mixing[-1])
         chosen = np.flatnonzero((values < _SOFT) & (errors < _FOUND * values))
-        size, is_outdated = residuals.shape[1], len(history) > _OUTDATED_STEPS
+        size, is_outdated = history.size, len(history) > _OUTDATED_STEPS
         if self._vectors.shape[1] != size or (is_outdated and len(self) == _MOST_MODES):
             self._vectors, self._weights = np.empty((0, size)), np.empty(0)
         chosen = chosen[: _MOST_MODES - len(self)]
         if not chosen.size:
             return
         mixing = mixing[:, chosen]
-        vectors = np.einsum("mk,mn->kn", mixing, turned[:-1])
+        vectors = np.einsum("mk,mn->kn", mixing, history.turned()[:-1])
+        residuals = history.residuals()
         untouched = np.einsum("mk,mn->kn", mixing, residuals[:-1])
         images = np.einsum("mk,mn->kn", _tridiagonal_times(matrix, mixing), residuals)
         # Eigenvectors in the space of these vectors, of which rounding makes some twice.
@@ -131,8 +132,10 @@ class _History:
     """Steps of conjugate gradients: vectors in whose space the matrix is simple."""
 
     def __init__(self, size: int) -> None:
-        self._most = _MOST_NUMBERS // size
-        self._pairs: list[tuple[FloatArray, FloatArray]] = []
+        most = _MOST_NUMBERS // size
+        self.size, self._most = size, most if most >= _WORTH_STEPS else 0
+        self._residuals: list[AnyArray] = []
+        self._turned: list[AnyArray] = []
         self._shares: list[float] = []
         self._ratios: list[float] = []
 
@@ -145,20 +148,26 @@ class _History:
         """Add a step: a residual, the same preconditioned, their product, and coefficients."""
         if len(self) < self._most:
             scale = (-1.0) ** len(self) / np.sqrt(square)
-            pair = (scale * residual).astype(np.float32), (scale * turned).astype(np.float32)
-            self._pairs.append(pair)
+            self._residuals.append((scale * residual).astype(np.float32))
+            self._turned.append((scale * turned).astype(np.float32))
             self._shares.append(share)
             self._ratios.append(ratio)
 
-    def lanczos(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return m vectors, the same preconditioned, and the tridiagonal matrix between them."""
+    def residuals(self) -> FloatArray:
+        """Return the m Lanczos vectors."""
+        return np.array(self._residuals, dtype=np.float64)
+
+    def turned(self) -> FloatArray:
+        """Return the preconditioned Lanczos vectors."""
+        return np.array(self._turned, dtype=np.float64)
+
+    def matrix(self) -> FloatArray:
+        """Return the tridiagonal matrix between them."""
         shares, ratios = np.array(self._shares), np.array(self._ratios)
         diagonal = 1 / shares
         diagonal[1:] += ratios[:-1] / shares[:-1]
         beside = np.sqrt(ratios[:-1]) / shares[:-1]
-        matrix = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
-        residuals, turned = np.array(self._pairs, dtype=np.float64).swapaxes(0, 1)
-        return residuals, turned, matrix
+        return np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
 
 
 def solve(

@@ -376,16 +376,19 @@ def settle(
     # Jacobians of many pixels would fill the memory.
     newton = min(_MOST_NEWTON, steps) if scene.images.size <= _MOST_PIXELS else 0
     taken = shortened = 0
-    while taken < newton and shortened < _MOST_SHORTENED:
-        here = linear or scene.linear(now, counts)
 
+    def newton_step(here: Linear, down: FloatArray) -> FloatArray:
         def times(flat: FloatArray) -> FloatArray:
             if after_step is not None:
-                after_step(value)  # noqa: B023
-            return scales.hessian_times(here, flat)  # noqa: B023
+                after_step(value)
+            return scales.hessian_times(here, flat)
 
+        return solve(times, down, tolerance=tolerance, iterations=solving, modes=modes)
+
+    while taken < newton and shortened < _MOST_SHORTENED:
         down = -scales.transpose_times(slope).flat()
-        step = solve(times, down, tolerance=tolerance, iterations=solving, modes=modes)
+        # No name is given to the Jacobians here: the next ones are made when these are gone.
+        step = newton_step(linear or scene.linear(now, counts), down)
         expected_gain = product(down, step) / 2
         if value - expected_gain > hopeless:
             break
