@@ -597,7 +597,7 @@ def merge(
     has_beam: bool,
     rows: AnyArray,
     columns: AnyArray,
-    values: FloatArray,
+    values: AnyArray,
 ) -> None:
     """Add the lines of `collect` up in a sparse matrix: begins of its rows, columns and values."""
     cells, instrument_columns = begins.shape, of_instrument.shape[1]
@@ -652,7 +652,7 @@ def _add_entry(
     entry: int,
     places: IntArray,
     columns: AnyArray,
-    values: FloatArray,
+    values: AnyArray,
 ) -> int:
     """Add a value to a column of the row that begins at `first`; return where the next begins."""
     place = places[number]
@@ -669,7 +669,7 @@ def rows_times(
     stop: int,
     begins: IntArray,
     columns: IntArray,
-    values: FloatArray,
+    values: AnyArray,
     vector: FloatArray,
     out: FloatArray,
 ) -> None:
@@ -687,7 +687,7 @@ def normal_times(
     stop: int,
     begins: IntArray,
     columns: IntArray,
-    values: FloatArray,
+    values: AnyArray,
     vector: FloatArray,
     weights: FloatArray,
     slopes: FloatArray,
@@ -710,7 +710,7 @@ def normal_times(
 def transpose_times(
     begins: IntArray,
     columns: IntArray,
-    values: FloatArray,
+    values: AnyArray,
     vector: FloatArray,
     out: FloatArray,
 ) -> None:

@@ -230,7 +230,7 @@ class RayModel:
         -------
         csr_array
             A row for each pixel; columns, in no order, for the coefficients, the beam's pixels and
-            the frame.
+            the frame; in single precision.
         """
         size = self._guarded
         model = potential, counts, beam, frame
@@ -261,7 +261,7 @@ class RayModel:
         )
         rows = np.empty(math.prod(self.seen) + 1, np.int32)
         entries = (16 + instrument_columns) * int(used.sum())
-        columns, values = np.empty(entries, np.int32), np.empty(entries)
+        columns, values = np.empty(entries, np.int32), np.empty(entries, np.float32)
         kernels.merge(begins, *lines, of_beam, rows, columns, values)
         shape = (len(rows) - 1, potential.size + beam.size + 6)
         return csr_array((values[: rows[-1]], columns[: rows[-1]], rows), shape=shape)
