@@ -222,6 +222,18 @@ def test_pixels_that_fill_up_blocks_and_masked_ones_do_not_count() -> None:
     assert np.isfinite(data.scene.images).all()
 
 
+@pytest.mark.parametrize(
+    ("side", "filled"), [(200, 200), (204, 208), (464, 472), (576, 592), (1000, 1000)]
+)
+def test_sides_are_filled_to_lengths_with_fast_transforms(side: int, filled: int) -> None:
+    """251 and 307 coefficients would be primes: 4 and 8 more are not."""
+    data = given(images=np.ones((2, 40, side)))
+    assert data.size == (40, side)
+    assert data.scene.images.shape == (2, 40, filled)
+    assert data.scene.rays.shape[1] == filled // 2 + 16 + 3
+    assert not data.scene.weights[:, :, side:].any()
+
+
 def test_strengths_are_relative_to_the_first_image() -> None:
     data = given(strengths=[[2, 4], [1, 3]])
     np.testing.assert_allclose(data.scene.strengths, [[1, 1], [0.5, 0.75]])
