@@ -9,6 +9,7 @@ from functools import partial
 
 import pytest
 
+from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import run_both, run_in_parallel
 from napari_shadowinv.errors import InversionCancelled
 
@@ -74,6 +75,28 @@ def test_the_first_failure_is_raised_not_those_that_follow_from_it() -> None:
 
     with pytest.raises(ValueError, match="no field"):
         run_in_parallel([go_on, fail], 2, lambda number: None)
+
+
+def test_cores_are_divided_between_functions_that_still_run() -> None:
+    begun, counted = threading.Barrier(2), threading.Event()
+
+    def shares(after_step: Step) -> list[int]:
+        begun.wait(10)
+        beside = available_threads(4)
+        counted.set()
+        stop = time.monotonic() + 10
+        while available_threads(4) == beside and time.monotonic() < stop:
+            time.sleep(0.001)
+        inner = run_in_parallel([lambda _: available_threads(4)] * 4, 4, after_step)
+        return [beside, available_threads(4), available_threads(1), *inner[:1]]
+
+    def end(after_step: Step) -> int:
+        begun.wait(10)
+        assert counted.wait(10)
+        return 0
+
+    assert run_both(shares, end, 2, lambda number: None)[0] == [2, 4, 1, 1]
+    assert available_threads(4) == 4
 
 
 def test_a_step_after_the_end_of_all_functions_is_no_request_to_stop() -> None:

@@ -1,7 +1,7 @@
 """Memory, threads and signals.
 
 - `physical_memory`, `available_threads`, `set_default_threads`
-- `in_ranges`, `run_together`, `begin`: work in threads
+- `in_ranges`, `run_together`, `begin`, `Crew`: work in threads
 - Ctrl-C, SIGTERM and SIGHUP: `defer_interrupts`, `clear_up_when_terminated`, `handling`
 """
 
@@ -69,14 +69,52 @@ def set_default_threads(threads: int | None) -> None:
 
 
 def available_threads(threads: int | None) -> int:
-    """Return `threads`; where it is None the default, or the number of cores of this process."""
+    """Return `threads`; where it is None the default, or the number of cores of this process.
+
+    In a thread of a `Crew`, its share of them at the time.
+    """
     threads = _default_threads if threads is None else threads
-    if threads is not None:
-        return threads
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on macOS or Windows
-        return os.cpu_count() or 1
+    if threads is None:
+        try:
+            threads = len(os.sched_getaffinity(0))
+        except AttributeError:  # not on macOS or Windows
+            threads = os.cpu_count() or 1
+    crew = _crew_of_this_thread()
+    return threads if crew is None else max(1, threads // crew.size)
+
+
+class Crew:
+    """Threads that do some works side by side, and between which all available ones are divided.
+
+    The last works have the threads of those that have ended.
+    """
+
+    def __init__(self, works: int, threads: int) -> None:
+        self._remaining, self._threads = works, threads
+        self._around, self._lock = _crew_of_this_thread(), threading.Lock()
+
+    @property
+    def size(self) -> int:
+        """The number of works that are being done, with those that are done beside the crew."""
+        around = 1 if self._around is None else self._around.size
+        return max(1, min(self._threads, self._remaining)) * around
+
+    def do(self, work: Callable[..., _T], *args: Any) -> _T:
+        """Call one of the works in a thread of the crew."""
+        _of_this_thread.crew = self
+        try:
+            return work(*args)
+        finally:
+            _of_this_thread.crew = None
+            with self._lock:
+                self._remaining -= 1
+
+
+_of_this_thread = threading.local()
+
+
+def _crew_of_this_thread() -> Crew | None:
+    return getattr(_of_this_thread, "crew", None)
 
 
 def in_ranges(

@@ -11,6 +11,7 @@ from queue import SimpleQueue
 from threading import Event
 from typing import Any, ParamSpec, Protocol, TypeVar
 
+from napari_shadowinv._system.machine import Crew
 from napari_shadowinv.errors import InversionCancelled
 
 
@@ -83,7 +84,7 @@ class Reporter:
 def run_in_parallel(
     works: Sequence[Callable[[Callable[_P, None]], _T]], threads: int, on_step: Callable[_P, None]
 ) -> list[_T]:
-    """Call functions in threads and return their results, in the order of the functions.
+    """Call functions in a `Crew` and return their results, in the order of the functions.
 
     Their steps are reported by the thread that calls, so that an exception of `on_step`, or
     Ctrl-C, ends all of them at their next step.
@@ -104,7 +105,8 @@ def run_in_parallel(
         steps.put(None)
 
     with ThreadPoolExecutor(threads, thread_name_prefix="fits of shadowinv") as pool:
-        futures = [pool.submit(work, report) for work in works]
+        crew = Crew(len(works), threads)
+        futures = [pool.submit(crew.do, work, report) for work in works]
         for future in futures:
             future.add_done_callback(end)
         try:

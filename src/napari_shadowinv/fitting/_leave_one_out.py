@@ -119,7 +119,7 @@ def leave_one_out(
         steps += 1
         report("leave one out", steps, None, stage, objective)
 
-    work = _Work(data, options, on_step, options.threads)
+    work = _Work(data, options, on_step)
     first = work.search_all(should_stop)
     agreeing = work.find_agreeing(first)
     scene, common = work.estimate_smoothness(agreeing, first)
@@ -165,12 +165,11 @@ class _JointFit:
     linear: Linear
     unknowns: Unknowns  # of all images
 
-    def only(self, members: list[int], threads: int | None) -> Linear | None:
+    def only(self, members: list[int]) -> Linear | None:
         """Return some images to first order; None if there is no such joint fit of them."""
         if not set(members) <= set(self.members):
             return None
-        linear = self.linear.only([self.members.index(k) for k in members])
-        return linear and replace(linear, scene=replace(linear.scene, threads=threads))
+        return self.linear.only([self.members.index(k) for k in members])
 
 
 @dataclass(frozen=True)
@@ -182,27 +181,21 @@ class _OwnFit:
 
 
 class _Work:
-    """Context of all steps: images, options, threads, and the callback for progress."""
+    """Context of all steps: images, options, and the callback for progress."""
 
-    def __init__(
-        self, data: FitData, options: FitOptions, on_step: OnStep, threads: int | None
-    ) -> None:
+    def __init__(self, data: FitData, options: FitOptions, on_step: OnStep) -> None:
         self._data, self._options, self._on_step = data, options, on_step
-        self._threads, self._count = threads, len(data.units)
+        self._count = len(data.units)
 
     def _run_for_each(self, numbers: list[int], work: Callable[[_Work, int], _T]) -> dict[int, _T]:
         """Call `work(context, number)` for images, in threads."""
-        threads = available_threads(self._threads)
-        alone = max(1, threads // max(len(numbers), 1))
 
         def run(k: int, on_step: OnStep) -> _T:
-            return work(_Work(self._data, self._options, on_step, alone), k)
+            return work(_Work(self._data, self._options, on_step), k)
 
+        threads = available_threads(self._options.threads)
         results = run_in_parallel([partial(run, k) for k in numbers], threads, self._on_step)
         return dict(zip(numbers, results, strict=True))
-
-    def _only(self, scene: Scene, members: list[int]) -> Scene:
-        return replace(scene.only(members), threads=self._threads)
 
     def search_all(self, should_stop: ShouldStop | None) -> Minimum:
         """Where a search in all images ends, in pixels of two."""
@@ -261,7 +254,7 @@ class _Work:
         scene = self._data.scene_with(self._options.smoothness)
         rng = np.random.default_rng(self._options.seed)
         first = replace(begun, unknowns=begun.unknowns.only(members))
-        part, best = estimate_smoothness(self._only(scene, members), first, rng, self._on_step)
+        part, best = estimate_smoothness(scene.only(members), first, rng, self._on_step)
         scene = replace(scene, smoothness=part.smoothness)
         common = replace(best, unknowns=begun.unknowns.with_images(members, best.unknowns))
         if self._data.counted:
@@ -298,7 +291,7 @@ class _Work:
 
     def _fit_jointly(self, scene: Scene, common: Minimum, members: list[int]) -> _JointFit | None:
         """Fit images with dense rays; None if they are too many for Jacobians."""
-        if self._only(scene, members).images.size > _MAX_SAMPLED_PIXELS:
+        if scene.only(members).images.size > _MAX_SAMPLED_PIXELS:
             return None
         _, fine, unknowns, _ = self._fit_densely(scene, common, members)
         linear = fine.linear(unknowns, fine.ray_counts(unknowns))
@@ -311,7 +304,7 @@ class _Work:
         coarse = self._settle_members(scene, common, members, _name(members), _LAST_GAIN)
         first = replace(coarse, unknowns=coarse.unknowns.only(members))
         fine, unknowns, *_ = refine_minimum(
-            self._only(scene, members), first, self._options, self._on_step
+            scene.only(members), first, self._options, self._on_step
         )
         # Folds are deeper in the image that is left out if it is displaced most.
         fine = replace(fine, spacing=_RAY_SPACING_RATIO * fine.spacing)
@@ -334,7 +327,7 @@ class _Work:
         self, scene: Scene, common: Minimum, members: list[int], joint: _JointFit | None
     ) -> _SampledFit:
         """Fit some images, from a joint fit of these and others if there is one."""
-        linear = None if joint is None else joint.only(members, self._threads)
+        linear = None if joint is None else joint.only(members)
         large = False
         if linear is not None and joint is not None:
             fine, start = linear.scene, joint.unknowns
@@ -345,9 +338,7 @@ class _Work:
             start, sampled = finer(coarse.unknowns), (fine, unknowns)
             large = fine.images.size > _MAX_SAMPLED_PIXELS
             if large:
-                middle = replace(
-                    coarser(self._only(scene, members), MIDDLE), spacing=MIDDLE_SPACING
-                )
+                middle = replace(coarser(scene.only(members), MIDDLE), spacing=MIDDLE_SPACING)
                 sampled = middle, coarse.unknowns.only(members)
         rng = np.random.default_rng(self._options.seed)
         posterior = Posterior(
@@ -374,13 +365,13 @@ class _Work:
         if scene.free_frames.any():
             unknowns = _align_image(scene, unknowns, others[0], k)
         unknowns = unknowns.only([k])._replace(brightness=np.zeros(1))
-        scene = self._only(scene, [k])
+        scene = scene.only([k])
         (rough,) = scene.model(unknowns, scene.ray_counts(unknowns))
         scene = replace(scene, spacing=_RAY_SPACING_RATIO * scene.spacing)
         (image,) = scene.model(unknowns, scene.ray_counts(unknowns))
         brightness, weights = self._match_brightness(k, image, scene)
         chi2 = _chi2(brightness * image, scene.images[0], weights)
-        variance = fit.variance_in(self._linear_of(k, scene, unknowns, joint))
+        variance = fit.variance_in(_linear_of(k, scene, unknowns, joint))
         variance += _RAY_VARIANCE_RATIO * _chi2(brightness * image, brightness * rough, weights)
         limit = _MAX_NOISE_RATIO + _MAX_VARIANCE_RATIO * variance
         return _Prediction(
@@ -392,16 +383,9 @@ class _Work:
         unknowns = fit.unknowns.only([k])
         chi2 = float(fit.scene.chi2(unknowns, fit.scene.ray_counts(unknowns))[0])
         # A field of an image's own follows the noise by as much as it is left open.
-        variance = fit.variance_in(self._linear_of(k, fit.scene, unknowns, joint))
+        variance = fit.variance_in(_linear_of(k, fit.scene, unknowns, joint))
         share = min(variance, _MAX_FITTED_SHARE)
         return _OwnFit(chi2, chi2 / (1 - share))
-
-    def _linear_of(
-        self, k: int, scene: Scene, unknowns: Unknowns, joint: _JointFit | None
-    ) -> Linear:
-        """One image to first order, by a joint fit if it takes part in it."""
-        linear = None if joint is None else joint.only([k], self._threads)
-        return linear or scene.linear(unknowns, scene.ray_counts(unknowns))
 
     def _match_brightness(self, k: int, made: FloatArray, one: Scene) -> tuple[float, FloatArray]:
         """Brightness with which a prediction is nearest to an image, and the pixels' weights."""
@@ -424,14 +408,21 @@ class _Work:
     ) -> Minimum:
         """Fit some of the images; brightness and frames of the others stay."""
         first = replace(minimum, unknowns=minimum.unknowns.only(members), modes=SoftModes())
-        end = settle_minimum(self._only(scene, members), first, self._on_step, name, least_gain)
+        end = settle_minimum(scene.only(members), first, self._on_step, name, least_gain)
         unknowns = minimum.unknowns.with_images(members, end.unknowns)
         return replace(end, unknowns=unknowns, modes=SoftModes())
 
-    def _chi2_in_middle(self, scene: Scene, minimum: Minimum, members: list[int]) -> FloatArray:
-        middle = replace(coarser(self._only(scene, members), MIDDLE), spacing=MIDDLE_SPACING)
+    @staticmethod
+    def _chi2_in_middle(scene: Scene, minimum: Minimum, members: list[int]) -> FloatArray:
+        middle = replace(coarser(scene.only(members), MIDDLE), spacing=MIDDLE_SPACING)
         unknowns = minimum.unknowns.only(members)
         return middle.chi2(unknowns, middle.ray_counts(unknowns))
+
+
+def _linear_of(k: int, scene: Scene, unknowns: Unknowns, joint: _JointFit | None) -> Linear:
+    """One image to first order, by a joint fit if it takes part in it."""
+    linear = None if joint is None else joint.only([k])
+    return linear or scene.linear(unknowns, scene.ray_counts(unknowns))
 
 
 def _name(members: list[int]) -> str:

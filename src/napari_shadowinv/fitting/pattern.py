@@ -347,18 +347,17 @@ def name_cause(
     misfit = pixels.chi2(best.unknowns, pixels.ray_counts(best.unknowns)) - 1
     excess = float((misfit * (pixels.weights > 0).sum(axis=(1, 2))).sum())
     rivals = list(_rivals(scene, best, names, setups))
-    threads = available_threads(scene.threads)
 
     def gain(rival: _Rival, on_step: OnStep) -> float:
         start = replace(best, unknowns=rival.unknowns, modes=SoftModes())
-        alone = replace(rival.scene, threads=max(1, threads // len(rivals)))
         end = settle_minimum(
-            alone, start, on_step, "rivals", steps=_STEPS, to_beat=best.value, is_rough=True
+            rival.scene, start, on_step, "rivals", steps=_STEPS, to_beat=best.value, is_rough=True
         )
         return 2 * (best.value - end.value) - rival.free_numbers
 
     works = [partial(gain, rival) for rival in rivals]
     causes = [rival.cause for rival in rivals]
+    threads = available_threads(scene.threads)
     gains = list(zip(run_in_parallel(works, threads, on_step), causes, strict=True))
     gains.sort(reverse=True)
     if not gains or gains[0][0] < _MIN_GAIN:

@@ -210,17 +210,15 @@ class Posterior:
 
         The first comes before all others, which know the modes that it has found.
         """
-        threads = available_threads(self._scene.threads)
-        alone = replace(self._scene, threads=max(1, threads // max(len(slopes) - 1, 1)))
 
         def change_alone(slope: Unknowns, after_step: Callable[[], None]) -> Unknowns:
             posterior = self.reporting(after_step)
-            posterior._scene, posterior._linear = alone, replace(self._linear, scene=alone)
             posterior._modes = copy(self._modes)
             return posterior._change(slope, tolerance)
 
         first = [self._change(slope, tolerance) for slope in slopes[:1]]
         works = [partial(change_alone, slope) for slope in slopes[1:]]
+        threads = available_threads(self._scene.threads)
         return first + run_in_parallel(works, threads, self._after_step)
 
     def solve(self, samples: Sequence[Sample], steps: int = _SOLVING_STEPS) -> list[Sample]:

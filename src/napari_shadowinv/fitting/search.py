@@ -180,11 +180,9 @@ def _is_shared(start: Start) -> bool:
 
 
 def _descend_together(scene: Scene, descents: Sequence[_Descent], on_step: OnStep) -> list[Minimum]:
-    threads = available_threads(scene.threads)
-    alone = replace(scene, threads=max(1, threads // max(len(descents), 1)))
-    held = replace(alone, beam_spread=_HELD_BEAM)
-    works = [partial(each.run, held if each.start.beam_held else alone) for each in descents]
-    return run_in_parallel(works, threads, on_step)
+    held = replace(scene, beam_spread=_HELD_BEAM)
+    works = [partial(each.run, held if each.start.beam_held else scene) for each in descents]
+    return run_in_parallel(works, available_threads(scene.threads), on_step)
 
 
 def _distinct_minima(minima: list[Minimum]) -> list[Minimum]:
