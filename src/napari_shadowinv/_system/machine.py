@@ -22,6 +22,7 @@ _CGROUPS = Path("/sys/fs/cgroup")
 _MEMBERSHIP = Path("/proc/self/cgroup")
 
 
+@cache
 def physical_memory() -> int | None:
     """Return the memory in bytes that this process may use, or None where it is not reported.
 
