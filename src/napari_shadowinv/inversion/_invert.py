@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import check_mask, unpack_array, unpack_shot
-from napari_shadowinv._system.machine import available_threads, begin
+from napari_shadowinv._system.machine import begin
 from napari_shadowinv._system.progress import (
     OnProgress,
     OnReport,
     Progress,
     Reporter,
     ShouldStop,
-    run_both,
 )
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
@@ -456,11 +455,7 @@ def _read_fields(
         )
     tiles = int(np.clip(math.ceil(_TILES_PER_SPACING / solution.level.spacing), 2, _MOST_TILES))
 
-    def reproject(report: OnReport) -> _Reprojection:
-        with _measure_time("read-out", seconds):
-            return make_images(report)
-
-    def make_images(report: OnReport) -> _Reprojection:
+    def reproject() -> _Reprojection:
         def image_of(source: FloatArray, first: int, last: int) -> FloatArray:
             def on_progress(news: Progress) -> None:
                 report_share(report, news.step / (news.total or 1), first, last)
@@ -486,14 +481,14 @@ def _read_fields(
     inner = plan.within(potential)
     moves = np.ascontiguousarray(plan.within(displacement))
 
-    def estimate(report: OnReport) -> Errors | None:
+    def estimate() -> Errors | None:
         return budget.errors(solutions, moves) if solution.converged else None
 
-    read_s, begun = seconds["read-out"], time.perf_counter()
-    threads = available_threads(options.threads)
-    reprojection, errors = run_both(reproject, estimate, threads, report)
-    later_s = time.perf_counter() - begun - (seconds["read-out"] - read_s)
-    seconds["errors"] = seconds.get("errors", 0.0) + max(later_s, 0.0)
+    errors_at_end = begin(estimate, options.threads)
+    with _measure_time("read-out", seconds):
+        reprojection = reproject()
+    with _measure_time("errors", seconds):
+        errors = errors_at_end()
     fields = _Fields(
         np.ascontiguousarray(inner - border_mean(inner)),
         moves,
