@@ -547,3 +547,18 @@ def test_the_headline_puts_verdict_and_warnings_before_the_peak(image):
     assert doubtful.text == f"{verdict}; {CAUTION_CODES['beam']}; {peak_text}"
     unconverged = dataclasses.replace(inversion.report, converged=False)
     assert dataclasses.replace(inversion, report=unconverged).headline.level == "failed"
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_arrays_may_change_after_they_have_been_passed(measured):
+    rng = np.random.default_rng(8)
+    image, source = 1 + 0.1 * rng.random((2, 24, 28))
+    kept_image, kept_source = image.copy(), source.copy()
+    plan = plan_sites(source, measured=measured)
+    inversion = invert(image, source=source)
+    source[:], image[:] = 3.0, 5.0
+    np.testing.assert_array_equal(plan.source, kept_source)
+    np.testing.assert_array_equal(inversion.source, kept_source)
+    again = invert(kept_image, source=kept_source)
+    np.testing.assert_array_equal(again.image, inversion.image)
+    np.testing.assert_array_equal(again.displacement, inversion.displacement)

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -99,6 +99,7 @@ def plan_sites(
     options = as_model(InversionOptions, options, "options")
     source, _, mask = unpack_shot(source, None, mask)
     plan = _plan(source, options, mask, measured)
+    plan = replace(plan, source=plan.source.copy())  # the caller's may change
     if options.is_adaptive:
         return plan
     levels = plan.levels.with_reporter(Reporter(on_progress, should_stop))
@@ -120,7 +121,7 @@ def _plan(
     )
     return replace(
         plan,
-        source=domain.beam * domain.unit,
+        source=domain.source,
         mask=domain.mask,
         margin=domain.margin,
         unit=domain.unit,
@@ -139,8 +140,9 @@ def count_sites(
 
 
 class _SiteDomain(NamedTuple):
-    """Beam that sites are spread over, in units of a power of two, and their number."""
+    """Beam that sites are spread over, also in units of a power of two, and their number."""
 
+    source: FloatArray
     beam: FloatArray
     unit: float
     mask: BoolArray | None
@@ -153,17 +155,17 @@ def _site_domain(
 ) -> _SiteDomain:
     usable = None if mask is None else check_mask(mask, np.shape(source))
     check_memory(np.shape(source), normalise.bytes_per_pixel(options), "an inversion")
-    beam = normalise.check_source(source, usable)
+    checked = normalise.check_source(source, usable)
     if usable is not None:
-        beam = normalise.masked_source(beam, usable, options)
-    n_sites = normalise.number_of_sites(beam.shape, options)
-    unit = normalise.power_of_two(beam)
-    beam = beam / unit
+        checked = normalise.masked_source(checked, usable, options)
+    n_sites = normalise.number_of_sites(checked.shape, options)
+    unit = normalise.power_of_two(checked)
+    beam = checked / unit
     if options.boundary != "free":
-        return _SiteDomain(beam, unit, usable, None, n_sites)
+        return _SiteDomain(checked, beam, unit, usable, None, n_sites)
     margin = Margin.around(beam, margin_around(beam.shape, options), usable)
     n_sites = round(n_sites * margin.beam.sum() / beam.sum())
-    return _SiteDomain(beam, unit, usable, margin, n_sites)
+    return _SiteDomain(checked, beam, unit, usable, margin, n_sites)
 
 
 @contextmanager
@@ -283,12 +285,18 @@ def invert(
             )
             scale = prepared.flux_scale / image_flux
             prepared = prepare(image, source, options, mask, flux_scale=scale)
+
         # They do not depend on the transport.
-        correlation, threads = instrument.noise_correlation, options.threads
-        noise = begin(partial(ImageNoise, prepared.in_units(), options, correlation), threads)
-        recorded = prepared.image * prepared.flux_scale
-        beam = prepared.source if plan.measured else None
-        signs = begin(partial(image_warnings, recorded, beam, prepared.mask), threads)
+        def estimate_noise() -> ImageNoise:
+            return ImageNoise(prepared.in_units(), options, instrument.noise_correlation)
+
+        def check_image() -> tuple[Caution, ...]:
+            recorded = prepared.image * prepared.flux_scale
+            beam = prepared.source if plan.measured else None
+            return image_warnings(recorded, beam, prepared.mask)
+
+        noise = begin(estimate_noise, options.threads)
+        signs = begin(check_image, options.threads)
         budget = Budget(plan, prepared, noise, options, instrument)
         if not options.is_adaptive and not levels.is_complete:
             levels = levels.up_to(_site_domain(plan.source, options, plan.mask).n_sites)

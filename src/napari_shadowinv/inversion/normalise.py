@@ -67,7 +67,7 @@ def prepare(
     check_memory(shape, bytes_per_pixel(options), "an inversion")
     usable = check_mask(mask, shape)
     values = _finite_image(image, "image", usable)
-    negative = int((values < 0).sum())
+    negative = int(np.count_nonzero(values < 0)) if values.min() < 0 else 0
     if negative and options.negative == "refuse":
         raise InputError(
             f"image has {negative} negative pixels (lowest {values.min():.4g}), expected none: "
@@ -79,7 +79,7 @@ def prepare(
     if source is None:
         beam = np.where(usable, values.sum() / usable.sum(), 0.0)
     else:
-        beam = check_source(source, usable)
+        beam = np.array(check_source(source, usable))
         if _is_same_pattern(values, beam, usable):
             raise InputError(
                 "the source is the image itself, so the deflection would be zero: give an image "
@@ -99,12 +99,13 @@ def prepare(
     least = options.floor * values.sum() / usable.sum()
     floored_flux = masked_source(beam, usable, options).sum() if conserved else None
     floored = _raise_to_floor(values, least, floored_flux)
-    below = int((values[usable] < least).sum())
+    below = int(np.count_nonzero(usable & (values < least)))
     unit = power_of_two(beam)
+    floored /= unit
     return Prepared(
         image=values,
         source=beam,
-        floored_image=floored / unit,
+        floored_image=floored,
         unit=unit,
         mask=usable,
         clipped_pixels=negative,
@@ -149,8 +150,9 @@ def _is_same_pattern(image: FloatArray, beam: FloatArray, usable: BoolArray) -> 
 
 def _clip_negative(values: FloatArray) -> FloatArray:
     """Clip an image, refusing one without positive pixels."""
-    values = np.maximum(values, 0)
-    if not values.any():
+    if values.min() < 0:
+        values = np.maximum(values, 0)
+    if not values.max() > 0:
         raise InputError(
             "image has no positive pixel, expected a beam: check the file and its background"
         )
@@ -173,6 +175,8 @@ def power_of_two(source: FloatArray) -> float:
 
 def masked_source(source: FloatArray, mask: BoolArray, options: InversionOptions) -> FloatArray:
     """Return a source with its masked pixels at the floor, so that cells fill the image."""
+    if mask.all():
+        return source
     return np.where(mask, source, options.floor * source[mask].mean())
 
 
@@ -209,12 +213,12 @@ def _warnings(
 
 
 def check_source(source: ArrayLike, mask: BoolArray | None = None) -> FloatArray:
-    """Return a source as floats, 0 where masked, or raise an `InputError`."""
+    """Return a source as floats, 0 where masked, or raise an `InputError`; it may be no copy."""
     shape = check_plane(source, "source", _SMALLEST_SIDE).shape
     if mask is not None and shape != mask.shape:
         raise InputError(f"source has shape {shape}, image {mask.shape}: they must match")
     beam = _finite_image(source, "source", np.ones(shape, bool) if mask is None else mask)
-    if (beam < 0).any():
+    if beam.min() < 0:
         raise InputError(
             f"source has {int((beam < 0).sum())} negative pixels, expected none: "
             "clip or smooth it first"
@@ -235,8 +239,11 @@ def _check_range(values: FloatArray, name: str) -> None:
 
 
 def _finite_image(values: ArrayLike, name: str, mask: BoolArray) -> FloatArray:
-    array = np.where(mask, values, 0.0).astype(np.float64, copy=False)
-    if not np.isfinite(array).all():
+    used = values if mask.all() else np.where(mask, values, 0.0)
+    array = np.ascontiguousarray(used, dtype=np.float64)
+    with np.errstate(over="ignore"):
+        is_finite = np.isfinite(array.sum()) or np.isfinite(array).all()
+    if not is_finite:
         bad = int((~np.isfinite(array)).sum())
         raise InputError(
             f"{name} has {bad} pixels that are NaN or infinite, expected none: mask them, or "

@@ -55,12 +55,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
 from napari_shadowinv._system.arrays import complete_block_means
+from napari_shadowinv._system.machine import begin
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Verdict
@@ -202,23 +204,29 @@ def find_cautions(
     Contrast at the edge counts as a cut object only if it is well above the relative
     `beam_difference` of image and source outside the object.
     """
+    misfit_at_end = begin(partial(_misfit, prepared, reprojection, n_sites), options.threads)
     square = np.einsum("cyx,cyx->yx", displacement, displacement)
-    rms = float(np.sqrt(square[prepared.mask].mean()))
-    misfit = _misfit(prepared, reprojection, n_sites)
+    mask = prepared.mask
+    rms = float(np.sqrt(square[mask].mean()))
+    folds, masked_peak = _deep_folds(jacobian, mask), _peak_at_mask(displacement, mask)
+    closed_edge = ""
+    if options.boundary == "closed":
+        peak = float(np.sqrt(square[mask].max()))
+        closed_edge = _cut_off(displacement, mask, noise, rms, peak)
+    misfit = misfit_at_end()
     # Where the finest structure is a pattern, it is no measure of noise.
     no_deflection = "" if misfit else _no_deflection(noise, rms)
     if no_deflection:
         return (Caution("no-deflection", no_deflection),)
     texts = {
         "misfit": misfit,
-        "folds": _deep_folds(jacobian, prepared.mask),
+        "folds": folds,
         "correlated-noise": _far_correlation(noise),
-        "masked-peak": _peak_at_mask(displacement, prepared.mask),
+        "masked-peak": masked_peak,
+        "closed-edge": closed_edge,
     }
-    if options.boundary == "closed":
-        texts["closed-edge"] = _cut_off(displacement, prepared.mask, noise, rms)
-        if not texts["closed-edge"]:
-            texts["cut-object"] = _cut_by_edge(prepared, noise, beam_difference)
+    if options.boundary == "closed" and not closed_edge:
+        texts["cut-object"] = _cut_by_edge(prepared, noise, beam_difference)
     return tuple(Caution(code, text) for code, text in texts.items() if text)
 
 
@@ -452,14 +460,15 @@ def _share_where_widest(jacobian: FloatArray, inner: float, outer: float, least:
     return largest
 
 
-def _cut_off(displacement: FloatArray, mask: BoolArray, noise: ImageNoise, rms: float) -> str:
+def _cut_off(
+    displacement: FloatArray, mask: BoolArray, noise: ImageNoise, rms: float, peak: float
+) -> str:
     """Describe a field that reaches the closed edge."""
     sides = inner_sides(displacement, mask)
     if sides is None:
         return ""
     turned = turning_displacement(sides)
     by_noise = noise.largest * np.sqrt(sides.depth / sum(side.size for side in sides.outwards))
-    peak = float(np.hypot(*displacement)[mask].max())
     if turned > max(TURNED_BACK * rms, _BAND_DEVIATIONS * by_noise):
         how = (
             f"near the edge it displaces rays by {turned:.2g} px towards or away from the edge "

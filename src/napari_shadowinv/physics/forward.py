@@ -429,7 +429,7 @@ def synthetic_image(
     available = available_threads(threads)
     pool = ThreadPoolExecutor(available)
     try:
-        coefficients = np.stack([_spline_coefficients(part, available) for part in field])
+        coefficients = _spline_coefficients(field, available)
         for done, (top, window) in enumerate(pool.map(image_of_band, bands), start=1):
             image[top : top + len(window)] += window
             report("image", done, len(bands))
@@ -553,16 +553,17 @@ def _landing_rows(coefficients: FloatArray, first: int, last: int) -> tuple[int,
     return math.floor(top), math.ceil(bottom)
 
 
-def _spline_coefficients(values: FloatArray, threads: int = 1) -> FloatArray:
-    """Coefficients of the bicubic B-spline through all values, two more on each side."""
-    height, width = values.shape
+def _spline_coefficients(field: FloatArray, threads: int = 1) -> FloatArray:
+    """Coefficients of bicubic B-splines through all values of planes, two more on each side."""
+    count, height, width = field.shape
     along_y = np.empty((height + 4, width))
-    coefficients = np.empty((height + 4, width + 4))
+    coefficients = np.empty((count, height + 4, width + 4))
     columns = max(_MIN_COLUMNS, _MIN_PIXELS_PER_THREAD // height)
     rows = max(1, _MIN_PIXELS_PER_THREAD // width)
     pivots = _pivots(height), _pivots(width)
-    in_ranges(_filter_columns, width, threads, values, pivots[0], along_y, smallest=columns)
-    in_ranges(_filter_rows, height + 4, threads, along_y, pivots[1], coefficients, smallest=rows)
+    for values, out in zip(field, coefficients, strict=True):
+        in_ranges(_filter_columns, width, threads, values, pivots[0], along_y, smallest=columns)
+        in_ranges(_filter_rows, height + 4, threads, along_y, pivots[1], out, smallest=rows)
     return coefficients
 
 

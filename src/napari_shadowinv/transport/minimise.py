@@ -436,8 +436,9 @@ def _blur_means(image: FloatArray, width: float, parts: int, threads: int | None
 def _means(image: FloatArray, parts: int) -> FloatArray:
     """Return the means of squares of pixels; the last pixels are repeated beyond the border."""
     height, width = image.shape
-    padded = np.pad(image, ((0, -height % parts), (0, -width % parts)), mode="edge")
-    rows = sum((padded[k::parts] for k in range(parts)), start=np.zeros(()))
+    if height % parts or width % parts:
+        image = np.pad(image, ((0, -height % parts), (0, -width % parts)), mode="edge")
+    rows = sum((image[k::parts] for k in range(parts)), start=np.zeros(()))
     return sum((rows[:, k::parts] for k in range(parts)), start=np.zeros(())) / parts**2
 
 
