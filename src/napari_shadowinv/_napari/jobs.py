@@ -39,15 +39,15 @@ from napari_shadowinv.preprocessing import Radiograph, Recipe
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
-# Measured on two cores with two to four images of 64² to 400² px without crossing rays. Crossing
-# rays, or a search for the cause of a misfit, multiply the time by 1.9 to 4.
-_TIME_S, _TIME_PER_PIXEL_S = 1.5, 5e-5
+# Twice what two fast cores take for two to four images of 64² to 400² px without crossing rays.
+# Crossing rays, or a search for the cause of a misfit, multiply the time by 1.9 to 4.
+_TIME_S, _TIME_PER_PIXEL_S = 0.45, 1.7e-5
 _CROSSING_RAYS_FACTOR = 4.0
-_TWO_FIELDS_FACTOR, _UNKNOWN_BEAM_FACTOR = 1.5, 1.6
+_TWO_FIELDS_FACTOR, _UNKNOWN_BEAM_FACTOR = 1.5, 1.2
 # Time of an error bar's sample relative to the fit, and its steps. Modes that beam and field share
 # converge slowly.
 _TIME_PER_SAMPLE, _STEPS_PER_SAMPLE = 0.008, 12.0
-_TIME_PER_BEAM_SAMPLE, _STEPS_PER_BEAM_SAMPLE = 0.02, 50.0
+_TIME_PER_BEAM_SAMPLE, _STEPS_PER_BEAM_SAMPLE = 0.012, 50.0
 _EVIDENCE_IN_SAMPLES = 20
 _MINUTE_S, _HOUR_S = 60, 3600
 
