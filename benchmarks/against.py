@@ -10,7 +10,8 @@ the truth, or for real frames against this version's with one site a pixel; and 
 each process so far.
 
 Images are those of the reference toroid, and of the burner's frames where they are present. Those
-of fits are rays counted as in fit.py, for minutes; `--only "fit, three"` counts those of one fit.
+of fits are rays counted as in fit.py, for minutes; `--only "fit, three"` counts those of one fit,
+`--only layers` those of which each is left out, too. `--only 4096` enlarges a burner's frame.
 """
 
 from __future__ import annotations
@@ -63,6 +64,8 @@ def works(folder: Path, only: str) -> dict[str, Work]:
         places = np.indices(size, dtype=np.float64)
         np.save(folder / f"{name} truth.npy", [field(*places) for field in case.fields])
         found[name] = {"fit": name, "noise": noise, "keywords": case.keywords}
+        if "layers" in title:
+            found[f"{name}, each left out"] = {**found[name], "leave_one_out": True}
     files = sorted((DATA / "burner").rglob("*.bmp"))
     if not files:
         return found
@@ -79,6 +82,12 @@ def works(folder: Path, only: str) -> dict[str, Work]:
         found[f"burner, {n_sites:,} sites"] = one
         found[f"burner, {n_sites:,} sites, read-out"] = {**one, "stage": "read-out"}
     found["burner, a frame of a stream"] = {"stream": "binned"}
+    if "4096" in only:
+        for file, plane in (("large beam", files[0]), ("large frame", files[3])):
+            large = Image.open(plane).convert("F").resize((4096, 4096), Image.Resampling.BICUBIC)
+            np.save(folder / f"{file}.npy", np.maximum(np.asarray(large, np.float64), 1.0))
+        sources = {"source": "large beam", "truth": "large"}
+        found["burner, 4096²"] = {"image": "large frame", **sources}
     return found
 
 
@@ -94,6 +103,10 @@ def fits() -> Iterator[tuple[str, Case, float, tuple[int, int]]]:
     yield "unknown beam", by_name["toroid 97, beam unknown, 2 energies"], 0.03, small
     yield "B and E", by_name["B and E × 1, four energies"], 0.03, small
     yield "576×464, two energies", Case("", [blobs(BLOBS)], (14.7, 30.0)), 0.05, (464, 576)
+    for count in (5, 17):
+        energies = tuple(np.linspace(14.7, 60, count))
+        centred = [(60, 7, 7, 0, 27.5, 27.5)]
+        yield f"{count} layers", Case("", [blobs(centred)], energies), 0.05, (56, 56)
     mild = [(1500, 90, 90, 0, 450, 500), (-1200, 70, 80, 0, 600, 620)]
     yield "1024², two energies", Case("", [blobs(mild)], (14.7, 30.0)), 0.05, (1024, 1024)
 
@@ -101,6 +114,7 @@ def fits() -> Iterator[tuple[str, Case, float, tuple[int, int]]]:
 def worker() -> None:
     """Do what is asked for line by line, and tell the seconds, and the error where there is one."""
     from napari_shadowinv import FitOptions, InversionOptions, fit, invert, plan_sites
+    from napari_shadowinv.fitting import leave_one_out
 
     def inverted(work: Work, folder: Path) -> tuple[float, float]:
         known = {
@@ -134,14 +148,12 @@ def worker() -> None:
         truth = np.load(folder / f"{work['fit']} truth.npy")
         keywords = {"source": np.ones(truth.shape[-2:]), **work["keywords"]}
         options = FitOptions(threads=work.get("threads"))
+        keywords |= {"strengths": shots["strengths"], "noise": work["noise"], "options": options}
         begun = time.perf_counter()
-        result = fit(
-            shots["images"],
-            strengths=shots["strengths"],
-            noise=work["noise"],
-            options=options,
-            **keywords,
-        )
+        if work.get("leave_one_out"):
+            leave_one_out(shots["images"], **keywords)
+            return time.perf_counter() - begun, float("nan")
+        result = fit(shots["images"], **keywords)
         seconds = time.perf_counter() - begun
         pairs = zip(result.fields, truth, strict=True)
         shares = [np.linalg.norm(f.displacement - t) / np.linalg.norm(t) for f, t in pairs]
