@@ -53,6 +53,16 @@ def test_clipping_counts_and_keeps_the_input():
     np.testing.assert_array_equal(image, original)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("values", [[np.nan], [np.inf], [np.inf, -np.inf], [1e308, 1e308, np.nan]])
+def test_values_that_are_not_finite_are_counted_without_a_warning(values):
+    image = np.ones((20, 30))
+    image[0, : len(values)] = values
+    bad = np.count_nonzero(~np.isfinite(values))
+    with pytest.raises(InputError, match=f"image has {bad} pixels that are NaN or infinite"):
+        prepare(image, None, InversionOptions())
+
+
 def test_integer_images_are_taken_as_they_are():
     image = np.arange(100, dtype=np.uint8).reshape(10, 10)
     prepared = prepare(image, None, InversionOptions())

@@ -213,7 +213,7 @@ def _warnings(
 
 
 def check_source(source: ArrayLike, mask: BoolArray | None = None) -> FloatArray:
-    """Return a source as floats, 0 where masked, or raise an `InputError`; it may be no copy."""
+    """Return a source as floats, 0 where masked, perhaps without a copy, or raise `InputError`."""
     shape = check_plane(source, "source", _SMALLEST_SIDE).shape
     if mask is not None and shape != mask.shape:
         raise InputError(f"source has shape {shape}, image {mask.shape}: they must match")
@@ -241,7 +241,7 @@ def _check_range(values: FloatArray, name: str) -> None:
 def _finite_image(values: ArrayLike, name: str, mask: BoolArray) -> FloatArray:
     used = values if mask.all() else np.where(mask, values, 0.0)
     array = np.ascontiguousarray(used, dtype=np.float64)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         is_finite = np.isfinite(array.sum()) or np.isfinite(array).all()
     if not is_finite:
         bad = int((~np.isfinite(array)).sum())
