@@ -78,7 +78,7 @@ def test_the_first_failure_is_raised_not_those_that_follow_from_it() -> None:
 
 
 def test_cores_are_divided_between_functions_that_still_run() -> None:
-    begun, counted = threading.Barrier(2), threading.Event()
+    begun, counted, all_counted = threading.Barrier(2), threading.Event(), threading.Barrier(4)
 
     def shares(after_step: Step) -> list[int]:
         begun.wait(10)
@@ -87,23 +87,35 @@ def test_cores_are_divided_between_functions_that_still_run() -> None:
         stop = time.monotonic() + 10
         while available_threads(4) == beside and time.monotonic() < stop:
             time.sleep(0.001)
-        inner = run_in_parallel([lambda _: available_threads(4)] * 4, 4, after_step)
-        return [beside, available_threads(4), available_threads(1), *inner[:1]]
+        inner = run_in_parallel([count_beside_others] * 4, 4, after_step)
+        return [beside, available_threads(4), available_threads(1), *inner]
+
+    def count_beside_others(after_step: Step) -> int:
+        share = available_threads(4)
+        all_counted.wait(10)
+        return share
 
     def end(after_step: Step) -> int:
         begun.wait(10)
         assert counted.wait(10)
         return 0
 
-    assert run_both(shares, end, 2, lambda number: None)[0] == [2, 4, 1, 1]
+    assert run_both(shares, end, 2, lambda number: None)[0] == [2, 4, 1, 1, 1, 1, 1]
     assert available_threads(4) == 4
 
 
 def test_a_step_after_the_end_of_all_functions_is_no_request_to_stop() -> None:
+    received: list[int] = []
     callbacks: list[Step] = []
-    run_in_parallel([callbacks.append] * 2, 2, lambda number: None)
-    for after_step in callbacks:
+
+    def work(after_step: Step) -> None:
         after_step(1)
+        callbacks.append(after_step)
+
+    run_in_parallel([work] * 2, 2, received.append)
+    for after_step in callbacks:
+        after_step(2)
+    assert received == [1, 1]
 
 
 @pytest.mark.parametrize("threads", [1, 2])
