@@ -72,7 +72,7 @@ def set_default_threads(threads: int | None) -> None:
 def available_threads(threads: int | None) -> int:
     """Return `threads`; where it is None the default, or the number of cores of this process.
 
-    In a thread of a `Crew`, its share of them at the time.
+    In a thread of a `Crew`: its current share of them.
     """
     threads = _default_threads if threads is None else threads
     if threads is None:
@@ -85,26 +85,26 @@ def available_threads(threads: int | None) -> int:
 
 
 class Crew:
-    """Threads that do some works side by side, and between which all available ones are divided.
+    """Functions that run side by side, and share the available threads.
 
-    The last works have the threads of those that have ended.
+    Those that run last have the threads of those that have ended.
     """
 
-    def __init__(self, works: int, threads: int) -> None:
-        self._remaining, self._threads = works, threads
+    def __init__(self, functions: int, threads: int) -> None:
+        self._remaining, self._threads = functions, threads
         self._around, self._lock = _crew_of_this_thread(), threading.Lock()
 
     @property
     def size(self) -> int:
-        """The number of works that are being done, with those that are done beside the crew."""
+        """The number of functions that run now, times that of the crew around this one."""
         around = 1 if self._around is None else self._around.size
         return max(1, min(self._threads, self._remaining)) * around
 
-    def do(self, work: Callable[..., _T], *args: Any) -> _T:
-        """Call one of the works in a thread of the crew."""
+    def call(self, function: Callable[..., _T], *args: Any) -> _T:
+        """Call one of the functions in this thread."""
         _of_this_thread.crew = self
         try:
-            return work(*args)
+            return function(*args)
         finally:
             _of_this_thread.crew = None
             with self._lock:

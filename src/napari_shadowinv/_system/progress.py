@@ -106,7 +106,7 @@ def run_in_parallel(
 
     with ThreadPoolExecutor(threads, thread_name_prefix="fits of shadowinv") as pool:
         crew = Crew(len(works), threads)
-        futures = [pool.submit(crew.do, work, report) for work in works]
+        futures = [pool.submit(crew.call, work, report) for work in works]
         for future in futures:
             future.add_done_callback(end)
         try:

@@ -101,7 +101,7 @@ def _tridiagonal_times(matrix: FloatArray, columns: FloatArray) -> FloatArray:
 
 
 def _tridiagonal_eigensystem(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    # The default of SciPy multiplies matrices by BLAS.
+    # SciPy's default driver multiplies matrices by BLAS.
     values, vectors = eigh_tridiagonal(np.diag(matrix), np.diag(matrix, -1), lapack_driver="stev")
     return values, vectors
 
@@ -109,17 +109,17 @@ def _tridiagonal_eigensystem(matrix: FloatArray) -> tuple[FloatArray, FloatArray
 def eigensystem(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Eigenvalues and eigenvectors (columns) of a symmetric matrix, without BLAS; see `product`."""
     matrix, turns = matrix.copy(), np.eye(len(matrix))
-    for k in range(len(matrix) - 2):  # mirror each column to the next axis: tridiagonal at the end
+    for k in range(len(matrix) - 2):  # each reflection makes one column tridiagonal
         column = matrix[k + 1 :, k].copy()
         length = np.sqrt(product(column, column))
         if length == 0:
             continue
         column[0] += np.copysign(length, column[0])
         column *= np.sqrt(2 / product(column, column))
-        rest = matrix[k + 1 :, k + 1 :]
-        image = np.einsum("ij,j->i", rest, column)
+        trailing = matrix[k + 1 :, k + 1 :]
+        image = np.einsum("ij,j->i", trailing, column)
         image -= product(column, image) / 2 * column
-        rest -= np.multiply.outer(column, image) + np.multiply.outer(image, column)
+        trailing -= np.multiply.outer(column, image) + np.multiply.outer(image, column)
         matrix[k + 1, k] = -np.copysign(length, matrix[k + 1, k])
         turns[:, k + 1 :] -= np.multiply.outer(
             np.einsum("ij,j->i", turns[:, k + 1 :], column), column

@@ -387,7 +387,7 @@ def settle(
 
     while taken < newton and shortened < _MOST_SHORTENED:
         down = -scales.transpose_times(slope).flat()
-        # No name is given to the Jacobians here: the next ones are made when these are gone.
+        # A name here would keep the Jacobians in memory while the next are made.
         step = newton_step(linear or scene.linear(now, counts), down)
         expected_gain = product(down, step) / 2
         if value - expected_gain > hopeless:

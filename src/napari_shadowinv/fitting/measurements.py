@@ -62,7 +62,7 @@ __all__ = [
 _MIN_SIGMA_PX = 1e-6  # of a fiducial; the square of less overflows
 _BLOCK = 8  # px; sides are filled up to a multiple of it, for pixels four times as wide
 # Transforms of 251 or 307 numbers take five times as long as of 255 and 315.
-_MOST_FILL, _FAST_PRIME = 0.03, 19  # of a side; of factors
+_MOST_FILL, _FAST_PRIME = 0.03, 19  # share of a side; largest prime factor of a length
 _SMALLEST_SIDE = 32
 _BYTES_PER_PIXEL, _BYTES_PER_PIXEL_AND_IMAGE = 2000, 600  # measured peak
 _LEAST_NOISE = 0.005  # of the beam: what the model itself is off by, about
@@ -501,10 +501,10 @@ def _brightness(data: FloatArray, beams: FloatArray, used: BoolArray) -> FloatAr
 
 
 def _fill(side: int, pad: int) -> int:
-    """Return the pixels to add to a side: whole blocks, and lengths with fast transforms."""
+    """Return how many pixels to add to a side, for whole blocks and fast transforms."""
     least = -side % _BLOCK
     for fill in range(least, least + int(_MOST_FILL * side) + 1, _BLOCK):
-        if _largest_prime_factor(RayModel((side + fill, side), pad).shape[0]) <= _FAST_PRIME:
+        if _largest_prime_factor(RayModel((side + fill, side + fill), pad).shape[0]) <= _FAST_PRIME:
             return fill
     return least
 
