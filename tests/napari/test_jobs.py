@@ -58,6 +58,14 @@ def test_other_progress_is_passed_on() -> None:
     assert progress.history == []
 
 
+def test_samples_beside_the_fit_do_not_change_the_objective_shown() -> None:
+    progress = FitProgress(estimate_fit_time((48, 48), 2, 1, None, OPTIONS))
+    steps = [("smoothness", 20.0), ("samples", 20.0), ("full size", 81.0), ("samples", 20.0)]
+    shown = [progress.update(Progress("fit", 1, None, *step)).objective for step in steps]
+    assert shown == [20, 20, 81, 81]
+    assert progress.history == steps
+
+
 def test_a_forecast_grows_with_what_is_asked_for() -> None:
     def seconds(side: int, count: int, fields: int = 1, source: str | None = None) -> float:
         return estimate_fit_time((side, side), count, fields, source, FitOptions()).seconds

@@ -139,6 +139,7 @@ class FitProgress:
         self._expected["full size"] += estimate.samples_steps
         self._last_stage = "full size and error bars" if estimate.samples else "full size"
         self._stage, self._steps, self._done = "", 0, 0.0
+        self._objective = float("nan")
 
     def update(self, progress: Progress) -> Progress:
         """Return the progress of the fit, with a share of the total time and the stage in words."""
@@ -146,6 +147,8 @@ class FitProgress:
             return progress
         name, value = progress.message, progress.objective
         self.history.append((name, value))
+        if name != "samples":  # drawn in larger pixels, whose objective is another
+            self._objective = value
         stage = _STAGE_NAMES.get(name, "starts")
         if stage != self._stage:
             self._stage, self._steps = stage, 0
@@ -154,7 +157,8 @@ class FitProgress:
         words = {"starts": f"starts ({name})", "full size": self._last_stage}
         number = list(self._weights).index(stage) + 1
         message = f"stage {number} of {len(self._weights)}, {words.get(stage, stage)}"
-        return Progress(progress.stage, int(_BAR_LENGTH * self._done), _BAR_LENGTH, message, value)
+        done = int(_BAR_LENGTH * self._done)
+        return Progress(progress.stage, done, _BAR_LENGTH, message, self._objective)
 
     def _share(self) -> float:
         stages = list(self._weights)
