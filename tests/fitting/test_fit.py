@@ -255,6 +255,17 @@ def test_an_object_that_the_edge_cuts_is_told(boundary: Any) -> None:
     assert "larger field of view" in result.explanation
 
 
+@pytest.mark.parametrize("column", [0, 463])
+def test_an_object_cut_by_either_end_of_a_filled_side_is_reported(column: int) -> None:
+    """464 px are filled to 472, all on the right."""
+    size = (40, 464)
+    cut = bump(0.7, 8, (20, column))
+    images = [counted(lambda y, x: s * cut(y, x), size) for s in (1, 0.7)]  # noqa: B023
+    result = fit(noisy(images, 0.02), strengths=[1, 0.7], noise=0.02, options=PLAIN)
+    assert result.verdict is Verdict.EDGE
+    assert "larger field of view" in result.explanation
+
+
 def test_an_unknown_beam_does_not_hide_a_strong_field() -> None:
     """Of 14.7 and 3 MeV; the beam has to be held until the field is found."""
     size = (100, 100)
