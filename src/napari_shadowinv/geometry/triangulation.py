@@ -260,7 +260,7 @@ class RegularTriangulation:
         self._weigh_ghosts()
         self._build()
 
-    def lower_hidden(self, weights: ArrayLike) -> FloatArray:
+    def lower_hidden(self, weights: ArrayLike, *, threads: int = 1) -> FloatArray:
         """Raise the weights of hidden sites by the least that makes their cells count.
 
         The lifted heights (|r|² - w) / 2 of hidden sites are lowered to the convex hull of the
@@ -270,7 +270,7 @@ class RegularTriangulation:
         `update`. Sites at the same place get the weight of the heaviest; only one of them can be
         in the triangulation. Returns the new weights.
         """
-        self.update(weights)
+        self.update(weights, threads=threads)
         ghosts = np.inf
         while self._mesh.hidden.any() and ghosts != self._mesh.weights[-1]:
             ghosts = self._mesh.weights[-1]
@@ -281,7 +281,7 @@ class RegularTriangulation:
             # The ghosts follow if the lightest sites were raised; then a site may hide again.
             self._weigh_ghosts()
             if ghosts != self._mesh.weights[-1]:
-                self.update(self.weights[:-4])
+                self.update(self.weights[:-4], threads=threads)
         return self.weights[:-4].copy()
 
     def copy(self) -> RegularTriangulation:

@@ -324,11 +324,12 @@ def invert(
             with _measure_time("errors", seconds):
                 budget.free_target(solutions)
         fields, errors = _read_fields(plan, prepared, solutions, budget, report, seconds)
+        units = prepared.in_units()
         more = adaptive and answer.converged and len(answer.weights) < levels.counts[-1]
-        if not more or not is_coarse(prepared.in_units(), fields.reprojection, noise()):
+        if not more or not is_coarse(units, fields.reprojection, noise(), options.threads):
             break
         coarse = len(answer.weights)
-    quality = _make_report(prepared.in_units(), noise(), solutions, fields, seconds, budget)
+    quality = _make_report(units, noise(), solutions, fields, seconds, budget)
     finest = adaptive and len(answer.weights) == levels.counts[-1]
     if finest and errors is not None and quality.warnings == prepared.warnings:
         missed = errors.accuracy_caution(

@@ -206,6 +206,8 @@ class ImageNoise:
     correlation_length : float
         Standard deviation of the Gaussian blur that clumps white noise as much, px; 0 for white
         noise.
+    variance_terms : ndarray, shape (3,)
+        Terms of a pixel's variance: constant, in proportion to its brightness, and to its square.
     is_correlated_far : bool
         Whether calm parts vary over more pixels than a correlation can be measured: all of the
         above is then too small.
@@ -235,15 +237,14 @@ class ImageNoise:
         self.typical = _clipped_rms(differences) * math.sqrt(inflation)
         # The source's mean, in units of the recorded image.
         quantum = prepared.flux_scale * prepared.unit * mean
-        # Terms of the variance: constant, in proportion to the brightness, and to its square.
-        self._terms = np.zeros(3)
+        self.variance_terms = np.zeros(3)
         level, counts = (
             (None, None) if options is None else (options.noise_level, options.units_per_quantum)
         )
         if level is not None:
-            self._terms[0] = (level / quantum) ** 2
+            self.variance_terms[0] = (level / quantum) ** 2
         elif counts is not None:
-            self._terms[1] = counts / quantum
+            self.variance_terms[1] = counts / quantum
             self.clumping = 1.0  # a blur leaves the counting noise of many pixels as it was
             self.is_correlated_far = False
         elif used.any():
@@ -252,9 +253,9 @@ class ImageNoise:
             low, right = rows + 1, columns + 1
             bright = image[low, right] + image[low, columns] + image[rows, right]
             bright = (bright + image[rows, columns]) / (4 * mean)
-            self._terms = inflation * _terms(bright, differences[::step])
+            self.variance_terms = inflation * _terms(bright, differences[::step])
         if (level, counts) != (None, None):  # stated for the image, not for its source
-            self._terms[0] += _clipped_rms(_finest(prepared.source / mean, used)) ** 2
+            self.variance_terms[0] += _clipped_rms(_finest(prepared.source / mean, used)) ** 2
         self.correlation_length = 0.0
         if self.clumping > 1:
             self.correlation_length = math.sqrt(self.clumping / (4 * math.pi))
@@ -266,7 +267,7 @@ class ImageNoise:
 
     def variance(self, brightness: FloatArray) -> FloatArray:
         """Return the variance of pixels by their brightness, in units of the source's mean."""
-        constant, linear, square = self._terms
+        constant, linear, square = self.variance_terms
         return np.asarray(constant + brightness * (linear + square * brightness))
 
     def displacements(self, level: float) -> tuple[float, float]:

@@ -62,10 +62,11 @@ import numpy as np
 from scipy import ndimage
 
 from napari_shadowinv._system.arrays import complete_block_means
-from napari_shadowinv._system.machine import begin
-from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv._system.machine import available_threads, begin, in_ranges
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray, IntArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Verdict
+from napari_shadowinv.geometry.compiler import kernel
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion.budget import Errors
@@ -143,6 +144,7 @@ _ABOVE_NOISE = 1.5**2  # mean square in a square of the image, of noise and invi
 _INVISIBLE, _LEAST_VARIANCE = 0.04, 1e-12  # of the brightness; so that nothing divides by zero
 _SQUARE_PX = 16
 _MIN_SHARE_OF_SQUARE = 0.5  # of its pixels that count
+_PIXELS_PER_THREAD = 1 << 16  # fewer are not worth a thread
 _SQUARES_BELOW = 0.98  # share of the squares
 
 _ROUNDING = 1e-6  # px, where image and source are the same
@@ -281,17 +283,28 @@ def assess_verdict(
     return Assessment(Verdict.UNCERTAIN, "; ".join(filter(None, parts)))
 
 
-def is_coarse(prepared: Prepared, reprojection: FloatArray, noise: ImageNoise) -> bool:
+def is_coarse(
+    prepared: Prepared, reprojection: FloatArray, noise: ImageNoise, threads: int | None = None
+) -> bool:
     """Return whether the re-projection misses structures that noise does not hide.
 
     That is the case if the residual exceeds the noise in some squares away from bright lines.
     """
-    residual, counted = _residual_off_lines(prepared, reprojection)
-    mean = prepared.source[prepared.mask].mean()
-    brightness = np.maximum(prepared.image, reprojection) / mean
-    hidden = noise.variance(brightness) + (_INVISIBLE * brightness) ** 2 + _LEAST_VARIANCE
-    excess = _square_means(np.where(counted, (residual / mean) ** 2 / hidden, 0.0))
-    share = _square_means(counted.astype(float))
+    planes = prepared.image, prepared.source, reprojection, prepared.mask
+    side = min(_SQUARE_PX, *prepared.mask.shape)
+    rows, columns = (length // side for length in prepared.mask.shape)
+    excess, share = np.empty((rows, columns)), np.empty((rows, columns))
+    sums = noise.variance_terms, excess, share
+    in_ranges(
+        _excess_by_square,
+        rows,
+        available_threads(threads),
+        *planes,
+        _mean_source(prepared),
+        side,
+        *sums,
+        smallest=max(1, _PIXELS_PER_THREAD // (side * prepared.mask.shape[1])),
+    )
     is_measured = share > _MIN_SHARE_OF_SQUARE
     if not is_measured.any():
         return False
@@ -299,29 +312,85 @@ def is_coarse(prepared: Prepared, reprojection: FloatArray, noise: ImageNoise) -
     return bool(ratio > _ABOVE_NOISE)
 
 
-def _square_means(values: FloatArray) -> FloatArray:
-    """Return means over squares of pixels; incomplete squares are left out."""
-    side = min(_SQUARE_PX, *values.shape)
-    rows, columns = (length // side for length in values.shape)
-    cropped = values[: rows * side, : columns * side]
-    return np.asarray(cropped.reshape(rows, side, columns, side).mean(axis=(1, 3)))
+def _mean_source(prepared: Prepared) -> float:
+    """Return the mean of the source where it is used; it is 0 elsewhere."""
+    return float(prepared.source.sum() / np.count_nonzero(prepared.mask))
 
 
-def _residual_off_lines(
-    prepared: Prepared, reprojection: FloatArray
-) -> tuple[FloatArray, BoolArray]:
-    """Return image minus re-projection, 0 at bright lines, and the mask of the other pixels."""
-    mean = prepared.source[prepared.mask].mean()
-    bright = ndimage.uniform_filter(prepared.image, 3) > _BRIGHT * np.maximum(prepared.source, mean)
-    counted = prepared.mask & ~bright
-    return np.where(counted, prepared.image - reprojection, 0.0), counted
+@kernel
+def _is_off_lines(
+    y: int, x: int, image: FloatArray, source: FloatArray, mask: BoolArray, mean: float
+) -> bool:
+    """Return whether a pixel is used and the mean of those around it is no bright line."""
+    if not mask[y, x]:
+        return False
+    height, width = mask.shape
+    total = 0.0
+    for row in (max(y - 1, 0), y, min(y + 1, height - 1)):
+        for column in (max(x - 1, 0), x, min(x + 1, width - 1)):
+            total += image[row, column]
+    return bool(total <= 9 * _BRIGHT * max(source[y, x], mean))
+
+
+@kernel
+def _excess_by_square(
+    start: int,
+    stop: int,
+    image: FloatArray,
+    source: FloatArray,
+    reprojection: FloatArray,
+    mask: BoolArray,
+    mean: float,
+    side: int,
+    terms: FloatArray,
+    excess: FloatArray,
+    share: FloatArray,
+) -> None:
+    """Average residual² over the noise's variance in rows of squares, and count their pixels."""
+    for i in range(start, stop):
+        for j in range(excess.shape[1]):
+            total, count = 0.0, 0
+            for y in range(side * i, side * (i + 1)):
+                for x in range(side * j, side * (j + 1)):
+                    if not _is_off_lines(y, x, image, source, mask, mean):
+                        continue
+                    residual = (image[y, x] - reprojection[y, x]) / mean
+                    bright = max(image[y, x], reprojection[y, x]) / mean
+                    hidden = terms[0] + bright * (terms[1] + terms[2] * bright)
+                    hidden += (_INVISIBLE * bright) ** 2 + _LEAST_VARIANCE
+                    total += residual * residual / hidden
+                    count += 1
+            excess[i, j], share[i, j] = total / (side * side), count / (side * side)
+
+
+@kernel
+def _residual_rows(
+    start: int,
+    stop: int,
+    image: FloatArray,
+    source: FloatArray,
+    reprojection: FloatArray,
+    mask: BoolArray,
+    mean: float,
+    residual: FloatArray,
+    counts: IntArray,
+) -> None:
+    """Fill rows with image minus re-projection, 0 at bright lines; count the other pixels."""
+    for y in range(start, stop):
+        counts[y] = 0
+        for x in range(mask.shape[1]):
+            is_counted = _is_off_lines(y, x, image, source, mask, mean)
+            residual[y, x] = image[y, x] - reprojection[y, x] if is_counted else 0.0
+            counts[y] += is_counted
 
 
 def _misfit(prepared: Prepared, reprojection: FloatArray, n_sites: int) -> str:
     """Describe a pattern in the image that the re-projection misses."""
-    mask, mean = prepared.mask, prepared.source[prepared.mask].mean()
-    residual, counted = _residual_off_lines(prepared, reprojection)
-    share = float(np.sqrt((residual**2).sum() / max(counted.sum(), 1)) / mean)
+    mask, mean = prepared.mask, _mean_source(prepared)
+    residual, counts = np.empty(mask.shape), np.empty(len(mask), np.int64)
+    planes = prepared.image, prepared.source, reprojection, mask
+    _residual_rows(0, len(mask), *planes, mean, residual, counts)
+    share = float(np.sqrt(np.einsum("yx,yx->", residual, residual) / max(counts.sum(), 1)) / mean)
     if share < _NOTABLE_RESIDUAL:
         return ""
     # A few hot pixels are no pattern.

@@ -315,7 +315,9 @@ def with_full_cells(
     Hidden sites are lowered to where they just show; then a little of the zero weights,
     for which every cell is round and full, is mixed in.
     """
-    visible = objective.triangulation.lower_hidden(weights)
+    visible = objective.triangulation.lower_hidden(
+        weights, threads=available_threads(objective.threads)
+    )
     for share in _SHARES_OF_START:
         diagram = objective.diagram_if_full(share * visible)
         if diagram is not None and diagram.masses.min() > _MIN_START_FLUX * objective.mass.mean():

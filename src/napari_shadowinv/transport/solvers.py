@@ -20,6 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
+from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.density import Density, split_pixels
@@ -238,7 +239,8 @@ def _solve_from(
     options = target.options
     objective = target.objective(level)
     if options.solver == "newton":
-        is_full = objective.triangulation.update(start, stop_when_hidden=True)
+        threads = available_threads(options.threads)
+        is_full = objective.triangulation.update(start, stop_when_hidden=True, threads=threads)
         solution = newton(
             objective,
             start,
