@@ -1,6 +1,11 @@
 """Levels of the multigrid: ever fewer nodes, each a group of the level before.
 
 - all levels of a Laplacian: `build_hierarchy`, which returns a `Hierarchy` over one `Network`
+
+Level 0 of a large network is cut into blocks of nodes, which threads sweep side by side. Groups do
+not cross the cuts, and the conductors that do, the `Cuts`, are few. The number of blocks follows
+from that of the nodes, so that results do not depend on the threads.
+
 - refuse a graph of several parts: `require_connected`
 
 See `napari_shadowinv.transport.linear`.
@@ -21,6 +26,7 @@ from napari_shadowinv.geometry.triangle_mesh import Indices
 _MAX_COARSEST_NODES = 60
 _MIN_TIE = 0.2
 _MAX_PAIRED_SHARE = 0.75
+_NODES_PER_BLOCK, _MOST_BLOCKS = 25_000, 8
 _NOT_CONNECTED = (
     "the cells form several groups with no flux between them, so the relative weights of the "
     "groups are undetermined"
@@ -28,29 +34,51 @@ _NOT_CONNECTED = (
 
 
 class Network(NamedTuple):
-    """Conductors as rows of (neighbour, conductance), those to lower nodes first."""
+    """Conductors as rows of (neighbour, conductance).
+
+    Those to lower nodes of the same block come first, and those to other blocks last.
+    """
 
     starts: Indices
-    middles: Indices
+    middles: Indices  # where those to higher nodes begin
+    ends: Indices  # where those to other blocks begin
     neighbors: Indices
     conductances: NDArray[np.float32]  # whose sums the degrees are, so nothing leaks
     degrees: FloatArray
     inverse_degrees: FloatArray
 
 
+class Cuts(NamedTuple):
+    """Conductors between blocks of level 0: their ends, `first` > `second`."""
+
+    first: Indices
+    second: Indices
+    conductances: FloatArray
+    nodes: Indices  # all ends, each once
+    saved: FloatArray  # room for a value of each
+
+
 class Hierarchy(NamedTuple):
-    """Data of one cycle: the nodes of level k are `bounds[k]` to `bounds[k + 1]`."""
+    """Data of one cycle: the nodes of level k are `bounds[k]` to `bounds[k + 1]`.
+
+    Those of level 0 in block b are `blocks[b]` to `blocks[b + 1]`, and their groups `groups[b]` to
+    `groups[b + 1]`.
+    """
 
     bounds: IntArray
     twice: BoolArray
     network: Network
     parents: Indices
     inverse: FloatArray
+    blocks: IntArray
+    groups: IntArray
+    cuts: Cuts
 
 
 def _empty_network(nodes: int, entries: int) -> Network:
     return Network(
         np.zeros(nodes + 1, np.int32),
+        np.empty(nodes, np.int32),
         np.empty(nodes, np.int32),
         np.empty(entries, np.int32),
         np.empty(entries, np.float32),
@@ -60,45 +88,76 @@ def _empty_network(nodes: int, entries: int) -> Network:
 
 
 @kernel
-def _put_lower_first(
-    neighbors: Indices,
-    conductances: NDArray[np.float32],
-    begin: int | np.uint32,
-    end: int | np.uint32,
-    node: int | np.uint32,
-) -> tuple[int, float]:
-    """Sort a row to lower and upper neighbours; return where the upper begin, and the sum."""
-    middle = np.uint32(begin)
+def _sort_row(network: Network, end: np.uint32, node: np.uint32, low: int, high: int) -> None:
+    """Complete the last row, up to an entry: sort it, and sum its conductances.
+
+    The nodes from `low` to `high` are those of its block.
+    """
+    starts, middles, ends, neighbors, conductances, degrees, inverse_degrees = network
+    step = np.uint32(1)
+    middle = np.uint32(starts[node])
+    crossing = False
     degree = 0.0
-    for k in range(np.uint32(begin), np.uint32(end)):
+    for k in range(np.uint32(starts[node]), end):
         neighbor, conductance = neighbors[k], conductances[k]
         degree += conductance
         neighbors[k], conductances[k] = neighbors[middle], conductances[middle]
         neighbors[middle], conductances[middle] = neighbor, conductance
-        middle += np.uint32(1) if neighbor < node else np.uint32(0)
-    return int(middle), degree
+        middle += step if low <= neighbor < node else np.uint32(0)
+        crossing |= neighbor < low or neighbor >= high
+    last = end
+    if crossing:
+        last = middle
+        for k in range(middle, end):
+            neighbor, conductance = neighbors[k], conductances[k]
+            if low <= neighbor < high:
+                neighbors[k], conductances[k] = neighbors[last], conductances[last]
+                neighbors[last], conductances[last] = neighbor, conductance
+                last += step
+    middles[node], ends[node], starts[node + step] = middle, last, end
+    degrees[node] = degree
+    inverse_degrees[node] = 1.0 / degree if degree != 0.0 else np.inf
 
 
 @kernel
 def _read_laplacian(
-    starts: Indices, columns: Indices, values: FloatArray, network: Network
+    starts: Indices, columns: Indices, values: FloatArray, network: Network, blocks: IntArray
 ) -> None:
     """Take the conductors out of a sparse matrix, in any order of columns."""
-    row_starts, middles, neighbors, conductances, degrees, inverse_degrees = network
+    neighbors, conductances = network.neighbors, network.conductances
     step = np.uint32(1)
     end = np.uint32(0)
-    for i in range(np.uint32(starts.shape[0] - 1)):
-        begin = end
-        for k in range(np.uint32(starts[i]), np.uint32(starts[i + step])):
-            if columns[k] != i and values[k] < 0.0:
-                neighbors[end] = columns[k]
-                conductances[end] = -values[k]
-                end += step
-        row_starts[i + step] = end
-        middle, degree = _put_lower_first(neighbors, conductances, begin, end, i)
-        middles[i] = middle
-        degrees[i] = degree
-        inverse_degrees[i] = 1.0 / degree if degree != 0.0 else np.inf
+    for b in range(blocks.size - 1):
+        low, high = blocks[b], blocks[b + 1]
+        for i in range(np.uint32(low), np.uint32(high)):
+            for k in range(np.uint32(starts[i]), np.uint32(starts[i + step])):
+                if columns[k] != i and values[k] < 0.0:
+                    neighbors[end] = columns[k]
+                    conductances[end] = -values[k]
+                    end += step
+            _sort_row(network, end, i, low, high)
+
+
+@njit(nogil=True, cache=True)
+def _list_cuts(network: Network, n: int) -> Cuts:
+    """List the conductors between blocks of the first n nodes."""
+    starts, _, ends, neighbors, conductances, _, _ = network
+    count = 0
+    for i in range(n):
+        count += starts[i + 1] - ends[i]
+    first, second = np.empty(count // 2, np.int32), np.empty(count // 2, np.int32)
+    values = np.empty(count // 2)
+    nodes = np.empty(count, np.int32)
+    end = last = 0
+    for i in range(n):
+        if ends[i] < starts[i + 1]:
+            nodes[last] = i
+            last += 1
+        for k in range(ends[i], starts[i + 1]):
+            if neighbors[k] < i:
+                first[end], second[end], values[end] = i, neighbors[k], conductances[k]
+                end += 1
+    return Cuts(first, second, values, nodes[:last], np.empty(last))
 
 
 @kernel
@@ -110,9 +169,14 @@ def _pair(
     inverses: FloatArray,
     groups: Indices,
     first: int,
+    count: int,
     group_inverses: FloatArray,
 ) -> int:
-    """Group each node with a free neighbour or a group; return the number after the last group."""
+    """Group each node of a block with a free neighbour or a group.
+
+    Groups are numbered from `count` on; the number after the last one is returned. `group_inverses`
+    begins with the group `first`.
+    """
     # A tie is a conductance times the sum of the inverses of the two sides' degrees, where a
     # group's degree is the sum over the nodes of the level it stands for (Napov and Notay,
     # Eq. 3.6, for rows that sum to zero). The inverses are given for the nodes and found for
@@ -120,16 +184,15 @@ def _pair(
     # held much more strongly by others, the sweeps do not smooth an error that differs between
     # them.
     # the attributes are looked up once because each look-up counts references
-    starts, _, neighbors, conductances, _, _ = network
+    starts, _, ends, neighbors, conductances, _, _ = network
     for i in range(start, stop):
         groups[i] = -1
-    count = first
     for i in range(np.uint32(start), np.uint32(stop)):
         if groups[i] >= 0:
             continue
         free = taken = -1
         free_tie = taken_tie = weakest
-        for k in range(np.uint32(starts[i]), np.uint32(starts[i + 1])):
+        for k in range(np.uint32(starts[i]), np.uint32(ends[i])):
             neighbour = np.uint32(neighbors[k])
             group = groups[neighbour]
             if group < 0:
@@ -183,12 +246,13 @@ def _list_members(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _contract(
-    fine: Network, start: int, stop: int, groups: Indices, coarse: Network, first: int, last: int
+    fine: Network, start: int, stop: int, groups: Indices, coarse: Network, blocks: IntArray
 ) -> None:
     """Make each group one node, with the sums of the conductances between groups."""
+    first, last = blocks[0], blocks[-1]
     begins, members = _list_members(start, stop, groups, first, last)
     place = np.full(last - first, -1, np.int32)
-    _sum_conductances(fine, groups, begins, members, place, coarse, first)
+    _sum_conductances(fine, groups, begins, members, place, coarse, blocks)
 
 
 @kernel
@@ -199,16 +263,19 @@ def _sum_conductances(
     members: Indices,
     place: Indices,
     coarse: Network,
-    first: int,
+    blocks: IntArray,
 ) -> None:
     """Fill the rows of the coarse network; `place` is -1 for each group."""
-    starts, _, neighbors, conductances, _, _ = fine
-    rows, middles, coarse_neighbors, coarse_conductances, degrees, inverse_degrees = coarse
-    step, offset = np.uint32(1), np.uint32(first)
-    end = rows[first]
+    starts, _, _, neighbors, conductances, _, _ = fine
+    rows, _, _, coarse_neighbors, coarse_conductances, _, _ = coarse
+    step, offset = np.uint32(1), np.uint32(blocks[0])
+    end = rows[offset]
+    block = 0
     for group in range(np.uint32(place.size)):
         begin = end
         g = group + offset
+        while g >= blocks[block + 1]:
+            block += 1
         for m in range(np.uint32(begins[group]), np.uint32(begins[group + step])):
             node = np.uint32(members[m])
             for k in range(np.uint32(starts[node]), np.uint32(starts[node + step])):
@@ -223,11 +290,7 @@ def _sum_conductances(
                     end += 1
                 else:
                     coarse_conductances[np.uint32(at)] += conductances[k]
-        rows[g + step] = end
-        middle, degree = _put_lower_first(coarse_neighbors, coarse_conductances, begin, end, g)
-        middles[g] = middle
-        degrees[g] = degree
-        inverse_degrees[g] = 1.0 / degree if degree != 0.0 else np.inf
+        _sort_row(coarse, np.uint32(end), g, blocks[block], blocks[block + 1])
 
 
 def build_hierarchy(laplacian: csr_array, ground: FloatArray | None = None) -> Hierarchy:
@@ -237,19 +300,26 @@ def build_hierarchy(laplacian: csr_array, ground: FloatArray | None = None) -> H
     # pages that are never touched take no memory
     network = _empty_network(4 * n + _MAX_COARSEST_NODES, 2 * int(laplacian.nnz))
     parents: Indices = np.empty(4 * n + _MAX_COARSEST_NODES, np.int32)
+    count = min(max(n // _NODES_PER_BLOCK, 1), _MOST_BLOCKS)
+    blocks = np.arange(count + 1) * n // count
     _read_laplacian(
         laplacian.indptr.astype(np.int32, copy=False),
         laplacian.indices.astype(np.int32, copy=False),
         laplacian.data.astype(np.float64, copy=False),
         network,
+        blocks,
     )
     _tie_to_ground(network, 0, ground)
     bounds = [0, n]
+    groups = blocks
     while bounds[-1] - bounds[-2] > _MAX_COARSEST_NODES:
-        network, last = _add_level(network, parents, bounds[-2], bounds[-1])
+        within = blocks if len(bounds) == 2 else np.array(bounds[-2:])
+        network, ends = _add_level(network, parents, within)
+        groups = ends if len(bounds) == 2 else groups
+        last = int(ends[-1])
         if ground is not None:
-            groups = parents[bounds[-2] : bounds[-1]] - bounds[-1]
-            ground = np.bincount(groups, ground, last - bounds[-1]).astype(np.float64)
+            joined = parents[bounds[-2] : bounds[-1]] - bounds[-1]
+            ground = np.bincount(joined, ground, last - bounds[-1]).astype(np.float64)
             _tie_to_ground(network, bounds[-1], ground)
         bounds.append(last)
     return Hierarchy(
@@ -258,6 +328,9 @@ def build_hierarchy(laplacian: csr_array, ground: FloatArray | None = None) -> H
         network,
         parents,
         _invert_coarsest(network, bounds[-2], bounds[-1], grounded=ground is not None),
+        blocks,
+        groups,
+        _list_cuts(network, n if count > 1 else 0),
     )
 
 
@@ -269,25 +342,52 @@ def _tie_to_ground(network: Network, start: int, ground: FloatArray | None) -> N
         network.inverse_degrees[nodes] = 1.0 / network.degrees[nodes]
 
 
-def _add_level(network: Network, parents: Indices, start: int, stop: int) -> tuple[Network, int]:
-    """Pair the last level's nodes, pair the pairs; return the network and its number of nodes."""
+def _add_level(
+    network: Network, parents: Indices, blocks: IntArray
+) -> tuple[Network, IntArray]:
+    """Pair the nodes of each block of the last level, and pair the pairs.
+
+    Returns the network, and the bounds of each block's groups.
+    """
+    start, stop = int(blocks[0]), int(blocks[-1])
     if stop - start > 1 and not network.degrees[start:stop].min() > 0.0:
         raise RuntimeError(_NOT_CONNECTED)
     inverses = np.empty(stop - start)
     for weakest in (_MIN_TIE, 0.0):
-        count = _pair(network, start, stop, weakest, network.inverse_degrees, parents, 0, inverses)
+        nodes = network, blocks, weakest, network.inverse_degrees
+        pair_blocks = _pair_blocks(*nodes, parents, 0, inverses)
+        count = int(pair_blocks[-1])
         if count <= _MAX_PAIRED_SHARE * (stop - start):
             break
     else:
         raise RuntimeError("the fluxes between cells are not finite, or underflow")
     pairs = _empty_network(count, network.starts[stop] - network.starts[start])
-    _contract(network, start, stop, parents, pairs, 0, count)
+    _contract(network, start, stop, parents, pairs, pair_blocks)
     groups = np.empty(count, np.int32)
-    last = _pair(pairs, 0, count, _MIN_TIE, inverses, groups, stop, np.empty(count))
+    nodes = pairs, pair_blocks, _MIN_TIE, inverses
+    ends = _pair_blocks(*nodes, groups, stop, np.empty(count))
     network = _grow_network(network, network.starts[stop] + pairs.starts[count])
-    _contract(pairs, 0, count, groups, network, stop, last)
+    # The coarser level is one block.
+    _contract(pairs, 0, count, groups, network, ends[[0, -1]])
     parents[start:stop] = groups[parents[start:stop]]
-    return network, last
+    return network, ends
+
+
+def _pair_blocks(
+    network: Network,
+    blocks: IntArray,
+    weakest: float,
+    inverses: FloatArray,
+    groups: Indices,
+    first: int,
+    group_inverses: FloatArray,
+) -> IntArray:
+    """Pair the nodes of each block; return the bounds of its groups, numbered from `first` on."""
+    bounds = np.full(len(blocks), first)
+    for b in range(len(blocks) - 1):
+        within = network, blocks[b], blocks[b + 1], weakest, inverses, groups
+        bounds[b + 1] = _pair(*within, first, bounds[b], group_inverses)
+    return bounds
 
 
 def _grow_network(network: Network, entries: int) -> Network:

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
+from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.compiler import kernel, njit
 from napari_shadowinv.geometry.interpolation import WIDTH
@@ -122,6 +123,7 @@ class FactorisedLaplacian:
 
 
 _MAX_DIRECT_NODES = 200
+_ROWS_PER_THREAD = 1 << 15  # fewer are not worth a thread
 _EXTRA_ITERATIONS = 3  # that cost less than a new setup
 _REUSE_LENGTH = 0.4  # right-hand sides below this length, relative to the setup's, reuse it
 _MAX_KEPT_NODES = 500_000  # nodes; a larger setup takes the memory that trial steps need
@@ -143,7 +145,7 @@ class _Vectors(NamedTuple):
 
 @kernel
 def _multiply(start: int, stop: int, network: Network, x: FloatArray, product: FloatArray) -> None:
-    starts, _, neighbors, conductances, degrees, _ = network
+    starts, _, _, neighbors, conductances, degrees, _ = network
     for i in range(np.uint32(start), np.uint32(stop)):
         total = degrees[i] * x[i]
         for k in range(np.uint32(starts[i]), np.uint32(starts[i + 1])):
@@ -153,23 +155,29 @@ def _multiply(start: int, stop: int, network: Network, x: FloatArray, product: F
 
 @kernel
 def _descend(
-    start: int, stop: int, end: int, network: Network, parents: Indices, vectors: _Vectors
+    start: int,
+    stop: int,
+    first: int,
+    last: int,
+    network: Network,
+    parents: Indices,
+    vectors: _Vectors,
 ) -> None:
-    """Sweep forward from zero and pass the residual to the next level, up to `end`."""
+    """Sweep forward from zero and pass the residual to the groups `first` to `last`."""
     # After such a sweep only the conductors to higher nodes leave a residual, and each is
     # also an entry of the higher node's row: both are done in one walk over half the entries.
-    starts, middles, neighbors, conductances, _, inverse_degrees = network
+    starts, middles, _, neighbors, conductances, _, inverse_degrees = network
     residual, x = vectors.residual, vectors.correction
-    for i in range(np.uint32(stop), np.uint32(end)):
+    for i in range(np.uint32(first), np.uint32(last)):
         residual[i] = 0.0
     for i in range(np.uint32(start), np.uint32(stop)):
-        first, middle = np.uint32(starts[i]), np.uint32(middles[i])
+        begin, middle = np.uint32(starts[i]), np.uint32(middles[i])
         total = residual[i]
-        for k in range(first, middle):
+        for k in range(begin, middle):
             total += conductances[k] * x[np.uint32(neighbors[k])]
         value = total * inverse_degrees[i]
         x[i] = value
-        for k in range(first, middle):
+        for k in range(begin, middle):
             parent = np.uint32(parents[np.uint32(neighbors[k])])
             residual[parent] += conductances[k] * value
 
@@ -177,14 +185,14 @@ def _descend(
 @kernel
 def _ascend(start: int, stop: int, network: Network, parents: Indices, vectors: _Vectors) -> None:
     """Add the next level's correction and sweep backward."""
-    starts, _, neighbors, conductances, _, inverse_degrees = network
+    starts, _, ends, neighbors, conductances, _, inverse_degrees = network
     residual, x = vectors.residual, vectors.correction
     for j in range(np.uint32(start), np.uint32(stop)):
         x[j] += x[np.uint32(parents[j])]
     for node in range(stop - 1, start - 1, -1):
         i = np.uint32(node)
         total = residual[i]
-        for k in range(np.uint32(starts[i]), np.uint32(starts[i + np.uint32(1)])):
+        for k in range(np.uint32(starts[i]), np.uint32(ends[i])):
             total += conductances[k] * x[np.uint32(neighbors[k])]
         x[i] = total * inverse_degrees[i]
 
@@ -241,23 +249,23 @@ def _second_step(
 
 
 @njit(nogil=True, cache=True)
-def _cycle(hierarchy: Hierarchy, vectors: _Vectors) -> None:
-    """Turn the residual of level 0 into its correction by one K-cycle."""
+def _cycle(hierarchy: Hierarchy, top: int, vectors: _Vectors) -> None:
+    """Turn the residual of level `top` into its correction by one K-cycle."""
     # What the first step of each level has found waits in arrays, because a cached kernel
     # must not call itself.
-    bounds, twice, network, parents, inverse = hierarchy
+    bounds, twice, network, parents, inverse, _, _, _ = hierarchy
     deepest = bounds.shape[0] - 2
     energies, lengths = np.zeros(deepest + 1), np.zeros(deepest + 1)
     halfway = np.zeros(deepest + 1, np.bool_)
-    level = 0
+    level = top
     while True:
         while level < deepest:
             start, stop, end = bounds[level], bounds[level + 1], bounds[level + 2]
-            _descend(start, stop, end, network, parents, vectors)
+            _descend(start, stop, stop, end, network, parents, vectors)
             level += 1
         _solve_coarsest(bounds[level], bounds[level + 1], inverse, vectors)
         again = False
-        while level > 0 and not again:
+        while level > top and not again:
             level -= 1
             start, stop = bounds[level], bounds[level + 1]
             _ascend(start, stop, network, parents, vectors)
@@ -269,6 +277,49 @@ def _cycle(hierarchy: Hierarchy, vectors: _Vectors) -> None:
                 halfway[level] = again = True
         if not again:
             return
+
+
+@njit(nogil=True, cache=True)
+def _descend_blocks(start: int, stop: int, hierarchy: Hierarchy, vectors: _Vectors) -> None:
+    """Sweep blocks `start` to `stop` of level 0 forward."""
+    blocks, groups = hierarchy.blocks, hierarchy.groups
+    network, parents = hierarchy.network, hierarchy.parents
+    for b in range(start, stop):
+        nodes = blocks[b], blocks[b + 1], groups[b], groups[b + 1]
+        _descend(nodes[0], nodes[1], nodes[2], nodes[3], network, parents, vectors)
+
+
+@njit(nogil=True, cache=True)
+def _ascend_blocks(start: int, stop: int, hierarchy: Hierarchy, vectors: _Vectors) -> None:
+    """Sweep blocks `start` to `stop` of level 0 backward."""
+    blocks = hierarchy.blocks
+    for b in range(start, stop):
+        _ascend(blocks[b], blocks[b + 1], hierarchy.network, hierarchy.parents, vectors)
+
+
+@njit(nogil=True, cache=True)
+def _between_sweeps(hierarchy: Hierarchy, vectors: _Vectors) -> None:
+    """Complete the forward sweep where blocks meet, correct by the levels below, turn round."""
+    # A block's sweep knows the others as they were before: zero, then what `_cycle` has made.
+    first, second, conductances, nodes, saved = hierarchy.cuts
+    residual, x, parents = vectors.residual, vectors.correction, hierarchy.parents
+    for k in range(first.size):
+        i, j, conductance = first[k], second[k], conductances[k]
+        residual[parents[i]] += conductance * x[j]
+        residual[parents[j]] += conductance * x[i]
+    _cycle(hierarchy, 1, vectors)
+    for k in range(nodes.size):
+        saved[k] = residual[nodes[k]]
+    for k in range(first.size):
+        i, j, conductance = first[k], second[k], conductances[k]
+        residual[i] += conductance * (x[j] + x[parents[j]])
+        residual[j] += conductance * (x[i] + x[parents[i]])
+
+
+@kernel
+def _restore(nodes: Indices, saved: FloatArray, residual: FloatArray) -> None:
+    for k in range(nodes.size):
+        residual[nodes[k]] = saved[k]
 
 
 @kernel
@@ -298,13 +349,16 @@ class LaplacianSolver:
     with nothing positive off the diagonal and rows that sum to zero; its columns may come in any
     order, but neighbours should be near in the numbering for speed. A ground at potential 0, if
     any, is tied to each node by a conductance, added to the diagonal. A graph that is not
-    connected raises a RuntimeError.
+    connected raises a RuntimeError. Solutions do not depend on the number of threads.
     """
 
-    def __init__(self, laplacian: csr_array, ground: FloatArray | None = None) -> None:
+    def __init__(
+        self, laplacian: csr_array, ground: FloatArray | None = None, *, threads: int | None = 1
+    ) -> None:
+        self._threads = available_threads(threads)
         self._n = int(laplacian.shape[0])
         self._grounded = ground is not None
-        self._matrix = _with_ground(laplacian, ground)
+        self._rows = _rows(laplacian, ground)
         self._hierarchy = build_hierarchy(laplacian, ground)
         nodes = int(self._hierarchy.bounds[-1])
         self._vectors = _Vectors(*(np.zeros(nodes) for _ in _Vectors._fields))
@@ -325,7 +379,7 @@ class LaplacianSolver:
         of the setup, and should be similar to it.
         """
         if laplacian is not None:
-            self._matrix = _with_ground(laplacian, ground)
+            self._rows = _rows(laplacian, ground)
         right = self._centre(right)
         scale = self._norm(right)
         solution: FloatArray = np.zeros(self._n)
@@ -357,7 +411,7 @@ class LaplacianSolver:
     def _iterate(self, solution: FloatArray, energy: float) -> float:
         """Do one step of flexible conjugate gradients; return its direction's energy."""
         n, vectors = self._n, self._vectors
-        _cycle(self._hierarchy, vectors)
+        self._precondition()
         share = _dot(0, n, vectors.correction, vectors.direction_product) / energy
         _turn(n, share, self._grounded, vectors)
         self._multiply(vectors.direction, vectors.direction_product)
@@ -367,9 +421,22 @@ class LaplacianSolver:
             _advance(n, length, solution, vectors)
         return energy
 
+    def _precondition(self) -> None:
+        """Turn the residual into a correction by one K-cycle."""
+        hierarchy, vectors = self._hierarchy, self._vectors
+        count = len(hierarchy.blocks) - 1
+        if count == 1:
+            _cycle(hierarchy, 0, vectors)
+            return
+        in_ranges(_descend_blocks, count, self._threads, hierarchy, vectors, smallest=1)
+        _between_sweeps(hierarchy, vectors)
+        in_ranges(_ascend_blocks, count, self._threads, hierarchy, vectors, smallest=1)
+        _restore(hierarchy.cuts.nodes, hierarchy.cuts.saved, vectors.residual)
+
     def _multiply(self, x: FloatArray, product: FloatArray) -> None:
         # Not with the hierarchy's rounded conductances.
-        product[: self._n] = self._matrix @ x[: self._n]
+        vectors = *self._rows, x, product
+        in_ranges(_multiply_rows, self._n, self._threads, *vectors, smallest=_ROWS_PER_THREAD)
 
     def _norm(self, x: FloatArray) -> float:
         return float(np.sqrt(_dot(0, self._n, x, x)))
@@ -379,6 +446,34 @@ def _with_ground(laplacian: csr_array, ground: FloatArray | None) -> csr_array:
     return laplacian if ground is None else csr_array(laplacian + diags_array(ground))
 
 
+def _rows(
+    laplacian: csr_array, ground: FloatArray | None
+) -> tuple[Indices, Indices, FloatArray]:
+    """Return starts, columns and values of the rows of a grounded Laplacian."""
+    matrix = _with_ground(laplacian, ground)
+    starts, columns = (
+        indices.astype(np.int32, copy=False) for indices in (matrix.indptr, matrix.indices)
+    )
+    return starts, columns, matrix.data.astype(np.float64, copy=False)
+
+
+@kernel
+def _multiply_rows(
+    start: int,
+    stop: int,
+    starts: Indices,
+    columns: Indices,
+    values: FloatArray,
+    x: FloatArray,
+    product: FloatArray,
+) -> None:
+    for i in range(np.uint32(start), np.uint32(stop)):
+        total = 0.0
+        for k in range(np.uint32(starts[i]), np.uint32(starts[i + np.uint32(1)])):
+            total += values[k] * x[np.uint32(columns[k])]
+        product[i] = total
+
+
 class SimilarSystems:
     """Solver of consecutive systems that reuses its setup.
 
@@ -386,7 +481,8 @@ class SimilarSystems:
     have become short.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, threads: int | None = 1) -> None:
+        self._threads = threads
         self._solver: LaplacianSolver | None = None
         self._most, self._longest = 0, 0.0
 
@@ -410,7 +506,7 @@ class SimilarSystems:
             if residual <= tolerance:
                 return solution
         self._solver = None  # one at a time: they are large
-        solver = LaplacianSolver(laplacian, ground)
+        solver = LaplacianSolver(laplacian, ground, threads=self._threads)
         solution, iterations, residual = solver.solve(right, tolerance)
         if residual > tolerance:
             return _solve_by_factors(laplacian, right, ground)

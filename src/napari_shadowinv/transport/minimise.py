@@ -210,7 +210,7 @@ def newton(
     residual = objective.residual(diagram)
     keep = 0.5 * min(float(diagram.masses.min() / mass.mean()), float(mass.min() / mass.mean()))
     errors = [_length(mass - diagram.masses)]
-    systems = SimilarSystems()
+    systems = SimilarSystems(objective.threads)
     first = 1.0
     reason = f"the solver used all {max_iterations} iterations allowed"
     while residual > tolerance and len(errors) <= max_iterations:
