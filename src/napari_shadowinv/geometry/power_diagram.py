@@ -154,6 +154,32 @@ def _sum_over_cells(edges: Indices, integrals: FloatArray, column: int, sums: Fl
             sums[b] -= value
 
 
+@kernel
+def _sum_moments(edges: Indices, integrals: FloatArray, sums: FloatArray) -> None:
+    """Do the same with the columns of `_integrate_moments` for mass and moments."""
+    n = np.uint32(sums.shape[0])
+    for e in range(edges.shape[0]):
+        a, b = np.uint32(edges[e, 0]), np.uint32(edges[e, 1])
+        if a < n:
+            for k in range(3):
+                sums[a, k] += integrals[e, k + 1]
+        if b < n:
+            for k in range(3):
+                sums[b, k] -= integrals[e, k + 1]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _find_centroids(
+    start: int, stop: int, sites: FloatArray, sums: FloatArray, centroids: FloatArray
+) -> None:
+    """Divide the moments of cells, about the corner of the image, by their masses."""
+    for i in range(start, stop):
+        mass = sums[i, 0]
+        for axis in range(2):
+            moment = sums[i, 1 + axis] - 0.5 * mass
+            centroids[i, axis] = moment / mass if mass > 0 else sites[i, axis]
+
+
 @njit(nogil=True, cache=True)
 def _laplacian(
     points: FloatArray, n: int, edges: Indices, integrals: FloatArray
@@ -268,29 +294,32 @@ class PowerDiagram:
     @cached_property
     def masses(self) -> FloatArray:
         """Flux in each cell, shape (n,): S(V_i) or T(P_i) of the paper."""
+        if self._with_moments:
+            return np.ascontiguousarray(self._moments[:, 0])
         return self._cell_sums(self._integrals, 1)
 
     @cached_property
-    def _first_moments(self) -> FloatArray:
+    def _moments(self) -> FloatArray:
+        """Masses of the cells, and their moments y and x about the image's corner, (n, 3)."""
         if not self._with_moments:
             raise ValueError("this diagram was made without moments: pass with_moments=True")
-        corner = np.stack([self._cell_sums(self._integrals, column) for column in (2, 3)], axis=1)
-        return corner - 0.5 * self.masses[:, None]
+        sums = np.zeros((self.n_sites, 3))
+        _sum_moments(self.edges, self._integrals, sums)
+        return sums
 
     @cached_property
     def centroids(self) -> FloatArray:
         """Centre of mass of each cell, shape (n, 2); the site where a cell is empty."""
-        filled = self.masses > 0
-        centroids = np.array(self.sites)
-        centroids[filled] = self._first_moments[filled] / self.masses[filled, None]
+        centroids = np.empty((self.n_sites, 2))
+        cells = self.sites, self._moments, centroids
+        in_ranges(_find_centroids, self.n_sites, self._threads, *cells, smallest=1 << 15)
         return centroids
 
     @cached_property
     def inertia(self) -> FloatArray:
         """∫ |r - r_i|² I dr over each cell about its site, shape (n,)."""
-        # the walk's moments are about the image's corner, (-0.5, -0.5)
-        site = self.sites + 0.5
-        corner = self._first_moments + 0.5 * self.masses[:, None]
+        site = self.sites + 0.5  # from the image's corner
+        corner = self._moments[:, 1:]
         shifted = (site**2).sum(axis=1) * self.masses - 2 * (site * corner).sum(axis=1)
         integrals = self._integrate(_integrate_inertia, self._density.sums, np.array([2]))
         inertia: FloatArray = self._cell_sums(integrals, 0) + shifted
