@@ -66,7 +66,7 @@ def alone(samples, clean, seed):
     gained = PowerDiagram(objective.triangulation, Density.from_image(change)).masses
     half = 0.5 * SimilarSystems().solve(laplacian, -gained, 1e-11, ground=ground)
     at_sites = with_gradients(level.triangulation, np.repeat(half[:, None], WIDTH, axis=1))
-    mirrored = level.mirrored()
+    mirrored = level.mirrored
     gradients = mirrored.sense * at_sites[mirrored.origin, 1:, 0]
     surface = CloughTocher(mirrored.triangulation, half[mirrored.origin], gradients)
     potential, displacement = (plan.within(part) for part in read_dual(surface, level.shape))

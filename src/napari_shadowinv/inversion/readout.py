@@ -118,7 +118,7 @@ class LinearReadout:
             for size, padded_size in zip(plan.source.shape, level.shape, strict=True)
         ]
         pixels = np.stack(np.meshgrid(*beyond, indexing="ij"), axis=-1)
-        mirrored = level.mirrored()
+        mirrored = level.mirrored
         queries = pixels.reshape(-1, 2).astype(np.float64)
         corners, weights = corner_weights(mirrored.triangulation, queries, threads)
         weights[..., 1:] *= mirrored.sense[corners]

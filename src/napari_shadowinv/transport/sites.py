@@ -150,8 +150,9 @@ class Level:
         """Mean distance between neighbours, sqrt(area of the image / n), in px."""
         return _spacing(self.shape, len(self.sites))
 
+    @cached_property
     def mirrored(self) -> Mirrored:
-        """Return the sites with those near the border mirrored across it."""
+        """The sites with those near the border mirrored across it."""
         points, origin, sense = with_mirror_images(
             self.sites, self.shape, _MIRROR_BAND * self.spacing
         )
@@ -244,7 +245,8 @@ class Levels(Sequence[Level]):
     ) -> Iterator[Callable[[Sequence[int]], None]]:
         """Yield a function that starts to compute levels, by their counts, in another thread.
 
-        Levels that are not finished at the end of the block are abandoned.
+        Levels that are not finished at the end of the block are abandoned. After the levels, it
+        mirrors the sites of the last one, which a solution of it needs at its end.
         """
         if available_threads(threads) == 1:
             yield lambda counts: None
@@ -258,6 +260,8 @@ class Levels(Sequence[Level]):
                 if count not in self._slots:
                     self._report("sites", 0, None, f"{count:,} sites")
                     pool.submit(quiet.at, count)
+            if counts:
+                pool.submit(lambda: quiet.at(counts[-1]).mirrored)
 
         try:
             yield begin

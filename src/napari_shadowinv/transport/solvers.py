@@ -88,7 +88,7 @@ class LevelSolution(Solution):
         centroids (px) are, nearly, its gradients. No flux crosses the border of the image, so the
         potential is level across it, and its mirror image continues it smoothly.
         """
-        mirrored = self.level.mirrored()
+        mirrored = self.level.mirrored
         potential = 0.5 * self.weights
         gradient = fit_gradients(self.level.triangulation, potential, -self.displacement)
         return CloughTocher(
