@@ -8,6 +8,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.geometry import triangle_mesh
 from napari_shadowinv.geometry.compiler import kernel, kernel_that_allocates
 from napari_shadowinv.geometry.triangle_mesh import (
+    CROSS_BOUND,
     FLIP,
     LEGAL,
     LIFT_BOUND,
@@ -440,10 +441,25 @@ def add(mesh: Mesh, order: IntArray) -> int:
 
 
 @kernel
-def _return_overturned(mesh: Mesh, origins: FloatArray, strays: BoolArray) -> bool:
-    """Return corners of overturned triangles to their origins, and whether there were any."""
+def look_for_overturned(start: int, stop: int, mesh: Mesh, suspects: BoolArray) -> None:
+    """Mark the triangles that may be overturned."""
+    points, corners = mesh.points, mesh.corners
+    for t in range(start, stop):
+        a, b, c = corners[3 * t], corners[3 * t + 1], corners[3 * t + 2]
+        x_term = (points[b, 0] - points[a, 0]) * (points[c, 1] - points[a, 1])
+        y_term = (points[b, 1] - points[a, 1]) * (points[c, 0] - points[a, 0])
+        suspects[t] = not x_term - y_term > CROSS_BOUND * (abs(x_term) + abs(y_term))
+
+
+@kernel
+def return_overturned(
+    mesh: Mesh, suspects: BoolArray, origins: FloatArray, strays: BoolArray
+) -> bool:
+    """Return corners of overturned suspects to their origins, and whether there were any."""
     overturned = False
-    for t in range(mesh.counters[triangle_mesh.SIZE]):
+    for t in range(suspects.size):
+        if not suspects[t]:
+            continue
         i, j, k = mesh.corners[3 * t], mesh.corners[3 * t + 1], mesh.corners[3 * t + 2]
         if turn(mesh.points, mesh.scratch, i, j, k) <= 0:
             overturned = True
@@ -472,21 +488,11 @@ def _remove_strays(mesh: Mesh, strays: BoolArray) -> int:
 
 
 @kernel_that_allocates
-def relocate(mesh: Mesh, targets: FloatArray) -> int:
-    """Move the sites and repair the mesh; EXHAUSTED where building a new one is faster."""
-    # All sites move at once, but for the corners of triangles that this would turn over: these
-    # are taken out and put in again where they belong.
+def put_strays(mesh: Mesh, targets: FloatArray, strays: BoolArray) -> int:
+    """Move strays to their targets in a regular mesh, and insert what is hidden."""
     n = targets.shape[0]
-    origins = mesh.points[:n].copy()
-    strays = np.zeros(n, dtype=np.bool_)
-    # By single numbers: numba takes two seconds to compile assignments of arrays.
-    for v in range(n):
-        mesh.points[v, 0], mesh.points[v, 1] = targets[v, 0], targets[v, 1]
-    while _return_overturned(mesh, origins, strays):
-        pass
-    if strays.sum() > MOST_STRAYS * n or repair(mesh, REMOVE, strays[:0]) != DONE:
-        return EXHAUSTED
     status = _remove_strays(mesh, strays)
+    # By single numbers: numba takes two seconds to compile assignments of arrays.
     for v in range(n):
         if strays[v]:
             mesh.points[v, 0], mesh.points[v, 1] = targets[v, 0], targets[v, 1]

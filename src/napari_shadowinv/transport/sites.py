@@ -369,11 +369,12 @@ def lloyd(
             report(step)
         diagram = PowerDiagram(triangulation, source, with_moments=True, threads=threads)
         centroids = diagram.centroids
-        away = np.sqrt(((centroids - triangulation.sites) ** 2).sum(axis=1).mean())
+        moves = centroids - triangulation.sites
+        away = np.sqrt(np.einsum("na,na->", moves, moves) / len(moves))
         if step == iterations or away < near:
             return diagram, step
-        del diagram  # before the next one is made: they are large
-        triangulation.move(centroids)
+        del diagram, moves  # before the next one is made: they are large
+        triangulation.move(centroids, threads=available_threads(threads))
         step += 1
 
 
