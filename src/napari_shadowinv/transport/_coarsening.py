@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.geometry.compiler import kernel, njit
 from napari_shadowinv.geometry.triangle_mesh import Indices
@@ -293,7 +294,9 @@ def _sum_conductances(
         _sort_row(coarse, np.uint32(end), g, blocks[block], blocks[block + 1])
 
 
-def build_hierarchy(laplacian: csr_array, ground: FloatArray | None = None) -> Hierarchy:
+def build_hierarchy(
+    laplacian: csr_array, ground: FloatArray | None = None, threads: int = 1
+) -> Hierarchy:
     """Group nodes, and groups of nodes, until few are left; see `LaplacianSolver`."""
     n = int(laplacian.shape[0])
     # every level has at most three quarters of the nodes of the last, so 4 n are enough;
@@ -314,7 +317,7 @@ def build_hierarchy(laplacian: csr_array, ground: FloatArray | None = None) -> H
     groups = blocks
     while bounds[-1] - bounds[-2] > _MAX_COARSEST_NODES:
         within = blocks if len(bounds) == 2 else np.array(bounds[-2:])
-        network, ends = _add_level(network, parents, within)
+        network, ends = _add_level(network, parents, within, threads)
         groups = ends if len(bounds) == 2 else groups
         last = int(ends[-1])
         if ground is not None:
@@ -343,7 +346,7 @@ def _tie_to_ground(network: Network, start: int, ground: FloatArray | None) -> N
 
 
 def _add_level(
-    network: Network, parents: Indices, blocks: IntArray
+    network: Network, parents: Indices, blocks: IntArray, threads: int
 ) -> tuple[Network, IntArray]:
     """Pair the nodes of each block of the last level, and pair the pairs.
 
@@ -355,7 +358,7 @@ def _add_level(
     inverses = np.empty(stop - start)
     for weakest in (_MIN_TIE, 0.0):
         nodes = network, blocks, weakest, network.inverse_degrees
-        pair_blocks = _pair_blocks(*nodes, parents, 0, inverses)
+        pair_blocks = _pair_blocks(*nodes, parents, 0, inverses, threads)
         count = int(pair_blocks[-1])
         if count <= _MAX_PAIRED_SHARE * (stop - start):
             break
@@ -365,12 +368,34 @@ def _add_level(
     _contract(network, start, stop, parents, pairs, pair_blocks)
     groups = np.empty(count, np.int32)
     nodes = pairs, pair_blocks, _MIN_TIE, inverses
-    ends = _pair_blocks(*nodes, groups, stop, np.empty(count))
+    ends = _pair_blocks(*nodes, groups, stop, np.empty(count), threads)
     network = _grow_network(network, network.starts[stop] + pairs.starts[count])
     # The coarser level is one block.
     _contract(pairs, 0, count, groups, network, ends[[0, -1]])
     parents[start:stop] = groups[parents[start:stop]]
     return network, ends
+
+
+@njit(nogil=True, cache=True)
+def _pair_within_blocks(
+    begin: int,
+    end: int,
+    blocks: IntArray,
+    network: Network,
+    weakest: float,
+    inverses: FloatArray,
+    groups: Indices,
+    first: int,
+    group_inverses: FloatArray,
+    ends: IntArray,
+) -> None:
+    """Pair blocks `begin` to `end`, as if each node of those before made a group of its own."""
+    for b in range(begin, end):
+        low, high = blocks[b], blocks[b + 1]
+        count = first + low - blocks[0]
+        ends[b] = _pair(
+            network, low, high, weakest, inverses, groups, first, count, group_inverses
+        )
 
 
 def _pair_blocks(
@@ -381,12 +406,18 @@ def _pair_blocks(
     groups: Indices,
     first: int,
     group_inverses: FloatArray,
+    threads: int,
 ) -> IntArray:
     """Pair the nodes of each block; return the bounds of its groups, numbered from `first` on."""
-    bounds = np.full(len(blocks), first)
-    for b in range(len(blocks) - 1):
-        within = network, blocks[b], blocks[b + 1], weakest, inverses, groups
-        bounds[b + 1] = _pair(*within, first, bounds[b], group_inverses)
+    count = len(blocks) - 1
+    begins, ends = first + blocks[:-1] - blocks[0], np.empty(count, np.int64)
+    pairing = network, weakest, inverses, groups, first, group_inverses, ends
+    in_ranges(_pair_within_blocks, count, threads, blocks, *pairing, smallest=1)
+    bounds = np.concatenate([[first], first + np.cumsum(ends - begins)])
+    for b in range(1, count):
+        groups[blocks[b] : blocks[b + 1]] -= begins[b] - bounds[b]
+        moved = group_inverses[begins[b] - first : ends[b] - first]
+        group_inverses[bounds[b] - first : bounds[b + 1] - first] = moved
     return bounds
 
 

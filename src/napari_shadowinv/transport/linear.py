@@ -359,7 +359,7 @@ class LaplacianSolver:
         self._n = int(laplacian.shape[0])
         self._grounded = ground is not None
         self._rows = _rows(laplacian, ground)
-        self._hierarchy = build_hierarchy(laplacian, ground)
+        self._hierarchy = build_hierarchy(laplacian, ground, self._threads)
         nodes = int(self._hierarchy.bounds[-1])
         self._vectors = _Vectors(*(np.zeros(nodes) for _ in _Vectors._fields))
 
