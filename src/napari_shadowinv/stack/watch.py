@@ -263,10 +263,8 @@ class Watch:
 
     def _advance(self, most: int | None) -> None:
         """Write the oldest shot once it is done, or start the next one."""
-        begun = len(self._running)
-        is_full = begun == _LANES or (most is not None and self._ended + begun == most)
-        if begun and (is_full or self._running[0].attempt.done()):
-            self._finish()
+        if self._running and (self._is_full(most) or self._running[0].attempt.done()):
+            self._finish(partial(self._begin_waiting, most))
             return
         arrived = self._arrivals.next_name(_POLL_S)
         if arrived is not None and self._latest:
@@ -274,6 +272,23 @@ class Watch:
             self._skip(older)
         if arrived is not None:
             self._begin(arrived)
+
+    def _is_full(self, most: int | None) -> bool:
+        begun = len(self._running)
+        return begun == _LANES or (most is not None and self._ended + begun >= most)
+
+    def _begin_waiting(self, most: int | None, finished: str) -> None:
+        """Begin the next shot, if it waits, before the finished one is written."""
+        # The latest shot is numbered when it begins, and the first ones create the store.
+        if self._latest or self._task is None or self.store is None or self._is_full(most):
+            return
+        if self._arrivals.peek(1) in ([], [finished]):
+            return
+        arrived = self._arrivals.next_name(0.0)
+        if arrived == finished:
+            self._arrivals.put_back(arrived)
+        elif arrived is not None:
+            self._begin(arrived, quietly=True)
 
     def _skip(self, names: Iterable[str]) -> None:
         """Note shots that are not inverted, unless an earlier version of them was."""
@@ -298,7 +313,7 @@ class Watch:
         store.skip(self._skipped, *following)
         self._skipped.clear()
 
-    def _begin(self, name: str) -> None:
+    def _begin(self, name: str, *, quietly: bool = False) -> None:
         self._skipped.pop(text_of(name), None)
         while any(name == running.name for running in self._running):
             self._finish()  # it may have changed since it was read
@@ -307,7 +322,7 @@ class Watch:
             stamp_now = stamp(file.path)
             report = self._previous_report(text_of(name))
             if report is not None and _is_unchanged(file, report, stamp_now):
-                if not self._arrivals.waiting:
+                if not (quietly or self._arrivals.waiting):
                     self.report()
                 return
         except OSError:
@@ -323,10 +338,11 @@ class Watch:
             # Now, as the shot must not wait for it once it is done.
             with defer_interrupts():
                 self._store_skipped(self.store, text_of(name))
-        self.report()
+        if not quietly:
+            self.report()
 
-    def _finish(self) -> None:
-        """Wait for the oldest attempt, and write its outcome."""
+    def _finish(self, begin_next: Callable[[str], None] | None = None) -> None:
+        """Wait for the oldest attempt, let the next one begin, and write the outcome."""
         running = self._running[0]
         attempt, stamp_before = running.attempt.result(), running.stamp_before
         self._running.popleft()
@@ -341,13 +357,23 @@ class Watch:
             return
         if attempt.failure:
             self._arrivals.check()
-        name = text_of(running.name)
-        again = self._previous_report(name) is not None
-        with defer_interrupts():
-            outcome = self._write(name, replace(attempt, origin={**stamp_before, **attempt.origin}))
-        self._redo.discard(name)
         self._lanes[running.lane] = self._start_for_next(attempt)
         self._ended += 1
+        try:
+            if begin_next is not None:
+                begin_next(running.name)
+        finally:
+            self._store_outcome(
+                running.name, replace(attempt, origin={**stamp_before, **attempt.origin})
+            )
+
+    def _store_outcome(self, file: str, attempt: Attempt) -> None:
+        """Write the outcome of an attempt at a file, and report it."""
+        name = text_of(file)
+        again = self._previous_report(name) is not None
+        with defer_interrupts():
+            outcome = self._write(name, attempt)
+        self._redo.discard(name)
         self._last = time.monotonic()
         self._note_report(name, {"reason": outcome.reason, "warnings": outcome.warnings})
         self.report(name=name, outcome=outcome, result=attempt.result, again=again)
