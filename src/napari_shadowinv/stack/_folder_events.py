@@ -101,12 +101,12 @@ class Arrivals:
                     self._settling[name] = (stamp_now, time.monotonic())
 
     def next_name(self, timeout: float) -> str | None:
-        """Return the name of the next complete file; None after the timeout, or if woken."""
+        """Return the name of the next complete file; None after the timeout, or if woken in it."""
         end = time.monotonic() + timeout
         with self._changed:
             while True:
                 self._check()
-                if self._woken:
+                if self._woken and timeout > 0:
                     self._woken = False
                     return None
                 due = self._settle_some()
