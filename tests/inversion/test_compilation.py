@@ -69,7 +69,7 @@ def test_it_leaves_nothing_to_compile_for_an_inversion():
     script = """
 import sys
 import numpy as np
-from napari_shadowinv import invert
+from napari_shadowinv import InversionOptions, invert
 from napari_shadowinv.inversion import compilation
 
 compilation.is_compiled = lambda: False
@@ -81,8 +81,9 @@ kernels = {
 }
 compiled = {kernel: len(kernel.signatures) for kernel in kernels}
 assert sum(compiled.values()) > 10
-y, x = np.indices((40, 60)) / 60
-invert(1 + y * x, source=1 + x)
+for side in (40, 230):  # the latter needs blocks of nodes
+    y, x = np.indices((side, 240)) / 240
+    invert(1 + y * x, source=1 + x, options=InversionOptions(n_sites=240 * side))
 print([kernel.py_func.__name__ for kernel in kernels if len(kernel.signatures) > compiled[kernel]])
 """
     printed = subprocess.run(

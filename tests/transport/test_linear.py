@@ -172,6 +172,43 @@ def test_iterations_hardly_grow_with_size() -> None:
     assert iterations(80_000) <= 1.6 * iterations(5_000)
 
 
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("blocks", [2, 7])
+def test_blocks_of_nodes_cost_hardly_an_iteration(name: str, blocks: int) -> None:
+    laplacian = NETWORKS[name]()
+    right = noise(laplacian.shape[0])
+    undivided = LaplacianSolver(laplacian, blocks=1).solve(right, 1e-3)
+    solution, iterations, _ = LaplacianSolver(laplacian, blocks=blocks).solve(right, 1e-3)
+    assert iterations <= 1.15 * undivided[1] + 2
+    assert residual(laplacian, solution, right) <= 1e-3
+
+
+def test_threads_do_not_change_a_solution() -> None:
+    laplacian = unit_delaunay(60_000)
+    right = noise(60_000)
+    solutions = [LaplacianSolver(laplacian, threads=n).solve(right, 1e-4)[0] for n in (1, 2, 3)]
+    np.testing.assert_array_equal(solutions[0], solutions[1])
+    np.testing.assert_array_equal(solutions[0], solutions[2])
+
+
+def test_a_cycle_is_symmetric_where_blocks_meet() -> None:
+    solver = LaplacianSolver(unit_delaunay(400), blocks=3)
+    network = solver._hierarchy.network
+    assert len(solver._hierarchy.cuts.first) > 10
+    # Without second steps, which make a cycle depend on the residual, it is a matrix.
+    solver._hierarchy.twice[:] = False
+    columns = []
+    for k in range(400):
+        solver._vectors.residual[:] = 0.0
+        solver._vectors.residual[k] = 1.0
+        solver._precondition()
+        columns.append(solver._vectors.correction[:400].copy())
+        assert solver._vectors.residual[:400].tolist() == np.eye(400)[k].tolist()
+    cycle = np.stack(columns, axis=1)
+    np.testing.assert_allclose(cycle, cycle.T, atol=1e-12 * np.abs(cycle).max())
+    assert network.ends[:400].sum() < network.starts[1:401].sum()
+
+
 @pytest.mark.parametrize("order", ["by column", "diagonal first", "descending"])
 def test_columns_may_come_in_any_order(order: str) -> None:
     laplacian = unit_delaunay(3000)

@@ -13,6 +13,7 @@ See `napari_shadowinv.transport.linear`.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -89,7 +90,7 @@ def _empty_network(nodes: int, entries: int) -> Network:
 
 
 @kernel
-def _sort_row(network: Network, end: np.uint32, node: np.uint32, low: int, high: int) -> None:
+def _sort_row(network: Network, end: np.uint32, node: int | np.uint32, low: int, high: int) -> None:
     """Complete the last row, up to an entry: sort it, and sum its conductances.
 
     The nodes from `low` to `high` are those of its block.
@@ -295,34 +296,51 @@ def _sum_conductances(
 
 
 def build_hierarchy(
-    laplacian: csr_array, ground: FloatArray | None = None, threads: int = 1
+    laplacian: csr_array,
+    ground: FloatArray | None = None,
+    *,
+    blocks: int | None = None,
+    threads: int = 1,
 ) -> Hierarchy:
-    """Group nodes, and groups of nodes, until few are left; see `LaplacianSolver`."""
+    """Group nodes, and groups of nodes, until few are left; see `LaplacianSolver`.
+
+    Level 0 is cut into a number of blocks; by default, it follows from that of the nodes.
+    """
+    count = blocks or min(max(int(laplacian.shape[0]) // _NODES_PER_BLOCK, 1), _MOST_BLOCKS)
+    if count > 1:
+        # Where nodes have few neighbours in their block, only all together can be grouped.
+        with suppress(RuntimeError):
+            return _build_blocks(laplacian, ground, count, threads)
+    return _build_blocks(laplacian, ground, 1, threads)
+
+
+def _build_blocks(
+    laplacian: csr_array, ground: FloatArray | None, count: int, threads: int
+) -> Hierarchy:
     n = int(laplacian.shape[0])
     # every level has at most three quarters of the nodes of the last, so 4 n are enough;
     # pages that are never touched take no memory
     network = _empty_network(4 * n + _MAX_COARSEST_NODES, 2 * int(laplacian.nnz))
     parents: Indices = np.empty(4 * n + _MAX_COARSEST_NODES, np.int32)
-    count = min(max(n // _NODES_PER_BLOCK, 1), _MOST_BLOCKS)
-    blocks = np.arange(count + 1) * n // count
+    block_bounds = np.arange(count + 1) * n // count
     _read_laplacian(
         laplacian.indptr.astype(np.int32, copy=False),
         laplacian.indices.astype(np.int32, copy=False),
         laplacian.data.astype(np.float64, copy=False),
         network,
-        blocks,
+        block_bounds,
     )
     _tie_to_ground(network, 0, ground)
     bounds = [0, n]
-    groups = blocks
+    group_bounds = block_bounds
     while bounds[-1] - bounds[-2] > _MAX_COARSEST_NODES:
-        within = blocks if len(bounds) == 2 else np.array(bounds[-2:])
+        within = block_bounds if len(bounds) == 2 else np.array(bounds[-2:])
         network, ends = _add_level(network, parents, within, threads)
-        groups = ends if len(bounds) == 2 else groups
+        group_bounds = ends if len(bounds) == 2 else group_bounds
         last = int(ends[-1])
         if ground is not None:
-            joined = parents[bounds[-2] : bounds[-1]] - bounds[-1]
-            ground = np.bincount(joined, ground, last - bounds[-1]).astype(np.float64)
+            groups = parents[bounds[-2] : bounds[-1]] - bounds[-1]
+            ground = np.bincount(groups, ground, last - bounds[-1]).astype(np.float64)
             _tie_to_ground(network, bounds[-1], ground)
         bounds.append(last)
     return Hierarchy(
@@ -331,8 +349,8 @@ def build_hierarchy(
         network,
         parents,
         _invert_coarsest(network, bounds[-2], bounds[-1], grounded=ground is not None),
-        blocks,
-        groups,
+        block_bounds,
+        group_bounds,
         _list_cuts(network, n if count > 1 else 0),
     )
 
@@ -393,9 +411,7 @@ def _pair_within_blocks(
     for b in range(begin, end):
         low, high = blocks[b], blocks[b + 1]
         count = first + low - blocks[0]
-        ends[b] = _pair(
-            network, low, high, weakest, inverses, groups, first, count, group_inverses
-        )
+        ends[b] = _pair(network, low, high, weakest, inverses, groups, first, count, group_inverses)
 
 
 def _pair_blocks(

@@ -349,17 +349,23 @@ class LaplacianSolver:
     with nothing positive off the diagonal and rows that sum to zero; its columns may come in any
     order, but neighbours should be near in the numbering for speed. A ground at potential 0, if
     any, is tied to each node by a conductance, added to the diagonal. A graph that is not
-    connected raises a RuntimeError. Solutions do not depend on the number of threads.
+    connected raises a RuntimeError. Blocks of nodes, by default as many as pay, are swept side by
+    side; solutions do not depend on the number of threads.
     """
 
     def __init__(
-        self, laplacian: csr_array, ground: FloatArray | None = None, *, threads: int | None = 1
+        self,
+        laplacian: csr_array,
+        ground: FloatArray | None = None,
+        *,
+        blocks: int | None = None,
+        threads: int | None = 1,
     ) -> None:
         self._threads = available_threads(threads)
         self._n = int(laplacian.shape[0])
         self._grounded = ground is not None
         self._rows = _rows(laplacian, ground)
-        self._hierarchy = build_hierarchy(laplacian, ground, self._threads)
+        self._hierarchy = build_hierarchy(laplacian, ground, blocks=blocks, threads=self._threads)
         nodes = int(self._hierarchy.bounds[-1])
         self._vectors = _Vectors(*(np.zeros(nodes) for _ in _Vectors._fields))
 
@@ -446,9 +452,7 @@ def _with_ground(laplacian: csr_array, ground: FloatArray | None) -> csr_array:
     return laplacian if ground is None else csr_array(laplacian + diags_array(ground))
 
 
-def _rows(
-    laplacian: csr_array, ground: FloatArray | None
-) -> tuple[Indices, Indices, FloatArray]:
+def _rows(laplacian: csr_array, ground: FloatArray | None) -> tuple[Indices, Indices, FloatArray]:
     """Return starts, columns and values of the rows of a grounded Laplacian."""
     matrix = _with_ground(laplacian, ground)
     starts, columns = (
