@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,7 +44,7 @@ from napari_shadowinv.inversion.solution_checks import (
 from napari_shadowinv.options import MAX_DEFAULT_SITES, Instrument, InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean
-from napari_shadowinv.preprocessing.image_checks import image_warnings
+from napari_shadowinv.preprocessing.image_checks import CheckedImage, image_warnings
 from napari_shadowinv.transport.sites import Levels, Margin, SitePlan, edge_flux, plan_levels
 from napari_shadowinv.transport.solvers import LevelSolution, fit_flux_factor, solve
 
@@ -292,7 +293,7 @@ def invert(
 
         def check_image() -> tuple[Caution, ...]:
             recorded = prepared.image * prepared.flux_scale
-            beam = prepared.source if plan.measured else None
+            beam = _checked_source(plan, prepared) if plan.measured else None
             return image_warnings(recorded, beam, prepared.mask)
 
         noise = begin(estimate_noise, options.threads)
@@ -366,6 +367,14 @@ def invert(
         options=options,
         instrument=instrument,
     )
+
+
+_checked_sources: WeakKeyDictionary[SitePlan, CheckedImage] = WeakKeyDictionary()
+
+
+def _checked_source(plan: SitePlan, prepared: Prepared) -> CheckedImage:
+    """Return the source, whose checks all shots with a plan share."""
+    return _checked_sources.setdefault(plan, CheckedImage.of(prepared.source, prepared.mask))
 
 
 def _sites_reason(

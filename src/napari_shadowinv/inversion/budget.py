@@ -15,7 +15,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial import KDTree
 
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion.imperfections import (
     IMPERFECTIONS,
@@ -43,7 +43,7 @@ from napari_shadowinv.options import (
 )
 from napari_shadowinv.physics.units import PeakError
 from napari_shadowinv.transport.minimise import Solution, with_full_cells
-from napari_shadowinv.transport.sites import RATIO, SitePlan
+from napari_shadowinv.transport.sites import RATIO, Level, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
 
 __all__ = ["FLUX_ERRORS", "Budget", "ErrorEstimate", "Errors", "discretisation_share"]
@@ -624,14 +624,8 @@ class Budget:
 
     def _beams(self, response: LinearResponse) -> FloatArray:
         """Return the flux that cells gain from beams that differ from the source by 1 (r.m.s.)."""
-        rng = np.random.default_rng(self.options.seed)
-        mass = response.level.mass
         length = self._beam.length * min(self._prepared.mask.shape)
-        samples = random_waves(response.level.sites, length, _BEAM_SAMPLES, rng)
-        for sample in samples:
-            sample -= (mass * sample).sum() / mass.sum()
-            sample /= np.sqrt((mass * sample**2).sum() / mass.sum())
-        return mass * samples
+        return _unit_beams(response.level, length, self.options.seed)
 
     def _beams_of(self, response: LinearResponse, components: BeamComponents) -> FloatArray:
         """Return the flux that cells gain from beams that vary in certain shapes."""
@@ -647,17 +641,33 @@ class Budget:
         return np.asarray(samples - samples.sum(axis=1, keepdims=True) * mass / mass.sum())
 
 
+@lru_cache(maxsize=4)
+def _unit_beams(level: Level, length: float, seed: int) -> FloatArray:
+    """Return the flux that cells gain from random beams of r.m.s. 1, shape (k, n)."""
+    mass = level.mass
+    samples = random_waves(level.sites, length, _BEAM_SAMPLES, np.random.default_rng(seed))
+    for sample in samples:
+        sample -= (mass * sample).sum() / mass.sum()
+        sample /= np.sqrt((mass * sample**2).sum() / mass.sum())
+    return np.asarray(mass * samples)
+
+
+@lru_cache(maxsize=4)
+def _nearest_sites(level: Level, size: float) -> tuple[IntArray, int]:
+    """Return the nearest site of each square of a size, px, and the number of squares in a row."""
+    height, width = (int(side / size) + 1 for side in level.shape)
+    middles = (np.indices((height, width)).reshape(2, -1).T + 0.5) * size - 0.5
+    return np.asarray(KDTree(level.sites).query(middles)[1]), width
+
+
 def _solver_gap(
     response: LinearResponse, solution: LevelSolution, options: InversionOptions
 ) -> FloatArray:
     """Return the solver's remaining flux error in each cell."""
     gap = solution.flux - solution.level.mass
     # The nearest of the few sites is looked up by squares.
-    size = response.spacing
-    height, width = (int(side / size) + 1 for side in solution.level.shape)
-    middles = (np.indices((height, width)).reshape(2, -1).T + 0.5) * size - 0.5
-    nearest = KDTree(response.level.sites).query(middles)[1]
-    rows, columns = ((solution.level.sites + 0.5) / size).astype(np.int64).T
+    nearest, width = _nearest_sites(response.level, response.spacing)
+    rows, columns = ((solution.level.sites + 0.5) / response.spacing).astype(np.int64).T
     group = nearest[rows * width + columns]
     return np.bincount(group, gap, len(response.flux)).astype(np.float64)[None]
 

@@ -22,7 +22,7 @@ common pattern limits such noise, and shadows need not be deep.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -65,8 +65,51 @@ _DETAIL_BLOCKS = 9  # coarse pixels
 _MIN_SWAPPED_RATIO = 0.75  # see `is_swapped`
 
 
+@dataclass(frozen=True, eq=False)
+class CheckedImage:
+    """An image with what its checks find, each found once.
+
+    Attributes
+    ----------
+    image : ndarray, shape (H, W)
+        0 at pixels that are not usable.
+    usable : ndarray of bool, shape (H, W)
+    """
+
+    image: FloatArray
+    usable: BoolArray
+
+    @classmethod
+    def of(cls, image: FloatArray, mask: BoolArray | None = None) -> CheckedImage:
+        """Return an image without the pixels beyond its mask."""
+        usable = np.ones(image.shape, bool) if mask is None else mask
+        return cls(image if usable.all() else np.where(usable, image, 0.0), usable)
+
+    @cached_property
+    def is_uniform(self) -> bool:
+        """Whether all usable pixels are the same."""
+        return not np.ptp(self.image[self.usable]) > 0
+
+    @cached_property
+    def stray(self) -> BoolArray:
+        """The `stray_pixels`, shape (H, W)."""
+        return stray_pixels(self.image, self.usable)
+
+    @cached_property
+    def saturated(self) -> float:
+        """The `saturated_share` of the other pixels."""
+        return saturated_share(self.image, self.usable & ~self.stray)
+
+    @cached_property
+    def noise(self) -> _NoisyPlane:
+        """The noise by brightness."""
+        return _NoisyPlane(self.image, self.usable)
+
+
 def image_warnings(
-    image: FloatArray, source: FloatArray | None = None, mask: BoolArray | None = None
+    image: FloatArray,
+    source: FloatArray | CheckedImage | None = None,
+    mask: BoolArray | None = None,
 ) -> tuple[Caution, ...]:
     """Return a caution for everything in an image and its reference that looks wrong.
 
@@ -74,8 +117,9 @@ def image_warnings(
     ----------
     image : ndarray, shape (H, W)
         The shot, in any unit.
-    source : ndarray, shape (H, W), optional
-        The beam, if it was measured; an estimate says nothing about the detector.
+    source : ndarray, shape (H, W), or CheckedImage, optional
+        The beam, if it was measured; an estimate says nothing about the detector. One that many
+        images share is checked once if it is a `CheckedImage`, with the same mask.
     mask : ndarray of bool, shape (H, W), optional
         True at usable pixels.
 
@@ -84,37 +128,31 @@ def image_warnings(
     tuple of Caution
         Empty if nothing looks wrong.
     """
-    usable = np.ones(image.shape, bool) if mask is None else mask
-    if not usable.all():
-        image = np.where(usable, image, 0.0)
-        source = None if source is None else np.where(usable, source, 0.0)
-    if source is not None and not np.ptp(source[usable]) > 0:
-        source = None  # a uniform beam was assumed
-    return tuple(_warnings(image, source, usable))
+    if isinstance(source, np.ndarray):
+        source = CheckedImage.of(source, mask)
+    if source is not None and source.is_uniform:
+        source = None  # it was assumed
+    return tuple(_warnings(CheckedImage.of(image, mask), source))
 
 
-def _warnings(image: FloatArray, source: FloatArray | None, usable: BoolArray) -> Iterator[Caution]:
-    if dark := dark_level(image, usable, source):
+def _warnings(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caution]:
+    planes = {"image": image} if source is None else {"image": image, "source": source}
+    if dark := _dark_level([plane.noise for plane in planes.values()]):
         yield Caution(
             "dark-level",
             f"dark level: the noise of the image vanishes at {dark:.0%} of its mean instead of at "
             "zero, so the detector's dark level seems to be left in it: the field comes out too "
             "weak, by this share or more; subtract it from image and source by the step 'dark'",
         )
-    strays = np.zeros(image.shape, bool)
-    for name, plane in (("image", image), ("source", source)):
-        if plane is None:
-            continue
-        stray = stray_pixels(plane, usable)
-        strays |= stray
-        if (share := saturated_share(plane, usable & ~stray)) > 0:
+    for name, plane in planes.items():
+        if (share := plane.saturated) > 0:
             yield Caution(
                 "saturation",
                 f"saturation: {share:.2%} of the {name}'s pixels are at its maximum: bright lines "
                 "are cut off there, and the field around them is too weak; mask these pixels, or "
                 "record with less exposure",
             )
-        if count := int(stray.sum()):
+        if count := int(plane.stray.sum()):
             yield Caution(
                 "hot-pixels",
                 f"hot pixels: {count} pixel{'s' * (count > 1)} of the {name} differ"
@@ -123,7 +161,8 @@ def _warnings(image: FloatArray, source: FloatArray | None, usable: BoolArray) -
             )
     if source is None:
         return
-    pair = ReferencePair(image, source, usable & ~strays)
+    used = image.usable & ~(image.stray | source.stray)
+    pair = ReferencePair(image.image, source.image, used)
     if pair.is_negative:
         yield Caution(
             "negative",
@@ -443,9 +482,12 @@ def dark_level(
         0 unless the noise cannot be explained without an offset, by any sum of a constant
         variance, one in proportion to the signal, and one to its square.
     """
-    if min(image.shape) < _WINDOW_PX:
+    return _dark_level([_NoisyPlane(plane, mask) for plane in (image, source) if plane is not None])
+
+
+def _dark_level(planes: Sequence[_NoisyPlane]) -> float:
+    if min(planes[0].image.shape) < _WINDOW_PX:
         return 0.0
-    planes = [_NoisyPlane(plane, mask) for plane in (image, source) if plane is not None]
     if any(plane.brightness.size < _MIN_PIXELS for plane in planes):
         return 0.0
     mean = float(planes[0].brightness.mean())

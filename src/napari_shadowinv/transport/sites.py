@@ -134,7 +134,7 @@ class Mirrored:
     sense: NDArray[np.int8]  # (y, x): -1 for the axes along which a point was mirrored, else 1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Level:
     """The n sites of one level of the multilevel solution."""
 
@@ -293,7 +293,7 @@ class _Slot:
     level: Level | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SitePlan:
     """Sites of a source on all levels, which do not depend on the image."""
 
