@@ -166,10 +166,10 @@ class OpenObjective(TransportObjective):
 
 
 SHORTEST_STEP = 1e-7
+EVEN_RESIDUAL = 1.0  # largest relative flux error of a cell
 
 _EVENING_STEPS = 3
 _EVENING_SHARE = 0.6
-_EVEN_RESIDUAL = 1.0  # largest relative flux error of a cell
 _HALVING_STEPS = 15  # steps within which the error must halve, or the start was a bad one
 _LINEAR_TOLERANCE = 1e-2
 _SHARES_OF_START = (0.999, 0.99, 0.9, 0.5)
@@ -191,11 +191,13 @@ def newton(
     max_iterations: int,
     shortest_step: float = SHORTEST_STEP,
     fill: bool = False,
+    even: float = EVEN_RESIDUAL,
     report: Reporter | None = None,
 ) -> Solution:
     """Solve T(w) = S by damped Newton steps that never empty a cell.
 
-    With `fill`, empty cells are filled first (`with_full_cells`). The solver stops without
+    With `fill`, empty cells are filled first (`with_full_cells`). A start with a larger relative
+    flux error of a cell than `even` is evened out before the first step. The solver stops without
     convergence if the error has not halved in many steps (a bad start), or if less than
     `shortest_step` of Newton's step is possible.
     """
@@ -204,7 +206,7 @@ def newton(
         weights, diagram = with_full_cells(objective, weights)
     else:
         diagram = objective.diagram(weights)
-    weights, diagram = _even_out(objective, weights, diagram)
+    weights, diagram = _even_out(objective, weights, diagram, even)
     # Steps keep this gauge. The triangulation belongs to the weights after any step.
     weights = objective.in_gauge(weights)
     residual = objective.residual(diagram)
@@ -245,7 +247,7 @@ def newton(
 
 
 def _even_out(
-    objective: TransportObjective, weights: FloatArray, diagram: PowerDiagram
+    objective: TransportObjective, weights: FloatArray, diagram: PowerDiagram, even: float
 ) -> tuple[FloatArray, PowerDiagram]:
     """Let cells that are almost empty or far too full settle with their neighbours.
 
@@ -253,7 +255,7 @@ def _even_out(
     Newton's steps short for the whole image.
     """
     for _ in range(_EVENING_STEPS):
-        if objective.residual(diagram) <= _EVEN_RESIDUAL:
+        if objective.residual(diagram) <= even:
             break
         gap = np.clip(objective.mass - diagram.masses, -objective.mass, objective.mass)
         stiffness = _stiffness(diagram.laplacian())

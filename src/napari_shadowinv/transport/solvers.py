@@ -46,6 +46,7 @@ _MAX_WARM_STEPS = 10
 _FIT_SITES = 1500
 _FIT_STEPS = (0.03, 0.01)
 _MAX_FIT_SHIFT = 4.0  # steps
+_EVEN_WARM_RESIDUAL = 3.0  # a few cells of a similar image do not keep steps short
 _SHORTEST_WARM_STEP = 0.1  # where steps must be shorter, starting afresh is faster
 
 
@@ -248,6 +249,7 @@ def _solve_from(
             tolerance=options.tolerance,
             max_iterations=min(_MAX_WARM_STEPS, options.max_iterations),
             shortest_step=_SHORTEST_WARM_STEP,
+            even=_EVEN_WARM_RESIDUAL,
             report=report,
         )
     else:
