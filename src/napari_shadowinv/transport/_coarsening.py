@@ -28,6 +28,7 @@ from napari_shadowinv.geometry.triangle_mesh import Indices
 _MAX_COARSEST_NODES = 60
 _MIN_TIE = 0.2
 _MAX_PAIRED_SHARE = 0.75
+_LAST_SECOND_STEP = 3  # level; more of them hardly save an iteration
 _NODES_PER_BLOCK, _MOST_BLOCKS = 25_000, 8
 _NOT_CONNECTED = (
     "the cells form several groups with no flux between them, so the relative weights of the "
@@ -449,11 +450,11 @@ def _grow_network(network: Network, entries: int) -> Network:
 
 
 def _choose_second_steps(network: Network, bounds: list[int]) -> BoolArray:
-    """Choose the levels with two steps a cycle: those whose visits cost less than level 0."""
+    """Choose the levels with two steps a cycle: the first ones, if they cost less than level 0."""
     entries = np.diff(network.starts[bounds])
     twice = np.zeros(len(entries), np.bool_)
     visits = 2
-    for level in range(1, len(entries) - 1):
+    for level in range(1, min(_LAST_SECOND_STEP + 1, len(entries) - 1)):
         if visits * entries[level] <= entries[0]:
             twice[level] = True
             visits *= 2
