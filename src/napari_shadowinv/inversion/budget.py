@@ -492,14 +492,21 @@ class Budget:
         effects: dict[str, ErrorEstimate] = {}
         sensitivities: dict[str, ErrorEstimate] = {}
         sizes: dict[str, float] = {}
+        tests: list[tuple[dict[str, ErrorEstimate], str, FloatArray]] = []
         for imperfection in IMPERFECTIONS:
             stated = imperfection.stated(self.instrument)
             for size, errors in ((imperfection.tested, sensitivities), (stated, effects)):
                 if size:
                     pattern = imperfection.pattern(shot, size)
-                    errors[imperfection.name(size)] = estimate(response.to(pattern))
+                    tests.append((errors, imperfection.name(size), pattern))
             if stated:
                 sizes[imperfection.name(stated)] = stated
+        # Together, as the solver takes several for the time of one.
+        moves = response.to(np.concatenate([pattern for *_, pattern in tests]))
+        first = 0
+        for errors, name, pattern in tests:
+            errors[name] = estimate(moves[:, first : first + len(pattern)])
+            first += len(pattern)
         if share := self.instrument.other_field:
             name = f"other field, {100 * share:.2g} %"
             effects[name], sizes[name] = _scale_error(lengths, share), share
