@@ -15,7 +15,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial import KDTree
 
+from napari_shadowinv._system.machine import begin
 from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion.imperfections import (
@@ -413,7 +414,7 @@ class Budget:
             self._beam.components.check_shape(prepared.mask.shape)
         self._places = _places(prepared)
         self._moves: dict[LevelSolution, FloatArray] = {}
-        self._responses: dict[LevelSolution, LinearResponse] = {}
+        self._responses: dict[LevelSolution, Callable[[], LinearResponse]] = {}
         self._by_noise: dict[LinearResponse, tuple[FloatArray, FloatArray]] = {}
         self.reason = ""
 
@@ -436,6 +437,9 @@ class Budget:
 
         Their error must be within the accuracy, or small against the error by noise.
         """
+        count = len(solutions[-1].weights)
+        if count <= _MAX_RESPONSE_SITES < RATIO * count:
+            self._begin_response(solutions[-1], self.options.threads)  # beside the next level
         solved = _usable_levels(solutions)
         if len(solved) < 2:
             return math.inf
@@ -590,9 +594,18 @@ class Budget:
 
     def _response(self, solved: Sequence[LevelSolution]) -> LinearResponse:
         few = [candidate for candidate in solved if len(candidate.weights) <= _MAX_RESPONSE_SITES]
-        solution = few[-1] if few else self._coarser(solved[-1])
+        return self._begin_response(few[-1] if few else self._coarser(solved[-1]), 1)()
+
+    def _begin_response(
+        self, solution: LevelSolution, threads: int | None
+    ) -> Callable[[], LinearResponse]:
+        """Begin to compute a response, if that has not begun; return a function that waits for it.
+
+        With one thread it is computed when it is waited for.
+        """
         if solution not in self._responses:
-            self._responses[solution] = LinearResponse(solution, self.target, self._plan)
+            work = partial(LinearResponse, solution, self.target, self._plan)
+            self._responses[solution] = begin(work, threads)
         return self._responses[solution]
 
     def _coarser(self, solution: LevelSolution) -> LevelSolution:
