@@ -157,6 +157,22 @@ _DIMMEST = 1e-3  # of the mean, for a logarithm
 _MIN_ROUNDNESS = 0.3  # double area by the longest side's square; of an equilateral triangle 0.87
 
 
+@njit(nogil=True, cache=True)
+def _add_slopes(
+    corners: Indices, slopes: FloatArray, values: FloatArray, moves: FloatArray
+) -> None:
+    """Compute each triangle's gradients (t, k, 2) of k sets of values at the sites, (n, k)."""
+    for t in range(moves.shape[0]):
+        a, b, c = corners[t]
+        for k in range(moves.shape[1]):
+            for axis in range(2):
+                moves[t, k, axis] = (
+                    slopes[t, 0, axis] * values[a, k]
+                    + slopes[t, 1, axis] * values[b, k]
+                    + slopes[t, 2, axis] * values[c, k]
+                )
+
+
 class LinearResponse:
     """Response of one level's solution.
 
@@ -219,9 +235,11 @@ class LinearResponse:
 
     def to(self, changes: FloatArray) -> FloatArray:
         """Return each triangle's displacement (t, k, 2), px, by flux changes of cells (k, n)."""
-        potential = -0.5 * self._factors.solve(changes.T)
+        half_weights = 0.5 * self._factors.solve(changes.T)
         corners, slopes = self._slopes
-        return np.asarray(-np.swapaxes(potential[corners], 1, 2) @ slopes)
+        moves = np.empty((len(corners), len(changes), 2))
+        _add_slopes(corners, slopes, half_weights, moves)
+        return moves
 
     def finer(self, variance: FloatArray, spacing: float, grain: float = 0.0) -> FloatArray:
         """Return each triangle's mean square displacement, px², by waves too fine for this level.
@@ -236,7 +254,7 @@ class LinearResponse:
         corners, _ = self._slopes
         return np.asarray(of_cell[corners].mean(axis=1) * powers / (2 * np.pi))
 
-    @property
+    @cached_property
     def places(self) -> FloatArray:
         """Middles of the triangles, px of the image, shape (t, 2)."""
         corners, _ = self._slopes
