@@ -557,16 +557,23 @@ def _dissection_order(matrix: csr_array, positions: FloatArray) -> NDArray[np.in
     edges = matrix.tocoo()
     first, second = edges.row, edges.col
     spans = np.ptp(positions, axis=0) if n else np.zeros(2)
+    ranks = [_ranks(np.argsort(positions[:, axis], kind="stable")) for axis in (0, 1)]
     for division in range(1, depth + 1):
         axis = int(np.argmax(spans))
         spans[axis] /= 2
-        ranks = np.empty(n, dtype=np.intp)
-        ranks[np.lexsort((positions[:, axis], halves))] = np.arange(n)
+        places = _ranks(np.argsort(halves * n + ranks[axis]))
         starts = np.concatenate([[0], np.cumsum(np.bincount(halves))])
-        halves = 2 * halves + (ranks >= ((starts[:-1] + starts[1:]) // 2)[halves])
+        halves = 2 * halves + (places >= ((starts[:-1] + starts[1:]) // 2)[halves])
         divisions[first[halves[first] < halves[second]]] = division
         is_inside = np.minimum(divisions[first], divisions[second]) > division
         first, second = first[is_inside], second[is_inside]
     above = depth + 1 - divisions
     ends = ((halves >> above) + 1) << above
     return np.lexsort((-divisions, ends))
+
+
+def _ranks(order: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the place of each item in an order."""
+    ranks = np.empty_like(order)
+    ranks[order] = np.arange(len(order))
+    return ranks
