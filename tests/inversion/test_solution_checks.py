@@ -14,11 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from helpers.public_data import load_donut, public_file, public_names
 from helpers.toroid import noisy_toroid_image, toroid_image
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.inversion import Inversion, Report, invert, solution_checks
+from napari_shadowinv.inversion.noise import ImageNoise
+from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.solution_checks import (
     image_residual,
     inner_sides,
@@ -178,6 +181,32 @@ def test_too_few_sites_do_not_fit_and_the_advice_is_more():
     assert report.warnings[0].code == MISFIT
     assert "use more sites" in report.warnings[0].text
     assert signs(image, n_sites=5000) == []
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_the_residual_off_bright_lines_is_that_of_whole_planes(threads):
+    rng = np.random.default_rng(3)
+    image = rng.gamma(0.5, 2.0, (70, 90))  # many pixels are brighter than a line must be
+    prepared = prepare(image, np.ones_like(image), InversionOptions(), image > 0.01)
+    noise = ImageNoise(prepared)
+    mask, mean = prepared.mask, prepared.source[prepared.mask].mean()
+    around = ndimage.uniform_filter(prepared.image, 3)
+    counted = mask & (around <= 3.0 * np.maximum(prepared.source, mean))
+    assert 0.5 < counted.mean() < 0.95
+    for scale in (0.01, 0.1, 0.3, 1.0):
+        reprojection = prepared.image * (1 + scale * rng.normal(size=image.shape))
+        bright = np.maximum(prepared.image, reprojection) / mean
+        hidden = noise.variance(bright) + (0.04 * bright) ** 2 + 1e-12
+        excess = np.where(counted, ((prepared.image - reprojection) / mean) ** 2 / hidden, 0.0)
+        squares = excess[:64, :80].reshape(4, 16, 5, 16).mean(axis=(1, 3))
+        share = counted[:64, :80].reshape(4, 16, 5, 16).mean(axis=(1, 3))
+        ratio = np.quantile((squares / share)[share > 0.5], 0.98)
+        found = solution_checks.is_coarse(prepared, reprojection, noise, threads)
+        assert found == (ratio > 1.5**2)
+        sums = np.empty((4, 5)), np.empty((4, 5))
+        planes = prepared.image, prepared.source, reprojection, mask
+        solution_checks._excess_by_square(0, 4, *planes, mean, 16, noise.variance_terms, *sums)
+        np.testing.assert_allclose(sums, (squares, share), rtol=1e-9)
 
 
 @pytest.mark.parametrize("counts", [4, 25, 250])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from napari_shadowinv import InversionOptions, invert, run, synthetic_image
+from napari_shadowinv import InversionOptions, invert, plan_sites, run, synthetic_image
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
 from napari_shadowinv.preprocessing import (
@@ -16,9 +16,15 @@ from napari_shadowinv.preprocessing import (
     Radiograph,
     Recipe,
     ReferencePair,
+    image_checks,
     image_warnings,
 )
-from napari_shadowinv.preprocessing.image_checks import dark_level, saturated_share, stray_pixels
+from napari_shadowinv.preprocessing.image_checks import (
+    CheckedImage,
+    dark_level,
+    saturated_share,
+    stray_pixels,
+)
 
 SHAPE = (160, 160)
 COUNTS = 300
@@ -54,6 +60,30 @@ def faint() -> tuple[np.ndarray, np.ndarray]:
 def named(image, source, mask=None) -> list[str]:
     """The names of the warnings."""
     return [caution.code for caution in image_warnings(image, source, mask)]
+
+
+def test_a_source_that_shots_share_is_checked_once(shot, faint, monkeypatch):
+    checked: list[np.ndarray] = []
+    find = image_checks.stray_pixels
+
+    def note(image: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+        checked.append(image)
+        return find(image, mask)
+
+    monkeypatch.setattr(image_checks, "stray_pixels", note)
+    source = shot[1].copy()
+    source[40, 50] *= 30
+    alone = [image_warnings(image, source) for image in (shot[0], faint[0])]
+    assert all("hot-pixels" in [caution.code for caution in cautions] for cautions in alone)
+    checked.clear()
+    shared = CheckedImage.of(source)
+    assert [image_warnings(image, shared) for image in (shot[0], faint[0])] == alone
+    assert len(checked) == 3
+    plan = plan_sites(source)
+    checked.clear()
+    for image in (shot[0], faint[0]):
+        invert(image, plan=plan)
+    assert len(checked) == 3
 
 
 def test_image_warnings_are_silent_on_a_right_shot(shot):

@@ -33,6 +33,8 @@ from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv.cli import _batch
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
 from napari_shadowinv.stack import RunStatus, _folder_events
+from napari_shadowinv.stack._worker import Attempt, ShotOutcome
+from napari_shadowinv.stack.watch import Watch
 
 pytestmark = pytest.mark.usefixtures("impatient")
 
@@ -91,6 +93,24 @@ def test_watch_starts_each_shot_from_the_last_but_one(folder, out, tmp_path):
     for index in (0, 2, 4):
         inversion = invert(IMAGES[index], plan=plan, options=OPTIONS, start=inversion)
         np.testing.assert_array_equal(fast.displacement[index], inversion.displacement)
+
+
+def test_a_shot_that_waits_begins_before_the_last_one_is_written(folder, out, monkeypatch):
+    put(folder, *range(6))
+    at_work = []
+    write = Watch._write
+
+    def note(self: Watch, name: str, attempt: Attempt) -> ShotOutcome:
+        at_work.append([shot.name for shot in self._running])
+        return write(self, name, attempt)
+
+    monkeypatch.setattr(Watch, "_write", note)
+    result = watched_once(folder, out)
+    names = [f"shot_{index}.npy" for index in range(6)]
+    # The first shot creates the store; until then nothing begins.
+    assert all(names[k + 1] in at_work[k] for k in range(1, 5))
+    assert list(result.name.values) == names
+    assert list(result.status.values) == [DONE] * 6
 
 
 def test_the_accuracy_decides_once_how_many_sites_all_shots_get(folder, out):
