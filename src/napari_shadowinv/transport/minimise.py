@@ -172,7 +172,7 @@ _EVENING_STEPS = 3
 _EVENING_SHARE = 0.6
 _HALVING_STEPS = 15  # steps within which the error must halve, or the start was a bad one
 _LINEAR_TOLERANCE = 1e-2
-_SHARES_OF_START = (0.999, 0.99, 0.9, 0.5)
+_SHARES_OF_START = (1.0, 0.999, 0.99, 0.9, 0.5)
 _MIN_START_FLUX = 1e-12  # of a mean cell's flux
 
 _MATRICES = 4  # n × n matrices that scipy's BFGS holds at once
@@ -314,13 +314,14 @@ def with_full_cells(
 ) -> tuple[FloatArray, PowerDiagram]:
     """Find nearby weights for which every cell holds some flux, and their diagram.
 
-    Hidden sites are lowered to where they just show; then a little of the zero weights,
+    Hidden sites, if any, are lowered to where they just show; then a little of the zero weights,
     for which every cell is round and full, is mixed in.
     """
     visible = objective.triangulation.lower_hidden(
         weights, threads=available_threads(objective.threads)
     )
-    for share in _SHARES_OF_START:
+    all_seen = np.array_equal(visible, weights)
+    for share in _SHARES_OF_START if all_seen else _SHARES_OF_START[1:]:
         diagram = objective.diagram_if_full(share * visible)
         if diagram is not None and diagram.masses.min() > _MIN_START_FLUX * objective.mass.mean():
             return share * visible, diagram
