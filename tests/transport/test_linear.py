@@ -183,6 +183,13 @@ def test_blocks_of_nodes_cost_hardly_an_iteration(name: str, blocks: int) -> Non
     assert residual(laplacian, solution, right) <= 1e-3
 
 
+def test_a_network_too_small_for_levels_is_one_block() -> None:
+    laplacian, right = unit_delaunay(30), noise(30)
+    solution, iterations, _ = LaplacianSolver(laplacian, blocks=3).solve(right, 1e-8)
+    assert iterations == 1
+    assert residual(laplacian, solution, right) <= 1e-8
+
+
 def test_threads_do_not_change_a_solution() -> None:
     laplacian = unit_delaunay(60_000)
     right = noise(60_000)

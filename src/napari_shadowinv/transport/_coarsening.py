@@ -1,12 +1,11 @@
 """Levels of the multigrid: ever fewer nodes, each a group of the level before.
 
 - all levels of a Laplacian: `build_hierarchy`, which returns a `Hierarchy` over one `Network`
+- refuse a graph of several parts: `require_connected`
 
 Level 0 of a large network is cut into blocks of nodes, which threads sweep side by side. Groups do
 not cross the cuts, and the conductors that do, the `Cuts`, are few. The number of blocks follows
 from that of the nodes, so that results do not depend on the threads.
-
-- refuse a graph of several parts: `require_connected`
 
 See `napari_shadowinv.transport.linear`.
 """
@@ -308,7 +307,7 @@ def build_hierarchy(
     Level 0 is cut into a number of blocks; by default, it follows from that of the nodes.
     """
     count = blocks or min(max(int(laplacian.shape[0]) // _NODES_PER_BLOCK, 1), _MOST_BLOCKS)
-    if count > 1:
+    if count > 1 and laplacian.shape[0] > _MAX_COARSEST_NODES:
         # Where nodes have few neighbours in their block, only all together can be grouped.
         with suppress(RuntimeError):
             return _build_blocks(laplacian, ground, count, threads)
