@@ -204,8 +204,9 @@ def test_the_residual_off_bright_lines_is_that_of_whole_planes(threads):
         found = solution_checks.is_coarse(prepared, reprojection, noise, threads)
         assert found == (ratio > 1.5**2)
         sums = np.empty((4, 5)), np.empty((4, 5))
-        planes = prepared.image, prepared.source, reprojection, mask
-        solution_checks._excess_by_square(0, 4, *planes, mean, 16, noise.variance_terms, *sums)
+        planes = solution_checks._Planes.of(prepared, reprojection)
+        terms = noise.variance_terms + np.array([1e-12, 0.0, 0.04**2])
+        solution_checks._average_squares(0, 4, planes, 16, terms, *sums)
         np.testing.assert_allclose(sums, (squares, share), rtol=1e-9)
 
 

@@ -8,7 +8,6 @@ from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.geometry import triangle_mesh
 from napari_shadowinv.geometry.compiler import kernel, kernel_that_allocates
 from napari_shadowinv.geometry.triangle_mesh import (
-    CROSS_BOUND,
     FLIP,
     LEGAL,
     LIFT_BOUND,
@@ -17,6 +16,7 @@ from napari_shadowinv.geometry.triangle_mesh import (
     after,
     around,
     before,
+    certain_turn,
     edge_state,
     excess,
     insertion_order,
@@ -443,12 +443,10 @@ def add(mesh: Mesh, order: IntArray) -> int:
 @kernel
 def look_for_overturned(start: int, stop: int, mesh: Mesh, suspects: BoolArray) -> None:
     """Mark the triangles that may be overturned."""
-    points, corners = mesh.points, mesh.corners
+    corners = mesh.corners
     for t in range(start, stop):
-        a, b, c = corners[3 * t], corners[3 * t + 1], corners[3 * t + 2]
-        x_term = (points[b, 0] - points[a, 0]) * (points[c, 1] - points[a, 1])
-        y_term = (points[b, 1] - points[a, 1]) * (points[c, 0] - points[a, 0])
-        suspects[t] = not x_term - y_term > CROSS_BOUND * (abs(x_term) + abs(y_term))
+        i, j, k = corners[3 * t], corners[3 * t + 1], corners[3 * t + 2]
+        suspects[t] = certain_turn(mesh.points, i, j, k) <= 0
 
 
 @kernel

@@ -202,8 +202,8 @@ def _exact_turn(points: FloatArray, terms: FloatArray, a: int, b: int, c: int) -
 
 
 @kernel
-def turn(points: FloatArray, scratch: FloatArray, a: int, b: int, c: int) -> int:
-    """Return the exact sign of cross(b - a, c - a): 1 where a, b, c turn counter-clockwise."""
+def certain_turn(points: FloatArray, a: int, b: int, c: int) -> int:
+    """Return the sign of cross(b - a, c - a), or 0 where rounding may decide it."""
     x_term = (points[b, 0] - points[a, 0]) * (points[c, 1] - points[a, 1])
     y_term = (points[b, 1] - points[a, 1]) * (points[c, 0] - points[a, 0])
     cross = x_term - y_term
@@ -212,7 +212,14 @@ def turn(points: FloatArray, scratch: FloatArray, a: int, b: int, c: int) -> int
         return 1
     if cross < -bound:
         return -1
-    return _exact_turn(points, scratch, a, b, c)
+    return 0
+
+
+@kernel
+def turn(points: FloatArray, scratch: FloatArray, a: int, b: int, c: int) -> int:
+    """Return the exact sign of cross(b - a, c - a): 1 where a, b, c turn counter-clockwise."""
+    sign = certain_turn(points, a, b, c)
+    return sign if sign != 0 else _exact_turn(points, scratch, a, b, c)
 
 
 @kernel

@@ -76,8 +76,8 @@ def compile_rest() -> None:
     surface(sites)
     surface.at_pixels((20, 20))
     density = Density.from_image(np.ones((20, 20)))
-    assert PowerDiagram(triangulation, density, with_moments=True).centroids.any()
+    centroids = PowerDiagram(triangulation, density, with_moments=True).centroids
     diagram = PowerDiagram(triangulation, density)
     laplacian = diagram.laplacian()
     LaplacianSolver(laplacian).solve(diagram.masses)
-    FactorisedLaplacian(laplacian, sites).solve(diagram.masses[:, None])
+    FactorisedLaplacian(laplacian, centroids).solve(diagram.masses[:, None])

@@ -63,7 +63,7 @@ from scipy import ndimage
 
 from napari_shadowinv._system.arrays import complete_block_means
 from napari_shadowinv._system.machine import available_threads, begin, in_ranges
-from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray, IntArray
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.geometry.compiler import kernel
@@ -283,6 +283,22 @@ def assess_verdict(
     return Assessment(Verdict.UNCERTAIN, "; ".join(filter(None, parts)))
 
 
+class _Planes(NamedTuple):
+    """An image and its re-projection, as kernels compare them."""
+
+    image: FloatArray
+    reprojection: FloatArray
+    source: FloatArray
+    mask: BoolArray
+    mean: float  # of the source where it is used
+
+    @classmethod
+    def of(cls, prepared: Prepared, reprojection: FloatArray) -> _Planes:
+        # The source is 0 elsewhere.
+        mean = float(prepared.source.sum() / np.count_nonzero(prepared.mask))
+        return cls(prepared.image, reprojection, prepared.source, prepared.mask, mean)
+
+
 def is_coarse(
     prepared: Prepared, reprojection: FloatArray, noise: ImageNoise, threads: int | None = None
 ) -> bool:
@@ -290,21 +306,13 @@ def is_coarse(
 
     That is the case if the residual exceeds the noise in some squares away from bright lines.
     """
-    planes = prepared.image, prepared.source, reprojection, prepared.mask
-    side = min(_SQUARE_PX, *prepared.mask.shape)
-    rows, columns = (length // side for length in prepared.mask.shape)
-    excess, share = np.empty((rows, columns)), np.empty((rows, columns))
-    sums = noise.variance_terms, excess, share
-    in_ranges(
-        _excess_by_square,
-        rows,
-        available_threads(threads),
-        *planes,
-        _mean_source(prepared),
-        side,
-        *sums,
-        smallest=max(1, _PIXELS_PER_THREAD // (side * prepared.mask.shape[1])),
-    )
+    shape = prepared.mask.shape
+    side = min(_SQUARE_PX, *shape)
+    excess, share = np.empty((2, shape[0] // side, shape[1] // side))
+    hidden = noise.variance_terms + np.array([_LEAST_VARIANCE, 0.0, _INVISIBLE**2])
+    sums = _Planes.of(prepared, reprojection), side, hidden, excess, share
+    smallest = max(1, _PIXELS_PER_THREAD // (side * shape[1]))
+    in_ranges(_average_squares, len(excess), available_threads(threads), *sums, smallest=smallest)
     is_measured = share > _MIN_SHARE_OF_SQUARE
     if not is_measured.any():
         return False
@@ -312,85 +320,67 @@ def is_coarse(
     return bool(ratio > _ABOVE_NOISE)
 
 
-def _mean_source(prepared: Prepared) -> float:
-    """Return the mean of the source where it is used; it is 0 elsewhere."""
-    return float(prepared.source.sum() / np.count_nonzero(prepared.mask))
-
-
 @kernel
-def _is_off_lines(
-    y: int, x: int, image: FloatArray, source: FloatArray, mask: BoolArray, mean: float
-) -> bool:
+def _is_off_lines(y: int, x: int, planes: _Planes) -> bool:
     """Return whether a pixel is used and the mean of those around it is no bright line."""
-    if not mask[y, x]:
+    if not planes.mask[y, x]:
         return False
-    height, width = mask.shape
+    height, width = planes.mask.shape
     total = 0.0
     for row in (max(y - 1, 0), y, min(y + 1, height - 1)):
         for column in (max(x - 1, 0), x, min(x + 1, width - 1)):
-            total += image[row, column]
-    return bool(total <= 9 * _BRIGHT * max(source[y, x], mean))
+            total += planes.image[row, column]
+    return bool(total <= 9 * _BRIGHT * max(planes.source[y, x], planes.mean))
 
 
 @kernel
-def _excess_by_square(
+def _average_squares(
     start: int,
     stop: int,
-    image: FloatArray,
-    source: FloatArray,
-    reprojection: FloatArray,
-    mask: BoolArray,
-    mean: float,
+    planes: _Planes,
     side: int,
-    terms: FloatArray,
+    hidden: FloatArray,
     excess: FloatArray,
     share: FloatArray,
 ) -> None:
-    """Average residual² over the noise's variance in rows of squares, and count their pixels."""
+    """Average over rows of squares: residual² over what is hidden, and the pixels off lines.
+
+    What is hidden is a polynomial of the brightness.
+    """
+    image, reprojection, mean = planes.image, planes.reprojection, planes.mean
     for i in range(start, stop):
         for j in range(excess.shape[1]):
             total, count = 0.0, 0
             for y in range(side * i, side * (i + 1)):
                 for x in range(side * j, side * (j + 1)):
-                    if not _is_off_lines(y, x, image, source, mask, mean):
-                        continue
-                    residual = (image[y, x] - reprojection[y, x]) / mean
-                    bright = max(image[y, x], reprojection[y, x]) / mean
-                    hidden = terms[0] + bright * (terms[1] + terms[2] * bright)
-                    hidden += (_INVISIBLE * bright) ** 2 + _LEAST_VARIANCE
-                    total += residual * residual / hidden
-                    count += 1
+                    if _is_off_lines(y, x, planes):
+                        residual = (image[y, x] - reprojection[y, x]) / mean
+                        bright = max(image[y, x], reprojection[y, x]) / mean
+                        variance = hidden[0] + bright * (hidden[1] + bright * hidden[2])
+                        total += residual * residual / variance
+                        count += 1
             excess[i, j], share[i, j] = total / (side * side), count / (side * side)
 
 
 @kernel
-def _residual_rows(
-    start: int,
-    stop: int,
-    image: FloatArray,
-    source: FloatArray,
-    reprojection: FloatArray,
-    mask: BoolArray,
-    mean: float,
-    residual: FloatArray,
-    counts: IntArray,
-) -> None:
-    """Fill rows with image minus re-projection, 0 at bright lines; count the other pixels."""
-    for y in range(start, stop):
-        counts[y] = 0
-        for x in range(mask.shape[1]):
-            is_counted = _is_off_lines(y, x, image, source, mask, mean)
-            residual[y, x] = image[y, x] - reprojection[y, x] if is_counted else 0.0
-            counts[y] += is_counted
+def _subtract_off_lines(planes: _Planes, residual: FloatArray) -> int:
+    """Fill a plane with image minus re-projection, 0 at bright lines; count the other pixels."""
+    count = 0
+    for y in range(residual.shape[0]):
+        for x in range(residual.shape[1]):
+            is_counted = _is_off_lines(y, x, planes)
+            difference = planes.image[y, x] - planes.reprojection[y, x]
+            residual[y, x] = difference if is_counted else 0.0
+            count += is_counted
+    return count
 
 
 def _misfit(prepared: Prepared, reprojection: FloatArray, n_sites: int) -> str:
     """Describe a pattern in the image that the re-projection misses."""
-    mask, mean = prepared.mask, _mean_source(prepared)
-    residual, counts = np.empty(mask.shape), np.empty(len(mask), np.int64)
-    planes = prepared.image, prepared.source, reprojection, mask
-    _residual_rows(0, len(mask), *planes, mean, residual, counts)
-    share = float(np.sqrt(np.einsum("yx,yx->", residual, residual) / max(counts.sum(), 1)) / mean)
+    mask, planes = prepared.mask, _Planes.of(prepared, reprojection)
+    mean, residual = planes.mean, np.empty(mask.shape)
+    count = _subtract_off_lines(planes, residual)
+    share = float(np.sqrt(np.einsum("yx,yx->", residual, residual) / max(count, 1)) / mean)
     if share < _NOTABLE_RESIDUAL:
         return ""
     # A few hot pixels are no pattern.

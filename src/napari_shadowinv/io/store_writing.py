@@ -254,8 +254,7 @@ def _create_columns(store: StackStore, columns: Sequence[Column], description: s
     for column in columns:
         text = (store.path / column.key / "zarr.json").read_text(encoding="utf-8")
         document["consolidated_metadata"]["metadata"][column.key] = json.loads(text)
-    with replacing(file, overwrite=True) as draft:
-        draft.write_text(json.dumps(reseal(document), indent=2), encoding="utf-8")
+    _replace_description(store.path, document)
     _open_arrays.cache_clear()  # it has been opened without them
 
 

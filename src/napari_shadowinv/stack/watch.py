@@ -190,6 +190,7 @@ class Watch:
         self._latest = latest
         self._skipped: dict[str, None] = {}  # not in the store yet, in order of arrival
         self._begun = self._ended = 0
+        self._most: int | None = None  # shots to end
         self._last = self._busy_since = time.monotonic()
         self._busy_s = 0.0
 
@@ -230,12 +231,13 @@ class Watch:
 
     def run(self, idle: float | None = None, most: int | None = None) -> None:
         """Invert existing and arriving files until the watch ends."""
+        self._most = most
         for name in () if self._latest else sorted(self._redo):
             self._arrivals.put_back(name)
         self.report()
         try:
-            while not self._is_over(idle, most):
-                self._advance(most)
+            while not self._is_over(idle):
+                self._advance()
         except InversionCancelled:
             pass
         finally:
@@ -248,8 +250,8 @@ class Watch:
                     self.store.close()
             self.report()
 
-    def _is_over(self, idle: float | None, most: int | None) -> bool:
-        if most is not None and self._ended >= most:
+    def _is_over(self, idle: float | None) -> bool:
+        if self._most is not None and self._ended >= self._most:
             return True
         if self._should_stop is not None and self._should_stop():
             return True
@@ -261,10 +263,10 @@ class Watch:
         requested = self._should_stop is not None and self._should_stop()
         return requested or self._abandoned.is_set()
 
-    def _advance(self, most: int | None) -> None:
+    def _advance(self) -> None:
         """Write the oldest shot once it is done, or start the next one."""
-        if self._running and (self._is_full(most) or self._running[0].attempt.done()):
-            self._finish(partial(self._begin_waiting, most))
+        if self._running and (self._is_full or self._running[0].attempt.done()):
+            self._finish(begin_next=True)
             return
         arrived = self._arrivals.next_name(_POLL_S)
         if arrived is not None and self._latest:
@@ -273,14 +275,16 @@ class Watch:
         if arrived is not None:
             self._begin(arrived)
 
-    def _is_full(self, most: int | None) -> bool:
-        begun = len(self._running)
+    @property
+    def _is_full(self) -> bool:
+        """Whether no other shot may begin now."""
+        begun, most = len(self._running), self._most
         return begun == _LANES or (most is not None and self._ended + begun >= most)
 
-    def _begin_waiting(self, most: int | None, finished: str) -> None:
+    def _begin_waiting(self, finished: str) -> None:
         """Begin the next shot, if it waits, before the finished one is written."""
         # The latest shot is numbered when it begins, and the first ones create the store.
-        if self._latest or self._task is None or self.store is None or self._is_full(most):
+        if self._latest or self._task is None or self.store is None or self._is_full:
             return
         if self._arrivals.peek(1) in ([], [finished]):
             return
@@ -341,7 +345,7 @@ class Watch:
         if not quietly:
             self.report()
 
-    def _finish(self, begin_next: Callable[[str], None] | None = None) -> None:
+    def _finish(self, *, begin_next: bool = False) -> None:
         """Wait for the oldest attempt, let the next one begin, and write the outcome."""
         running = self._running[0]
         attempt, stamp_before = running.attempt.result(), running.stamp_before
@@ -360,8 +364,8 @@ class Watch:
         self._lanes[running.lane] = self._start_for_next(attempt)
         self._ended += 1
         try:
-            if begin_next is not None:
-                begin_next(running.name)
+            if begin_next:
+                self._begin_waiting(running.name)
         finally:
             self._store_outcome(
                 running.name, replace(attempt, origin={**stamp_before, **attempt.origin})
