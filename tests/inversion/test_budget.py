@@ -38,6 +38,7 @@ from napari_shadowinv.preprocessing import (
     polynomial_source,
 )
 from napari_shadowinv.stack import invert_stack, run_stack
+from napari_shadowinv.transport.solvers import solve
 
 SIDE = 96
 
@@ -388,6 +389,31 @@ def test_sites_needed_follow_from_the_fall_of_the_error(monkeypatch, image, powe
     monkeypatch.setattr(budget._noise, "displacements", lambda level: (0.0, 0.0))
     levels = [SimpleNamespace(weights=np.zeros(n), residual=0.0) for n in (100, 400)]
     assert budget.needed(levels) == pytest.approx(1.3 * 4 ** (1 / power))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_level_that_stalled_has_no_part_in_the_response(threads):
+    image = synthetic_image(pair().displacement)
+    options = InversionOptions(threads=threads)
+    prepared = prepare(image, None, options)
+    plan = plan_sites(prepared.source)
+    noise = ImageNoise(prepared.in_units())
+    finest = plan.levels[-1]
+    assert len(finest.sites) > 4500
+    *coarse, fine = solve(plan.levels, prepared.floored_image, options)
+    assert len(coarse) == 2
+
+    def flux_of_response(seen):
+        budget = Budget(plan, prepared, lambda: noise, options, Instrument())
+        for count in range(1, len(seen) + 1):
+            budget.needed(seen[:count])
+        return budget._response([fine]).flux
+
+    stalled = [
+        dataclasses.replace(solution, residual=1.0, weights=0 * solution.weights)
+        for solution in coarse
+    ]
+    np.testing.assert_array_equal(flux_of_response(stalled), flux_of_response([]))
 
 
 def test_noise_needs_fewer_sites():

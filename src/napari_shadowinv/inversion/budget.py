@@ -437,9 +437,10 @@ class Budget:
 
         Their error must be within the accuracy, or small against the error by noise.
         """
-        count = len(solutions[-1].weights)
-        if count <= _MAX_RESPONSE_SITES < RATIO * count:
-            self._begin_response(solutions[-1], self.options.threads)  # beside the next level
+        last = solutions[-1]
+        is_usable, count = last.residual < _MAX_RESIDUAL, len(last.weights)
+        if is_usable and count <= _MAX_RESPONSE_SITES < RATIO * count:
+            self._begin_response(last, self.options.threads)  # beside the next level
         solved = _usable_levels(solutions)
         if len(solved) < 2:
             return math.inf
