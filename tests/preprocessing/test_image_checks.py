@@ -86,6 +86,15 @@ def test_a_source_that_shots_share_is_checked_once(shot, faint, monkeypatch):
     assert len(checked) == 3
 
 
+def test_a_result_that_is_changed_does_not_change_later_checks(faint):
+    image, source = faint
+    plan = plan_sites(source)
+    first = invert(image, plan=plan)
+    first.source[:] = np.roll(first.source, 6, axis=0)
+    assert "register" in named(image, first.source)
+    assert invert(image, plan=plan).report.warnings == first.report.warnings
+
+
 def test_image_warnings_are_silent_on_a_right_shot(shot):
     image, source = shot
     assert named(image, source) == []

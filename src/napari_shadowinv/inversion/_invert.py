@@ -293,7 +293,7 @@ def invert(
 
         def check_image() -> tuple[Caution, ...]:
             recorded = prepared.image * prepared.flux_scale
-            beam = _checked_source(plan, prepared) if plan.measured else None
+            beam = _checked_source(plan) if plan.measured else None
             return image_warnings(recorded, beam, prepared.mask)
 
         noise = begin(estimate_noise, options.threads)
@@ -372,9 +372,10 @@ def invert(
 _checked_sources: WeakKeyDictionary[SitePlan, CheckedImage] = WeakKeyDictionary()
 
 
-def _checked_source(plan: SitePlan, prepared: Prepared) -> CheckedImage:
+def _checked_source(plan: SitePlan) -> CheckedImage:
     """Return the source, whose checks all shots with a plan share."""
-    return _checked_sources.setdefault(plan, CheckedImage.of(prepared.source, prepared.mask))
+    # Not a result's source, which its owner may change.
+    return _checked_sources.setdefault(plan, CheckedImage.of(plan.source, plan.mask))
 
 
 def _sites_reason(
