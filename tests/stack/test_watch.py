@@ -33,6 +33,7 @@ from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv.cli import _batch
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
 from napari_shadowinv.stack import RunStatus, _folder_events
+from napari_shadowinv.stack import watch as watching
 from napari_shadowinv.stack._worker import Attempt, ShotOutcome
 from napari_shadowinv.stack.watch import Watch
 
@@ -111,6 +112,30 @@ def test_a_shot_that_waits_begins_before_the_last_one_is_written(folder, out, mo
     assert all(names[k + 1] in at_work[k] for k in range(1, 5))
     assert list(result.name.values) == names
     assert list(result.status.values) == [DONE] * 6
+
+
+def test_a_file_that_is_written_again_keeps_the_order_of_the_others(folder, out, monkeypatch):
+    put(folder, 0, 1, 2)
+    again = threading.Event()
+    attempt = watching.try_shot
+
+    def note(task: Any, shot: Any, *args: Any) -> Attempt:
+        done = attempt(task, shot, *args)
+        if shot.name == "shot_2.npy" and not again.is_set():
+            np.save(folder / shot.name, 1.01 * IMAGES[2])  # after it was read
+            time.sleep(0.3)
+            again.set()
+            time.sleep(0.3)
+        elif shot.name == "shot_1.npy":
+            again.wait(20)
+        return done
+
+    monkeypatch.setattr(watching, "try_shot", note)
+    with Watched(folder, out) as watched:
+        watched.ended(4)
+    assert [event.name for event in watched.shots] == [f"shot_{k}.npy" for k in (0, 1, 2, 2)]
+    assert list(watched.result.name.values) == [f"shot_{k}.npy" for k in (0, 1, 2)]
+    assert list(watched.result.status.values) == [DONE] * 3
 
 
 def test_the_accuracy_decides_once_how_many_sites_all_shots_get(folder, out):

@@ -286,12 +286,17 @@ class Watch:
         # The latest shot is numbered when it begins, and the first ones create the store.
         if self._latest or self._task is None or self.store is None or self._is_full:
             return
-        if self._arrivals.peek(1) in ([], [finished]):
+        # A file that was written again waits for its earlier version to be written to the store.
+        at_work = {finished, *(shot.name for shot in self._running)}
+        waiting = self._arrivals.peek(1)
+        if not waiting or waiting[0] in at_work:
             return
         arrived = self._arrivals.next_name(0.0)
-        if arrived == finished:
+        if arrived is None:
+            return
+        if arrived in at_work:
             self._arrivals.put_back(arrived)
-        elif arrived is not None:
+        else:
             self._begin(arrived, quietly=True)
 
     def _skip(self, names: Iterable[str]) -> None:
