@@ -453,7 +453,7 @@ def look_for_overturned(start: int, stop: int, mesh: Mesh, suspects: BoolArray) 
 def return_overturned(
     mesh: Mesh, suspects: BoolArray, origins: FloatArray, strays: BoolArray
 ) -> bool:
-    """Return corners of overturned suspects to their origins, and whether there were any."""
+    """Move corners of overturned suspects back to their origins; return if there were any."""
     overturned = False
     for t in range(suspects.size):
         if not suspects[t]:

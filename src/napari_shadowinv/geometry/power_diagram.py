@@ -156,7 +156,7 @@ def _sum_over_cells(edges: Indices, integrals: FloatArray, column: int, sums: Fl
 
 @kernel
 def _sum_moments(edges: Indices, integrals: FloatArray, sums: FloatArray) -> None:
-    """Do the same with the columns of `_integrate_moments` for mass and moments."""
+    """Add the masses and moments of `_integrate_moments` to the two cells of each edge."""
     n = np.uint32(sums.shape[0])
     for e in range(edges.shape[0]):
         a, b = np.uint32(edges[e, 0]), np.uint32(edges[e, 1])

@@ -506,7 +506,7 @@ class Budget:
                     tests.append((errors, imperfection.name(size), pattern))
             if stated:
                 sizes[imperfection.name(stated)] = stated
-        # Together, as the solver takes several for the time of one.
+        # All at once, because the solver needs as long for one as for several.
         moves = response.to(np.concatenate([pattern for *_, pattern in tests]))
         first = 0
         for errors, name, pattern in tests:

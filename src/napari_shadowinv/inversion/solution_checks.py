@@ -343,9 +343,9 @@ def _average_squares(
     excess: FloatArray,
     share: FloatArray,
 ) -> None:
-    """Average over rows of squares: residual² over what is hidden, and the pixels off lines.
+    """Average residual² over the hidden variance in rows of squares; find the share off lines.
 
-    What is hidden is a polynomial of the brightness.
+    The hidden variance, of noise and invisible residuals, is a polynomial of the brightness.
     """
     image, reprojection, mean = planes.image, planes.reprojection, planes.mean
     for i in range(start, stop):

@@ -67,7 +67,7 @@ _MIN_SWAPPED_RATIO = 0.75  # see `is_swapped`
 
 @dataclass(frozen=True, eq=False)
 class CheckedImage:
-    """An image with what its checks find, each found once.
+    """An image and the findings of its checks, each computed once.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ def image_warnings(
     if isinstance(source, np.ndarray):
         source = CheckedImage.of(source, mask)
     if source is not None and source.is_uniform:
-        source = None  # it was assumed
+        source = None  # an assumed beam
     return tuple(_warnings(CheckedImage.of(image, mask), source))
 
 

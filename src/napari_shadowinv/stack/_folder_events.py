@@ -101,7 +101,7 @@ class Arrivals:
                     self._settling[name] = (stamp_now, time.monotonic())
 
     def next_name(self, timeout: float) -> str | None:
-        """Return the name of the next complete file; None after the timeout, or if woken in it."""
+        """Return the name of the next complete file; None at the timeout, or if woken."""
         end = time.monotonic() + timeout
         with self._changed:
             while True:

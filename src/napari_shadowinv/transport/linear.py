@@ -299,8 +299,9 @@ def _ascend_blocks(start: int, stop: int, hierarchy: Hierarchy, vectors: _Vector
 
 @njit(nogil=True, cache=True)
 def _between_sweeps(hierarchy: Hierarchy, vectors: _Vectors) -> None:
-    """Complete the forward sweep where blocks meet, correct by the levels below, turn round."""
-    # A block's sweep knows the others as they were before: zero, then what `_cycle` has made.
+    """Complete the forward sweep where blocks meet, correct, and prepare the backward sweep."""
+    # The sweep of a block uses the values that the other blocks had before: zero, and then those
+    # that the coarser levels have corrected.
     first, second, conductances, nodes, saved = hierarchy.cuts
     residual, x, parents = vectors.residual, vectors.correction, hierarchy.parents
     for k in range(first.size):
