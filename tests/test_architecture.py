@@ -43,7 +43,7 @@ ROOMS = (
     ("pipeline",),
     ("stack", "plotting"),
     ("cli", "_napari"),
-    ("",),  # the package itself, with the public names
+    ("", "__main__"),  # the package itself, with the public names, and the start of the command
 )
 HEIGHT = {room: height for height, rooms in enumerate(ROOMS) for room in rooms}
 CORE = {room for room in HEIGHT if HEIGHT[room] < HEIGHT["io"]}

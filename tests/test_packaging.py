@@ -77,9 +77,9 @@ def test_the_wheel_offers_the_command_and_the_plugin(
 ) -> None:
     entries = ConfigParser()
     entries.read_string(about["entry_points.txt"])
-    assert dict(entries["console_scripts"]) == {"shadowinv": "napari_shadowinv.cli:app"}
+    assert dict(entries["console_scripts"]) == {"shadowinv": "napari_shadowinv.__main__:main"}
     assert dict(entries["napari.manifest"]) == {"napari-shadowinv": "napari_shadowinv:napari.yaml"}
-    assert "\napp = typer.Typer(" in wheel["napari_shadowinv/cli/__init__.py"]
+    assert "\ndef main() -> None:\n" in wheel["napari_shadowinv/__main__.py"]
 
 
 def test_the_version_has_one_place(metadata: Message) -> None:
@@ -213,7 +213,8 @@ def test_the_conda_recipe_requires_what_the_wheel_requires(metadata: Message) ->
     run = {text.replace("${{ python_min }}", context["python_min"]) for text in run}
     assert {text.replace("-", "_") for text in run} == {text.replace("-", "_") for text in needs}
     assert context["version"] == __version__
-    assert recipe["build"]["python"]["entry_points"] == ["shadowinv = napari_shadowinv.cli:app"]
+    (command,) = recipe["build"]["python"]["entry_points"]
+    assert command == "shadowinv = napari_shadowinv.__main__:main"
 
 
 def test_both_containers_install_the_same_files_in_the_same_way() -> None:

@@ -1354,3 +1354,24 @@ def test_a_second_ctrl_c_does_not_interrupt_the_clean_up(folder: Path, shot: Pat
     code, errors = interrupted(folder, impatient, ["invert", "shot.npy"])
     assert (code, errors.strip()) == (130, "Cancelled")
     assert sorted(content(folder)) == ["shot.npy"]
+
+
+def test_ctrl_c_while_the_command_is_loaded_is_one_word() -> None:
+    script = """
+import sys
+class Interrupted:
+    def find_spec(self, name, path=None, target=None):
+        if name == "napari_shadowinv.cli":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupted())
+from napari_shadowinv.__main__ import main
+main()
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "Cancelled\n")
+
+
+def test_the_package_runs_as_the_command() -> None:
+    command = [sys.executable, "-m", "napari_shadowinv", "--version"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert ended.stdout == f"shadowinv {__version__}\n"
