@@ -326,6 +326,27 @@ def test_a_store_opens_as_lazy_layers(
     assert [name for name, layer in layers.items() if layer.visible] == ["field"]
 
 
+def test_the_contrast_of_a_store_suits_its_strongest_shot(store: Path, solved: Inversion) -> None:
+    import xarray as xr
+
+    with xr.open_zarr(store, consolidated=False) as run:
+        reversed_run = run.isel(shot=[2, 0, 1]).load()
+    later = store.with_name("reversed.shadowinv.zarr")
+    for variable in reversed_run.variables.values():
+        variable.encoding.clear()
+    reversed_run.chunk({"shot": 1}).to_zarr(later, consolidated=False)
+    by_role = {role_of(keywords): keywords for _, keywords, _ in read_paths(str(later))}
+    setup = setup_of(by_role["field"])
+    assert isinstance(setup, ProtonSetup)
+    strongest = np.hypot(*setup.path_integrated_b(solved.displacement)).max()
+    # The unit is that of the first finished shot, whose field is half as strong.
+    assert by_role["field"]["contrast_limits"] == pytest.approx((0, 1e6 * strongest))
+    low, high = by_role["residual"]["contrast_limits"]
+    residual = 100 * np.abs(solved.residual) / solved.image[solved.mask].mean()
+    assert low == -high
+    assert np.median(residual) < high < residual.max()
+
+
 def rays(solved: Inversion, factor: float = 1.0) -> Any:
     """Start and displacement of the arrows of a shot of the store."""
     return sample_arrows(factor * solved.displacement)[0]

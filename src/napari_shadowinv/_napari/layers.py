@@ -540,6 +540,16 @@ def symmetric_limits(residual: AnyArray) -> Limits:
     return _nonempty((-limit, limit))
 
 
+def widen_limits(limits: Limits, plane: AnyArray) -> Limits:
+    """Extend limits to the values of a plane; limits around zero stay symmetric."""
+    finite = plane[np.isfinite(plane)]
+    if not finite.size:
+        return limits
+    symmetric = limits[0] == -limits[1]
+    low, high = symmetric_limits(plane) if symmetric else (float(finite.min()), float(finite.max()))
+    return min(limits[0], low), max(limits[1], high)
+
+
 def _sample(plane: AnyArray) -> AnyArray:
     """Sample enough pixels of a large image for its limits."""
     step = max(1, int(np.sqrt(plane.size / _LIMITS_SAMPLE_SIZE)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._napari.events import connect
-from napari_shadowinv._napari.layer_metadata import frame_for, metadata_of, role_of
+from napari_shadowinv._napari.layer_metadata import frame_for, main_layers, metadata_of, role_of
 from napari_shadowinv._napari.layers import (
     FullLayerData,
     arrows_in_shot,
     dataset_layers,
     sample_arrows,
+    widen_limits,
 )
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -28,20 +29,38 @@ from napari_shadowinv.io.store import columns_of_store, open_dataset, with_own_s
 if TYPE_CHECKING:
     import xarray
 
+_CONTRAST_SHOTS = 16
+
 
 @as_file_errors
 def store_layers(path: Path, name: str = "", shot: int | None = None) -> list[FullLayerData]:
     """Describe the layers of a ``.shadowinv.zarr`` folder, with the arrows of one shot.
 
-    `shot` also sets the units and contrast; default: the first finished shot.
+    `shot` also sets the units and contrast. Default: the first finished shot, with a contrast for
+    up to 16 finished shots of the run.
     """
     dataset = _open(path)
     name = name or path.name.removesuffix(".zarr").removesuffix(RESULT.suffix)
-    shot = _first_done(dataset, path) if shot is None else shot
-    setup = setup_from_dataset(dataset.isel(shot=shot))
+    reference = _first_done(dataset, path) if shot is None else shot
+    setup = setup_from_dataset(dataset.isel(shot=reference))
     frame = frame_for(dataset["displacement"].shape, setup)
     facts = {"store": str(path), "name": name, "shots": _shot_names(dataset)}
-    return dataset_layers(dataset, setup, frame, name, facts, shot)
+    layers = dataset_layers(dataset, setup, frame, name, facts, reference)
+    if shot is None:
+        finished = _finished_shots(dataset)
+        spread = np.linspace(0, len(finished) - 1, min(len(finished), _CONTRAST_SHOTS))
+        for index in np.take(finished, np.rint(spread).astype(int)):
+            with suppress(FileFormatError, OSError):  # the shot is damaged
+                _include_in_contrast(layers, int(index))
+    return layers
+
+
+def _include_in_contrast(layers: Sequence[FullLayerData], shot: int) -> None:
+    """Extend the limits of the images shown by default to one more shot."""
+    for data, keywords, kind in main_layers(layers):
+        if kind == "image":
+            limits = keywords["contrast_limits"]
+            keywords["contrast_limits"] = widen_limits(limits, np.asarray(data[shot]))
 
 
 @as_file_errors
@@ -95,17 +114,21 @@ def shot_rows(path: Path, index: int) -> list[tuple[str, str]]:
 
 
 def _first_done(dataset: xarray.Dataset, path: Path) -> int:
-    from napari_shadowinv.io.store import DONE
-
     displacement = dataset["displacement"]
-    shots: Iterable[int] = range(displacement.sizes["shot"])
-    if "status" in dataset and "shot" in dataset["status"].dims:
-        shots = np.flatnonzero(dataset["status"].values == DONE)
-    for shot in shots:
+    for shot in _finished_shots(dataset):
         with suppress(FileFormatError):  # the shot is damaged
             if np.isfinite(displacement[shot].values).all():
                 return int(shot)
     raise FileFormatError(f"{path} contains no finished shot yet: wait for the first one")
+
+
+def _finished_shots(dataset: xarray.Dataset) -> Sequence[int]:
+    from napari_shadowinv.io.store import DONE
+
+    if "status" in dataset and "shot" in dataset["status"].dims:
+        finished: list[int] = np.flatnonzero(dataset["status"].values == DONE).tolist()
+        return finished
+    return range(dataset.sizes["shot"])
 
 
 def _shot_names(dataset: xarray.Dataset) -> list[str]:

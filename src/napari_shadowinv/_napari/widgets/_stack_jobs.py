@@ -16,12 +16,13 @@ from qtpy.QtCore import Signal
 
 from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import KEY, role_of
+from napari_shadowinv._napari.layers import widen_limits
 from napari_shadowinv._napari.widgets._forms import PathEdit, labelled
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import column
 from napari_shadowinv._napari.widgets._results import Origins, result_frame
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
-from napari_shadowinv._typing import AnyArray, BoolArray
+from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 from napari_shadowinv.preprocessing import Recipe
@@ -153,8 +154,8 @@ class StackRequest(Job):
     def _run_limits(self, role: str) -> tuple[float, float]:
         """Limits over all shots of this run and of earlier runs into the same store."""
         limits = self._limits[role]
-        earlier = self._earlier.get(role)
-        return limits if earlier is None else _widen_limits(limits, np.array(earlier))
+        earlier = self._earlier.get(role, limits)
+        return min(limits[0], earlier[0]), max(limits[1], earlier[1])
 
     def _update(self, index: int | None) -> None:
         """Describe the layers once a shot is done, and include each shot in the limits."""
@@ -169,7 +170,7 @@ class StackRequest(Job):
         for data, keywords, kind in layer_data:
             if kind == "image":
                 role = str(role_of(keywords))
-                self._limits[role] = _widen_limits(self._limits[role], np.asarray(data[index]))
+                self._limits[role] = widen_limits(self._limits[role], np.asarray(data[index]))
 
     def _store_layers(self, shot: int | None) -> list[FullLayerData]:
         """Describe the layers of the store; none if that has to wait for the next shot."""
@@ -200,16 +201,6 @@ class StackRequest(Job):
 def is_image(layer: Any) -> bool:
     """Return whether a layer is an image."""
     return kind_of(layer) == "image"
-
-
-def _widen_limits(limits: tuple[float, float], plane: AnyArray) -> tuple[float, float]:
-    """Extend limits to the values of a plane; limits around zero stay symmetric."""
-    finite = plane[np.isfinite(plane)]
-    low = min(limits[0], float(finite.min(initial=np.inf)))
-    high = max(limits[1], float(finite.max(initial=-np.inf)))
-    if limits[0] == -limits[1]:
-        return -max(-low, high), max(-low, high)
-    return low, high
 
 
 def placement_on(layer: Any, recipe: Recipe) -> dict[str, Any]:
