@@ -553,28 +553,49 @@ def _dissection_order(matrix: csr_array, positions: FloatArray) -> NDArray[np.in
     """Order nodes so that those which separate two halves come after both, in each half again."""
     n = len(positions)
     depth = max(0, math.ceil(math.log2(max(n, 1) / _MAX_UNDIVIDED)))
-    halves = np.zeros(n, dtype=np.intp)  # a binary digit for each division
-    divisions = np.full(n, depth + 1)  # the one that a node separates
-    edges = matrix.tocoo()
-    first, second = edges.row, edges.col
     spans = np.ptp(positions, axis=0) if n else np.zeros(2)
-    ranks = [_ranks(np.argsort(positions[:, axis], kind="stable")) for axis in (0, 1)]
-    for division in range(1, depth + 1):
-        axis = int(np.argmax(spans))
-        spans[axis] /= 2
-        places = _ranks(np.argsort(halves * n + ranks[axis]))
-        starts = np.concatenate([[0], np.cumsum(np.bincount(halves))])
-        halves = 2 * halves + (places >= ((starts[:-1] + starts[1:]) // 2)[halves])
-        divisions[first[halves[first] < halves[second]]] = division
-        is_inside = np.minimum(divisions[first], divisions[second]) > division
-        first, second = first[is_inside], second[is_inside]
+    axes = np.empty(depth, np.int64)
+    for division in range(depth):
+        axes[division] = np.argmax(spans)
+        spans[axes[division]] /= 2
+    orders = np.argsort(positions.T, axis=1, kind="stable")
+    halves = np.zeros(n, np.int64)  # a binary digit for each division
+    divisions = np.full(n, depth + 1)  # the one that a node separates
+    _dissect(matrix.indptr, matrix.indices, orders, axes, halves, divisions)
     above = depth + 1 - divisions
     ends = ((halves >> above) + 1) << above
-    return np.lexsort((-divisions, ends))
+    return np.argsort((depth + 2) * ends - divisions, kind="stable")
 
 
-def _ranks(order: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the place of each item in an order."""
-    ranks = np.empty_like(order)
-    ranks[order] = np.arange(len(order))
-    return ranks
+@njit(nogil=True, cache=True)
+def _dissect(
+    starts: NDArray[np.int32],
+    neighbors: NDArray[np.int32],
+    orders: NDArray[np.int64],
+    axes: NDArray[np.int64],
+    halves: NDArray[np.int64],
+    divisions: NDArray[np.int64],
+) -> None:
+    """Divide nodes along axes, and find those that separate the halves of each division."""
+    n = halves.size
+    is_upper = np.empty(n, np.bool_)
+    for division in range(1, axes.size + 1):
+        first = np.zeros((1 << (division - 1)) + 1, np.int64)  # of each part, in the order
+        for i in range(n):
+            first[halves[i] + 1] += 1
+        first = first.cumsum()
+        middle = (first[:-1] + first[1:]) // 2
+        for i in orders[axes[division - 1]]:
+            part = halves[i]
+            is_upper[i] = first[part] >= middle[part]
+            first[part] += 1
+        for i in range(n):
+            halves[i] = 2 * halves[i] + is_upper[i]
+        for i in range(n):
+            if divisions[i] < division:
+                continue
+            for k in range(starts[i], starts[i + 1]):
+                j = neighbors[k]
+                if divisions[j] >= division and halves[i] < halves[j]:
+                    divisions[i] = division
+                    break
