@@ -119,7 +119,7 @@ def _crew_of_this_thread() -> Crew | None:
 
 
 def in_ranges(
-    kernel: Callable[..., Any], n: int, threads: int, *args: Any, smallest: int = 4096
+    kernel: Callable[..., Any], n: int, threads: int, *args: Any, smallest: int = 1 << 14
 ) -> None:
     """Call ``kernel(start, stop, *args)`` on ranges of at least `smallest` items that cover n."""
     # The items are independent and a kernel writes only what belongs to them, so the cut cannot

@@ -44,7 +44,8 @@ _LARGEST_CAVITY = 256
 _PATCH = 31  # numbers that describe the surface over a triangle
 _CACHED_PATCHES = 512  # triangles whose patches are remembered
 _EDGE_PX, _EDGE_SHARE = 1e-6, 1e-9  # beyond a triangle's edges that still belongs to it
-STRIP_PX = 32  # rows between two reports of progress
+STRIP_PX = 32  # rows whose triangles are looked through together
+_STRIPS_AT_ONCE = 4  # between two reports of progress
 _MIN_PIXELS_PER_THREAD = 1 << 13
 
 
@@ -53,7 +54,7 @@ def _in_blocks(
 ) -> None:
     """Call a kernel on ranges of the blocks of queries."""
     blocks = -(-len(queries) // BLOCK)
-    in_ranges(kernel, blocks, available_threads(threads), queries, *operands, smallest=2)
+    in_ranges(kernel, blocks, available_threads(threads), queries, *operands, smallest=4)
 
 
 @njit(nogil=True, cache=True)
@@ -265,6 +266,8 @@ def _mean_slopes(
 
 @njit(nogil=True, cache=True)
 def _minimise_bending(
+    start: int,
+    stop: int,
     vertices: Indices,
     neighbors: Indices,
     points: FloatArray,
@@ -274,30 +277,35 @@ def _minimise_bending(
 ) -> None:
     """Make one Jacobi sweep towards the gradients of least bending along the edges.
 
-    Values (n, k) and gradients (n, 2, k) of k sets are written to the surface (n, 3, k).
+    For sites `start` to `stop`. Values (n, k) and gradients (n, 2, k) of k sets are written to the
+    surface (n, 3, k).
     """
     n, width = values.shape
-    system = np.zeros((n, 3))
+    system = np.zeros((stop - start, 3))
     for t in range(vertices.shape[0]):
         for k in range(3):
             a, b = vertices[t, (k + 1) % 3], vertices[t, (k + 2) % 3]
             if neighbors[t, k] < t or a >= n or b >= n:
                 continue
+            if not (start <= a < stop or start <= b < stop):
+                continue
             ey, ex = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
             length2 = ey * ey + ex * ex
             stiffness = 1.0 / (length2 * np.sqrt(length2))
             for i, j in ((a, b), (b, a)):
-                system[i, 0] += stiffness * ey * ey
-                system[i, 1] += stiffness * ey * ex
-                system[i, 2] += stiffness * ex * ex
+                if not start <= i < stop:
+                    continue
+                system[i - start, 0] += stiffness * ey * ey
+                system[i - start, 1] += stiffness * ey * ex
+                system[i - start, 2] += stiffness * ex * ex
                 for s in range(width):
                     rise = 3 * (values[b, s] - values[a, s])
                     slope_there = gradients[j, 0, s] * ey + gradients[j, 1, s] * ex
                     pull = stiffness * (rise - slope_there) / 2
                     surface[i, 1, s] += pull * ey
                     surface[i, 2, s] += pull * ex
-    for i in range(n):
-        yy, yx, xx = system[i]
+    for i in range(start, stop):
+        yy, yx, xx = system[i - start]
         determinant = yy * xx - yx * yx
         fitted = determinant > 1e-12 * (yy + xx) ** 2
         for s in range(width):
@@ -401,20 +409,29 @@ def with_mirror_images(
 
 
 def fit_gradients(
-    triangulation: RegularTriangulation, values: FloatArray, gradients: FloatArray, sweeps: int = 1
+    triangulation: RegularTriangulation,
+    values: FloatArray,
+    gradients: FloatArray,
+    sweeps: int = 1,
+    threads: int | None = 1,
 ) -> FloatArray:
     """Improve gradients at the sites so that the surface bends least along the edges."""
     for _ in range(sweeps):
-        surface = _bend_least(triangulation, values[:, None], gradients[:, :, None])
+        surface = _bend_least(triangulation, values[:, None], gradients[:, :, None], threads)
         gradients = np.ascontiguousarray(surface[:, 1:, 0])
     return gradients
 
 
 def _bend_least(
-    triangulation: RegularTriangulation, values: FloatArray, gradients: FloatArray
+    triangulation: RegularTriangulation,
+    values: FloatArray,
+    gradients: FloatArray,
+    threads: int | None = 1,
 ) -> FloatArray:
-    surface = np.zeros((len(values), 3, values.shape[1]))
-    _minimise_bending(*_mesh_arrays(triangulation), values, gradients, surface)
+    n = len(values)
+    surface = np.zeros((n, 3, values.shape[1]))
+    operands = *_mesh_arrays(triangulation), values, gradients, surface
+    in_ranges(_minimise_bending, n, available_threads(threads), *operands)
     return surface
 
 
@@ -645,10 +662,11 @@ def _triangles_by_strip(
 
 
 @njit(nogil=True, cache=True)
-def _evaluate_rows(
+def _evaluate_strips(
     start: int,
     stop: int,
-    strip_top: int,
+    first: int,
+    starts: Indices,
     members: Indices,
     vertices: Indices,
     neighbors: Indices,
@@ -657,40 +675,40 @@ def _evaluate_rows(
     gradients: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Evaluate rows of a strip on its triangles."""
-    # A pixel on an edge takes the value of the last triangle that holds it, whichever rows are
-    # evaluated together.
-    width = out.shape[1]
+    """Evaluate strips `start` to `stop`, counted from the `first`, on their triangles."""
+    # A pixel on an edge takes the value of the last triangle that holds it.
+    height, width = out.shape
     p, f, g, patch = np.empty((3, 2)), np.empty(3), np.empty((3, 2)), np.empty(_PATCH)
-    begin, end = strip_top + start, strip_top + stop
-    for row in range(begin, end):
-        for column in range(width):
-            out[row, column] = np.nan
-    for t in members:
-        a, b, c = vertices[t, 0], vertices[t, 1], vertices[t, 2]
-        ya, yb, yc = points[a, 0], points[b, 0], points[c, 0]
-        top = math.ceil(max(min(ya, yb, yc) - _EDGE_PX, float(begin)))
-        bottom = math.floor(min(max(ya, yb, yc) + _EDGE_PX, end - 1.0))
-        xa, xb, xc = points[a, 1], points[b, 1], points[c, 1]
-        first = math.ceil(max(min(xa, xb, xc) - _EDGE_PX, 0.0))
-        last = math.floor(min(max(xa, xb, xc) + _EDGE_PX, width - 1.0))
-        if top > bottom or first > last:
-            continue
-        _gather_corners(vertices, t, points, values, gradients, p, f, g)
-        _fill_patch(p, f, g, patch)
-        for row in range(top, bottom + 1):
-            for column in range(first, last + 1):
-                b0, b1, b2 = _patch_coordinates(patch, row, column)
-                if min(b0, b1, b2) >= -_EDGE_SHARE:
-                    out[row, column], _ = _value_on_patch(patch, row, column)
-    t = 0
-    for row in range(begin, end):
-        for column in range(width):
-            if np.isnan(out[row, column]):
-                t = _locate(vertices, neighbors, points, t, row, column)
-                out[row, column] = _value_beyond(
-                    vertices[t], points, values, gradients, row, column
-                )
+    for strip in range(first + start, first + stop):
+        begin, end = strip * STRIP_PX, min((strip + 1) * STRIP_PX, height)
+        for row in range(begin, end):
+            for column in range(width):
+                out[row, column] = np.nan
+        for t in members[starts[strip] : starts[strip + 1]]:
+            a, b, c = vertices[t, 0], vertices[t, 1], vertices[t, 2]
+            ya, yb, yc = points[a, 0], points[b, 0], points[c, 0]
+            top = math.ceil(max(min(ya, yb, yc) - _EDGE_PX, float(begin)))
+            bottom = math.floor(min(max(ya, yb, yc) + _EDGE_PX, end - 1.0))
+            xa, xb, xc = points[a, 1], points[b, 1], points[c, 1]
+            left = math.ceil(max(min(xa, xb, xc) - _EDGE_PX, 0.0))
+            right = math.floor(min(max(xa, xb, xc) + _EDGE_PX, width - 1.0))
+            if top > bottom or left > right:
+                continue
+            _gather_corners(vertices, t, points, values, gradients, p, f, g)
+            _fill_patch(p, f, g, patch)
+            for row in range(top, bottom + 1):
+                for column in range(left, right + 1):
+                    b0, b1, b2 = _patch_coordinates(patch, row, column)
+                    if min(b0, b1, b2) >= -_EDGE_SHARE:
+                        out[row, column], _ = _value_on_patch(patch, row, column)
+        t = 0
+        for row in range(begin, end):
+            for column in range(width):
+                if np.isnan(out[row, column]):
+                    t = _locate(vertices, neighbors, points, t, row, column)
+                    out[row, column] = _value_beyond(
+                        vertices[t], points, values, gradients, row, column
+                    )
 
 
 @njit(nogil=True, cache=True)
@@ -755,14 +773,13 @@ class CloughTocher:
         out = np.empty(shape)
         vertices, _, points, values, _ = self._arrays
         starts, members = _triangles_by_strip(vertices, points, len(values), shape)
-        smallest = max(1, _MIN_PIXELS_PER_THREAD // width)
-        for strip, top in enumerate(range(0, height, STRIP_PX)):
-            rows = min(STRIP_PX, height - top)
-            triangles = members[starts[strip] : starts[strip + 1]]
-            operands = top, triangles, *self._arrays, out
-            in_ranges(_evaluate_rows, rows, self.threads, *operands, smallest=smallest)
+        smallest = max(1, _MIN_PIXELS_PER_THREAD // (STRIP_PX * width))
+        for first in range(0, len(starts) - 1, _STRIPS_AT_ONCE):
+            last = min(first + _STRIPS_AT_ONCE, len(starts) - 1)
+            operands = first, starts, members, *self._arrays, out
+            in_ranges(_evaluate_strips, last - first, self.threads, *operands, smallest=smallest)
             if on_share is not None:
-                on_share((top + rows) / height)
+                on_share(min(last * STRIP_PX / height, 1.0))
         return out
 
     @property

@@ -18,6 +18,7 @@ cells, so the cells tile the image to rounding.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cached_property
 
@@ -36,6 +37,8 @@ from napari_shadowinv.geometry.density import (
 )
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
+
+_MIN_SQUARES_PER_THREAD = 1 << 14  # that borders are walked through
 
 
 @kernel
@@ -180,37 +183,25 @@ def _find_centroids(
             centroids[i, axis] = moment / mass if mass > 0 else sites[i, axis]
 
 
-@njit(nogil=True, cache=True)
-def _laplacian(
-    points: FloatArray, n: int, edges: Indices, integrals: FloatArray
-) -> tuple[FloatArray, Indices, Indices]:
-    """Assemble the graph Laplacian with conductance flux / (2 |r_i - r_j|) as CSR."""
-    starts = np.ones(n + 1, np.int32)
-    starts[0] = 0
-    _count_ties(edges, integrals, starts[1:])
-    for i in range(n):
-        starts[i + 1] += starts[i]
-    filled = starts[:-1] + 1
-    columns = np.empty(starts[n], np.int32)
-    values = np.zeros(starts[n])
-    for i in range(n):
-        columns[starts[i]] = i
-    _fill_laplacian(points, edges, integrals, starts, filled, columns, values)
-    return values, columns, starts
-
-
 @kernel
-def _count_ties(edges: Indices, integrals: FloatArray, counts: Indices) -> None:
-    n = np.uint32(counts.size)
+def _count_ties(
+    start: int, stop: int, n: int, edges: Indices, integrals: FloatArray, counts: Indices
+) -> None:
+    """Add the neighbours of sites `start` to `stop` to their counts."""
+    first, end, ghosts = np.uint32(start), np.uint32(stop), np.uint32(n)
     for e in range(edges.shape[0]):
         a, b = np.uint32(edges[e, 0]), np.uint32(edges[e, 1])
-        if a < n and b < n and integrals[e, 0] > 0:
-            counts[a] += 1
-            counts[b] += 1
+        if a < ghosts and b < ghosts and integrals[e, 0] > 0:
+            if first <= a < end:
+                counts[a] += 1
+            if first <= b < end:
+                counts[b] += 1
 
 
 @kernel
 def _fill_laplacian(
+    start: int,
+    stop: int,
     points: FloatArray,
     edges: Indices,
     integrals: FloatArray,
@@ -219,19 +210,26 @@ def _fill_laplacian(
     columns: Indices,
     values: FloatArray,
 ) -> None:
-    n = np.uint32(filled.size)
+    """Fill the rows of sites `start` to `stop`; `filled` holds the next place of each row."""
+    first, end, ghosts = np.uint32(start), np.uint32(stop), np.uint32(filled.size)
+    for i in range(start, stop):
+        columns[starts[i]] = i
     for e in range(edges.shape[0]):
         a, b = np.uint32(edges[e, 0]), np.uint32(edges[e, 1])
-        if a < n and b < n and integrals[e, 0] > 0:
+        has_a, has_b = first <= a < end, first <= b < end
+        if (has_a or has_b) and a < ghosts and b < ghosts and integrals[e, 0] > 0:
             dy, dx = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1]
             conductance = integrals[e, 0] / (2 * np.sqrt(dy * dy + dx * dx))
-            of_a, of_b = np.uint32(filled[a]), np.uint32(filled[b])
-            columns[of_a], values[of_a] = b, -conductance
-            columns[of_b], values[of_b] = a, -conductance
-            filled[a] += 1
-            filled[b] += 1
-            values[np.uint32(starts[a])] += conductance
-            values[np.uint32(starts[b])] += conductance
+            if has_a:
+                place = np.uint32(filled[a])
+                columns[place], values[place] = b, -conductance
+                filled[a] += 1
+                values[np.uint32(starts[a])] += conductance
+            if has_b:
+                place = np.uint32(filled[b])
+                columns[place], values[place] = a, -conductance
+                filled[b] += 1
+                values[np.uint32(starts[b])] += conductance
 
 
 class PowerDiagram:
@@ -281,7 +279,9 @@ class PowerDiagram:
         # seen in units of the density's squares
         ends = self.vertices if side == 1 else (self.vertices + 0.5) / side - 0.5
         borders = sides, ends, density.image, sums, integrals
-        in_ranges(walk, len(sides), self._threads, *borders)
+        squares_per_side = math.sqrt(density.image.size / self.n_sites)
+        smallest = math.ceil(_MIN_SQUARES_PER_THREAD / max(squares_per_side, 1.0))
+        in_ranges(walk, len(sides), self._threads, *borders, smallest=smallest)
         if side > 1:
             integrals *= side**powers
         return integrals
@@ -328,13 +328,19 @@ class PowerDiagram:
     def laplacian(self) -> csr_array:
         """Return ∂T_i/∂w_j, shape (n, n): the Hessian of the paper's Eq. 6.
 
-        Off the diagonal it is -∫ I ds / (2 |r_i - r_j|) over the border of two cells;
-        rows sum to zero.
+        A graph Laplacian: off the diagonal it is -∫ I ds / (2 |r_i - r_j|) over the border of two
+        cells; rows sum to zero.
         """
-        values, columns, starts = _laplacian(
-            self._triangulation.points, self.n_sites, self.edges, self._integrals
-        )
-        return csr_array((values, columns, starts), shape=(self.n_sites, self.n_sites))
+        n, threads = self.n_sites, self._threads
+        borders = self.edges, self._integrals
+        starts = np.ones(n + 1, np.int32)
+        starts[0] = 0
+        in_ranges(_count_ties, n, threads, n, *borders, starts[1:])
+        np.cumsum(starts, out=starts)
+        columns, values = np.empty(starts[-1], np.int32), np.zeros(starts[-1])
+        rows = starts, starts[:-1] + 1, columns, values
+        in_ranges(_fill_laplacian, n, threads, self._triangulation.points, *borders, *rows)
+        return csr_array((values, columns, starts), shape=(n, n))
 
     @property
     def borders(self) -> FloatArray:

@@ -91,7 +91,9 @@ class LevelSolution(Solution):
         """
         mirrored = self.level.mirrored
         potential = 0.5 * self.weights
-        gradient = fit_gradients(self.level.triangulation, potential, -self.displacement)
+        gradient = fit_gradients(
+            self.level.triangulation, potential, -self.displacement, threads=self.threads
+        )
         return CloughTocher(
             mirrored.triangulation,
             potential[mirrored.origin],
