@@ -258,7 +258,7 @@ def test_number_of_threads_changes_no_bit() -> None:
 
 
 def test_synthetic_image_reports_each_band_and_stops_at_once() -> None:
-    field, steps = folding_field((90, 70)), []
+    field, steps = folding_field((360, 70)), []
     image = synthetic_image(field, on_progress=lambda news: steps.append(news.step / news.total))
     np.testing.assert_array_equal(image, synthetic_image(field))
     assert len(steps) > 20

@@ -346,7 +346,7 @@ def _edge_integral(row: int, cut: float, ya: float, xa: float, yb: float, xb: fl
 # A cubic spline without knots next to the border needs four samples.
 MIN_SIDE_PX = 4
 # Fixed, so that sums are formed in the same order whatever the number of threads.
-_N_BANDS = 32
+_MOST_BANDS, _MIN_BAND_ROWS = 32, 16
 _MIN_PIXELS_PER_THREAD, _MIN_COLUMNS = 1 << 15, 64
 _BYTES_PER_PIXEL = 72  # displacement, its spline, source and image
 
@@ -539,8 +539,8 @@ def _checked_source(source: ArrayLike | None, shape: tuple[int, int]) -> FloatAr
 
 def _bands(height: int) -> list[tuple[int, int]]:
     """Cut the rows of the source into bands, always the same ones for a height."""
-    edges = np.linspace(0, height, min(_N_BANDS, height) + 1).astype(int).tolist()
-    return list(itertools.pairwise(edges))
+    count = min(_MOST_BANDS, max(1, height // _MIN_BAND_ROWS))
+    return list(itertools.pairwise(height * k // count for k in range(count + 1)))
 
 
 def _landing_rows(coefficients: FloatArray, first: int, last: int) -> tuple[int, int]:
