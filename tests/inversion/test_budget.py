@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import json
 from itertools import islice
 from types import SimpleNamespace
@@ -26,6 +27,7 @@ from napari_shadowinv.inversion.budget import Budget, ErrorEstimate, discretisat
 from napari_shadowinv.inversion.imperfections import motions
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import prepare
+from napari_shadowinv.inversion.readout import LinearResponse
 from napari_shadowinv.options import ASSUMED_BEAM
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.pipeline import run
@@ -716,3 +718,18 @@ def test_discretisation_share_is_the_rest_of_a_geometric_series(rate: float) -> 
     remaining = np.sqrt(sum(rate ** (2 * k) for k in range(1, 200)))
     assert discretisation_share(4.0, rate) == pytest.approx(remaining)
     assert discretisation_share(16.0, rate) < discretisation_share(4.0, rate)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_no_linear_response_outlives_its_inversion(threads):
+    rng = np.random.default_rng(4)
+    image = 1 + gaussian_filter(rng.normal(size=(64, 64)), 6)
+    gc.collect()
+    gc.disable()
+    try:
+        inversion = invert(image, options=InversionOptions(threads=threads))
+        assert inversion.report.errors is not None
+        alive = [item for item in gc.get_objects() if isinstance(item, LinearResponse)]
+        assert not alive
+    finally:
+        gc.enable()

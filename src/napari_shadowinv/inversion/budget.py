@@ -416,6 +416,7 @@ class Budget:
         self._moves: dict[LevelSolution, FloatArray] = {}
         self._responses: dict[LevelSolution, Callable[[], LinearResponse]] = {}
         self._by_noise: dict[LinearResponse, tuple[FloatArray, FloatArray]] = {}
+        self._look_ahead: Callable[[], None] = lambda: None
         self.reason = ""
 
     @property
@@ -476,6 +477,7 @@ class Budget:
         peak = np.array([row, column], dtype=np.float64)
         along = displacement[:, row, column] / max(length[row, column], 1e-300)
         response = self._response(solved)
+        self._look_ahead()
         near = _near(peak, response.places, response.spacing)
         close = np.flatnonzero(near)
         nothing_finer = np.zeros(len(near))
@@ -515,7 +517,9 @@ class Budget:
         if share := self.instrument.other_field:
             name = f"other field, {100 * share:.2g} %"
             effects[name], sizes[name] = _scale_error(lengths, share), share
-        by_percent = estimate(_TESTED_VARIATION * response.to(self._beams(response)))
+        by_percent = estimate(
+            _TESTED_VARIATION * response.to(_unit_beams(response.level, *self._beam_waves))
+        )
         beam = _scale_error(by_percent, variation / _TESTED_VARIATION) if variation else None
         components = self._beam.components
         if components is not None and basis == components.basis:
@@ -606,7 +610,9 @@ class Budget:
         """
         if solution not in self._responses:
             work = partial(LinearResponse, solution, self.target, self._plan)
-            self._responses[solution] = begin(work, threads)
+            response = self._responses[solution] = begin(work, threads)
+            ahead = partial(_look_ahead, response, solution.level, *self._beam_waves)
+            self._look_ahead = begin(ahead, threads)
         return self._responses[solution]
 
     def _coarser(self, solution: LevelSolution) -> LevelSolution:
@@ -643,19 +649,20 @@ class Budget:
             if samples is not None:
                 yield cause, samples
 
-    def _beams(self, response: LinearResponse) -> FloatArray:
-        """Return the flux that cells gain from beams that differ from the source by 1 (r.m.s.)."""
-        length = self._beam.length * min(self._prepared.mask.shape)
-        return _unit_beams(response.level, length, self.options.seed)
+    @property
+    def _beam_waves(self) -> tuple[float, int]:
+        """Length of the waves of another beam, px, and their seed."""
+        return self._beam.length * min(self._prepared.mask.shape), self.options.seed
 
     def _beams_of(self, response: LinearResponse, components: BeamComponents) -> FloatArray:
         """Return the flux that cells gain from beams that vary in certain shapes."""
-        mass, block = response.level.mass, components.block
+        level, block = response.level, components.block
+        mass = level.mass
         places = (response.sites.T + 0.5) / block - 0.5
         width = max(response.spacing / block, 1.0) / 3  # a cell is a mean
         smooth = [gaussian_filter(pattern, width) for pattern in components.patterns]
         shapes = [mass * map_coordinates(p, places, order=1, mode="nearest") for p in smooth]
-        waves = components.rest * self._beams(response)
+        waves = components.rest * _unit_beams(level, *self._beam_waves)
         samples = np.sqrt(len(shapes) + len(waves)) * np.stack(
             [*shapes, *waves / np.sqrt(len(waves))]
         )
@@ -674,11 +681,20 @@ def _unit_beams(level: Level, length: float, seed: int) -> FloatArray:
 
 
 @lru_cache(maxsize=4)
-def _nearest_sites(level: Level, size: float) -> tuple[IntArray, int]:
-    """Return the nearest site of each square of a size, px, and the number of squares in a row."""
-    height, width = (int(side / size) + 1 for side in level.shape)
-    middles = (np.indices((height, width)).reshape(2, -1).T + 0.5) * size - 0.5
+def _nearest_sites(level: Level) -> tuple[IntArray, int]:
+    """Return the nearest site of squares as wide as the spacing, and how many make a row."""
+    height, width = (int(side / level.spacing) + 1 for side in level.shape)
+    middles = (np.indices((height, width)).reshape(2, -1).T + 0.5) * level.spacing - 0.5
     return np.asarray(KDTree(level.sites).query(middles)[1]), width
+
+
+def _look_ahead(
+    response: Callable[[], LinearResponse], level: Level, length: float, seed: int
+) -> None:
+    """Compute what errors need of a level, once its response, which is needed sooner, is ready."""
+    response()
+    _unit_beams(level, length, seed)
+    _nearest_sites(level)
 
 
 def _solver_gap(
@@ -687,7 +703,7 @@ def _solver_gap(
     """Return the solver's remaining flux error in each cell."""
     gap = solution.flux - solution.level.mass
     # The nearest of the few sites is looked up by squares.
-    nearest, width = _nearest_sites(response.level, response.spacing)
+    nearest, width = _nearest_sites(response.level)
     rows, columns = ((solution.level.sites + 0.5) / response.spacing).astype(np.int64).T
     group = nearest[rows * width + columns]
     return np.bincount(group, gap, len(response.flux)).astype(np.float64)[None]

@@ -257,8 +257,10 @@ class LinearResponse:
     @cached_property
     def places(self) -> FloatArray:
         """Middles of the triangles, px of the image, shape (t, 2)."""
-        corners, _ = self._slopes
-        return np.asarray(self.level.sites[corners].mean(axis=1) - self._plan.margin_width)
+        first, second, third = self._slopes[0].T
+        sites = self.level.sites
+        middles = (sites[first] + sites[second] + sites[third]) / 3
+        return np.asarray(middles - self._plan.margin_width)
 
     @cached_property
     def shares(self) -> FloatArray:
