@@ -118,8 +118,11 @@ def _crew_of_this_thread() -> Crew | None:
     return getattr(_of_this_thread, "crew", None)
 
 
+LIGHT_ITEMS = 1 << 14  # the smallest range of a kernel that does little with each item
+
+
 def in_ranges(
-    kernel: Callable[..., Any], n: int, threads: int, *args: Any, smallest: int = 1 << 14
+    kernel: Callable[..., Any], n: int, threads: int, *args: Any, smallest: int = 4096
 ) -> None:
     """Call ``kernel(start, stop, *args)`` on ranges of at least `smallest` items that cover n."""
     # The items are independent and a kernel writes only what belongs to them, so the cut cannot

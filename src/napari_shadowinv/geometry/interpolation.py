@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from napari_shadowinv._system.machine import available_threads, in_ranges
+from napari_shadowinv._system.machine import LIGHT_ITEMS, available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.compiler import njit
 from napari_shadowinv.geometry.triangle_mesh import Indices
@@ -431,7 +431,7 @@ def _bend_least(
     n = len(values)
     surface = np.zeros((n, 3, values.shape[1]))
     operands = *_mesh_arrays(triangulation), values, gradients, surface
-    in_ranges(_minimise_bending, n, available_threads(threads), *operands)
+    in_ranges(_minimise_bending, n, available_threads(threads), *operands, smallest=LIGHT_ITEMS)
     return surface
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from napari_shadowinv._system.machine import available_threads, in_ranges
+from napari_shadowinv._system.machine import LIGHT_ITEMS, available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.compiler import kernel, njit
 from napari_shadowinv.geometry.density import (
@@ -261,7 +261,8 @@ class PowerDiagram:
         self.vertices: FloatArray = np.empty((len(triangulation.vertices), 2))
         threads = available_threads(threads)
         dual = triangulation.points, triangulation.weights, self.n_sites, triangulation.vertices
-        in_ranges(_power_centres, len(self.vertices), threads, *dual, self.vertices)
+        operands = *dual, self.vertices
+        in_ranges(_power_centres, len(self.vertices), threads, *operands, smallest=LIGHT_ITEMS)
         # pairs of neighbouring sites, shape (e, 2); indices ≥ n are ghosts outside
         self.edges, sides = triangulation.edges
         self._sides, self._density, self._threads = sides, density, threads
@@ -335,11 +336,12 @@ class PowerDiagram:
         borders = self.edges, self._integrals
         starts = np.ones(n + 1, np.int32)
         starts[0] = 0
-        in_ranges(_count_ties, n, threads, n, *borders, starts[1:])
+        in_ranges(_count_ties, n, threads, n, *borders, starts[1:], smallest=LIGHT_ITEMS)
         np.cumsum(starts, out=starts)
         columns, values = np.empty(starts[-1], np.int32), np.zeros(starts[-1])
         rows = starts, starts[:-1] + 1, columns, values
-        in_ranges(_fill_laplacian, n, threads, self._triangulation.points, *borders, *rows)
+        operands = self._triangulation.points, *borders, *rows
+        in_ranges(_fill_laplacian, n, threads, *operands, smallest=LIGHT_ITEMS)
         return csr_array((values, columns, starts), shape=(n, n))
 
     @property

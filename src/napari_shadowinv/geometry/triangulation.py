@@ -27,7 +27,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from napari_shadowinv._system.machine import in_ranges
+from napari_shadowinv._system.machine import LIGHT_ITEMS, in_ranges
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry import flips
@@ -99,6 +99,11 @@ def _with_ghosts(sites: FloatArray, region: ArrayLike | None) -> tuple[FloatArra
     distance = GHOST_DISTANCE * extent
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     return np.concatenate([sites, low + (high - low) / 2 + distance * corners]), distance
+
+
+def _look(search: Callable[..., None], mesh: Mesh, suspects: BoolArray, threads: int) -> None:
+    """Search the triangles in threads, and mark suspects."""
+    in_ranges(search, suspects.size, threads, mesh, suspects, smallest=LIGHT_ITEMS)
 
 
 def _read_only(array: NDArray[T]) -> NDArray[T]:
@@ -228,7 +233,7 @@ class RegularTriangulation:
         self._is_regular = False
         self.forget()
         suspects = np.empty(self._mesh.counters[SIZE], np.bool_)
-        in_ranges(flips.look_for_irregular, suspects.size, threads, self._mesh, suspects)
+        _look(flips.look_for_irregular, self._mesh, suspects, threads)
         policy = flips.STOP if stop_when_hidden else flips.REMOVE
         status = flips.repair(self._mesh, policy, suspects)
         if status != flips.EXHAUSTED:
@@ -275,11 +280,11 @@ class RegularTriangulation:
         suspects = np.empty(mesh.counters[SIZE], np.bool_)
         overturned = True
         while overturned:
-            in_ranges(flips.look_for_overturned, suspects.size, threads, mesh, suspects)
+            _look(flips.look_for_overturned, mesh, suspects, threads)
             overturned = flips.return_overturned(mesh, suspects, origins, strays)
         if np.count_nonzero(strays) > flips.MOST_STRAYS * n:
             return False
-        in_ranges(flips.look_for_irregular, suspects.size, threads, mesh, suspects)
+        _look(flips.look_for_irregular, mesh, suspects, threads)
         if flips.repair(mesh, flips.REMOVE, suspects) != flips.DONE:
             return False
         return bool(flips.put_strays(mesh, targets, strays) == flips.DONE)
