@@ -246,8 +246,8 @@ def test_register_is_silent_on_a_beam_that_merely_differs():
     for seed in range(1000, 1030):
         rng = np.random.default_rng(seed)
         change = gaussian_filter(rng.normal(size=smooth.shape), 35)
-        other = smooth * (1 + 0.01 * (change - change.mean()) / change.std())
-        image, source = (rng.poisson(plane).astype(float) for plane in (other, smooth))
+        changed = smooth * (1 + 0.01 * (change - change.mean()) / change.std())
+        image, source = (rng.poisson(plane).astype(float) for plane in (changed, smooth))
         assert "register" not in named(image, source)
 
 

@@ -36,8 +36,8 @@ _CONTRAST_SHOTS = 16
 def store_layers(path: Path, name: str = "", shot: int | None = None) -> list[FullLayerData]:
     """Describe the layers of a ``.shadowinv.zarr`` folder, with the arrows of one shot.
 
-    `shot` also sets the units and contrast. Default: the first finished shot, with a contrast for
-    up to 16 finished shots of the run.
+    `shot` also sets the units and the contrast. By default, units are those of the first finished
+    shot, and the contrast suits up to 16 finished shots.
     """
     dataset = _open(path)
     name = name or path.name.removesuffix(".zarr").removesuffix(RESULT.suffix)
@@ -47,20 +47,19 @@ def store_layers(path: Path, name: str = "", shot: int | None = None) -> list[Fu
     facts = {"store": str(path), "name": name, "shots": _shot_names(dataset)}
     layers = dataset_layers(dataset, setup, frame, name, facts, reference)
     if shot is None:
-        finished = _finished_shots(dataset)
-        spread = np.linspace(0, len(finished) - 1, min(len(finished), _CONTRAST_SHOTS))
-        for index in np.take(finished, np.rint(spread).astype(int)):
-            with suppress(FileFormatError, OSError):  # the shot is damaged
-                _include_in_contrast(layers, int(index))
+        _widen_contrast(layers, _finished_shots(dataset))
     return layers
 
 
-def _include_in_contrast(layers: Sequence[FullLayerData], shot: int) -> None:
-    """Extend the limits of the images shown by default to one more shot."""
-    for data, keywords, kind in main_layers(layers):
-        if kind == "image":
-            limits = keywords["contrast_limits"]
-            keywords["contrast_limits"] = widen_limits(limits, np.asarray(data[shot]))
+def _widen_contrast(layers: Sequence[FullLayerData], finished: Sequence[int]) -> None:
+    """Extend the limits of the images shown by default to some of the finished shots."""
+    places = np.linspace(0, len(finished) - 1, min(len(finished), _CONTRAST_SHOTS))
+    images = [(data, words) for data, words, kind in main_layers(layers) if kind == "image"]
+    for shot in np.take(finished, np.rint(places).astype(int)).tolist():
+        with suppress(FileFormatError, OSError):  # the shot is damaged
+            for data, words in images:
+                plane = np.asarray(data[shot])
+                words["contrast_limits"] = widen_limits(words["contrast_limits"], plane)
 
 
 @as_file_errors

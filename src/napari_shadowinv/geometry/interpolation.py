@@ -690,14 +690,14 @@ def _evaluate_strips(
             top = math.ceil(max(min(ya, yb, yc) - _EDGE_PX, float(begin)))
             bottom = math.floor(min(max(ya, yb, yc) + _EDGE_PX, end - 1.0))
             xa, xb, xc = points[a, 1], points[b, 1], points[c, 1]
-            left = math.ceil(max(min(xa, xb, xc) - _EDGE_PX, 0.0))
-            right = math.floor(min(max(xa, xb, xc) + _EDGE_PX, width - 1.0))
-            if top > bottom or left > right:
+            leftmost = math.ceil(max(min(xa, xb, xc) - _EDGE_PX, 0.0))
+            rightmost = math.floor(min(max(xa, xb, xc) + _EDGE_PX, width - 1.0))
+            if top > bottom or leftmost > rightmost:
                 continue
             _gather_corners(vertices, t, points, values, gradients, p, f, g)
             _fill_patch(p, f, g, patch)
             for row in range(top, bottom + 1):
-                for column in range(left, right + 1):
+                for column in range(leftmost, rightmost + 1):
                     b0, b1, b2 = _patch_coordinates(patch, row, column)
                     if min(b0, b1, b2) >= -_EDGE_SHARE:
                         out[row, column], _ = _value_on_patch(patch, row, column)

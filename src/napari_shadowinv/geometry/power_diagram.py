@@ -187,7 +187,7 @@ def _find_centroids(
 def _count_ties(
     start: int, stop: int, n: int, edges: Indices, integrals: FloatArray, counts: Indices
 ) -> None:
-    """Add the neighbours of sites `start` to `stop` to their counts."""
+    """Count the neighbours of sites `start` to `stop`."""
     first, end, ghosts = np.uint32(start), np.uint32(stop), np.uint32(n)
     for e in range(edges.shape[0]):
         a, b = np.uint32(edges[e, 0]), np.uint32(edges[e, 1])
@@ -260,9 +260,9 @@ class PowerDiagram:
         self.sites = triangulation.sites
         self.vertices: FloatArray = np.empty((len(triangulation.vertices), 2))
         threads = available_threads(threads)
-        dual = triangulation.points, triangulation.weights, self.n_sites, triangulation.vertices
-        operands = *dual, self.vertices
-        in_ranges(_power_centres, len(self.vertices), threads, *operands, smallest=LIGHT_ITEMS)
+        points, triangles = triangulation.points, triangulation.vertices
+        dual = points, triangulation.weights, self.n_sites, triangles, self.vertices
+        in_ranges(_power_centres, len(triangles), threads, *dual, smallest=LIGHT_ITEMS)
         # pairs of neighbouring sites, shape (e, 2); indices ≥ n are ghosts outside
         self.edges, sides = triangulation.edges
         self._sides, self._density, self._threads = sides, density, threads

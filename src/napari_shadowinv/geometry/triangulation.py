@@ -101,8 +101,8 @@ def _with_ghosts(sites: FloatArray, region: ArrayLike | None) -> tuple[FloatArra
     return np.concatenate([sites, low + (high - low) / 2 + distance * corners]), distance
 
 
-def _look(search: Callable[..., None], mesh: Mesh, suspects: BoolArray, threads: int) -> None:
-    """Search the triangles in threads, and mark suspects."""
+def _mark(search: Callable[..., None], mesh: Mesh, suspects: BoolArray, threads: int) -> None:
+    """Search the triangles in threads, and mark those that a search suspects."""
     in_ranges(search, suspects.size, threads, mesh, suspects, smallest=LIGHT_ITEMS)
 
 
@@ -233,7 +233,7 @@ class RegularTriangulation:
         self._is_regular = False
         self.forget()
         suspects = np.empty(self._mesh.counters[SIZE], np.bool_)
-        _look(flips.look_for_irregular, self._mesh, suspects, threads)
+        _mark(flips.look_for_irregular, self._mesh, suspects, threads)
         policy = flips.STOP if stop_when_hidden else flips.REMOVE
         status = flips.repair(self._mesh, policy, suspects)
         if status != flips.EXHAUSTED:
@@ -280,11 +280,11 @@ class RegularTriangulation:
         suspects = np.empty(mesh.counters[SIZE], np.bool_)
         overturned = True
         while overturned:
-            _look(flips.look_for_overturned, mesh, suspects, threads)
+            _mark(flips.look_for_overturned, mesh, suspects, threads)
             overturned = flips.return_overturned(mesh, suspects, origins, strays)
         if np.count_nonzero(strays) > flips.MOST_STRAYS * n:
             return False
-        _look(flips.look_for_irregular, mesh, suspects, threads)
+        _mark(flips.look_for_irregular, mesh, suspects, threads)
         if flips.repair(mesh, flips.REMOVE, suspects) != flips.DONE:
             return False
         return bool(flips.put_strays(mesh, targets, strays) == flips.DONE)

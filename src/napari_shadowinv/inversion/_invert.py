@@ -45,13 +45,7 @@ from napari_shadowinv.options import MAX_DEFAULT_SITES, Instrument, InversionOpt
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.preprocessing.image_checks import CheckedImage, image_warnings
-from napari_shadowinv.transport.sites import (
-    Levels,
-    Margin,
-    SitePlan,
-    edge_flux,
-    plan_levels,
-)
+from napari_shadowinv.transport.sites import Levels, Margin, SitePlan, edge_flux, plan_levels
 from napari_shadowinv.transport.solvers import LevelSolution, fit_flux_factor, solve
 
 __all__ = ["count_sites", "invert", "plan_sites"]
@@ -298,7 +292,7 @@ def invert(
             return ImageNoise(prepared.in_units(), options, instrument.noise_correlation)
 
         def check_image() -> tuple[Caution, ...]:
-            noise()  # is needed sooner
+            noise()  # before the checks, because the first levels wait for it
             recorded = prepared.image * prepared.flux_scale
             beam = _checked_source(plan) if plan.measured else None
             return image_warnings(recorded, beam, prepared.mask)
@@ -336,7 +330,7 @@ def invert(
         more = adaptive and answer.converged and len(answer.weights) < levels.counts[-1]
         if not more or not is_coarse(units, fields.reprojection, noise(), options.threads):
             break
-        wait_for_errors()  # of too few sites; they share the budget with those to come
+        wait_for_errors()  # they use the budget that the next solution changes
         coarse = len(answer.weights)
     quality = _make_report(units, noise(), solutions, fields, seconds, budget)
     with _measure_time("errors", seconds):
@@ -471,7 +465,7 @@ def _read_fields(
     report: Reporter,
     seconds: dict[str, float],
 ) -> tuple[_Fields, Callable[[], Errors | None]]:
-    """Read the last solution, and estimate its errors beside; return how to wait for them."""
+    """Read the last solution, and begin to estimate its errors; return a function that waits."""
     solution, options = solutions[-1], budget.options
 
     def report_share(report: OnReport, share: float, first: int, last: int) -> None:
