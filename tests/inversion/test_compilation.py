@@ -219,3 +219,18 @@ def test_machine_code_of_an_earlier_process_is_recognised(monkeypatch, tmp_path)
     assert not machine_code.is_compiled()
     (tmp_path / f"{source.stem}.build-402.py311.nbi").touch()
     assert machine_code.is_compiled()
+
+
+def test_a_first_inversion_loads_no_optimiser_that_it_does_not_need():
+    script = """
+import sys
+import numpy as np
+from napari_shadowinv import invert
+
+invert(1 + 0.1 * np.random.default_rng(1).random((40, 40)))
+print({f"scipy.{name}" for name in ("optimize", "integrate", "interpolate")} & set(sys.modules))
+"""
+    printed = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert printed.stdout.strip() == "set()"

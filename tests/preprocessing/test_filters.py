@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import (
@@ -12,6 +13,7 @@ from napari_shadowinv.preprocessing import (
     remove_background,
     remove_hot_pixels,
 )
+from napari_shadowinv.preprocessing.pixels import nonnegative_fit
 
 SHAPE = (48, 60)
 FILTERS = {
@@ -280,3 +282,18 @@ def test_arrays_that_are_no_images_are_refused(name, image, words):
 def test_options_that_make_no_sense_are_refused(call, words):
     with pytest.raises(InputError, match=words):
         call(random_image())
+
+
+def test_a_nonnegative_fit_agrees_with_another_program():
+    draw = np.random.default_rng(3)
+    columns_used = set()
+    for _ in range(1000):
+        counts = np.sort(draw.uniform(0, 10 ** draw.uniform(0, 5), 12))
+        columns = counts[:, None] ** np.arange(3) / counts.mean() ** np.arange(3)
+        values = columns @ draw.normal(size=3) + 0.1 * draw.normal(size=12)
+        terms, distance = nonnegative_fit(columns, values)
+        expected, expected_distance = nnls(columns, values)
+        np.testing.assert_allclose(terms, expected, atol=1e-9)
+        assert distance == pytest.approx(expected_distance, rel=1e-12)
+        columns_used.add(tuple(terms > 0))
+    assert len(columns_used) == 8

@@ -27,10 +27,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.optimize import nnls
 
 from napari_shadowinv._system.arrays import NORMAL_MAD, order_by_value
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.preprocessing.pixels import nonnegative_fit
 
 if TYPE_CHECKING:
     from napari_shadowinv.inversion.normalise import Prepared
@@ -435,7 +435,7 @@ def _terms(bright: FloatArray, differences: FloatArray) -> FloatArray:
     # Relative deviations: bins on bright lines, whose structure looks like noise, count little.
     weights = 1 / np.maximum(variances, 1e-6 * variances.max())
     powers = np.stack([np.ones_like(places), places, places**2], axis=1)
-    return np.asarray(nnls(weights[:, None] * powers, weights * variances)[0])
+    return nonnegative_fit(weights[:, None] * powers, weights * variances)[0]
 
 
 @lru_cache(maxsize=8)

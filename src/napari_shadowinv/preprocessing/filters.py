@@ -485,7 +485,8 @@ def _noise(difference: FloatArray, brightness: FloatArray) -> FloatArray:
     share = 1 / np.maximum(variance, 1e-3 * variance.max())
     unit, scale = variance.mean(), levels.mean() or 1.0
     columns = np.stack([np.ones_like(levels), levels / scale], axis=1) * unit
-    constant, slope = scipy.optimize.nnls(columns * share[:, None], variance * share)[0] * unit
+    terms, _ = pixels.nonnegative_fit(columns * share[:, None], variance * share)
+    constant, slope = terms * unit
     fitted: FloatArray = np.sqrt(constant + slope * np.maximum(brightness, 0) / scale)
     return fitted
 

@@ -29,11 +29,11 @@ from functools import cached_property
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import fft, ndimage
-from scipy.optimize import nnls
 
 from napari_shadowinv._system.arrays import NORMAL_MAD, complete_block_means, order_by_value
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
+from napari_shadowinv.preprocessing.pixels import nonnegative_fit
 
 # Saturation
 _MIN_PLATEAU_PIXELS, _MIN_PLATEAU_SHARE = 10, 5e-4
@@ -583,10 +583,10 @@ def _offset(bins: FloatArray, max_pattern: float, min_gain: float) -> float:
     variances, weights = noise**2, 1 / (noise * uncertainty)
     powers = np.stack([np.ones_like(levels), levels, levels**2], axis=1) * weights[:, None]
     weighted = variances * weights
-    terms, freely = nnls(powers, weighted)
+    terms, freely = nonnegative_fit(powers, weighted)
     distance = freely
     if terms[2] > max_pattern:
-        distance = nnls(powers[:, :2], weighted - max_pattern * powers[:, 2])[1]
+        distance = nonnegative_fit(powers[:, :2], weighted - max_pattern * powers[:, 2])[1]
     # Weighted least squares of v = g (m - D).
     line = powers[:, [1, 0]] * [1.0, -1.0]
     (gain, offset), *_ = np.linalg.lstsq(line, weighted, rcond=None)

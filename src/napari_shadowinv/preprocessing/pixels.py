@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import itertools
 import operator
 from typing import Literal
 
@@ -291,6 +292,39 @@ def fit_polynomial(
         if np.abs(fit - previous).max() < 1e-6 * scale:
             break
     return fit
+
+
+def nonnegative_fit(columns: FloatArray, values: FloatArray) -> tuple[FloatArray, float]:
+    """Fit values by columns whose coefficients are not negative, by least squares.
+
+    Every subset of the columns is tried, which suits the two or three terms of a detector's noise.
+
+    Parameters
+    ----------
+    columns : ndarray of float64, shape (N, K)
+    values : ndarray of float64, shape (N,)
+
+    Returns
+    -------
+    coefficients : ndarray of float64, shape (K,)
+        One in the values' unit over the column's.
+    distance : float
+        Root of the sum of squared residuals, in the values' unit.
+    """
+    count = columns.shape[1]
+    scales = 1 / np.maximum(np.linalg.norm(columns, axis=0), np.finfo(np.float64).tiny)
+    best, least = np.zeros(count), float(np.linalg.norm(values))
+    for subset in itertools.product((True, False), repeat=count):
+        used = np.flatnonzero(subset)
+        terms = np.zeros(count)
+        terms[used] = np.linalg.lstsq(columns[:, used] * scales[used], values, rcond=None)[0]
+        terms *= scales
+        distance = float(np.linalg.norm(values - columns @ terms))
+        if (terms >= 0).all() and distance < least:
+            best, least = terms, distance
+            if all(subset):  # no subset fits better than all
+                break
+    return best, least
 
 
 def _weighted_fit(

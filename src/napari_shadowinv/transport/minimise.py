@@ -35,8 +35,8 @@ from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from scipy.fft import dctn, idctn
-from scipy.optimize import minimize
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
@@ -369,7 +369,7 @@ def descend(
         if residual <= tolerance:
             raise StopIteration
 
-    result = minimize(
+    result = scipy.optimize.minimize(
         scaled_problem,
         start / area,
         jac=True,
