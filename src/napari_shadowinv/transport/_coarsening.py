@@ -90,17 +90,24 @@ def _empty_network(nodes: int, entries: int) -> Network:
 
 
 @kernel
-def _sort_row(network: Network, end: np.uint32, node: int | np.uint32, low: int, high: int) -> None:
-    """Complete the last row, up to an entry: sort it, and sum its conductances.
+def _sort_row(
+    network: Network,
+    begin: np.uint32,
+    end: np.uint32,
+    node: int | np.uint32,
+    low: int,
+    high: int,
+) -> None:
+    """Complete the row of a node, which its entries are filled for: sort it, and sum it.
 
     The nodes from `low` to `high` are those of its block.
     """
     starts, middles, ends, neighbors, conductances, degrees, inverse_degrees = network
     step = np.uint32(1)
-    middle = np.uint32(starts[node])
+    middle = begin
     crossing = False
     degree = 0.0
-    for k in range(np.uint32(starts[node]), end):
+    for k in range(begin, end):
         neighbor, conductance = neighbors[k], conductances[k]
         degree += conductance
         neighbors[k], conductances[k] = neighbors[middle], conductances[middle]
@@ -116,28 +123,51 @@ def _sort_row(network: Network, end: np.uint32, node: int | np.uint32, low: int,
                 neighbors[k], conductances[k] = neighbors[last], conductances[last]
                 neighbors[last], conductances[last] = neighbor, conductance
                 last += step
-    middles[node], ends[node], starts[node + step] = middle, last, end
+    starts[node], middles[node], ends[node] = begin, middle, last
     degrees[node] = degree
     inverse_degrees[node] = 1.0 / degree if degree != 0.0 else np.inf
 
 
 @kernel
-def _read_laplacian(
-    starts: Indices, columns: Indices, values: FloatArray, network: Network, blocks: IntArray
+def _read_blocks(
+    first: int,
+    last: int,
+    blocks: IntArray,
+    starts: Indices,
+    columns: Indices,
+    values: FloatArray,
+    network: Network,
+    spans: IntArray,
 ) -> None:
-    """Take the conductors out of a sparse matrix, in any order of columns."""
+    """Take the conductors of blocks out of a sparse matrix, in any order of columns."""
     neighbors, conductances = network.neighbors, network.conductances
     step = np.uint32(1)
-    end = np.uint32(0)
-    for b in range(blocks.size - 1):
+    end = np.uint32(starts[blocks[first]])
+    for b in range(first, last):
         low, high = blocks[b], blocks[b + 1]
+        spans[b, 0] = end
         for i in range(np.uint32(low), np.uint32(high)):
+            begin = end
             for k in range(np.uint32(starts[i]), np.uint32(starts[i + step])):
                 if columns[k] != i and values[k] < 0.0:
                     neighbors[end] = columns[k]
                     conductances[end] = -values[k]
                     end += step
-            _sort_row(network, end, i, low, high)
+            _sort_row(network, begin, end, i, low, high)
+        spans[b, 1] = end
+
+
+def _close_gaps(network: Network, blocks: IntArray, spans: IntArray) -> None:
+    """Move the entries of blocks, which threads have filled, to the end of those before."""
+    end = int(spans[0, 1])
+    for b, (first, last) in enumerate(spans[1:].tolist(), 1):
+        if first > end:
+            for entries in (network.neighbors, network.conductances):
+                entries[end : end + last - first] = entries[first:last]
+            for row_bounds in (network.starts, network.middles, network.ends):
+                row_bounds[blocks[b] : blocks[b + 1]] -= first - end
+        end += last - first
+    network.starts[blocks[-1]] = end
 
 
 @njit(nogil=True, cache=True)
@@ -246,15 +276,51 @@ def _list_members(
     return begins, members
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
 def _contract(
-    fine: Network, start: int, stop: int, groups: Indices, coarse: Network, blocks: IntArray
+    fine: Network,
+    nodes: IntArray,
+    groups: Indices,
+    coarse: Network,
+    blocks: IntArray,
+    threads: int,
+    *,
+    joined: bool = False,
 ) -> None:
-    """Make each group one node, with the sums of the conductances between groups."""
-    first, last = blocks[0], blocks[-1]
-    begins, members = _list_members(start, stop, groups, first, last)
-    place = np.full(last - first, -1, np.int32)
-    _sum_conductances(fine, groups, begins, members, place, coarse, blocks)
+    """Make each group one node, with the sums of the conductances between groups.
+
+    The groups of a block's nodes are the block's nodes; joined, all groups are those of one block.
+    """
+    spans = np.empty((len(nodes) - 1, 2), np.int64)
+    contraction = nodes, fine, groups, coarse, blocks, joined, spans
+    in_ranges(_contract_blocks, len(spans), threads, *contraction, smallest=1)
+    _close_gaps(coarse, blocks, spans)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _contract_blocks(
+    first: int,
+    last: int,
+    nodes: IntArray,
+    fine: Network,
+    groups: Indices,
+    coarse: Network,
+    blocks: IntArray,
+    joined: bool,
+    spans: IntArray,
+) -> None:
+    """Fill the rows of blocks of the coarse network."""
+    lowest, highest = blocks[0], blocks[-1]
+    place = np.full(highest - lowest, -1, np.int32)
+    end = coarse.starts[lowest] + fine.starts[nodes[first]] - fine.starts[nodes[0]]
+    for b in range(first, last):
+        low, high = blocks[b], blocks[b + 1]
+        begins, members = _list_members(nodes[b], nodes[b + 1], groups, low, high)
+        spans[b, 0] = end
+        within = (lowest, highest) if joined else (low, high)
+        end = _sum_conductances(
+            fine, groups, begins, members, place, coarse, end, low, lowest, within
+        )
+        spans[b, 1] = end
 
 
 @kernel
@@ -265,19 +331,22 @@ def _sum_conductances(
     members: Indices,
     place: Indices,
     coarse: Network,
-    blocks: IntArray,
-) -> None:
-    """Fill the rows of the coarse network; `place` is -1 for each group."""
+    start: int,
+    first: int,
+    lowest: int,
+    within: tuple[int, int],
+) -> int:
+    """Fill the rows of groups from `first` on with entries from `start` on, and return their end.
+
+    `place` holds an entry before `start`, or -1, for each group from `lowest` on.
+    """
     starts, _, _, neighbors, conductances, _, _ = fine
-    rows, _, _, coarse_neighbors, coarse_conductances, _, _ = coarse
-    step, offset = np.uint32(1), np.uint32(blocks[0])
-    end = rows[offset]
-    block = 0
-    for group in range(np.uint32(place.size)):
+    coarse_neighbors, coarse_conductances = coarse.neighbors, coarse.conductances
+    step, offset = np.uint32(1), np.uint32(lowest)
+    end = np.int32(start)
+    for group in range(np.uint32(begins.size - 1)):
         begin = end
-        g = group + offset
-        while g >= blocks[block + 1]:
-            block += 1
+        g = group + np.uint32(first)
         for m in range(np.uint32(begins[group]), np.uint32(begins[group + step])):
             node = np.uint32(members[m])
             for k in range(np.uint32(starts[node]), np.uint32(starts[node + step])):
@@ -292,7 +361,8 @@ def _sum_conductances(
                     end += 1
                 else:
                     coarse_conductances[np.uint32(at)] += conductances[k]
-        _sort_row(coarse, np.uint32(end), g, blocks[block], blocks[block + 1])
+        _sort_row(coarse, np.uint32(begin), np.uint32(end), g, within[0], within[1])
+    return int(end)
 
 
 def build_hierarchy(
@@ -323,13 +393,14 @@ def _build_blocks(
     network = _empty_network(4 * n + _MAX_COARSEST_NODES, 2 * int(laplacian.nnz))
     parents: Indices = np.empty(4 * n + _MAX_COARSEST_NODES, np.int32)
     block_bounds = np.arange(count + 1) * n // count
-    _read_laplacian(
+    spans = np.empty((count, 2), np.int64)
+    entries = (
         laplacian.indptr.astype(np.int32, copy=False),
         laplacian.indices.astype(np.int32, copy=False),
         laplacian.data.astype(np.float64, copy=False),
-        network,
-        block_bounds,
     )
+    in_ranges(_read_blocks, count, threads, block_bounds, *entries, network, spans, smallest=1)
+    _close_gaps(network, block_bounds, spans)
     _tie_to_ground(network, 0, ground)
     bounds = [0, n]
     group_bounds = block_bounds
@@ -383,13 +454,12 @@ def _add_level(
     else:
         raise RuntimeError("the fluxes between cells are not finite, or underflow")
     pairs = _empty_network(count, network.starts[stop] - network.starts[start])
-    _contract(network, start, stop, parents, pairs, pair_blocks)
+    _contract(network, blocks, parents, pairs, pair_blocks, threads)
     groups = np.empty(count, np.int32)
     nodes = pairs, pair_blocks, _MIN_TIE, inverses
     ends = _pair_blocks(*nodes, groups, stop, np.empty(count), threads)
     network = _grow_network(network, network.starts[stop] + pairs.starts[count])
-    # The coarser level is one block.
-    _contract(pairs, 0, count, groups, network, ends[[0, -1]])
+    _contract(pairs, pair_blocks, groups, network, ends, threads, joined=True)
     parents[start:stop] = groups[parents[start:stop]]
     return network, ends
 
