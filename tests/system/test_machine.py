@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -26,17 +27,42 @@ def test_ranges_cover_everything_once(threads):
     np.testing.assert_array_equal(values, np.arange(1001))
 
 
-def test_an_error_is_raised_after_all_ranges_have_ended():
-    ended = []
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_uneven_ranges_cover_everything_once(threads):
+    values = np.full(1001, -1)
+    in_ranges(fill, 1001, threads, values, smallest=10, uneven=True)
+    np.testing.assert_array_equal(values, np.arange(1001))
+
+
+def test_a_thread_takes_the_uneven_ranges_that_a_busy_one_leaves():
+    light = []
+    all_are_done = threading.Event()
 
     def work(start, stop):
         if start == 0:
+            assert all_are_done.wait(10)
+            return
+        light.append(stop)
+        if len(light) == 7:
+            all_are_done.set()
+
+    in_ranges(work, 80, 2, smallest=10, uneven=True)
+    assert sorted(light) == [20, 30, 40, 50, 60, 70, 80]
+
+
+def test_an_error_is_raised_after_all_ranges_that_have_begun_have_ended():
+    both_have_begun, ended = threading.Barrier(2), []
+
+    def work(start, stop):
+        both_have_begun.wait(10)
+        if start == 0:
             raise ValueError("first")
+        time.sleep(0.05)
         ended.append(stop)
 
     with pytest.raises(ValueError, match="first"):
-        in_ranges(work, 30, 3, smallest=10)
-    assert sorted(ended) == [20, 30]
+        in_ranges(work, 20, 2, smallest=10)
+    assert ended == [20]
 
 
 def test_work_begins_in_a_thread_of_its_own_where_there_are_two():

@@ -13,7 +13,8 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -120,43 +121,47 @@ def _crew_of_this_thread() -> Crew | None:
 
 LIGHT_ITEMS = 1 << 14  # the smallest range of a kernel that does little with each item
 
+_UNEVEN_RANGES = 4  # for each thread
+
 
 def in_ranges(
-    kernel: Callable[..., Any], n: int, threads: int, *args: Any, smallest: int = 4096
+    kernel: Callable[..., Any],
+    n: int,
+    threads: int,
+    *args: Any,
+    smallest: int = 4096,
+    uneven: bool = False,
 ) -> None:
-    """Call ``kernel(start, stop, *args)`` on ranges of at least `smallest` items that cover n."""
+    """Call ``kernel(start, stop, *args)`` on ranges of at least `smallest` items that cover n.
+
+    There is a range for each thread; more where items may take uneven times, so that a thread whose
+    ranges are light takes more of them.
+    """
     # The items are independent and a kernel writes only what belongs to them, so the cut cannot
     # change a result. Plain threads suffice because the kernels release the GIL; unlike numba's
     # own pool they can be used from any number of callers at once.
-    ranges = max(1, min(threads, n // smallest))
+    most = max(1, n // smallest)
+    threads = max(1, min(threads, most))
+    ranges = min(_UNEVEN_RANGES * threads, most) if uneven and threads > 1 else threads
     bounds = [n * k // ranges for k in range(ranges + 1)]
-    if ranges == 1:
-        kernel(0, n, *args)
-        return
-    pool = _kernel_pool()
-    futures = [pool.submit(kernel, bounds[k], bounds[k + 1], *args) for k in range(1, ranges)]
-    try:
-        kernel(bounds[0], bounds[1], *args)
-    finally:
-        wait(futures)
-    for future in futures:
-        future.result()
+    run_together([partial(kernel, *pair, *args) for pair in pairwise(bounds)], threads)
 
 
 def run_together(works: Sequence[Callable[[], Any]], threads: int) -> None:
     """Call functions that release the GIL and write nothing in common, in threads."""
-    threads = max(1, min(threads, len(works)))
+    remaining = iter(works)
 
-    def run(first: int) -> None:
-        for work in works[first::threads]:
+    def run() -> None:
+        for work in remaining:
             work()
 
-    futures = [_kernel_pool().submit(run, first) for first in range(1, threads)]
+    futures = [_kernel_pool().submit(run) for _ in range(min(threads, len(works)) - 1)]
     try:
-        run(0)
+        run()
     finally:
-        wait(futures)
-    for future in futures:
+        begun = [future for future in futures if not future.cancel()]
+        wait(begun)
+    for future in begun:
         future.result()
 
 

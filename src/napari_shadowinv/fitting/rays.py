@@ -347,7 +347,7 @@ class RayModel:
             threads = 1
         steepness = self._at_rest / KNOT / _SHARED
         fixed = (potential, counts, beam, _tables(), frame_px, self.pad, steepness)
-        in_ranges(kernel, ranges, threads, *fixed, *rest, smallest=1)
+        in_ranges(kernel, ranges, threads, *fixed, *rest, smallest=1, uneven=True)
 
     @property
     def _middle(self) -> tuple[float, float]:

@@ -54,7 +54,8 @@ def _in_blocks(
 ) -> None:
     """Call a kernel on ranges of the blocks of queries."""
     blocks = -(-len(queries) // BLOCK)
-    in_ranges(kernel, blocks, available_threads(threads), queries, *operands, smallest=4)
+    threads = available_threads(threads)
+    in_ranges(kernel, blocks, threads, queries, *operands, smallest=4, uneven=True)
 
 
 @njit(nogil=True, cache=True)
@@ -777,7 +778,14 @@ class CloughTocher:
         for first in range(0, len(starts) - 1, _STRIPS_AT_ONCE):
             last = min(first + _STRIPS_AT_ONCE, len(starts) - 1)
             operands = first, starts, members, *self._arrays, out
-            in_ranges(_evaluate_strips, last - first, self.threads, *operands, smallest=smallest)
+            in_ranges(
+                _evaluate_strips,
+                last - first,
+                self.threads,
+                *operands,
+                smallest=smallest,
+                uneven=True,
+            )
             if on_share is not None:
                 on_share(min(last * STRIP_PX / height, 1.0))
         return out

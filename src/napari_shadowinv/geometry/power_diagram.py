@@ -282,7 +282,7 @@ class PowerDiagram:
         borders = sides, ends, density.image, sums, integrals
         squares_per_side = math.sqrt(density.image.size / self.n_sites)
         smallest = math.ceil(_MIN_SQUARES_PER_THREAD / max(squares_per_side, 1.0))
-        in_ranges(walk, len(sides), self._threads, *borders, smallest=smallest)
+        in_ranges(walk, len(sides), self._threads, *borders, smallest=smallest, uneven=True)
         if side > 1:
             integrals *= side**powers
         return integrals
