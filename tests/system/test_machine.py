@@ -13,7 +13,14 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._system import machine
-from napari_shadowinv._system.machine import begin, in_ranges, physical_memory
+from napari_shadowinv._system.machine import (
+    Crew,
+    available_threads,
+    begin,
+    in_ranges,
+    physical_memory,
+    results_of,
+)
 
 
 def fill(start, stop, values):
@@ -63,6 +70,32 @@ def test_an_error_is_raised_after_all_ranges_that_have_begun_have_ended():
     with pytest.raises(ValueError, match="first"):
         in_ranges(work, 20, 2, smallest=10)
     assert ended == [20]
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_results_come_in_the_order_of_their_functions(threads):
+    assert results_of([lambda n=n: n**2 for n in range(7)], threads) == [n**2 for n in range(7)]
+
+
+def test_functions_side_by_side_share_the_threads_of_their_kernels():
+    both_have_begun = threading.Barrier(2)
+
+    def count():
+        both_have_begun.wait(10)
+        threads = available_threads(4)
+        both_have_begun.wait(10)
+        return threads
+
+    assert results_of([count, count], 2) == [2, 2]
+    assert available_threads(4) == 4
+
+
+def test_a_crew_within_a_crew_gives_the_thread_back():
+    def threads_around():
+        inside = Crew(1, 1).call(available_threads, 4)
+        return inside, available_threads(4)
+
+    assert Crew(2, 2).call(threads_around) == (2, 2)
 
 
 def test_work_begins_in_a_thread_of_its_own_where_there_are_two():

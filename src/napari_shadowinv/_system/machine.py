@@ -1,7 +1,7 @@
 """Memory, threads and signals.
 
 - `physical_memory`, `available_threads`, `set_default_threads`
-- `in_ranges`, `run_together`, `begin`, `Crew`: work in threads
+- `in_ranges`, `run_together`, `results_of`, `begin`, `Crew`: work in threads
 - Ctrl-C, SIGTERM and SIGHUP: `defer_interrupts`, `clear_up_when_terminated`, `handling`
 """
 
@@ -103,11 +103,11 @@ class Crew:
 
     def call(self, function: Callable[..., _T], *args: Any) -> _T:
         """Call one of the functions in this thread."""
-        _of_this_thread.crew = self
+        previous, _of_this_thread.crew = _crew_of_this_thread(), self
         try:
             return function(*args)
         finally:
-            _of_this_thread.crew = None
+            _of_this_thread.crew = previous
             with self._lock:
                 self._remaining -= 1
 
@@ -163,6 +163,17 @@ def run_together(works: Sequence[Callable[[], Any]], threads: int) -> None:
         wait(begun)
     for future in begun:
         future.result()
+
+
+def results_of(works: Sequence[Callable[[], _T]], threads: int) -> list[_T]:
+    """Call functions in threads, which they share with the ranges of their kernels."""
+    crew, results = Crew(len(works), threads), {}
+
+    def call(number: int) -> None:
+        results[number] = crew.call(works[number])
+
+    run_together([partial(call, number) for number in range(len(works))], threads)
+    return [results[number] for number in range(len(works))]
 
 
 def begin(work: Callable[[], _T], threads: int | None) -> Callable[[], _T]:

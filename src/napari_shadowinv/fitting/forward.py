@@ -8,23 +8,27 @@ by the instrument and multiplied by its brightness.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, partial
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, laplace
 from scipy.sparse import csr_array
 
+from napari_shadowinv._system.machine import available_threads, results_of
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.fitting.instrument import DARKEST, EXACT, Imperfect, Part, widen, widening
-from napari_shadowinv.fitting.rays import RayModel, at_rest
+from napari_shadowinv.fitting.rays import Pulls, RayModel, at_rest
 from napari_shadowinv.fitting.unknowns import AdditiveBlock, Fiducials, Prior, Unknowns
 
 __all__ = ["Linear", "Scene", "blurred"]
 
+_T = TypeVar("_T")
+
 _SIGMAS = 4.0  # how far Gaussians reach
+_MOST_PIXELS_SIDE_BY_SIDE = 1 << 16  # more than one larger image at a time takes much memory
 
 
 @dataclass(frozen=True)
@@ -184,8 +188,8 @@ class Scene:
     def value(self, unknowns: Unknowns, counts: list[IntArray]) -> float:
         """Return the objective at fixed numbers of rays."""
         value, _ = self._priors(unknowns)
-        for shot in self._shots(unknowns, counts):
-            *_, residual = self._misfit(unknowns, shot)
+        shots = list(self._shots(unknowns, counts))
+        for _, _, residual in self._of_each(partial(self._misfit, unknowns), shots):
             value += float(np.einsum("yx,yx", residual, residual)) / 2
         return value
 
@@ -211,30 +215,43 @@ class Scene:
         """Return the objective at fixed numbers of rays, and its derivatives."""
         value, slope = self._priors(unknowns)
         of_shape, strengths = np.zeros(self.beams.shape[1:]), self.strengths_with(unknowns)
-        for shot in self._shots(unknowns, counts):
-            k = shot.number
-            seen, model, residual = self._misfit(unknowns, shot)
-            value += float(np.einsum("yx,yx", residual, residual)) / 2
-            pull = np.sqrt(self.weights[k]) * blurred(residual, self.blur)
-            slope.brightness[k] += np.einsum("yx,yx", pull, model)
-            scaled = np.exp(unknowns.brightness[k]) * pull
-            self._add_light_pulls(slope, k, scaled)
-            seen.add_pulls(slope, k, scaled)
-            pulls = self.rays.gradient(
-                shot.potential,
-                shot.counts,
-                shot.beam,
-                self._spread_back(k, seen.slope * scaled, unknowns),
-                shot.frame,
-                of_beam=self._has_beam,
-                of_frame=k > 0 and bool(self.free_frames.any()),
-            )
+        shots = list(self._shots(unknowns, counts))
+        for k, each in enumerate(self._of_each(partial(self._pulls, unknowns), shots)):
+            value += each.value
+            slope.brightness[k] += each.of_brightness
+            self._add_light_pulls(slope, k, each.scaled)
+            each.seen.add_pulls(slope, k, each.scaled)
+            pulls = each.of_rays
             self._add_potential_pulls(slope, unknowns, strengths[k], k, pulls.potential)
             entering = self._entering(unknowns, k)
             of_shape += self._add_beam_pulls(slope, k, pulls.beam, entering)
             slope.frames[k] += pulls.frame
         slope.beam[:] += self._of_modes(of_shape * self._beam_shape(unknowns))
         return value, self._only_free(slope)
+
+    def _pulls(self, unknowns: Unknowns, shot: _Shot) -> _ShotPulls:
+        """Differentiate an image's part of the objective."""
+        k = shot.number
+        seen, model, residual = self._misfit(unknowns, shot)
+        pull = np.sqrt(self.weights[k]) * blurred(residual, self.blur)
+        scaled = np.exp(unknowns.brightness[k]) * pull
+        of_rays = self.rays.gradient(
+            shot.potential,
+            shot.counts,
+            shot.beam,
+            self._spread_back(k, seen.slope * scaled, unknowns),
+            shot.frame,
+            of_beam=self._has_beam,
+            of_frame=k > 0 and bool(self.free_frames.any()),
+        )
+        value = float(np.einsum("yx,yx", residual, residual)) / 2
+        return _ShotPulls(value, seen, scaled, np.einsum("yx,yx", pull, model), of_rays)
+
+    def _of_each(self, function: Callable[[_Shot], _T], shots: Sequence[_Shot]) -> list[_T]:
+        """Call a function for each image, small ones side by side."""
+        is_small = math.prod(self.rays.seen) <= _MOST_PIXELS_SIDE_BY_SIDE
+        threads = available_threads(self.rays.threads) if is_small else 1
+        return results_of([partial(function, shot) for shot in shots], threads)
 
     def with_free_beam(self, modes: int, variation: float) -> Scene:
         """Return the scene with an unknown beam that differs from the known one by an r.m.s."""
@@ -269,10 +286,12 @@ class Scene:
         """Return the scene to first order around unknowns."""
         shots = list(self._shots(unknowns, counts))
         of_beam, of_frame = self._has_beam, bool(self.free_frames.any())
-        jacobians = [
-            self.rays.jacobian(*shot[1:], of_beam=of_beam, of_frame=shot.number > 0 and of_frame)
-            for shot in shots
-        ]
+
+        def differentiate(shot: _Shot) -> csr_array:
+            of_its_frame = shot.number > 0 and of_frame
+            return self.rays.jacobian(*shot[1:], of_beam=of_beam, of_frame=of_its_frame)
+
+        jacobians = self._of_each(differentiate, shots)
         if not of_beam and not of_frame:
             columns = math.prod(self.rays.shape)
             for jacobian in jacobians:
@@ -544,6 +563,16 @@ class _Seen:
         for is_common, place, values in self.effects:
             derivatives = slope.common if is_common else slope.separate[k]
             derivatives[place] += np.einsum("yx,yx", pull, values)
+
+
+class _ShotPulls(NamedTuple):
+    """An image's part of the objective, and its derivatives by all that it depends on."""
+
+    value: float
+    seen: _Seen
+    scaled: FloatArray  # by the image without its brightness
+    of_brightness: float
+    of_rays: Pulls
 
 
 @dataclass(frozen=True)
