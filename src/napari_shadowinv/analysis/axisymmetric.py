@@ -40,7 +40,11 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact
 from napari_shadowinv.inversion.error_bars import Quantity
-from napari_shadowinv.physics.beam import displacement_from_potential, length_text
+from napari_shadowinv.physics.beam import (
+    displacement_from_potential,
+    length_text,
+    number_field,
+)
 from napari_shadowinv.physics.units import PIXEL
 
 __all__ = ["AxisymmetricProfile", "AzimuthalProfile"]
@@ -104,34 +108,25 @@ class AxisymmetricProfile(Product):
         title="Inclined",
         description="Whether an axis that is to be found may be inclined.",
     )
-    radius: float | None = Field(
-        default=None,
+    radius: float | None = number_field(
+        "Radius (px)",
+        "Distance from the axis in px beyond which the object is undisturbed. Default: the "
+        "nearest edge of the image.",
+        None,
         ge=_MIN_RADIUS_PX,
-        allow_inf_nan=False,
-        title="Radius (px)",
-        description=(
-            "Distance from the axis in px beyond which the object is undisturbed. Default: the "
-            "nearest edge of the image."
-        ),
     )
-    slice_width: float = Field(
-        default=1.0,
+    slice_width: float = number_field(
+        "Slice (px)",
+        "Length along the axis in px over which a profile is averaged. 0: the whole axis.",
+        1.0,
         ge=0,
-        allow_inf_nan=False,
-        title="Slice (px)",
-        description=(
-            "Length along the axis in px over which a profile is averaged. 0: the whole axis."
-        ),
     )
-    smoothing: float | None = Field(
-        default=None,
+    smoothing: float | None = number_field(
+        "Smoothing",
+        "Weight of the profile's second differences against the deflections. Default: as "
+        "far as its error stays a quarter of that by noise, which the halves show.",
+        None,
         ge=0,
-        allow_inf_nan=False,
-        title="Smoothing",
-        description=(
-            "Weight of the profile's second differences against the deflections. Default: as "
-            "far as its error stays a quarter of that by noise, which the halves show."
-        ),
     )
     component: Literal["azimuthal", "axial"] = Field(
         default="azimuthal",
@@ -141,31 +136,24 @@ class AxisymmetricProfile(Product):
             "as that of a coil. An azimuthal field is not visible from the side."
         ),
     )
-    gladstone_dale: float | None = Field(
-        default=None,
+    gladstone_dale: float | None = number_field(
+        "Gladstone-Dale constant (m³/kg)",
+        "(η - 1)/ρ of the gas in m³/kg, 2.26e-4 for air in visible light: gives the density.",
+        None,
         gt=0,
-        allow_inf_nan=False,
-        title="Gladstone-Dale constant (m³/kg)",
-        description=(
-            "(η - 1)/ρ of the gas in m³/kg, 2.26e-4 for air in visible light: gives the density."
-        ),
     )
-    ambient_density: float | None = Field(
-        default=None,
+    ambient_density: float | None = number_field(
+        "Ambient density (kg/m³)",
+        "Density of the undisturbed gas in kg/m³, 1.20 for air at 20 °C.",
+        None,
         gt=0,
-        allow_inf_nan=False,
-        title="Ambient density (kg/m³)",
-        description="Density of the undisturbed gas in kg/m³, 1.20 for air at 20 °C.",
     )
-    ambient_temperature: float | None = Field(
-        default=None,
+    ambient_temperature: float | None = number_field(
+        "Ambient temperature (K)",
+        "Temperature of the undisturbed gas in K: gives that of the object, an ideal gas of "
+        "the same composition at the same pressure.",
+        None,
         gt=0,
-        allow_inf_nan=False,
-        title="Ambient temperature (K)",
-        description=(
-            "Temperature of the undisturbed gas in K: gives that of the object, an ideal gas of "
-            "the same composition at the same pressure."
-        ),
     )
     axis_error: float | None = Field(
         default=None,
@@ -535,12 +523,11 @@ class AzimuthalProfile(Product):
         description="Centre (y, x) of the circles in px.",
         json_schema_extra={"metavar": "Y,X"},
     )
-    radius: float | None = Field(
-        default=None,
+    radius: float | None = number_field(
+        "Radius (px)",
+        "Radius of the largest circle in px. Default: up to the edge of the image.",
+        None,
         ge=_MIN_RADIUS_PX,
-        allow_inf_nan=False,
-        title="Radius (px)",
-        description="Radius of the largest circle in px. Default: up to the edge of the image.",
     )
 
     def check(self, frame: FieldFrame) -> None:

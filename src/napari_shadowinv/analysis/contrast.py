@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis._derivatives import first_derivative, second_derivative
@@ -21,6 +20,7 @@ from napari_shadowinv.analysis.product import Variable
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.physics.beam import number_field
 
 __all__ = ["Contrast"]
 
@@ -51,14 +51,11 @@ class Contrast(Smoothed):
     lengths = ("scale",)
     reference = "A. F. A. Bott et al., J. Plasma Phys. 83, 905830614 (2017)"
     product: Literal["contrast"] = "contrast"
-    object_length: float | None = Field(
-        default=None,
+    object_length: float | None = number_field(
+        "Object length (m)",
+        "Length of the object along the beam, in m, for the diffusive regime. Default: unknown.",
+        None,
         gt=0,
-        allow_inf_nan=False,
-        title="Object length (m)",
-        description=(
-            "Length of the object along the beam, in m, for the diffusive regime. Default: unknown."
-        ),
     )
 
     def _width(self, plane: FloatArray, noise: FloatArray, spacing: float) -> float:

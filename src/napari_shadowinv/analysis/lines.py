@@ -19,6 +19,7 @@ from napari_shadowinv.analysis.paths import (
 from napari_shadowinv.analysis.product import Coordinate, Product, Variable, mask_cautions
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.physics.beam import number_field
 
 __all__ = ["LineProfile", "Path"]
 
@@ -67,15 +68,12 @@ class LineProfile(Product):
     recorded = ("intensity",)
     product: Literal["profile"] = "profile"
     path: Path = path_field("Corners of the line or path, (y, x) in px.")
-    width: float = Field(
-        default=0.0,
+    width: float = number_field(
+        "Width (px)",
+        "Width of the strip across the line over which values are averaged, in px. 0: values "
+        "on the line.",
+        0.0,
         ge=0,
-        allow_inf_nan=False,
-        title="Width (px)",
-        description=(
-            "Width of the strip across the line over which values are averaged, in px. 0: values "
-            "on the line."
-        ),
     )
 
     def check(self, frame: FieldFrame) -> None:

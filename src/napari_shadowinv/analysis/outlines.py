@@ -13,6 +13,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.paths import circle_path
 from napari_shadowinv.analysis.product import Product
+from napari_shadowinv.physics.beam import number_field
 
 __all__ = ["Outlined", "crosses_itself"]
 
@@ -37,12 +38,11 @@ class Outlined(Product):
         description="Centre (y, x) of a circle, in px.",
         json_schema_extra={"metavar": "Y,X"},
     )
-    radius: float | None = Field(
-        default=None,
+    radius: float | None = number_field(
+        "Radius (px)",
+        "Radius of the circle, in px.",
+        None,
         gt=0,
-        allow_inf_nan=False,
-        title="Radius (px)",
-        description="Radius of the circle, in px.",
     )
     rectangle: Annotated[tuple[Point, Point] | None, AfterValidator(_checked_corners)] = Field(
         default=None,

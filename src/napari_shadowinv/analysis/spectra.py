@@ -47,7 +47,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.inversion.error_bars import Quantity
-from napari_shadowinv.physics.beam import length_text
+from napari_shadowinv.physics.beam import length_text, number_field
 from napari_shadowinv.physics.units import PIXEL
 
 __all__ = ["TurbulenceSpectrum"]
@@ -87,45 +87,33 @@ class TurbulenceSpectrum(Product):
     lengths: ClassVar = ("correlation_length",)
     is_logarithmic: ClassVar = True
     product: Literal["spectrum"] = "spectrum"
-    path_length: float | None = Field(
-        default=None,
+    path_length: float | None = number_field(
+        "Path length (m)",
+        "Length l_z of the turbulence along the beam in m: gives the energy spectrum and the "
+        "r.m.s. field. Default: unknown.",
+        None,
         gt=0,
-        allow_inf_nan=False,
-        title="Path length (m)",
-        description=(
-            "Length l_z of the turbulence along the beam in m: gives the energy spectrum and the "
-            "r.m.s. field. Default: unknown."
-        ),
     )
-    correlation_length: float | None = Field(
-        default=None,
+    correlation_length: float | None = number_field(
+        "Correlation length (m)",
+        "Correlation length of the field in m, for the r.m.s. field from ⟨|b|²⟩ alone. "
+        "Default: that of the spectrum, (π/2) ∫E/k dk / ∫E dk.",
+        None,
         gt=0,
-        allow_inf_nan=False,
-        title="Correlation length (m)",
-        description=(
-            "Correlation length of the field in m, for the r.m.s. field from ⟨|b|²⟩ alone. "
-            "Default: that of the spectrum, (π/2) ∫E/k dk / ∫E dk."
-        ),
     )
-    longest: float | None = Field(
-        default=None,
+    longest: float | None = number_field(
+        "Longest wavelength (px)",
+        "Longest wavelength of the range of slope and r.m.s. field, in px. Default: a third of "
+        "the window.",
+        None,
         gt=0,
-        allow_inf_nan=False,
-        title="Longest wavelength (px)",
-        description=(
-            "Longest wavelength of the range of slope and r.m.s. field, in px. Default: a third of "
-            "the window."
-        ),
     )
-    shortest: float | None = Field(
-        default=None,
+    shortest: float | None = number_field(
+        "Shortest wavelength (px)",
+        "Shortest wavelength of that range, in px. Default: where noise, resolution or the "
+        "response of the inversion end what can be trusted.",
+        None,
         gt=0,
-        allow_inf_nan=False,
-        title="Shortest wavelength (px)",
-        description=(
-            "Shortest wavelength of that range, in px. Default: where noise, resolution or the "
-            "response of the inversion end what can be trusted."
-        ),
     )
     slope: bool = Field(
         default=True,

@@ -153,15 +153,10 @@ class BeamQuantity:
         return f"{', '.join(f'{value / size:.{digits}g}' for value in values)} {unit}"
 
 
-def positive_field(title: str, description: str, default: Any = ..., *, most: float) -> Any:
-    """Return the field of a positive number up to a limit."""
+def number_field(title: str, description: str, default: Any = ..., **limits: Any) -> Any:
+    """Return the field of a finite number within limits."""
     return Field(
-        default=default,
-        gt=0,
-        le=most,
-        allow_inf_nan=False,
-        title=title,
-        description=description,
+        default=default, allow_inf_nan=False, title=title, description=description, **limits
     )
 
 
@@ -199,23 +194,26 @@ class BeamSetup(CheckedModel):
         title="Source to object (m)",
         description="Distance l from the beam source to the object, in m; inf if collimated.",
     )
-    object_image_distance: float = positive_field(
+    object_image_distance: float = number_field(
         "Object to image (m)",
         "Distance L from the object to the detector, in m.",
-        most=_MAX_DISTANCE_M,
+        gt=0,
+        le=_MAX_DISTANCE_M,
     )
-    pixel_size: float | None = positive_field(
+    pixel_size: float | None = number_field(
         "Pixel size at the object (m)",
         "Pixel size in the object plane, in m. Give either this or the detector pixel size.",
         None,
-        most=_MAX_PIXEL_M,
+        gt=0,
+        le=_MAX_PIXEL_M,
     )
-    detector_pixel_size: float | None = positive_field(
+    detector_pixel_size: float | None = number_field(
         "Pixel size at the detector (m)",
         "Pixel size in the detector plane, in m; it is divided by the magnification. Give "
         "either this or the pixel size at the object.",
         None,
-        most=_MAX_PIXEL_M,
+        gt=0,
+        le=_MAX_PIXEL_M,
     )
 
     @field_validator("*", mode="before")

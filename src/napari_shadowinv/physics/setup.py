@@ -53,7 +53,7 @@ from napari_shadowinv.physics.beam import (
     field_of_view_text,
     geometry_text,
     length_text,
-    positive_field,
+    number_field,
     scale_by,
     setup_warnings,
 )
@@ -184,10 +184,11 @@ class ProtonSetup(BeamSetup):
     kind: Literal["proton"] = Field(
         default="proton", title="Kind", description="Kind of probe: a beam of charged particles."
     )
-    energy: float = positive_field(
+    energy: float = number_field(
         "Kinetic energy (MeV)",
         "Kinetic energy per particle (not per nucleon), in MeV.",
-        most=_MAX_ENERGY_MEV,
+        gt=0,
+        le=_MAX_ENERGY_MEV,
     )
     species: Species = Field(
         default="proton",
@@ -374,8 +375,8 @@ class OpticalSetup(BeamSetup):
             "Distance l from the beam source to the object, in m. Default: inf (collimated beam)."
         ),
     )
-    wavelength: float = positive_field(
-        "Wavelength (m)", "Vacuum wavelength of the light, in m.", most=1e-2
+    wavelength: float = number_field(
+        "Wavelength (m)", "Vacuum wavelength of the light, in m.", gt=0, le=1e-2
     )
 
     @property

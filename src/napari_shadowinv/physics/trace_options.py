@@ -13,6 +13,7 @@ from typing import Literal
 from pydantic import Field
 
 from napari_shadowinv._system.validation import CheckedModel
+from napari_shadowinv.physics.beam import number_field
 from napari_shadowinv.physics.field_grid import FieldGrid
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -39,28 +40,25 @@ class TraceOptions(CheckedModel):
             "the displacement is interpolated by cubic splines."
         ),
     )
-    counts: float = Field(
-        default=100.0,
+    counts: float = number_field(
+        "Counts per pixel",
+        "Mean number of particles per pixel of the image without the object.",
+        100.0,
         gt=0,
         le=1e6,
-        allow_inf_nan=False,
-        title="Counts per pixel",
-        description="Mean number of particles per pixel of the image without the object.",
     )
-    source_size: float = Field(
-        default=0.0,
+    source_size: float = number_field(
+        "Source size (m)",
+        "Standard deviation of the Gaussian source in m (FWHM / 2.355); for counts.",
+        0.0,
         ge=0,
         le=1.0,
-        allow_inf_nan=False,
-        title="Source size (m)",
-        description="Standard deviation of the Gaussian source in m (FWHM / 2.355); for counts.",
     )
-    energy_spread: float = Field(
-        default=0.0,
+    energy_spread: float = number_field(
+        "Energy spread (MeV)",
+        "Standard deviation of the kinetic energy in MeV; for counts.",
+        0.0,
         ge=0,
-        allow_inf_nan=False,
-        title="Energy spread (MeV)",
-        description="Standard deviation of the kinetic energy in MeV; for counts.",
     )
     step: float = Field(
         default=0.5,
