@@ -12,12 +12,7 @@ import numpy as np
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis._derivatives import finer_displacement, finer_potential
-from napari_shadowinv.analysis._field_samples import (
-    Callbacks,
-    Evaluation,
-    SampledField,
-    sampled_fields,
-)
+from napari_shadowinv.analysis._field_samples import Evaluation, SampledField, sampled_fields
 from napari_shadowinv.analysis.frame import FieldFrame, field_unit
 from napari_shadowinv.analysis.kinds import product_from_dict, product_from_text
 from napari_shadowinv.analysis.product import FieldNoise, Product, Variable
@@ -105,7 +100,7 @@ def analyse(
     chosen_unit = None if unit is None else field_unit(unit)
     content, own_setup = unpack_result(result)
     fields = sampled_fields(content, setup or own_setup, chosen_unit, deflector)
-    callbacks = Callbacks(on_progress, should_stop)
+    callbacks = {"on_progress": on_progress, "should_stop": should_stop}
     tasks = [_Task(each, _products_for(listed, each.frame, len(fields))) for each in fields]
     missing = [each for each in listed if not any(each in task.products for task in tasks)]
     if missing:
@@ -199,9 +194,9 @@ class _Task:
         headline: Fact,
     ) -> list[ProductResult]:
         """Return the results, with systematic errors of random sign added to the samples."""
-        systematic = {**evaluation.systematic, **self._by_energy()}
+        systematic = {**evaluation.systematic, **self._by_energy(evaluation.value)}
         if len(evaluation.samples):
-            systematic |= self._by_readout() | self._by_product()
+            systematic |= self._by_readout(evaluation.value) | self._by_product()
         samples = evaluation.samples
         for error in systematic.values():
             for sample, strength in zip(samples, _standard_numbers(rng, len(samples)), strict=True):
@@ -232,25 +227,20 @@ class _Task:
             )
         ]
 
-    def _by_energy(self) -> dict[str, FloatArray]:
+    def _by_energy(self, value: FloatArray) -> dict[str, FloatArray]:
         """Return the errors by the energy of the beam, which scales fields in SI units."""
         frame, share = self.field.frame, self.field.instrument.energy
         if not share or frame.setup is None or frame.unit.field == "displacement":
             return {}
-        share *= abs(frame.setup.sensitivity_to_beam(frame.unit.field))
-        values, scaled = (self._in_energy(factor) for factor in (1.0, 1.0 + share))
-        noun = frame.setup.beam_quantity().noun
-        return {f"{noun}, {100 * self.field.instrument.energy:.2g} %": scaled - values}
+        factor = 1.0 + share * abs(frame.setup.sensitivity_to_beam(frame.unit.field))
+        scaled = self.measure(factor * self.field.potential, factor * self.field.displacement)
+        return {f"{frame.setup.beam_quantity().noun}, {100 * share:.2g} %": scaled - value}
 
-    def _in_energy(self, factor: float) -> FloatArray:
-        return self.measure(factor * self.field.potential, factor * self.field.displacement)
-
-    def _by_readout(self) -> dict[str, FloatArray]:
+    def _by_readout(self, value: FloatArray) -> dict[str, FloatArray]:
         """Return the errors by means over pixels, and by central differences of the read-out."""
-        potential, displacement = self.field.potential, self.field.displacement
-        finer_plane = finer_potential(potential)
-        finer = self.measure(finer_plane, finer_displacement(finer_plane, displacement))
-        return {"pixels": finer - self.measure(potential, displacement)}
+        finer_plane = finer_potential(self.field.potential)
+        finer = finer_displacement(finer_plane, self.field.displacement)
+        return {"pixels": self.measure(finer_plane, finer) - value}
 
     def _by_product(self) -> dict[str, FloatArray]:
         """Return the errors by the products' own methods."""

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,6 +35,9 @@ Measure = Callable[[FloatArray, FloatArray], FloatArray]
 Choose = Callable[[FieldNoise | None], Measure]
 """Returns the measure, with the choices that follow from the noise."""
 
+Callbacks = dict[str, Any]
+"""Arguments `on_progress` and `should_stop` by their names."""
+
 _COARSER = 4  # times fewer sites
 _MIN_COARSE_SITES = 16
 _PILOT_SAMPLES = 8
@@ -59,64 +61,30 @@ class Evaluation:
     cautions: tuple[Caution, ...] = ()
 
 
-class SampledField(Protocol):
-    """A field and the scatter of products of it."""
-
-    @property
-    def frame(self) -> FieldFrame: ...
-
-    @property
-    def potential(self) -> FloatArray: ...
-
-    @property
-    def displacement(self) -> FloatArray: ...
-
-    @property
-    def instrument(self) -> Instrument: ...
-
-    def evaluate(self, choose: Choose, samples: int, report: Callbacks) -> Evaluation:
-        """Measure the field and samples of its errors."""
-
-
-@dataclass(frozen=True)
-class Callbacks:
-    """Arguments `on_progress` and `should_stop`."""
-
-    on_progress: Any = None
-    should_stop: Any = None
-
-    @property
-    def keywords(self) -> dict[str, Any]:
-        return {"on_progress": self.on_progress, "should_stop": self.should_stop}
-
-
 @dataclass(frozen=True, eq=False)
-class BareField:
-    """A field whose errors are not known."""
-
-    frame: FieldFrame
-    potential: FloatArray
-    displacement: FloatArray
-    instrument: Instrument = dataclasses.field(default_factory=Instrument)
-
-    def evaluate(self, choose: Choose, samples: int, report: Callbacks) -> Evaluation:
-        value = choose(None)(self.potential, self.displacement)
-        return Evaluation(value, np.zeros((0, value.size)), {}, ())
-
-
-@dataclass(frozen=True, eq=False)
-class StoredSamples:
-    """A fitted field with stored changes of its potential, (n, H, W)."""
+class SampledField:
+    """A field and the scatter of products of it; here one whose errors are not known."""
 
     frame: FieldFrame
     potential: FloatArray
     displacement: FloatArray
     instrument: Instrument
+
+    def evaluate(self, choose: Choose, samples: int, callbacks: Callbacks) -> Evaluation:
+        """Measure the field and samples of its errors."""
+        value = choose(None)(self.potential, self.displacement)
+        return Evaluation(value, np.zeros((0, value.size)), {}, ())
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSamples(SampledField):
+    """A fitted field with stored changes of its potential, (n, H, W)."""
+
     changes: FloatArray
     causes: tuple[str, ...]
 
-    def evaluate(self, choose: Choose, samples: int, report: Callbacks) -> Evaluation:
-        reporter = Reporter(**report.keywords)
+    def evaluate(self, choose: Choose, samples: int, callbacks: Callbacks) -> Evaluation:
+        report = Reporter(**callbacks)
         pilot = np.asarray(self.changes[:_PILOT_SAMPLES], dtype=np.float64)
         measure = choose(FieldNoise(pilot))
         value = measure(self.potential, self.displacement)
@@ -124,45 +92,32 @@ class StoredSamples:
         check_samples(count, value.size)
         scatter = np.empty((count, value.size), sample_type(value.size))
         for index, change in enumerate(self.changes[:count]):
-            reporter("samples", index, count)
+            report("samples", index, count)
             moved = self.displacement + displacement_from_potential(change)
             scatter[index] = measure(self.potential + change, moved)
         return Evaluation(value, scatter, {}, self.causes)
 
 
 @dataclass(frozen=True, eq=False)
-class ResampledInversion:
+class ResampledInversion(SampledField):
     """An inversion, of which samples are drawn by its noise and instrument."""
 
-    frame: FieldFrame
     inversion: Inversion
 
-    @property
-    def potential(self) -> FloatArray:
-        return self.inversion.potential
-
-    @property
-    def displacement(self) -> FloatArray:
-        return self.inversion.displacement
-
-    @property
-    def instrument(self) -> Instrument:
-        return self.inversion.instrument
-
-    def evaluate(self, choose: Choose, samples: int, report: Callbacks) -> Evaluation:
+    def evaluate(self, choose: Choose, samples: int, callbacks: Callbacks) -> Evaluation:
         inversion = self.inversion
         options, noise = recorded_shot(inversion)
         mask = None if inversion.mask.all() else inversion.mask
         plan = plan_sites(
             inversion.source, options, mask=mask, measured=has_measured_source(inversion),
-            **report.keywords,
+            **callbacks,
         )  # fmt: skip
-        coarse = self._coarse_field(report)
+        coarse = self._coarse_inversion(callbacks)
         measures: list[Measure] = []
 
         def quantities(changes: FloatArray) -> dict[str, Measure]:
             spacing = (inversion.image.size / number_of_inner_sites(inversion)) ** 0.5
-            measures.append(choose(FieldNoise(changes, spacing, Reporter(**report.keywords))))
+            measures.append(choose(FieldNoise(changes, spacing, Reporter(**callbacks))))
             size = measures[0](self.potential, self.displacement).size
             check_samples(samples, size)
             kind = sample_type(size)
@@ -176,15 +131,16 @@ class ResampledInversion:
             instrument=inversion.instrument,
             quantities=quantities,
             plan=plan,
-            **report.keywords,
+            **callbacks,
         )
         (measure,) = measures
         value = measure(self.potential, self.displacement)
         repeated = scatter.quantities["all"]
         systematic, causes = {}, ["noise", *scatter.imperfections]
         if coarse is not None:
+            share = discretisation_share(len(inversion.sites) / len(coarse.sites))
             change = value - measure(coarse.potential, coarse.displacement)
-            systematic["discretisation"] = coarse.share * change
+            systematic["discretisation"] = share * change
         cautions = list(self._sample_cautions(scatter))
         cautions += self._repeat_cautions(scatter.inversion)
         shifted = repeated.samples
@@ -199,7 +155,7 @@ class ResampledInversion:
             return
         yield from (each for each in scatter.warnings if each.code == "samples")
 
-    def _coarse_field(self, report: Callbacks) -> CoarseField | None:
+    def _coarse_inversion(self, callbacks: Callbacks) -> Inversion | None:
         """Invert the image with a quarter of the sites; None if these are too few."""
         inversion = self.inversion
         options, _ = recorded_shot(inversion)
@@ -212,12 +168,9 @@ class ResampledInversion:
             mask=None if inversion.mask.all() else inversion.mask,
             options=options.model_copy(update={"n_sites": count}),
             instrument=inversion.instrument,
-            **report.keywords,
+            **callbacks,
         )
-        times = len(inversion.sites) / len(coarse.sites)
-        if not times > 1:
-            return None
-        return CoarseField(coarse.potential, coarse.displacement, discretisation_share(times))
+        return coarse if len(coarse.sites) < len(inversion.sites) else None
 
     def _repeat_cautions(self, repeated: Inversion) -> Iterator[Caution]:
         change = float(np.linalg.norm(repeated.displacement - self.displacement))
@@ -228,15 +181,6 @@ class ResampledInversion:
                 f"the samples belong to an inversion that differs from the result by {share:.0%} "
                 "(r.m.s.): the bands may be too narrow; invert the image again",
             )
-
-
-@dataclass(frozen=True, eq=False)
-class CoarseField:
-    """Solution with fewer sites, and the discretisation error as a share of the change."""
-
-    potential: FloatArray
-    displacement: FloatArray
-    share: float
 
 
 def recorded_shot(inversion: Inversion) -> tuple[Any, Any]:
@@ -327,7 +271,9 @@ def _of_inversion(
     )  # fmt: skip
     is_folded = any(caution.code == "folds" for caution in inversion.cautions)
     frame = replace(frame, has_crossed_rays=is_folded, is_pixel_mean=True)
-    yield ResampledInversion(frame, inversion)
+    yield ResampledInversion(
+        frame, inversion.potential, inversion.displacement, inversion.instrument, inversion
+    )
 
 
 def _of_fit(
@@ -348,7 +294,7 @@ def _of_fit(
 def _fitted(fit: Fit, field: FittedField, frame: FieldFrame) -> SampledField:
     samples = getattr(field, "samples", None)
     if samples is None or not len(samples):
-        return BareField(frame, field.potential, field.displacement, fit.instrument)
+        return SampledField(frame, field.potential, field.displacement, fit.instrument)
     errors = fit.pixel_errors(field)
     causes = ("noise",) if errors is None else errors.causes
     return StoredSamples(
@@ -373,7 +319,7 @@ def _of_field(
     )
     mask = np.asarray(np.isfinite(displacement).all(axis=0))
     frame = make_frame(setup or retrieved.setup, mask, unit, deflector)
-    yield BareField(frame, potential, displacement)
+    yield SampledField(frame, potential, displacement, Instrument())
 
 
 def make_frame(
@@ -400,7 +346,8 @@ def make_frame(
             f"deflector is {deflector!r}, expected one of {', '.join(titles)} for this beam"
         )
     if unit is None:
-        unit = default_unit(setup, titles.get(deflector or "", ""))
+        main = setup.other_fields.get(titles.get(deflector or "", ""), setup.main_field)
+        unit = next(each for each in FIELD_UNITS.values() if each.field == main.name)
     elif not is_field_of(setup, unit, deflector):
         names = {"displacement", *(each.name for each in setup.si_fields)}
         symbols = [each.symbol for each in FIELD_UNITS.values() if each.field in names]
@@ -411,12 +358,6 @@ def make_frame(
     of_unit = [each.deflector for each in setup.si_fields if each.name == unit.field]
     key = deflector or next(filter(None, of_unit), "")
     return FieldFrame((height, width), mask, setup, key, unit, image, source)
-
-
-def default_unit(setup: Setup, deflector: str) -> FieldUnit:
-    """Return the first unit of the field that is shown of a setup."""
-    main = setup.other_fields.get(deflector, setup.main_field)
-    return next(unit for unit in FIELD_UNITS.values() if unit.field == main.name)
 
 
 def is_field_of(setup: Setup, unit: FieldUnit, deflector: str | None) -> bool:
