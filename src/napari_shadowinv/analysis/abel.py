@@ -92,10 +92,8 @@ def projection_matrix(count: int, offset: float = 0.0) -> FloatArray:
 
     Parameters
     ----------
-    count : int
-        Number of radii, R in px; at least 4, else an `InputError`.
-    offset : float
-        From 0 to 1 px.
+    count, offset
+        As of `deflection_matrix`.
 
     Returns
     -------

@@ -8,7 +8,7 @@ circulation around an outline is the outward flux of the deflection.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from scipy import constants
@@ -73,12 +73,24 @@ class Flux(Product):
 class _Enclosed(Outlined):
     """Outward flux of the deflection through an outline, which follows from what is inside."""
 
-    def _outward_flux(self, displacement: FloatArray) -> float:
-        """Return the outward flux of a displacement through the outline, px²."""
+    unit: ClassVar[str]
+    long_name: ClassVar[str]
+
+    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+        return {self.name(): Variable((), self.unit, self.long_name)}
+
+    def measure(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> dict[str, FloatArray]:
         points, sides = edge_midpoints(self.outline, _STEP_PX)
         down, right = (interpolate_cubic(plane, points) for plane in displacement)
         # From x to y around the outline, outwards is to the left of the direction.
-        return float((right * sides[:, 0] - down * sides[:, 1]).sum())
+        outward = float((right * sides[:, 0] - down * sides[:, 1]).sum())
+        return {self.name(): np.asarray(self._per_flux(frame) * outward * frame.pixel)}
+
+    def _per_flux(self, frame: FieldFrame) -> float:
+        """Return the content of an outline by an outward flux of the displacement of 1 px · m."""
+        raise NotImplementedError
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
         return mask_cautions(edge_midpoints(self.outline, _STEP_PX)[0], frame, "the outline")
@@ -93,16 +105,12 @@ class EnclosedCurrent(_Enclosed):
     title = "enclosed current"
     place = 40
     fields = (_B,)
+    unit = "A m"
+    long_name = "Current inside the outline, integrated along z"
     product: Literal["current"] = "current"
 
-    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
-        return {"current": Variable((), "A m", "Current inside the outline, integrated along z")}
-
-    def measure(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
-        outward = self._outward_flux(displacement)
-        return {"current": np.asarray(current_factor(frame) * outward * frame.pixel)}
+    def _per_flux(self, frame: FieldFrame) -> float:
+        return current_factor(frame)
 
     def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
         return (
@@ -117,16 +125,12 @@ class EnclosedCharge(_Enclosed):
     title = "enclosed charge"
     place = 50
     fields = (_E,)
+    unit = "C"
+    long_name = "Charge inside the outline"
     product: Literal["charge"] = "charge"
 
-    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
-        return {"charge": Variable((), "C", "Charge inside the outline")}
-
-    def measure(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
-        outward = self._outward_flux(displacement)
-        return {"charge": np.asarray(charge_factor(frame) * outward * frame.pixel)}
+    def _per_flux(self, frame: FieldFrame) -> float:
+        return charge_factor(frame)
 
     def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
         return (

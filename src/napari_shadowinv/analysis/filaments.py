@@ -111,15 +111,14 @@ class Filaments(Product):
         if self.angle is not None:
             return self
         displacement = displacement_from_potential(potential)
-        angle, _ = _direction(displacement, window_weights(frame.mask, _TAPER))
-        return self.model_copy(update={"angle": float(angle)})
+        angle = _direction(displacement, window_weights(frame.mask, _TAPER))
+        return self.model_copy(update={"angle": angle})
 
-    def _across(self, displacement: FloatArray, frame: FieldFrame) -> FloatArray:
+    def _across(self, displacement: FloatArray, weights: FloatArray) -> FloatArray:
         """Return the unit vector (y, x) across the filaments."""
-        angle = self.angle
-        if angle is None:
-            angle, _ = _direction(displacement, window_weights(frame.mask, _TAPER))
-        radians = math.radians(angle)
+        radians = math.radians(
+            _direction(displacement, weights) if self.angle is None else self.angle
+        )
         return np.array([math.cos(radians), -math.sin(radians)])
 
     def _lags(self, frame: FieldFrame) -> FloatArray:
@@ -150,13 +149,13 @@ class Filaments(Product):
     ) -> dict[str, FloatArray]:
         potential, displacement = frame.at_points(potential, displacement)
         weights = window_weights(frame.mask, _TAPER)
-        across = self._across(displacement, frame)
+        across = self._across(displacement, weights)
         component = np.tensordot(across, displacement, axes=1)
         plane = field_autocorrelation(component, weights)
         lags = self._lags(frame)
         correlation = _along(plane, across, lags)
         along = _along(plane, np.array([-across[1], across[0]]), lags)
-        zero = _first_zero(correlation, lags)
+        zero = _first_below(correlation, lags, 0.0)
         length, half = _reach(along, lags), _reach(correlation, lags)
         scatter = _scatter(weights, zero / math.sqrt(2), length)
         spacing, order = _next_maximum(correlation, lags, _PEAK_ERRORS * scatter)
@@ -215,27 +214,23 @@ class Filaments(Product):
         return cautions
 
     def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
-        remarks = [
+        return (
             "Size and spacing are those of the field; the bright lines of the image are spaced by "
-            "the size of filaments (Levesque et al.), and their number along the beam is unknown."
-        ]
-        remarks.append(
+            "the size of filaments (Levesque et al.), and their number along the beam is unknown.",
             "No spacing is stated (NaN) where the autocorrelation has no further maximum above "
-            "the scatter of structures at random places."
+            "the scatter of structures at random places.",
         )
-        return tuple(remarks)
 
 
-def _direction(displacement: FloatArray, weights: FloatArray) -> tuple[float, float]:
-    """Return the angle of the filaments in degrees, and how far it is defined, from 0 to 1."""
+def _direction(displacement: FloatArray, weights: FloatArray) -> float:
+    """Return the angle of the filaments in degrees."""
     y, x = displacement - (weights * displacement).sum(axis=(1, 2), keepdims=True) / weights.sum()
     yy, xx, yx = (float((weights * each).sum()) for each in (y * y, x * x, y * x))
     if not yy + xx > 0:
         raise InputError("the field is zero everywhere, expected one with filaments")
     # The displacement is strongest across filaments.
     across = math.degrees(0.5 * math.atan2(2 * yx, xx - yy))
-    angle = across + 90 if across <= 0 else across - 90
-    return angle, math.hypot(xx - yy, 2 * yx) / (yy + xx)
+    return across + 90 if across <= 0 else across - 90
 
 
 def _along(plane: FloatArray, direction: FloatArray, lags: FloatArray) -> FloatArray:
@@ -256,10 +251,6 @@ def _first_below(values: FloatArray, lags: FloatArray, level: float) -> float:
     last = below[0]
     step = (values[last - 1] - level) / (values[last - 1] - values[last])
     return float(lags[last - 1] + step * (lags[last] - lags[last - 1]))
-
-
-def _first_zero(values: FloatArray, lags: FloatArray) -> float:
-    return _first_below(values, lags, 0.0)
 
 
 def _reach(values: FloatArray, lags: FloatArray) -> float:
@@ -314,11 +305,8 @@ def _next_maximum(values: FloatArray, lags: FloatArray, least: float) -> tuple[f
     multiple = lags[high[0]] / lags[peaks]
     is_spacing = np.abs(multiple - np.round(multiple)) < _MULTIPLE_ERROR * np.round(multiple)
     peak = peaks[np.flatnonzero(is_spacing)[0]]
-    return _vertex(values[peak - 1 : peak + 2], lags[peak - 1 : peak + 2])
-
-
-def _vertex(values: FloatArray, lags: FloatArray) -> tuple[float, float]:
-    """Return lag and height of the top of the parabola through three values at equal steps."""
-    low, middle, high = (float(each) for each in values)
+    # The top of the parabola through three values
+    low, middle, high = (float(value) for value in values[peak - 1 : peak + 2])
     shift = (high - low) / (2 * (2 * middle - low - high))
-    return float(lags[1]) + shift * float(lags[1] - lags[0]), middle + shift * (high - low) / 4
+    step = float(lags[peak] - lags[peak - 1])
+    return float(lags[peak]) + shift * step, middle + shift * (high - low) / 4

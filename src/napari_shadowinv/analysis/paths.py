@@ -93,12 +93,7 @@ def sample_strip(
     """Return points (m, n, 2) of a strip: at n distances, m points across the path."""
     corners, cumulative_length = _corners(vertices)
     points = _points_at(corners, cumulative_length, distance)
-    edges = np.diff(corners, axis=0)
-    edge = np.clip(
-        np.searchsorted(cumulative_length, distance, side="right") - 1, 0, len(edges) - 1
-    )
-    lengths = np.maximum(np.hypot(*edges.T), np.finfo(float).tiny)
-    along_y, along_x = (edges / lengths[:, None])[edge].T
+    along_y, along_x = path_directions(vertices, distance).T
     across = np.stack([along_x, -along_y], axis=1)
     count = min(max(int(np.ceil(width / step - 1e-9)), 1), _MAX_SAMPLES)
     offsets = width * ((np.arange(count) + 0.5) / count - 0.5)

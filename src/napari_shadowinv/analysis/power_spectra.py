@@ -26,7 +26,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.optimize import minimize_scalar
 
 from napari_shadowinv._system.progress import Reporter, ShouldStop
-from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import InversionOptions
@@ -120,11 +120,6 @@ class RingSpectrum:
         return np.asarray(self.power / (2 * np.pi * self.k))
 
 
-def ring_numbers(k: FloatArray, width: float) -> IntArray:
-    """Return the ring of each mode: 1 for wavenumbers around `width`."""
-    return np.rint(k / width).astype(np.int64)
-
-
 def ring_spectrum(potential: FloatArray, weights: FloatArray) -> RingSpectrum:
     """Return the spectrum of the displacement d = -∇φ in a window.
 
@@ -153,7 +148,7 @@ def ring_spectrum(potential: FloatArray, weights: FloatArray) -> RingSpectrum:
     of_displacement = modes * k**2 / operator**2
     width = 2 * np.pi / min(potential.shape)
     count = int(0.9 * np.pi / width)
-    rings = np.minimum(ring_numbers(k, width), count + 1).ravel()
+    rings = np.minimum(np.rint(k / width).astype(np.int64), count + 1).ravel()
     size = count + 2
     summed = np.bincount(rings, of_displacement.ravel(), size)[1 : count + 1]
     number = np.bincount(rings, minlength=size)[1 : count + 1]

@@ -480,14 +480,9 @@ class TurbulenceSpectrum(Product):
         rings = np.flatnonzero(quantities["trusted"].value)
         k = self.coordinates(frame)["k"]
         if len(rings):
-            low, high = (float(length) for length in 2 * np.pi / k.values[rings[[-1, 0]]])
-            texts = (
-                [f"{length:.3g} px" for length in (low, high)]
-                if frame.setup is None
-                else [length_text(length) for length in (low, high)]
-            )
-            text = f"wavelengths of {texts[0]} to {texts[1]}"
-            facts.append(Fact("range", "Trusted range", text))
+            text_of = "{:.3g} px".format if frame.setup is None else length_text
+            low, high = (text_of(float(length)) for length in 2 * np.pi / k.values[rings[[-1, 0]]])
+            facts.append(Fact("range", "Trusted range", f"wavelengths of {low} to {high}"))
         else:
             facts.append(Fact("range", "Trusted range", "none", Level.DOUBTFUL))
         return facts
