@@ -26,7 +26,7 @@ from napari_shadowinv.physics.poisson import potential_from_displacement
 from napari_shadowinv.physics.setup import Setup
 
 if TYPE_CHECKING:
-    from napari_shadowinv.fitting.result import Fit, FittedField
+    from napari_shadowinv.fitting.result import Fit
     from napari_shadowinv.inversion.result import Inversion, RetrievedField
 
 Measure = Callable[[FloatArray, FloatArray], FloatArray]
@@ -288,18 +288,13 @@ def _of_fit(
         image = np.where(fit.mask[0], fit.images[0], np.nan)
         source = np.where(fit.mask[0], fit.source[0], np.nan)
         frame = make_frame(setup, fit.used, unit, field.name, image=image, source=source)
-        yield _fitted(fit, field, frame)
-
-
-def _fitted(fit: Fit, field: FittedField, frame: FieldFrame) -> SampledField:
-    samples = getattr(field, "samples", None)
-    if samples is None or not len(samples):
-        return SampledField(frame, field.potential, field.displacement, fit.instrument)
-    errors = fit.pixel_errors(field)
-    causes = ("noise",) if errors is None else errors.causes
-    return StoredSamples(
-        frame, field.potential, field.displacement, fit.instrument, samples, causes
-    )
+        parts = frame, field.potential, field.displacement, fit.instrument
+        if field.samples is None or not len(field.samples):
+            yield SampledField(*parts)
+        else:
+            errors = fit.pixel_errors(field)
+            causes = ("noise",) if errors is None else errors.causes
+            yield StoredSamples(*parts, field.samples, causes)
 
 
 def _of_field(

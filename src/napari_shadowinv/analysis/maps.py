@@ -59,14 +59,10 @@ _WIDTH_WITHOUT_NOISE_PX = 3.0
 _HALF_GAIN = math.sqrt(-2 * math.log(1 - 0.5 ** (1 / ORDER)))
 
 
-def _gaussian_gain(shape: tuple[int, ...], width: float) -> FloatArray:
-    """Gain of a Gaussian for each cosine of a plane."""
-    rows, columns = (np.exp(-0.5 * (np.pi * width * np.arange(n) / n) ** 2) for n in shape)
-    return np.asarray(rows[:, None] * columns)
-
-
 def _gain(shape: tuple[int, ...], width: float, order: int = ORDER) -> FloatArray:
-    return np.asarray(1 - (1 - _gaussian_gain(shape, width)) ** order)
+    """Gain 1 - (1 - G)^order for each cosine of a plane, with G that of a Gaussian."""
+    rows, columns = (np.exp(-0.5 * (np.pi * width * np.arange(n) / n) ** 2) for n in shape)
+    return np.asarray(1 - (1 - rows[:, None] * columns) ** order)
 
 
 def smooth(plane: FloatArray, width: float, order: int = ORDER) -> FloatArray:

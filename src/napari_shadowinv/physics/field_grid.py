@@ -216,7 +216,7 @@ def field_grid(field: Any) -> FieldGrid:
     for variable in map(str, field.data_vars):
         if match := _COMPONENT.fullmatch(variable):
             names[match[1].upper(), match[2].lower()] = variable
-    arrays: dict[str, FloatArray | None] = {}
+    arrays: dict[str, FloatArray] = {}
     for symbol, title in _FIELDS.items():
         present = [axis for axis in AXES if (symbol, axis) in names]
         if present and len(present) < len(AXES):
@@ -226,19 +226,17 @@ def field_grid(field: Any) -> FieldGrid:
                 f"{symbol}{missing}: expected all components of the {title}; add it, as zeros if "
                 "it vanishes"
             )
-        arrays[symbol] = (
-            np.stack([_component(field, names[symbol, axis], places) for axis in AXES])
-            if present
-            else None
-        )
-    if arrays["B"] is None and arrays["E"] is None:
+        if present:
+            components = [_component(field, names[symbol, axis], places) for axis in AXES]
+            arrays[symbol] = np.stack(components)
+    if not arrays:
         content = ", ".join(map(str, field.data_vars)) or "none"
         raise InputError(
             f"the dataset has the variables {content}: expected Bx, By, Bz or Ex, Ey, Ez"
         )
     return FieldGrid(
-        arrays["B"],
-        arrays["E"],
+        arrays.get("B"),
+        arrays.get("E"),
         spacing=[step for step, _, _ in places],
         centre=[centre for _, centre, _ in places],
     )

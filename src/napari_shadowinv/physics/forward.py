@@ -409,8 +409,7 @@ def synthetic_image(
     flux = _checked_source(source, shape)
     if rays_per_pixel < 1:
         raise InputError(f"rays per pixel are {rays_per_pixel}: expected 1 or more")
-    if threads is not None and threads < 1:
-        raise InputError(f"threads is {threads}: expected 1 or more, or None for all cores")
+    available = usable_threads(threads)
     tiles = math.isqrt(rays_per_pixel - 1) + 1
 
     samples = _spline_samples(tiles)
@@ -426,7 +425,6 @@ def synthetic_image(
     bands = _bands(shape[0])
     image = np.zeros(shape)
     report("image", 0, len(bands))
-    available = available_threads(threads)
     pool = ThreadPoolExecutor(available)
     try:
         coefficients = _spline_coefficients(field, available)
@@ -495,6 +493,13 @@ def _fill_determinant(start: int, stop: int, field: FloatArray, determinant: Flo
             dy_dx = of_x0 * field[0, y, x0] + of_x1 * field[0, y, x1] + of_x2 * field[0, y, x2]
             dx_dx = of_x0 * field[1, y, x0] + of_x1 * field[1, y, x1] + of_x2 * field[1, y, x2]
             determinant[y, x] = (1 + dy_dy) * (1 + dx_dx) - dy_dx * dx_dy
+
+
+def usable_threads(threads: int | None) -> int:
+    """Return the number of threads to use, or raise an `InputError` if it is not positive."""
+    if threads is not None and threads < 1:
+        raise InputError(f"threads is {threads}: expected 1 or more, or None for all cores")
+    return available_threads(threads)
 
 
 def checked_displacement(displacement: ArrayLike) -> FloatArray:

@@ -19,13 +19,13 @@ from numpy.typing import ArrayLike
 from scipy import constants
 
 from napari_shadowinv._system.arrays import as_numbers, check_finite
-from napari_shadowinv._system.machine import available_threads, in_ranges
+from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.field_grid import FieldGrid, field_grid
-from napari_shadowinv.physics.forward import MIN_SIDE_PX
+from napari_shadowinv.physics.forward import MIN_SIDE_PX, usable_threads
 from napari_shadowinv.physics.particle_push import (
     TRAPPED,
     UNTOUCHED,
@@ -133,8 +133,7 @@ def trace_particles(
     check_finite("start", starts)
     if not (np.isfinite(energies).all() and (energies > 0).all()):
         raise InputError("energy has values that are not positive numbers: expected MeV above 0")
-    threads = available_threads(checked_threads(threads))
-    flight = Flight(grid, setup, shape, options, threads, Reporter())
+    flight = Flight(grid, setup, shape, options, usable_threads(threads), Reporter())
     return flight.push(points, "particles", energies, starts)
 
 
@@ -168,7 +167,7 @@ def line_integrals(
     in_ranges(
         integrate_rays,
         len(rays),
-        available_threads(checked_threads(threads)),
+        usable_threads(threads),
         _interleave(grid),
         *_nodes(grid),
         rays,
@@ -395,10 +394,3 @@ def checked_shape(shape: Shape) -> Shape:
             "pixels each way"
         )
     return int(shape[0]), int(shape[1])
-
-
-def checked_threads(threads: int | None) -> int | None:
-    """Return a number of threads, or raise an `InputError`."""
-    if threads is not None and threads < 1:
-        raise InputError(f"threads is {threads}: expected 1 or more, or None for all cores")
-    return threads

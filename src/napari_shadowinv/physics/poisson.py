@@ -62,8 +62,9 @@ def poisson_invert(image: ArrayLike, *, source: ArrayLike | None = None) -> Floa
     else:
         beam = _checked_source(source, target.shape)
         ratio = target * (beam.sum() / flux) / beam
-    potential = _solve_neumann(ratio - 1)
-    return potential - border_mean(potential)
+    # The cosines are even about the image's edges, half a pixel outside the outermost centres.
+    rows, columns = (np.pi * np.arange(count) / count for count in target.shape)
+    return _potential_by_cosines(ratio - 1, -(rows[:, None] ** 2 + columns**2))
 
 
 def potential_from_displacement(displacement: FloatArray) -> FloatArray:
@@ -99,12 +100,7 @@ def potential_from_displacement(displacement: FloatArray) -> FloatArray:
     # The cosines diagonalise the sum of squared differences of neighbours.
     rows = 2 - 2 * np.cos(np.pi * np.arange(height) / height)
     columns = 2 - 2 * np.cos(np.pi * np.arange(width) / width)
-    square = rows[:, None] + columns
-    square[0, 0] = 1.0
-    spectrum = dctn(slopes) / square
-    spectrum[0, 0] = 0.0
-    potential: FloatArray = idctn(spectrum)
-    return potential - border_mean(potential)
+    return _potential_by_cosines(slopes, rows[:, None] + columns)
 
 
 def border_mean(potential: ArrayLike) -> float:
@@ -120,18 +116,13 @@ def border_mean(potential: ArrayLike) -> float:
     return float(values[border].mean())
 
 
-def _solve_neumann(laplacian: FloatArray) -> FloatArray:
-    """Solve ∇²φ = laplacian - mean(laplacian) with no gradient across the border."""
-    # The cosines are even about the image's edges, half a pixel outside the outermost centres.
-    height, width = laplacian.shape
-    wave_y = np.pi * np.arange(height) / height
-    wave_x = np.pi * np.arange(width) / width
-    square = wave_y[:, None] ** 2 + wave_x[None, :] ** 2
-    square[0, 0] = 1.0
-    spectrum = dctn(laplacian) / -square
+def _potential_by_cosines(plane: FloatArray, operator: FloatArray) -> FloatArray:
+    """Divide the cosines of a plane by an operator; subtract the mean over the border."""
+    operator[0, 0] = 1.0
+    spectrum = dctn(plane) / operator
     spectrum[0, 0] = 0.0
     potential: FloatArray = idctn(spectrum)
-    return potential
+    return potential - border_mean(potential)
 
 
 def _checked(name: str, values: ArrayLike) -> FloatArray:

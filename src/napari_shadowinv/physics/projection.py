@@ -193,25 +193,6 @@ def displacement_ratio(
     recorded_with, setup, deflector, dispersion
         As for `transferred_displacement`, whose errors this has.
     """
-    factor = _angle_ratio(recorded_with, setup, deflector, dispersion)
-    return factor * float(recorded_with.deflection_angle(1.0) / setup.deflection_angle(1.0))
-
-
-def default_deflector(recorded_with: Setup, setup: Setup) -> str:
-    """Return the default cause of the deflection.
-
-    It is a magnetic field for particles, and a refractive index for light of the same wavelength,
-    for which a plasma gives the same result. An `InputError` is raised if the wavelengths differ,
-    or if one experiment uses particles and the other light.
-    """
-    _require_same_kind(recorded_with, setup)
-    return setup.default_deflector(recorded_with)
-
-
-def _angle_ratio(
-    recorded_with: Setup, setup: Setup, deflector: str | None, dispersion: float
-) -> float:
-    """Deflection angle in the new experiment over that in the old one."""
     if not (math.isfinite(dispersion) and dispersion != 0):
         raise InputError(f"dispersion is {dispersion:g}: it must be a finite number, not 0")
     if deflector is not None and deflector not in deflector_titles().values():
@@ -228,7 +209,19 @@ def _angle_ratio(
             f"deflector is {usual!r}, but the beam is {setup.beam}: expected "
             f"{' or '.join(map(repr, setup.deflector_titles()))}"
         )
-    return setup.angle_ratio(recorded_with, usual) * dispersion
+    factor = setup.angle_ratio(recorded_with, usual) * dispersion
+    return factor * float(recorded_with.deflection_angle(1.0) / setup.deflection_angle(1.0))
+
+
+def default_deflector(recorded_with: Setup, setup: Setup) -> str:
+    """Return the default cause of the deflection.
+
+    It is a magnetic field for particles, and a refractive index for light of the same wavelength,
+    for which a plasma gives the same result. An `InputError` is raised if the wavelengths differ,
+    or if one experiment uses particles and the other light.
+    """
+    _require_same_kind(recorded_with, setup)
+    return setup.default_deflector(recorded_with)
 
 
 def _require_same_kind(recorded_with: Setup, setup: Setup) -> None:

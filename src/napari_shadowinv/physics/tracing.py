@@ -13,7 +13,6 @@ relativistic Boris scheme of `napari_shadowinv.physics.particle_push`.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,7 +24,6 @@ from scipy.ndimage import distance_transform_edt
 
 from napari_shadowinv import __version__
 from napari_shadowinv._system.arrays import PLANE, as_numbers, check_finite, plain_array
-from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model
@@ -33,7 +31,7 @@ from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.physics.field_grid import FieldGrid, field_grid
-from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.forward import synthetic_image, usable_threads
 from napari_shadowinv.physics.particle_flight import (
     PARTICLES_PER_BLOCK,
     Flight,
@@ -41,7 +39,6 @@ from napari_shadowinv.physics.particle_flight import (
     TracedParticles,
     check_particles,
     checked_shape,
-    checked_threads,
     image_range,
     line_integrals,
     pixel_centres,
@@ -309,9 +306,7 @@ def trace(
         raise InputError(f"seed is {seed}: expected a whole number, 0 or more")
     report = Reporter(on_progress, should_stop)
     report("field", 0)
-    flight = Flight(
-        grid, setup, shape, options, available_threads(checked_threads(threads)), report
-    )
+    flight = Flight(grid, setup, shape, options, usable_threads(threads), report)
     centres = pixel_centres(*image_range(shape), 1)
     straight = flight.push(centres, "rays")
     plane = (2, *shape)
@@ -346,18 +341,13 @@ def trace(
 
 
 def traced_displacement(
-    field: FieldGrid,
-    setup: ProtonSetup,
-    shape: Shape = (200, 200),
-    *,
-    options: TraceOptions | None = None,
-    threads: int | None = None,
+    field: FieldGrid, setup: ProtonSetup, shape: Shape = (200, 200)
 ) -> FloatArray:
     """Return the displacement of the ray through each pixel as `trace` does, without an image.
 
     Parameters
     ----------
-    field, setup, shape, options, threads
+    field, setup, shape
         As of `trace`.
 
     Returns
@@ -371,10 +361,8 @@ def traced_displacement(
         As of `trace`, or if a ray does not reach the detector.
     """
     check_particles(setup)
-    options = as_model(TraceOptions, options, "options")
-    size = checked_shape(shape)
-    count = available_threads(checked_threads(threads))
-    flight = Flight(field_grid(field), setup, size, options, count, Reporter())
+    size, threads = checked_shape(shape), usable_threads(None)
+    flight = Flight(field_grid(field), setup, size, TraceOptions(), threads, Reporter())
     rays = flight.push(pixel_centres(*image_range(size), 1), "rays")
     if rays.lost.any():
         raise InputError(
@@ -461,19 +449,12 @@ def _count(
         steps += int(particles.steps.sum())
         if options.keep_particles:
             batches.append(particles)
-    names = [part.name for part in dataclasses.fields(TracedParticles)]
-    particles_of_all = (
-        TracedParticles(
-            *(
-                np.concatenate([getattr(batch, name) for batch in batches], axis=-1)
-                for name in names
-            )
-        )
-        if batches
-        else None
-    )
+    all_particles = None
+    if batches:
+        arrays = zip(*(vars(batch).values() for batch in batches), strict=True)
+        all_particles = TracedParticles(*(np.concatenate(parts, axis=-1) for parts in arrays))
     counts = image.reshape(flight.shape).astype(np.float64)
-    return counts, source * scale, _Tally(total, landed, lost, steps), particles_of_all
+    return counts, source * scale, _Tally(total, landed, lost, steps), all_particles
 
 
 def _is_inside(landing: FloatArray, shape: Shape) -> AnyArray:
@@ -604,16 +585,13 @@ def _shadow(flight: Flight) -> FloatArray:
 
 def _check_choices(options: TraceOptions, setup: ProtonSetup, spectrum: ArrayLike | None) -> None:
     if options.output == "fluence":
-        names = [
-            name
-            for name, is_set in (
-                ("source_size", options.source_size > 0),
-                ("energy_spread", options.energy_spread > 0),
-                ("spectrum", spectrum is not None),
-                ("keep_particles", options.keep_particles),
-            )
-            if is_set
-        ]
+        choices = {
+            "source_size": options.source_size > 0,
+            "energy_spread": options.energy_spread > 0,
+            "spectrum": spectrum is not None,
+            "keep_particles": options.keep_particles,
+        }
+        names = [name for name, is_set in choices.items() if is_set]
         if names:
             raise InputError(
                 f"{' and '.join(names)} cannot be used for a fluence, which has one ray a point: "

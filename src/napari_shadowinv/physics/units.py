@@ -252,14 +252,11 @@ def place_coordinates(
     plane : str, optional
         The plane for the long names.
     """
-    coordinates: dict[str, Any] = {}
-    for name, count in zip(PLANE, shape, strict=True):
-        index = np.arange(count, dtype=np.float64)
-        if pixel_size is None:
-            coordinates[name] = (name, index, label(PIXEL, f"{name} in the {plane}"))
-        else:
-            coordinates[name] = (name, index * pixel_size, place_label(name, plane))
-    return coordinates
+    size, unit = (1.0, PIXEL) if pixel_size is None else (pixel_size, "m")
+    return {
+        name: (name, size * np.arange(count), label(unit, f"{name} in the {plane}"))
+        for name, count in zip(PLANE, shape, strict=True)
+    }
 
 
 def display_unit(units: str) -> str:
