@@ -238,13 +238,7 @@ def sample_type(size: int) -> type[Any]:
 def sampled_fields(
     result: Any, setup: Setup | None, unit: FieldUnit | None, deflector: str | None
 ) -> list[SampledField]:
-    """Return the fields of a result with samples of their errors.
-
-    Raises
-    ------
-    InputError
-        If the result has no field of that unit or deflector, or is not of one shot.
-    """
+    """Return the fields of a result with samples of their errors; an `InputError` if none fits."""
     makers: dict[str, Callable[..., Iterator[SampledField]]] = {
         "shadowinv result": _of_inversion,
         "shadowinv fit": _of_fit,

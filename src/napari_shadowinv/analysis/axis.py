@@ -167,7 +167,7 @@ def find_axis(
     size = 2 if find_tilt else 1
     simplex = np.vstack([np.zeros(size), 1.0 * np.eye(size)])
     best = minimize(
-        lambda choice: mismatch(np.append(choice, 0.0)),
+        mismatch,
         np.zeros(size),
         method="Nelder-Mead",
         options={"initial_simplex": simplex, "xatol": _TOLERANCE_PX, "fatol": 1e-9},

@@ -228,7 +228,7 @@ def add_products(dataset: xarray.Dataset, results: Sequence[ProductResult]) -> x
     variables: dict[str, Any] = {}
     for each in results:
         for name, variable in each.variables.items():
-            dims = _dims(each.name, variable)
+            dims = tuple(axis if axis in PLANE else f"{each.name}_{axis}" for axis in variable.dims)
             values = {"": each.quantities[name].value} | each.statistics(name)
             for statistic, numbers in values.items():
                 words = f"{variable.long_name}, {statistic}" if statistic else variable.long_name
@@ -238,12 +238,8 @@ def add_products(dataset: xarray.Dataset, results: Sequence[ProductResult]) -> x
                 )  # fmt: skip
         for axis, places in each.coordinates.items():
             if axis not in PLANE:
-                attributes = label(places.unit, places.long_name)
-                variables[f"{each.name}_{axis}"] = (
-                    f"{each.name}_{axis}",
-                    places.values,
-                    attributes,
-                )
+                key = f"{each.name}_{axis}"
+                variables[key] = key, places.values, label(places.unit, places.long_name)
     taken = variables.keys() & dataset.variables.keys()
     if taken:
         raise InputError(f"the result has a variable {min(taken)!r} already: give another label")
@@ -264,21 +260,11 @@ def add_products(dataset: xarray.Dataset, results: Sequence[ProductResult]) -> x
     return dataset.assign(variables).assign_attrs({_ATTRIBUTE: json.dumps(entries)})
 
 
-def _dims(name: str, variable: Variable) -> tuple[str, ...]:
-    """Return the axes of a variable in a file; maps have the image's."""
-    return tuple(axis if axis in PLANE else f"{name}_{axis}" for axis in variable.dims)
-
-
 def _without_products(dataset: xarray.Dataset) -> xarray.Dataset:
-    names = [entry["name"] for entry in json.loads(dataset.attrs[_ATTRIBUTE])]
-    of_products = [
-        each
-        for each in dataset.variables
-        if any(str(each).startswith(f"{name}_") for name in names)
-    ]
-    attributes = {key: value for key, value in dataset.attrs.items() if key != _ATTRIBUTE}
+    prefixes = tuple(f"{entry['name']}_" for entry in json.loads(dataset.attrs[_ATTRIBUTE]))
+    of_products = [name for name in dataset.variables if str(name).startswith(prefixes)]
     cleared = dataset.drop_vars(of_products)
-    cleared.attrs = attributes
+    cleared.attrs = {key: value for key, value in dataset.attrs.items() if key != _ATTRIBUTE}
     return cleared
 
 

@@ -24,6 +24,7 @@ References
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from typing import ClassVar, Literal, Self
@@ -443,21 +444,18 @@ class TurbulenceSpectrum(Product):
         slopes, modes = [], 0.0
         steps = [np.linspace(0, count - side, _SUBWINDOWS).astype(int)
                  for count, side in zip(potential.shape, size, strict=True)]  # fmt: skip
-        for row in steps[0]:
-            for column in steps[1]:
-                part = np.s_[row : row + size[0], column : column + size[1]]
-                if min(size) < _MIN_SUBWINDOW_PX or not frame.mask[part].all():
-                    continue
-                window = ring_spectrum(potential[part], window_weights(frame.mask[part], 0.5))
-                inside = (window.k >= k_range[0]) & (window.k <= k_range[1])
-                inside[: _LEAST_RING - 1] = False
-                if inside.sum() < _MIN_RINGS:
-                    continue
-                power = self._interpolated(window, spectrum)
-                slopes.append(
-                    fit_exponent(window.k[inside], power[inside], window.modes[inside])[0]
-                )
-                modes = float(window.modes[inside].sum())
+        for row, column in itertools.product(*steps):
+            part = np.s_[row : row + size[0], column : column + size[1]]
+            if min(size) < _MIN_SUBWINDOW_PX or not frame.mask[part].all():
+                continue
+            window = ring_spectrum(potential[part], window_weights(frame.mask[part], 0.5))
+            inside = (window.k >= k_range[0]) & (window.k <= k_range[1])
+            inside[: _LEAST_RING - 1] = False
+            if inside.sum() < _MIN_RINGS:
+                continue
+            power = self._interpolated(window, spectrum)
+            slopes.append(fit_exponent(window.k[inside], power[inside], window.modes[inside])[0])
+            modes = float(window.modes[inside].sum())
         expected = _exponent_error(spectrum.k[rings], spectrum.modes[rings])
         if len(slopes) < _SUBWINDOWS:
             return expected

@@ -233,9 +233,9 @@ def label(units: str, long_name: str) -> dict[str, str]:
     return {"units": units, "long_name": long_name}
 
 
-def place_label(name: str, plane: str = "object plane") -> dict[str, str]:
+def place_label(name: str) -> dict[str, str]:
     """Return the attributes of pixels' places along y or x in metres."""
-    return label("m", f"{name} in the {plane}")
+    return label("m", f"{name} in the object plane")
 
 
 def place_coordinates(
