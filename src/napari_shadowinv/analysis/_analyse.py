@@ -11,7 +11,7 @@ import numpy as np
 
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.analysis._derivatives import finer_displacement, finer_potential
+from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.analysis._field_samples import Evaluation, SampledField, sampled_fields
 from napari_shadowinv.analysis.frame import FieldFrame, field_unit
 from napari_shadowinv.analysis.kinds import product_from_dict, product_from_text
@@ -238,9 +238,8 @@ class _Task:
 
     def _by_readout(self, value: FloatArray) -> dict[str, FloatArray]:
         """Return the errors by means over pixels, and by central differences of the read-out."""
-        finer_plane = finer_potential(self.field.potential)
-        finer = finer_displacement(finer_plane, self.field.displacement)
-        return {"pixels": self.measure(finer_plane, finer) - value}
+        finer = finer_field(self.field.potential, self.field.displacement)
+        return {"pixels": self.measure(*finer) - value}
 
     def _by_product(self) -> dict[str, FloatArray]:
         """Return the errors by the products' own methods."""

@@ -35,25 +35,16 @@ def _shifted(plane: FloatArray, axis: int) -> list[FloatArray]:
     return [np.moveaxis(along[start : start + count], 0, axis) for start in range(5)]
 
 
-def finer_potential(potential: FloatArray) -> FloatArray:
-    """Return a potential without the mean over pixels that an image has, unchanged at the border.
+def finer_field(potential: FloatArray, displacement: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return potential and displacement at points rather than means over pixels.
 
-    A mean over a pixel takes 1/24 of the second derivative along each axis away.
+    A mean over a pixel takes 1/24 of the second derivative along each axis away. Inversions read
+    the displacement out by central differences, of second order, which lack 1 % of a wave of 26 px;
+    here derivatives are of fourth order. Both are unchanged within 2 px of the border.
     """
-    finer = potential.copy()
+    finer, moved = potential.copy(), displacement.copy()
     if min(potential.shape) > 4:
         finer[2:-2, 2:-2] -= laplacian(potential)[2:-2, 2:-2] / 24
-    return finer
-
-
-def finer_displacement(potential: FloatArray, displacement: FloatArray) -> FloatArray:
-    """Return the displacement by derivatives of fourth order, unchanged within 2 px of the border.
-
-    Inversions read it out by central differences, of second order, which lack 1 % of a wave of
-    26 px.
-    """
-    finer = displacement.copy()
-    if min(potential.shape) > 4:
-        finer[0, 2:-2] = -first_derivative(potential, 0)
-        finer[1, :, 2:-2] = -first_derivative(potential, 1)
-    return finer
+        moved[0, 2:-2] = -first_derivative(finer, 0)
+        moved[1, :, 2:-2] = -first_derivative(finer, 1)
+    return finer, moved

@@ -306,7 +306,7 @@ def _next_maximum(values: FloatArray, lags: FloatArray, least: float) -> tuple[f
     is_spacing = np.abs(multiple - np.round(multiple)) < _MULTIPLE_ERROR * np.round(multiple)
     peak = peaks[np.flatnonzero(is_spacing)[0]]
     # The top of the parabola through three values
-    low, middle, high = (float(value) for value in values[peak - 1 : peak + 2])
-    shift = (high - low) / (2 * (2 * middle - low - high))
+    before, top, after = (float(value) for value in values[peak - 1 : peak + 2])
+    shift = (after - before) / (2 * (2 * top - before - after))
     step = float(lags[peak] - lags[peak - 1])
-    return float(lags[peak]) + shift * step, middle + shift * (high - low) / 4
+    return float(lags[peak]) + shift * step, top + shift * (after - before) / 4

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
-from napari_shadowinv.analysis._derivatives import finer_displacement, finer_potential
+from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.units import PIXEL
@@ -189,8 +189,7 @@ class FieldFrame:
         """Return potential and displacement at the middles of pixels, rather than means."""
         if not self.is_pixel_mean:
             return potential, displacement
-        finer = finer_potential(potential)
-        return finer, finer_displacement(finer, displacement)
+        return finer_field(potential, displacement)
 
     def require_field(self, product: str, *fields: str) -> None:
         """Refuse a product of other fields than this one, with an `InputError`."""
