@@ -229,13 +229,11 @@ def add_products(dataset: xarray.Dataset, results: Sequence[ProductResult]) -> x
     for each in results:
         for name, variable in each.variables.items():
             dims = tuple(axis if axis in PLANE else f"{each.name}_{axis}" for axis in variable.dims)
-            values = {"": each.quantities[name].value} | each.statistics(name)
-            for statistic, numbers in values.items():
-                words = f"{variable.long_name}, {statistic}" if statistic else variable.long_name
-                ending = f"_{statistic}" if statistic else ""
-                variables[f"{each.name}_{name}{ending}"] = (
-                    dims, numbers, label(variable.unit, words),
-                )  # fmt: skip
+            key, long_name = f"{each.name}_{name}", variable.long_name
+            variables[key] = dims, each.quantities[name].value, label(variable.unit, long_name)
+            for statistic, numbers in each.statistics(name).items():
+                attributes = label(variable.unit, f"{long_name}, {statistic}")
+                variables[f"{key}_{statistic}"] = dims, numbers, attributes
         for axis, places in each.coordinates.items():
             if axis not in PLANE:
                 key = f"{each.name}_{axis}"

@@ -126,13 +126,9 @@ class FieldGrid:
         """Largest field on the faces of the grid over the largest field in it."""
         shares = [0.0]
         for array in (self.magnetic, self.electric):
-            if array is None:
-                continue
-            squared = _squared(array)
-            if not squared.max() > 0:
-                continue
-            faces = [squared.take(end, axis=axis).max() for axis in range(3) for end in (0, -1)]
-            shares.append(math.sqrt(max(faces) / squared.max()))
+            if array is not None and (squared := _squared(array)).max() > 0:
+                faces = [squared.take(end, axis=axis).max() for axis in range(3) for end in (0, -1)]
+                shares.append(math.sqrt(max(faces) / squared.max()))
         return max(shares)
 
     def centred(self) -> FieldGrid:
@@ -166,8 +162,7 @@ class FieldGrid:
                 f"beam is {beam!r} and right {right!r}: expected two different axes of x, y and z"
             )
         down = _cross(along, across)
-        axes = [axis for axis, _ in (along, down, across)]
-        signs = [sign for _, sign in (along, down, across)]
+        axes, signs = zip(along, down, across, strict=True)
         turned = {
             name: None if array is None else _turn(np.asarray(array), axes, signs)
             for name, array in (("magnetic", self.magnetic), ("electric", self.electric))
