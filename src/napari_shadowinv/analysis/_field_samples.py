@@ -141,11 +141,10 @@ class ResampledInversion(SampledField):
             share = discretisation_share(len(inversion.sites) / len(coarse.sites))
             change = value - measure(coarse.potential, coarse.displacement)
             systematic["discretisation"] = share * change
-        cautions = list(self._sample_cautions(scatter))
-        cautions += self._repeat_cautions(scatter.inversion)
+        cautions = *self._sample_cautions(scatter), *self._repeat_cautions(scatter.inversion)
         shifted = repeated.samples
         shifted += (value - repeated.value).astype(shifted.dtype)
-        return Evaluation(value, shifted, systematic, tuple(causes), tuple(cautions))
+        return Evaluation(value, shifted, systematic, tuple(causes), cautions)
 
     def _sample_cautions(self, scatter: Uncertainty) -> Iterator[Caution]:
         errors = self.inversion.errors

@@ -95,38 +95,33 @@ _JOULES_PER_MEV = 1e6 * _ELEMENTARY_CHARGE
 
 @dataclass(frozen=True)
 class Particle:
-    """Rest mass in kg and charge in C, with its sign, of a species of beam particle."""
+    """Rest mass in kg and charge in C, with its sign, of a species of beam particle.
+
+    Its usual energies in radiography are in MeV.
+    """
 
     mass: float
     charge: float
+    usual_energies: tuple[float, float]
 
 
-def _particle(name: str, charge_number: int) -> Particle:
-    return Particle(
-        constants.physical_constants[f"{name} mass"][0], charge_number * _ELEMENTARY_CHARGE
-    )
+def _particle(name: str, charge_number: int, least: float, most: float) -> Particle:
+    mass = constants.physical_constants[f"{name} mass"][0]
+    return Particle(mass, charge_number * _ELEMENTARY_CHARGE, (least, most))
 
 
 SPECIES: dict[Species, Particle] = {
-    "proton": _particle("proton", 1),
-    "deuteron": _particle("deuteron", 1),
-    "triton": _particle("triton", 1),
-    "helion": _particle("helion", 2),
-    "alpha": _particle("alpha particle", 2),
-    "electron": _particle("electron", -1),
+    "proton": _particle("proton", 1, 0.5, 100.0),
+    "deuteron": _particle("deuteron", 1, 0.5, 100.0),
+    "triton": _particle("triton", 1, 0.5, 100.0),
+    "helion": _particle("helion", 2, 0.5, 200.0),
+    "alpha": _particle("alpha particle", 2, 0.5, 200.0),
+    "electron": _particle("electron", -1, 0.01, 3000.0),
 }
 
 
 _MIN_ENERGY_MEV, _MAX_ENERGY_MEV = 1e-6, 1e5
 _MAX_ION_SOURCE_DISTANCE_M = 0.1  # sources of ions are small and shine from centimetres
-_USUAL_ENERGIES_MEV: dict[Species, tuple[float, float]] = {
-    "proton": (0.5, 100.0),
-    "deuteron": (0.5, 100.0),
-    "triton": (0.5, 100.0),
-    "helion": (0.5, 200.0),
-    "alpha": (0.5, 200.0),
-    "electron": (0.01, 3000.0),
-}
 
 
 class ProtonSetup(BeamSetup):
@@ -214,7 +209,7 @@ class ProtonSetup(BeamSetup):
         return math.inf if self.species == "electron" else _MAX_ION_SOURCE_DISTANCE_M
 
     def probe_doubts(self) -> Iterator[str]:
-        least, most = _USUAL_ENERGIES_MEV[self.species]
+        least, most = self.particle.usual_energies
         if not least <= self.energy <= most:
             yield (
                 f"{self.species}s of {self.energy:g} MeV are unusual in radiography, which uses "
