@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -43,26 +42,21 @@ def pack_figure(doses: FilmDoses, *, title: str | None = None) -> Figure:
     matplotlib.figure.Figure
         A figure with an Agg canvas; write it with `save_figure`.
     """
-    import matplotlib as mpl
-
     planes, usable = doses.dose, doses.usable
     count, *sides = planes.shape
     shape = sides[0], sides[1]
     panels_shown = count + (count >= 3)
     columns = min(_COLUMNS, panels_shown)
     width, height = (_PANEL_SHARE * side for side in _panels.panel_size(shape))
-    grid = Grid(-(-panels_shown // columns), columns, width, height, foot=0.1, head=0.0)
+    grid = Grid(-(-panels_shown // columns), columns, width, height, foot=0.1, head=0.52)
     header = _header(doses, int(grid.figure_size[0] * _LETTERS_PER_INCH))
-    grid = replace(grid, head=0.52 + 0.18 * len(header))
-    with mpl.rc_context(_panels.STYLE):
-        figure, panels = _panels.new_page(grid, Scale(1.0, "px"), title)
+    with _panels.new_page(grid, Scale(1.0, "px"), title, header) as (figure, panels):
         for k in range(count):
             _draw_dose(panels[k], planes[k], usable[k], _film_title(doses, k))
         if count >= 3:
             _draw_overlay(panels[count], planes, usable)
         for panel in panels[panels_shown:]:
             panel.axes.remove()
-        _panels.write_header(figure, header, grid)
     return figure
 
 

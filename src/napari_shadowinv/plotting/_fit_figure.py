@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import textwrap
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -70,9 +69,6 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
     matplotlib.figure.Figure
         A figure with an Agg canvas; write it with `save_figure`.
     """
-    import matplotlib as mpl
-
-    setup = fit.setups[0] if fit.setups else None
     count, *sides = fit.images.shape
     shape = sides[0], sides[1]
     kinds = _kinds(fit)
@@ -86,9 +82,8 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
     of_images = [fact for fact in facts if fact.key.startswith("image_")]
     letters = int(grid.figure_size[0] * _LETTERS_PER_INCH)
     footer = _panels.footer_lines(facts, fit.headline.text, letters)
-    grid = replace(grid, foot=0.12 + 0.18 * len(footer))
-    with mpl.rc_context(_panels.STYLE):
-        figure, panels = _panels.new_page(grid, _panels.image_scale(shape, setup), heading)
+    scale = _panels.image_scale(shape, fit.setup)
+    with _panels.new_page(grid, scale, heading, header, footer) as (figure, panels):
         for k in range(count):
             for j, kind in enumerate(kinds):
                 place = j * columns + k if upright else k * columns + j
@@ -96,8 +91,6 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
         for m, (field, error) in enumerate(fields):
             row = panels[(rows + m) * columns : (rows + m + 1) * columns]
             _draw_fitted(row, fit, fit.fields[m], field, error)
-        _panels.write_header(figure, header, grid)
-        _panels.write_footer(figure, footer, grid)
     return figure
 
 
@@ -110,12 +103,11 @@ def _kinds(fit: Fit) -> tuple[str, ...]:
 
 def _field_in_units(fit: Fit, field: FittedField) -> tuple[ShownField, ShownField | None]:
     """Return a field and its standard deviation, each in a handy unit."""
-    setup = fit.setups[0] if fit.setups else None
     deflector = deflector_titles()[field.name]
-    (in_units,) = shown_fields([field.displacement], setup, deflector, mask=fit.used)
+    (in_units,) = shown_fields([field.displacement], fit.setup, deflector, mask=fit.used)
     if field.uncertainty is None:
         return in_units, None
-    (error,) = shown_fields([field.uncertainty], setup, deflector, mask=fit.used)
+    (error,) = shown_fields([field.uncertainty], fit.setup, deflector, mask=fit.used)
     return in_units, error
 
 
@@ -149,7 +141,7 @@ def _draw_fitted(
     for panel, content in zip(panels, contents, strict=False):
         if content == "potential":
             potential = np.where(fit.used, field.potential, np.nan)
-            draw_potential(panel, potential, fit.setups[0] if fit.setups else None)
+            draw_potential(panel, potential, fit.setup)
         elif content == "field":
             draw_field(panel, in_units, title)
             hatch_insignificant(panel, fit.structures(field))
@@ -159,7 +151,7 @@ def _draw_fitted(
             label = f"σ of {in_units.symbol} ({error.unit})"
             panel.show(error.magnitude, "Standard deviation", label, "cividis", limits)
         else:
-            draw_cuts(panel, in_units, _magnitude_error(fit, field))
+            draw_cuts(panel, in_units, _magnitude_error(field, in_units))
     for panel in panels[len(contents) :]:
         panel.axes.remove()
 
@@ -171,13 +163,12 @@ def _crossed_rays(fit: Fit) -> BoolArray:
     return np.asarray(np.any([jacobian_determinant(total) < 0 for total in moved], axis=0))
 
 
-def _magnitude_error(fit: Fit, field: FittedField) -> FloatArray | None:
-    """Standard deviation of a field's magnitude in the unit in which it is shown."""
+def _magnitude_error(field: FittedField, in_units: ShownField) -> FloatArray | None:
+    """Return the standard deviation of a field's magnitude in the unit in which it is shown."""
     if field.uncertainty is None:
         return None
     length = np.sqrt((field.displacement**2).sum(axis=0))
     pixels = deviation_along(field.displacement, field.uncertainty)
-    in_units, _ = _field_in_units(fit, field)
     strongest = in_units.peak
     # Displacements become fields by a factor.
     return np.asarray(pixels * in_units.magnitude[strongest] / max(length[strongest], 1e-12))
@@ -206,8 +197,6 @@ def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figur
     matplotlib.figure.Figure
         A figure with an Agg canvas; write it with `save_figure`.
     """
-    import matplotlib as mpl
-
     count, *sides = left_out.images.shape
     shape = sides[0], sides[1]
     side_by_side = -(-count // _MAX_LEFT_OUT_ROWS)
@@ -217,9 +206,10 @@ def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figur
     grid, header, heading = _page(
         shape, rows, columns, [(sentence.text, level_colour(sentence.level))], title
     )
-    with mpl.rc_context(_panels.STYLE):
-        scale = _panels.image_scale(shape, setups[0] if setups else None)
-        figure, panels = _panels.new_page(grid, scale, heading)
+    scale = _panels.image_scale(shape, setups[0] if setups else None)
+    text = "Each image as predicted by a fit of the others, without those that are not explained."
+    footer = [(text, QUIET_COLOUR)]
+    with _panels.new_page(grid, scale, heading, header, footer) as (figure, panels):
         for k in range(count):
             row, column = k % rows, k // rows
             first = row * columns + column * _PANELS_PER_IMAGE
@@ -230,11 +220,6 @@ def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figur
             row, column = divmod(place, columns)
             if column // _PANELS_PER_IMAGE * rows + row >= count:
                 panel.axes.remove()
-        _panels.write_header(figure, header, grid)
-        text = (
-            "Each image as predicted by a fit of the others, without those that are not explained."
-        )
-        _panels.write_footer(figure, [(text, QUIET_COLOUR)], grid)
     return figure
 
 
@@ -253,8 +238,6 @@ def windows_figure(windows: FitWindows, *, title: str | None = None) -> Figure:
     matplotlib.figure.Figure
         A figure with an Agg canvas; write it with `save_figure`.
     """
-    import matplotlib as mpl
-
     displacement = windows.displacement
     count, fields = displacement.shape[:2]
     shape = displacement.shape[3], displacement.shape[4]
@@ -267,8 +250,11 @@ def windows_figure(windows: FitWindows, *, title: str | None = None) -> Figure:
     ]
     sentences = verdicts or [(f"All {count} windows are determined.", GOOD_COLOUR)]
     grid, header, heading = _page(shape, rows * fields, columns, sentences, title)
-    with mpl.rc_context(_panels.STYLE):
-        figure, panels = _panels.new_page(grid, _panels.image_scale(shape, windows.setup), heading)
+    scale = _panels.image_scale(shape, windows.setup)
+    text = "All fields on one colour scale"
+    text += ", at the strength of the image displaced most." if windows.setup is None else "."
+    footer = [(text, QUIET_COLOUR)]
+    with _panels.new_page(grid, scale, heading, header, footer) as (figure, panels):
         for m, field in enumerate(windows.fits[0].fields):
             block = panels[m * rows * columns : (m + 1) * rows * columns]
             in_units = shown_fields(
@@ -280,10 +266,6 @@ def windows_figure(windows: FitWindows, *, title: str | None = None) -> Figure:
             )
             for panel in block[count + 1 :]:
                 panel.axes.remove()
-        _panels.write_header(figure, header, grid)
-        text = "All fields on one colour scale"
-        text += ", at the strength of the image displaced most." if windows.setup is None else "."
-        _panels.write_footer(figure, [(text, QUIET_COLOUR)], grid)
     return figure
 
 
@@ -296,11 +278,11 @@ def _page(
 ) -> tuple[Grid, list[tuple[str, str]], str | None]:
     """Panels of one shape below a heading and sentences, wrapped to the page's width."""
     width, height = _panels.panel_size(shape)
-    grid = Grid(rows, columns, width, height, foot=0.3, head=0.0)
+    grid = Grid(rows, columns, width, height, foot=0.12, head=0.52)
     letters = int(grid.figure_size[0] * _LETTERS_PER_INCH)
     header = _panels.wrapped(sentences, letters)
     heading = title and textwrap.shorten(title, int(letters * 0.7), placeholder=" …")
-    return replace(grid, head=0.52 + 0.18 * len(header)), header, heading
+    return grid, header, heading
 
 
 def _draw_left_out(

@@ -126,15 +126,10 @@ class _Frame:
     def __init__(
         self, shape: tuple[int, int], setup: Any, label: str, limits: tuple[float, float]
     ) -> None:
-        from matplotlib import rc_context
-
-        with rc_context(STYLE):
-            grid = choose_grid(shape, 1, title=False)
-            lines = textwrap.wrap(label, max(12, int(grid.height / _LETTER_WIDTH_IN)))
-            grid = replace(
-                grid, right_margin=grid.right_margin + _LINE_HEIGHT_IN * (len(lines) - 1)
-            )
-            self._figure, (panel,) = new_page(grid, image_scale(shape, setup), None)
+        grid = choose_grid(shape, 1, title=False)
+        lines = textwrap.wrap(label, max(12, int(grid.height / _LETTER_WIDTH_IN)))
+        grid = replace(grid, right_margin=grid.right_margin + _LINE_HEIGHT_IN * (len(lines) - 1))
+        with new_page(grid, image_scale(shape, setup), None) as (self._figure, (panel,)):
             # Without values: the colour bar must not depend on the first shot.
             panel.show(np.full(shape, limits[0]), "", "\n".join(lines), _COLOUR_MAP, limits)
         self._panel = panel

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 _CUT_COLOURS = ("#1f9bff", "#18b368")
 _REFERENCE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 2.4, "alpha": 0.45}
 _CAUSTIC_DENSITY = 0.15  # level of the outline of a caustic
+_LINE_IN = 0.18  # of a header or footer
 
 
 def draw_intensity(
@@ -233,7 +235,10 @@ def image_scale(shape: tuple[int, int], setup: Setup | None) -> Scale:
 
 @dataclass(frozen=True)
 class Grid:
-    """Sizes in inches that put panels of one shape on a page without overlaps."""
+    """Sizes in inches that put panels of one shape on a page without overlaps.
+
+    Lines of a header or footer add to `head` and `foot`.
+    """
 
     rows: int
     columns: int
@@ -293,18 +298,41 @@ def panel_size(shape: tuple[int, int]) -> tuple[float, float]:
     return width, float(np.clip(width * aspect, 1.2, 6.4))
 
 
-def new_page(grid: Grid, scale: Scale, title: str | None) -> tuple[Figure, list[Panel]]:
-    """Return a figure with all its panels, still empty."""
+@contextmanager
+def styled_figure(size: tuple[float, float], **layout: Any) -> Iterator[Figure]:
+    """Yield an empty figure with an Agg canvas, to be drawn in the style of all pages."""
+    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=grid.figure_size)
-    FigureCanvasAgg(figure)
-    if title:
-        width, height = grid.figure_size
-        figure.text(0.2 / width, 1 - 0.26 / height, title, size=13, weight="bold", va="center")
-    boxes = [grid.box(index) for index in range(grid.rows * grid.columns)]
-    return figure, [Panel(figure.add_axes(box), scale, grid) for box in boxes]
+    with rc_context(STYLE):
+        figure = Figure(figsize=size, **layout)
+        FigureCanvasAgg(figure)
+        yield figure
+
+
+@contextmanager
+def new_page(
+    grid: Grid,
+    scale: Scale,
+    title: str | None,
+    header: Sequence[tuple[str, str]] = (),
+    footer: Sequence[tuple[str, str]] = (),
+) -> Iterator[tuple[Figure, list[Panel]]]:
+    """Yield a figure with its empty panels, between lines of text, each with its colour."""
+    top = grid.head - 0.08
+    head, foot = grid.head + _LINE_IN * len(header), grid.foot + _LINE_IN * len(footer)
+    grid = replace(grid, head=head, foot=foot)
+    width, height = grid.figure_size
+    with styled_figure(grid.figure_size) as figure:
+        if title:
+            figure.text(0.2 / width, 1 - 0.26 / height, title, size=13, weight="bold", va="center")
+        for number, (text, colour) in enumerate(header):
+            y = 1 - (top + _LINE_IN * number) / height
+            figure.text(0.2 / width, y, text, size=10, color=colour, va="top")
+        boxes = [grid.box(index) for index in range(grid.rows * grid.columns)]
+        yield figure, [Panel(figure.add_axes(box), scale, grid) for box in boxes]
+        write_footer(figure, footer, grid)
 
 
 def level_colour(level: Level) -> str:
@@ -320,17 +348,6 @@ def wrapped(sentences: Iterable[tuple[str, str]], letters: int) -> list[tuple[st
 def headline_sentence(headline: Headline) -> tuple[str, str]:
     """Return a headline with the colour of its level."""
     return headline.text, level_colour(headline.level)
-
-
-def write_header(
-    figure: Figure, lines: list[tuple[str, str]], grid: Grid, *, has_title: bool = True
-) -> None:
-    """Write lines, each with its colour, between the title and the panels."""
-    width, height = grid.figure_size
-    top = 0.44 if has_title else 0.14
-    for number, (text, colour) in enumerate(lines):
-        y = 1 - (top + 0.18 * number) / height
-        figure.text(0.2 / width, y, text, size=10, color=colour, va="top")
 
 
 _LEGENDS = {"masked": "hatched", "caustics": "outlined", "crossed_rays": "outlined"}
@@ -356,11 +373,11 @@ def footer_lines(facts: Iterable[Fact], headline: str, letters: int) -> list[tup
     return wrapped(paragraphs, letters)
 
 
-def write_footer(figure: Figure, lines: list[tuple[str, str]], grid: Grid) -> None:
+def write_footer(figure: Figure, lines: Sequence[tuple[str, str]], grid: Grid) -> None:
     """Write lines, each with its colour, below the panels."""
     width, height = grid.figure_size
     for number, (text, colour) in enumerate(reversed(lines)):
-        y = (0.1 + 0.18 * number) / height
+        y = (0.1 + _LINE_IN * number) / height
         figure.text(0.2 / width, y, text, size=8.5, color=colour, va="bottom")
 
 

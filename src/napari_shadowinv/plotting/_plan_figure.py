@@ -43,17 +43,14 @@ def plan_figure(plan: ExperimentPlan) -> Figure:
     matplotlib.figure.Figure
         A figure with an Agg canvas; write it with `save_figure`.
     """
-    import matplotlib as mpl
-
     setup = plan.setups[0] if plan.setups else None
     true, retrieved = shown_fields([plan.truth, plan.retrieved], setup)
     width = _panels.choose_grid(plan.shape, panels=6).figure_size[0]
     header = _panels.wrapped([_panels.headline_sentence(plan.headline)], int(width * 12))
     grid = _panels.choose_grid(plan.shape, panels=6, foot=0.12, title=True)
-    grid = replace(grid, head=0.52 + 0.18 * len(header))
-    with mpl.rc_context(_panels.STYLE):
-        figure, panels = _panels.new_page(grid, _panels.image_scale(plan.shape, setup), plan.title)
-        _panels.write_header(figure, header, grid)
+    grid = replace(grid, head=0.52)
+    scale = _panels.image_scale(plan.shape, setup)
+    with _panels.new_page(grid, scale, plan.title, header) as (figure, panels):
         mean = plan.options.counts
         image = plan.images[0] / mean
         draw_intensity(panels[0], image, "First draw", intensity_limits(image))
@@ -78,13 +75,7 @@ def sweep_figure(sweep: ExperimentSweep) -> Figure:
     matplotlib.figure.Figure
         A figure with an Agg canvas; write it with `save_figure`.
     """
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(_panels.STYLE):
-        figure = Figure(figsize=(6.4, 4.8), layout="constrained")
-        FigureCanvasAgg(figure)
+    with _panels.styled_figure((6.4, 4.8), layout="constrained") as figure:
         _draw_sweep(figure, sweep)
     return figure
 

@@ -42,18 +42,12 @@ def products_figure(results: Sequence[ProductResult], *, title: str | None = Non
     matplotlib.figure.Figure
         A figure with an Agg canvas; write it with `save_figure`.
     """
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     panels = [(each, names) for each in results for names in _panels_of(each)]
     lines = _footer(results)
     foot = 0.25 + _LINE_IN * len(lines)
     head = 0.35 if title else 0.1
     height = head + _HEIGHT_IN * len(panels) + foot
-    with mpl.rc_context(_panels.STYLE):
-        figure = Figure(figsize=(_WIDTH_IN, height))
-        FigureCanvasAgg(figure)
+    with _panels.styled_figure((_WIDTH_IN, height)) as figure:
         for number, (each, names) in enumerate(panels):
             bottom = height - head - _HEIGHT_IN * (number + 1)
             box = (0.1, (bottom + 0.6) / height, 0.78, (_HEIGHT_IN - 1.0) / height)

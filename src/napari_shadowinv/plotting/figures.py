@@ -64,8 +64,6 @@ def report_figure(
     matplotlib.figure.Figure
         A figure with an Agg canvas; write it with `save_figure`.
     """
-    import matplotlib as mpl
-
     setup = inversion.setup if setup is None else setup
     shape = inversion.potential.shape
     (field,) = shown_fields([inversion.displacement], setup, mask=inversion.mask)
@@ -75,10 +73,9 @@ def report_figure(
     facts = inversion.facts_in(setup)
     footer = _panels.footer_lines(facts, headline.text, int(width * 14))
     grid = _panels.choose_grid(shape, panels=6, foot=0.12 + 0.18 * len(footer), title=bool(title))
-    grid = replace(grid, head=(0.52 if title else 0.22) + 0.18 * len(header))
-    with mpl.rc_context(_panels.STYLE):
-        figure, panels = _panels.new_page(grid, _panels.image_scale(shape, setup), title)
-        _panels.write_header(figure, header, grid, has_title=bool(title))
+    grid = replace(grid, head=0.52 if title else 0.22, foot=0.12)
+    scale = _panels.image_scale(shape, setup)
+    with _panels.new_page(grid, scale, title, header, footer) as (figure, panels):
         mean = float(inversion.source.mean())
         limits = intensity_limits(inversion.image / mean)
 
@@ -96,7 +93,6 @@ def report_figure(
         residual = next(fact for fact in facts if fact.key == "image_residual")
         _draw_residual(panels[4], inversion, residual.short.capitalize())
         draw_cuts(panels[5], field)
-        _panels.write_footer(figure, footer, grid)
     return figure
 
 
@@ -130,8 +126,6 @@ def comparison_figure(
     InputError
         If there is no field or their shapes differ.
     """
-    import matplotlib as mpl
-
     arrays = [np.asarray(values, dtype=np.float64) for values in fields.values()]
     shapes = sorted({array.shape for array in arrays})
     if len(shapes) != 1:
@@ -139,8 +133,7 @@ def comparison_figure(
     in_units = dict(zip(fields, shown_fields(arrays, setup), strict=True))
     shape = shapes[0][1], shapes[0][2]
     grid = _panels.choose_grid(shape, panels=len(in_units) + 1, foot=0.35, title=bool(title))
-    with mpl.rc_context(_panels.STYLE):
-        figure, panels = _panels.new_page(grid, _panels.image_scale(shape, setup), title)
+    with _panels.new_page(grid, _panels.image_scale(shape, setup), title) as (figure, panels):
         draw_side_by_side(panels, in_units)
         _panels.write_footer(figure, [(caption, QUIET_COLOUR)], grid)
     return figure
