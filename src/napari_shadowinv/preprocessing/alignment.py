@@ -15,7 +15,7 @@ from scipy import ndimage
 from napari_shadowinv._system.arrays import NORMAL_MAD
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.preprocessing.image_checks import RING_SHARE, ReferencePair
+from napari_shadowinv.preprocessing.image_checks import ReferencePair, border_ring
 
 _BLUR_PX = 1.5  # makes gradients of noisy images
 _MAX_STEPS = 30
@@ -77,7 +77,7 @@ def align_source(
             f"the source has shape {source.shape}, the image {image.shape}: they must match"
         )
     usable = np.ones(image.shape, dtype=bool) if mask is None else mask
-    border = usable & _border(image.shape)
+    border = usable & border_ring(image.shape)
     fit = _fit_shift(image, source, border, ReferencePair(image, source, usable).shift or (0, 0))
     if fit is None:
         raise InputError(
@@ -87,13 +87,6 @@ def align_source(
     shift, error = fit
     moved = ndimage.shift(source, shift, order=3, mode="nearest")
     return AlignedSource(np.maximum(moved, 0.0), shift, error)
-
-
-def _border(shape: tuple[int, ...]) -> BoolArray:
-    border = np.ones(shape, dtype=bool)
-    depth = [max(2, round(RING_SHARE * side)) for side in shape]
-    border[depth[0] : -depth[0], depth[1] : -depth[1]] = False
-    return border
 
 
 def _fit_shift(

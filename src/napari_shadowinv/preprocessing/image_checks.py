@@ -51,7 +51,7 @@ _NOISE_SAMPLES = 50_000
 _COARSE_SIDE_PX = 128
 _MIN_BLOCKS = 16
 _MIN_USABLE_SHARE = 0.999  # share of a block's pixels
-RING_SHARE = 0.2  # of the side: there is rarely an object
+_RING_SHARE = 0.2  # of the side: there is rarely an object
 _MAX_SHIFT = 0.2  # of the side
 # Share of the mismatch that may be left after a shift, by the blur (blocks) of both: a beam that
 # merely differs, smooth as it is, may match somewhere by chance to a quarter.
@@ -101,9 +101,49 @@ class CheckedImage:
         return saturated_share(self.image, self.usable & ~self.stray)
 
     @cached_property
-    def noise(self) -> _NoisyPlane:
-        """The noise by brightness."""
-        return _NoisyPlane(self.image, self.usable)
+    def _local(self) -> tuple[FloatArray, FloatArray]:
+        """Means of 4 × 4 usable pixels, and differences in which smooth structure cancels."""
+        image, usable = self.image, self.usable
+        lines = max(1, image.size // _MAX_NOISE_SAMPLES)  # of long images, lines far apart
+        last = len(image) - _WINDOW_PX + 1
+        first, second, third, fourth = (image[k : last + k : lines] for k in range(_WINDOW_PX))
+        steps = second - third
+        columns = first + second + third + fourth
+        pairs = columns[:, 1:] + columns[:, :-1]
+        means = (pairs[:, 2:] + pairs[:, :-2]) / 16
+        differences = (steps[:, 1:-2] - steps[:, 2:-1]) / 2
+        if usable.all():
+            return means.ravel(), differences.ravel()
+        inside = sliding_window_view(usable, (_WINDOW_PX, _WINDOW_PX))[::lines].all(axis=(2, 3))
+        return means[inside], differences[inside]
+
+    @property
+    def brightness(self) -> FloatArray:
+        """Mean around each pixel."""
+        return self._local[0]
+
+    @cached_property
+    def noise_bins(self) -> FloatArray:
+        """Brightness, noise and its uncertainty by brightness, shape (3, bins).
+
+        The noise is a standard deviation; its uncertainty is the variance's, divided by the noise.
+        """
+        brightness, differences = self._local
+        order = order_by_value(brightness)
+        order = order[: int((1 - _BRIGHTEST_LEFT_OUT) * order.size)]
+        parts = np.array_split(order, _N_BRIGHTNESS_BINS)
+        levels = np.array([brightness[part].mean() for part in parts])
+        noise = np.sqrt([_clipped_variance(differences[part]) for part in parts])
+        counts = np.array([len(part) for part in parts]) * _INDEPENDENT_SHARE
+        return np.array([levels, noise, noise / np.sqrt(counts)])
+
+    @cached_property
+    def relative_differences(self) -> FloatArray:
+        """Differences over the brightness, clipped."""
+        brightness, differences = self._local
+        values = differences / np.maximum(brightness, _MIN_DARK * abs(float(brightness.mean())))
+        limit = _clip_limit(np.abs(values))
+        return np.clip(values, -limit, limit)
 
 
 def image_warnings(
@@ -137,7 +177,7 @@ def image_warnings(
 
 def _warnings(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caution]:
     planes = {"image": image} if source is None else {"image": image, "source": source}
-    if dark := _dark_level([plane.noise for plane in planes.values()]):
+    if dark := _dark_level(list(planes.values())):
         yield Caution(
             "dark-level",
             f"dark level: the noise of the image vanishes at {dark:.0%} of its mean instead of at "
@@ -340,10 +380,7 @@ class ReferencePair:
     def _ring(self) -> BoolArray:
         """Usable blocks near the border, where there is rarely an object."""
         usable = self._blocks[2]
-        depth = [max(2, round(RING_SHARE * side)) for side in usable.shape]
-        ring = usable.copy()
-        ring[depth[0] : -depth[0], depth[1] : -depth[1]] = False
-        return ring
+        return usable & border_ring(usable.shape)
 
     @cached_property
     def _has_border(self) -> bool:
@@ -351,6 +388,14 @@ class ReferencePair:
         if self._ring.sum() < _MIN_BLOCKS:
             return False
         return _contrast(self._blocks[1], self._ring) >= _MIN_CONTRAST
+
+
+def border_ring(shape: tuple[int, ...]) -> BoolArray:
+    """Return the part of an image near its border, where an object displaces least."""
+    ring = np.ones(shape, dtype=bool)
+    depth = [max(2, round(_RING_SHARE * side)) for side in shape]
+    ring[depth[0] : -depth[0], depth[1] : -depth[1]] = False
+    return ring
 
 
 def _coarse_step(shape: tuple[int, ...]) -> int:
@@ -435,7 +480,7 @@ def _fits_after(
     if gain(common) > match:
         return False
     y, x = np.ogrid[rows, columns]
-    y_top, x_left = height * RING_SHARE, width * RING_SHARE
+    y_top, x_left = height * _RING_SHARE, width * _RING_SHARE
     sides = (y < y_top, y >= height - y_top, x < x_left, x >= width - x_left)
     parts = [common & side for side in sides]
     better = [gain(part) < 1 for part in parts if part.sum() >= _MIN_BLOCKS]
@@ -446,10 +491,8 @@ _WINDOW_PX = 4  # side of the squares in which noise is measured
 _MAX_NOISE_SAMPLES = 80_000
 _N_BRIGHTNESS_BINS = 20
 _BRIGHTEST_LEFT_OUT = 0.05  # share of the pixels: bright lines are not smooth
-_CLIP_DEVIATIONS, _CLIPPED_VARIANCE = (
-    3.0,
-    0.9733,
-)  # standard deviations; variance of a clipped normal
+_CLIP_DEVIATIONS = 3.0
+_CLIPPED_VARIANCE = 0.9733  # of normal numbers that are clipped there
 _MIN_PIXELS = 4000
 _INDEPENDENT_SHARE = 4 / 9  # of the differences, which share pixels
 _WIDE_RANGE, _MIN_RANGE = 2.0, 1.3  # brightest over dimmest bin
@@ -482,10 +525,11 @@ def dark_level(
         0 unless the noise cannot be explained without an offset, by any sum of a constant
         variance, one in proportion to the signal, and one to its square.
     """
-    return _dark_level([_NoisyPlane(plane, mask) for plane in (image, source) if plane is not None])
+    planes = (image, source)
+    return _dark_level([CheckedImage.of(plane, mask) for plane in planes if plane is not None])
 
 
-def _dark_level(planes: Sequence[_NoisyPlane]) -> float:
+def _dark_level(planes: Sequence[CheckedImage]) -> float:
     if min(planes[0].image.shape) < _WINDOW_PX:
         return 0.0
     if any(plane.brightness.size < _MIN_PIXELS for plane in planes):
@@ -493,64 +537,11 @@ def _dark_level(planes: Sequence[_NoisyPlane]) -> float:
     mean = float(planes[0].brightness.mean())
     if not mean > 0:
         return 0.0
-    offsets = [_offset(plane.bins / mean, math.inf, _MIN_GAIN) for plane in planes]
+    offsets = [_offset(plane.noise_bins / mean, math.inf, _MIN_GAIN) for plane in planes]
     if len(planes) > 1:
-        both = np.concatenate([plane.bins for plane in planes], axis=1) / mean
+        both = np.concatenate([plane.noise_bins for plane in planes], axis=1) / mean
         offsets.append(_offset(both, _common_pattern(*planes), _MIN_SHARED_GAIN))
     return max(offsets)
-
-
-@dataclass(frozen=True, eq=False)
-class _NoisyPlane:
-    """An image with a measure of its noise at each pixel."""
-
-    image: FloatArray
-    mask: BoolArray | None
-
-    @cached_property
-    def _local(self) -> tuple[FloatArray, FloatArray]:
-        """Means of 4 × 4 usable pixels, and differences in which smooth structure cancels."""
-        image, mask = self.image, self.mask
-        lines = max(1, image.size // _MAX_NOISE_SAMPLES)  # of long images, lines far apart
-        last = len(image) - _WINDOW_PX + 1
-        first, second, third, fourth = (image[k : last + k : lines] for k in range(_WINDOW_PX))
-        steps = second - third
-        columns = first + second + third + fourth
-        pairs = columns[:, 1:] + columns[:, :-1]
-        means = (pairs[:, 2:] + pairs[:, :-2]) / 16
-        differences = (steps[:, 1:-2] - steps[:, 2:-1]) / 2
-        if mask is None or mask.all():
-            return means.ravel(), differences.ravel()
-        inside = sliding_window_view(mask, (_WINDOW_PX, _WINDOW_PX))[::lines].all(axis=(2, 3))
-        return means[inside], differences[inside]
-
-    @property
-    def brightness(self) -> FloatArray:
-        """Mean around each pixel."""
-        return self._local[0]
-
-    @cached_property
-    def bins(self) -> FloatArray:
-        """Brightness, noise and its uncertainty by brightness, shape (3, bins).
-
-        The noise is a standard deviation; its uncertainty is the variance's, divided by the noise.
-        """
-        brightness, differences = self._local
-        order = order_by_value(brightness)
-        order = order[: int((1 - _BRIGHTEST_LEFT_OUT) * order.size)]
-        parts = np.array_split(order, _N_BRIGHTNESS_BINS)
-        levels = np.array([brightness[part].mean() for part in parts])
-        noise = np.sqrt([_clipped_variance(differences[part]) for part in parts])
-        counts = np.array([len(part) for part in parts]) * _INDEPENDENT_SHARE
-        return np.array([levels, noise, noise / np.sqrt(counts)])
-
-    @cached_property
-    def relative(self) -> FloatArray:
-        """Differences over the brightness, clipped."""
-        brightness, differences = self._local
-        values = differences / np.maximum(brightness, _MIN_DARK * abs(float(brightness.mean())))
-        limit = _clip_limit(np.abs(values))
-        return np.clip(values, -limit, limit)
 
 
 def _clip_limit(sizes: FloatArray) -> float:
@@ -564,9 +555,9 @@ def _clipped_variance(differences: FloatArray) -> float:
     return float((sizes[sizes <= limit] ** 2).mean()) / _CLIPPED_VARIANCE
 
 
-def _common_pattern(first: _NoisyPlane, second: _NoisyPlane) -> float:
+def _common_pattern(first: CheckedImage, second: CheckedImage) -> float:
     """Most relative variance that two images may have in common, as by uneven pixels."""
-    product = first.relative * second.relative
+    product = first.relative_differences * second.relative_differences
     error = float(product.std()) / math.sqrt(_INDEPENDENT_SHARE * len(product))
     return max(float(product.mean()), 0.0) + _PATTERN_DEVIATIONS * error
 
