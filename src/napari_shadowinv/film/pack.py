@@ -69,10 +69,29 @@ class Stopping:
     losses: FloatArray
     density: float
 
-    @classmethod
-    def from_srim(cls, path: str | Path) -> Stopping:
+    @staticmethod
+    @as_file_errors
+    def from_srim(path: Path) -> Stopping:
         """Read a table as SRIM writes it in its default units; else a `FileFormatError`."""
-        return _from_srim(path)
+        text = small_text(path, "a table of stopping and ranges by SRIM", "latin-1")
+        density, unit = _DENSITY.search(text), _STOPPING_UNIT.search(text)
+        rows = [match.groups() for line in text.splitlines() if (match := _ROW.match(line))]
+        if density is None or unit is None or len(rows) < 2:
+            raise FileFormatError(
+                f"{path} has no density, unit or rows of energies and stopping: expected a table "
+                "of stopping and ranges as SRIM writes it"
+            )
+        if unit[1] != _MASS_UNIT:
+            raise FileFormatError(
+                f"{path} has stopping in {unit[1]}: expected SRIM's default, {_MASS_UNIT}; make "
+                "the table again with it"
+            )
+        energies = np.array([float(value) * _UNITS[name] for value, name, *_ in rows])
+        grams = float(density[1])
+        losses = np.array([float(electrons) + float(nuclei) for *_, electrons, nuclei in rows])
+        if not (np.diff(energies) > 0).all():
+            raise FileFormatError(f"{path} has energies that do not increase: make the table again")
+        return Stopping(energies, losses * 1000 * grams * _PER_M, 1000 * grams)
 
     @classmethod
     def by_bethe(cls, density: float, charge_per_mass: float, excitation: float) -> Stopping:
@@ -147,34 +166,16 @@ def _mass_loss(energies: FloatArray, charge_per_mass: float, excitation: float) 
     return np.asarray(_BETHE_FACTOR * charge_per_mass / squared * (0.5 * np.log(inside) - squared))
 
 
-@as_file_errors
-def _from_srim(path: Path) -> Stopping:
-    text = small_text(path, "a table of stopping and ranges by SRIM", "latin-1")
-    density, unit = _DENSITY.search(text), _STOPPING_UNIT.search(text)
-    rows = [match.groups() for line in text.splitlines() if (match := _ROW.match(line))]
-    if density is None or unit is None or len(rows) < 2:
-        raise FileFormatError(
-            f"{path} has no density, unit or rows of energies and stopping: expected a table of "
-            "stopping and ranges as SRIM writes it"
-        )
-    if unit[1] != _MASS_UNIT:
-        raise FileFormatError(
-            f"{path} has stopping in {unit[1]}: expected SRIM's default, {_MASS_UNIT}; make the "
-            "table again with it"
-        )
-    energies = np.array([float(value) * _UNITS[name] for value, name, *_ in rows])
-    grams = float(density[1])
-    losses = np.array([float(electrons) + float(nuclei) for *_, electrons, nuclei in rows])
-    if not (np.diff(energies) > 0).all():
-        raise FileFormatError(f"{path} has energies that do not increase: make the table again")
-    return Stopping(energies, losses * 1000 * grams * _PER_M, 1000 * grams)
-
-
 _SEEN_FROM = {
     None: "the source (assumed)",
     "source": "the source",
     "detector": "the source (scans from the detector, mirrored)",
 }
+
+
+def _file_field(title: str, description: str) -> Any:
+    """Return the field of a file that may be missing."""
+    return Field(default=None, title=title, description=description)
 
 
 class Material(CheckedModel):
@@ -192,9 +193,7 @@ class Material(CheckedModel):
         title="Mean excitation energy (eV)",
         description="About 10 eV times the atomic number.",
     )
-    table: Path | None = Field(
-        default=None, title="Stopping table", description="File with the stopping by SRIM."
-    )
+    table: Path | None = _file_field("Stopping table", "File with the stopping by SRIM.")
 
     @model_validator(mode="after")
     def _is_known(self) -> Material:
@@ -278,12 +277,8 @@ class FilmType(CheckedModel):
     before: Slabs = Field(default=(), title="Before", description="In front of the active layer.")
     active: Slab = Field(title="Active layer", description="Such as 12 um HD active.")
     behind: Slabs = Field(default=(), title="Behind", description="Behind the active layer.")
-    calibration: Path | None = Field(
-        default=None, title="Calibration", description="Table (.csv) of doses and pixels."
-    )
-    unexposed: Path | None = Field(
-        default=None, title="Unexposed film", description="Scan of a film that saw nothing."
-    )
+    calibration: Path | None = _file_field("Calibration", "Table (.csv) of doses and pixels.")
+    unexposed: Path | None = _file_field("Unexposed film", "Scan of a film that saw nothing.")
     dose_range: tuple[float, float] = Field(
         default=(0.0, np.inf),
         title="Range of doses (Gy)",
@@ -311,19 +306,15 @@ class PackLayer(CheckedModel):
     filters: Slabs = Field(
         default=(), title="Filters", description="In front of it, such as 13 um Al; 25 um Fe."
     )
-    file: Path | None = Field(
-        default=None, title="Scan", description="Its file; otherwise it is one of the pack's scan."
-    )
+    file: Path | None = _file_field("Scan", "Its file; otherwise it is one of the pack's scan.")
     turned: Annotated[Literal[0, 180], BeforeValidator(_from_digits)] = Field(
         default=0, title="Turned (°)", description="180 if it was scanned upside down."
     )
     mirrored: bool = Field(
         default=False, title="Mirrored", description="Whether it was scanned with its back down."
     )
-    mask: Path | None = Field(
-        default=None,
-        title="Mask",
-        description="Image of the upright film's shape, 0 at unusable pixels.",
+    mask: Path | None = _file_field(
+        "Mask", "Image of the upright film's shape, 0 at unusable pixels."
     )
     exclude: bool = Field(
         default=False, title="Exclude", description="Whether its scan is useless."
@@ -352,21 +343,15 @@ class Pack(CheckedModel):
         description="Distances, that of the image to the first film. The scans give the size of "
         "pixels, the pack the energies.",
     )
-    scan: Path | None = Field(
-        default=None,
-        title="Scan",
-        description="One scan with the films of all layers without a file, row by row.",
+    scan: Path | None = _file_field(
+        "Scan", "One scan with the films of all layers without a file, row by row."
     )
-    corners: Path | None = Field(
-        default=None,
-        title="Corners",
-        description="Table (.csv) of films on their scans, by number: film, y1, x1, … y4, x4.",
+    corners: Path | None = _file_field(
+        "Corners", "Table (.csv) of films on their scans, by number: film, y1, x1, … y4, x4."
     )
-    fiducials: Path | None = Field(
-        default=None,
-        title="Fiducials",
-        description="Table (.csv) of marks through the whole pack on the films' scans: film, name, "
-        "y, x.",
+    fiducials: Path | None = _file_field(
+        "Fiducials",
+        "Table (.csv) of marks through the whole pack on the films' scans: film, name, y, x.",
     )
     axis: tuple[float, float] | None = Field(
         default=None,
