@@ -234,12 +234,6 @@ class Inversion:
             return None
         return structures_of(self.displacement, errors, self.mask, element=element)
 
-    def _significance_facts(self) -> list[Fact]:
-        errors, structures = self.pixel_errors, self.structures
-        if errors is None or structures is None:
-            return []
-        return [significance_fact(structures, errors)]
-
     @property
     def error_rows(self) -> list[tuple[str, str]]:
         """Error budget of the displacement in words: names and texts."""
@@ -349,7 +343,7 @@ class Inversion:
                 f"{100 * report.image_residual:.3g} % of the mean (r.m.s.)",
                 short=f"residual {100 * report.image_residual:.3g} %",
             ),
-            *self._significance_facts(),
+            *_significance_facts(self.structures, self.pixel_errors),
             *(error_fact(name, text) for name, text in self._error_rows(errors)),
             Fact("caustics", "Caustics", f"{self.caustic.mean():.2%} of the pixels"),
             *masked_fact(self.mask),
@@ -495,6 +489,12 @@ class Inversion:
         )
 
 
+def _significance_facts(structures: Structures | None, errors: PixelErrors | None) -> list[Fact]:
+    if structures is None or errors is None:
+        return []
+    return [significance_fact(structures, errors)]
+
+
 def _pixel_errors(dataset: xarray.Dataset, name: str) -> PixelErrors | None:
     if name not in dataset:
         return None
@@ -552,11 +552,8 @@ class RetrievedField:
     @property
     def facts(self) -> tuple[Fact, ...]:
         """The peak of the field and its significance in words."""
-        facts = peak_facts(self.displacement, self.setup)
-        errors, structures = self.pixel_errors, self.structures
-        if errors is not None and structures is not None:
-            facts.append(significance_fact(structures, errors))
-        return tuple(facts)
+        significance = _significance_facts(self.structures, self.pixel_errors)
+        return (*peak_facts(self.displacement, self.setup), *significance)
 
     @property
     def pixel_errors(self) -> PixelErrors | None:
