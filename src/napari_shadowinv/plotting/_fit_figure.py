@@ -21,22 +21,7 @@ from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.significance import deviation_along
 from napari_shadowinv.physics.units import ShownField, intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
-from napari_shadowinv.plotting._panels import (
-    ALARM_COLOUR,
-    GOOD_COLOUR,
-    QUIET_COLOUR,
-    Grid,
-    Panel,
-    draw_cuts,
-    draw_differences,
-    draw_field,
-    draw_intensity,
-    draw_potential,
-    draw_side_by_side,
-    hatch_insignificant,
-    level_colour,
-    outline_caustics,
-)
+from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR, Grid, Panel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -110,14 +95,14 @@ def _draw_image(panel: Panel, fit: Fit, k: int, kind: str, fact: Fact) -> None:
     mean = float(fit.source[k].mean())
     if kind == "Residual":
         title, residual = f"Residual: {fact.short}", fit.normalised_residual[k]
-        draw_differences(panel, residual, title, "Residual (σ)", _MAX_RESIDUAL_SIGMA)
+        panel.draw_differences(residual, title, "Residual (σ)", _MAX_RESIDUAL_SIGMA)
         return
     plane = {"Beam": fit.source, "Image": fit.images, "Re-projection": fit.reprojection}[kind][k]
     probe = f": {fit.setups[k].probe}" if fit.setups else ""
     title = f"Image {k + 1}{probe}" if kind == "Image" else kind
     scale = fit.source if kind == "Beam" else fit.images
     hidden = plane / mean if kind == "Beam" else np.where(fit.mask[k], plane / mean, np.nan)
-    draw_intensity(panel, hidden, title, intensity_limits(scale[k] / mean))
+    panel.draw_intensity(hidden, title, intensity_limits(scale[k] / mean))
 
 
 def _draw_fitted(
@@ -136,17 +121,17 @@ def _draw_fitted(
     for panel, content in zip(panels, contents, strict=False):
         if content == "potential":
             potential = np.where(fit.used, field.potential, np.nan)
-            draw_potential(panel, potential, fit.setup)
+            panel.draw_potential(potential, fit.setup)
         elif content == "field":
-            draw_field(panel, in_units, title)
-            hatch_insignificant(panel, fit.structures(field))
-            outline_caustics(panel, _crossed_rays(fit))
+            panel.draw_field(in_units, title)
+            panel.hatch_insignificant(fit.structures(field))
+            panel.outline_caustics(_crossed_rays(fit))
         elif content == "error" and error is not None:
             limits = 0.0, error.largest or 1.0
             label = f"σ of {in_units.symbol} ({error.unit})"
             panel.show(error.magnitude, "Standard deviation", label, "cividis", limits)
         else:
-            draw_cuts(panel, in_units, _magnitude_error(field, in_units))
+            panel.draw_cuts(in_units, _magnitude_error(field, in_units))
     for panel in panels[len(contents) :]:
         panel.axes.remove()
 
@@ -194,7 +179,7 @@ def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figur
     sentence, *of_images = left_out.facts
     setups = left_out.setups
     grid, header, heading = _page(
-        shape, rows, columns, [(sentence.text, level_colour(sentence.level))], title
+        shape, rows, columns, [(sentence.text, _panels.level_colour(sentence.level))], title
     )
     scale = _panels.image_scale(shape, setups[0] if setups else None)
     text = "Each image as predicted by a fit of the others, without those that are not explained."
@@ -246,7 +231,7 @@ def windows_figure(windows: FitWindows, *, title: str | None = None) -> Figure:
                 list(displacement[:, m]), windows.setup, deflector_titles()[field.name]
             )
             names = [f"{field.name}: " * (fields > 1) + _name(windows, w) for w in range(count)]
-            draw_side_by_side(
+            _panels.draw_side_by_side(
                 block[: count + 1], dict(zip(names, in_units, strict=True)), common=True
             )
             for panel in block[count + 1 :]:
@@ -277,12 +262,10 @@ def _draw_left_out(
     mean = float(left_out.images[k][used].mean())
     limits = intensity_limits(left_out.images[k] / mean)
     residual = left_out.normalised_residual[k]
-    draw_intensity(panels[0], left_out.images[k] / mean, name, limits, label="Intensity / mean")
-    draw_intensity(
-        panels[1], left_out.predicted[k] / mean, "Prediction", limits, "Intensity / mean"
-    )
+    panels[0].draw_intensity(left_out.images[k] / mean, name, limits, label="Intensity / mean")
+    panels[1].draw_intensity(left_out.predicted[k] / mean, "Prediction", limits, "Intensity / mean")
     title = f"Residual: {fact.short}"
-    draw_differences(panels[2], residual, title, "Residual (σ)", _MAX_RESIDUAL_SIGMA)
+    panels[2].draw_differences(residual, title, "Residual (σ)", _MAX_RESIDUAL_SIGMA)
     if fact.level is not Level.SOUND:
         panels[2].axes.set_title(title, color=ALARM_COLOUR)
 

@@ -10,13 +10,7 @@ import numpy as np
 from napari_shadowinv.physics.units import intensity_limits, shown_fields
 from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep, percent
 from napari_shadowinv.plotting import _panels
-from napari_shadowinv.plotting._panels import (
-    ALARM_COLOUR,
-    GOOD_COLOUR,
-    QUIET_COLOUR,
-    draw_intensity,
-    draw_side_by_side,
-)
+from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,8 +47,10 @@ def plan_figure(plan: ExperimentPlan) -> Figure:
     with _panels.new_page(grid, scale, plan.title, header) as (figure, panels):
         mean = plan.options.counts
         image = plan.images[0] / mean
-        draw_intensity(panels[0], image, "First draw", intensity_limits(image))
-        draw_side_by_side(panels[1:4], {"object": true, "retrieved in the first draw": retrieved})
+        panels[0].draw_intensity(image, "First draw", intensity_limits(image))
+        _panels.draw_side_by_side(
+            panels[1:4], {"object": true, "retrieved in the first draw": retrieved}
+        )
         _draw_errors(panels[4].axes, plan)
         _draw_parts(panels[5].axes, plan)
     return figure

@@ -18,18 +18,7 @@ from napari_shadowinv.physics.units import intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._film_figure import pack_figure
 from napari_shadowinv.plotting._fit_figure import fit_figure
-from napari_shadowinv.plotting._panels import (
-    QUIET_COLOUR,
-    Panel,
-    draw_cuts,
-    draw_differences,
-    draw_field,
-    draw_intensity,
-    draw_potential,
-    draw_side_by_side,
-    hatch_insignificant,
-    outline_caustics,
-)
+from napari_shadowinv.plotting._panels import QUIET_COLOUR, Panel, draw_side_by_side
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,17 +66,17 @@ def report_figure(
         def blank_masked(plane: FloatArray) -> FloatArray:
             return np.where(inversion.mask, plane, np.nan)
 
-        draw_intensity(panels[0], blank_masked(inversion.image / mean), "Image", limits)
-        draw_potential(panels[1], blank_masked(inversion.potential), setup)
-        outline_caustics(panels[1], inversion.caustic)
-        draw_field(panels[2], field)
-        hatch_insignificant(panels[2], inversion.structures)
-        outline_caustics(panels[2], inversion.caustic)
+        panels[0].draw_intensity(blank_masked(inversion.image / mean), "Image", limits)
+        panels[1].draw_potential(blank_masked(inversion.potential), setup)
+        panels[1].outline_caustics(inversion.caustic)
+        panels[2].draw_field(field)
+        panels[2].hatch_insignificant(inversion.structures)
+        panels[2].outline_caustics(inversion.caustic)
         reprojection = blank_masked(inversion.reprojection / mean)
-        draw_intensity(panels[3], reprojection, "Re-projection", limits)
+        panels[3].draw_intensity(reprojection, "Re-projection", limits)
         residual = next(fact for fact in facts if fact.key == "image_residual")
         _draw_residual(panels[4], inversion, residual.short.capitalize())
-        draw_cuts(panels[5], field)
+        panels[5].draw_cuts(field)
     return figure
 
 
@@ -178,4 +167,4 @@ def _draw_residual(panel: Panel, inversion: Inversion, title: str) -> None:
     """Show image minus re-projection in percent of the mean."""
     residual = np.where(inversion.mask, inversion.residual, np.nan)
     percent = 100 * residual / inversion.image[inversion.mask].mean()
-    draw_differences(panel, percent, title, "Difference (% of mean)", _MAX_RESIDUAL_PERCENT)
+    panel.draw_differences(percent, title, "Difference (% of mean)", _MAX_RESIDUAL_PERCENT)
