@@ -47,12 +47,6 @@ from napari_shadowinv.physics.setup import Setup, bin_setup
 from napari_shadowinv.preprocessing import pixels
 from napari_shadowinv.preprocessing.filters import low_pass
 from napari_shadowinv.preprocessing.kriging import kriged_beam, kriged_source
-from napari_shadowinv.preprocessing.pixels import (
-    FILL_WIDTH,
-    beam_pixels,
-    fill_masked,
-    interpolated_source,
-)
 from napari_shadowinv.preprocessing.steps import Choice, degree_field, width_field
 
 _MIN_SUPPORT = 1e-6
@@ -291,7 +285,9 @@ def total_variation_source(
     weight = pixels.checked_number("weight", weight, above=0, unit="px")
     iterations = pixels.checked_integer("iterations", iterations, least=1)
     report = Reporter(None, should_stop)
-    complete = values if usable.all() else fill_masked(values, usable, FILL_WIDTH, 2, report)
+    complete = (
+        values if usable.all() else pixels.fill_masked(values, usable, pixels.FILL_WIDTH, 2, report)
+    )
     mean = values[usable].mean()
     beam = mean * least_variation(complete / mean, weight, iterations, report)
     return pixels.with_flux_of(beam, values, usable)
@@ -331,7 +327,7 @@ class InterpolatedEstimate(Estimate):
 
     needs_mask = True
     title = "filled in under the mask"
-    function = staticmethod(interpolated_source)
+    function = staticmethod(pixels.interpolated_source)
     place = 70
     method: Literal["interpolated"] = "interpolated"
     width: float = width_field(
@@ -686,7 +682,7 @@ def isotropic_source(
     >>> float(round(beam[0, 0] / beam[100, 100], 3))  # the corner, 9.3 degrees from the axis
     0.961
     """
-    values, usable = beam_pixels(image, mask)
+    values, usable = pixels.beam_pixels(image, mask)
     distance = point_distance(setup)
     y, x = (
         _edges(side, "centre_" + axis, centre) / distance

@@ -35,7 +35,6 @@ from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import pixels
-from napari_shadowinv.preprocessing.pixels import fill_masked_pixels
 from napari_shadowinv.preprocessing.steps import Radiograph, Step, degree_field, width_field
 
 
@@ -51,7 +50,7 @@ class Filter(Step):
     ) -> FloatArray:
         """Apply the filter, so that masked pixels, even NaN, do not affect the others."""
         values = np.asarray(image, dtype=np.float64)
-        return self._filter(fill_masked_pixels(values, mask, should_stop), mask, should_stop)
+        return self._filter(pixels.fill_masked_pixels(values, mask, should_stop), mask, should_stop)
 
     def _filter(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
