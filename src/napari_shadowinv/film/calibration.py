@@ -381,26 +381,19 @@ def combined_dose(
         As `dose`, and if the scan has no colours.
     """
     values = checked_scan(scan)
-    shape = values.shape[:2]
-    weights, weighted = np.zeros(shape), np.zeros(shape)
-    squares, counted, outside = np.zeros(shape), np.zeros(shape), np.ones(shape, bool)
-    ends = []
-    for channel in _CHANNELS:
-        channel_dose = dose(values, calibration, background=background, channel=channel)
-        logarithm = np.log(channel_dose.dose)
-        log_error = calibration.log_error(channel_dose.dose, channel)
-        weight = np.where(channel_dose.outside, 0.0, log_error**-2)
-        weights += weight
-        weighted += weight * logarithm
-        squares += weight * logarithm**2
-        counted += ~channel_dose.outside
-        outside &= channel_dose.outside
-        ends.append(logarithm)
-    inside = np.where(outside, 1.0, weights)
-    mean = np.where(outside, np.median(ends, axis=0), weighted / inside)
+    maps = {c: dose(values, calibration, background=background, channel=c) for c in _CHANNELS}
+    logarithms = np.log([each.dose for each in maps.values()])
+    errors = np.array([calibration.log_error(each.dose, c) for c, each in maps.items()])
+    is_inside = ~np.array([each.outside for each in maps.values()])
+    weights = np.where(is_inside, errors**-2, 0.0)
+    outside = np.asarray(~is_inside.any(axis=0))
+    total = np.where(outside, 1.0, weights.sum(axis=0))
+    weighted = (weights * logarithms).sum(axis=0)
+    mean = np.where(outside, np.median(logarithms, axis=0), weighted / total)
     # Of the mean, by how far the channels are from it.
-    scatter = np.sqrt(np.maximum(squares / inside - mean**2, 0.0) / np.maximum(counted - 1, 1))
-    error = np.maximum(1 / np.sqrt(inside), scatter)
+    variance = (weights * logarithms**2).sum(axis=0) / total - mean**2
+    scatter = np.sqrt(np.maximum(variance, 0.0) / np.maximum(is_inside.sum(axis=0) - 1, 1))
+    error = np.maximum(1 / np.sqrt(total), scatter)
     return CombinedDose(np.exp(mean), np.where(outside, np.inf, error), outside)
 
 
