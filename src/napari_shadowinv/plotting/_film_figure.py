@@ -47,7 +47,9 @@ def pack_figure(doses: FilmDoses, *, title: str | None = None) -> Figure:
     header = _header(doses, int(grid.figure_size[0] * _LETTERS_PER_INCH))
     with _panels.new_page(grid, Scale(1.0, "px"), title, header) as (figure, panels):
         for k in range(count):
-            _draw_dose(panels[k], planes[k], usable[k], _film_title(doses, k))
+            label = doses.film_label(k)
+            film_title = f"{label[:1].upper()}{label[1:]}, {doses.pack.layers[k].film}"
+            _draw_dose(panels[k], planes[k], usable[k], film_title)
         if count >= 3:
             _draw_overlay(panels[count], planes, usable)
         for panel in panels[panels_shown:]:
@@ -61,11 +63,6 @@ def _header(doses: FilmDoses, letters: int) -> list[tuple[str, str]]:
     line = _panels.fact_line(fact for fact in facts if fact.level is Level.SOUND)
     sentences = [(line, QUIET_COLOUR), *((text, ALARM_COLOUR) for text in cautions)]
     return _panels.wrapped(sentences, letters)
-
-
-def _film_title(doses: FilmDoses, k: int) -> str:
-    label = doses.film_label(k)
-    return f"{label[:1].upper()}{label[1:]}, {doses.pack.layers[k].film}"
 
 
 def _draw_dose(panel: Panel, dose: FloatArray, usable: BoolArray, title: str) -> None:

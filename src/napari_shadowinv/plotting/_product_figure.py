@@ -84,7 +84,7 @@ def _draw(axes: Axes, result: ProductResult, names: Sequence[str]) -> None:
     if len(result.variables[names[0]].dims) == 2:
         _draw_map(axes, result, names[0])
         return
-    draw_curves(axes, result, names)
+    _draw_curves(axes, result, names)
     if "intensity" in result.variables:
         beside = axes.twinx()
         places, _ = result.shown_places("intensity")
@@ -110,16 +110,8 @@ def make_logarithmic(axes: Axes) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> None:
-    """Draw variables along an axis with their bands, in the unit that they are shown in.
-
-    Parameters
-    ----------
-    axes : Axes
-    result : ProductResult
-    names : sequence of str
-        Variables with one common axis.
-    """
+def _draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> None:
+    """Draw variables along a common axis with their bands, in the unit that they are shown in."""
     from matplotlib.ticker import MaxNLocator
 
     places, words = result.shown_places(names[0])

@@ -18,7 +18,7 @@ from napari_shadowinv.physics.units import intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._film_figure import pack_figure
 from napari_shadowinv.plotting._fit_figure import fit_figure
-from napari_shadowinv.plotting._panels import QUIET_COLOUR, Panel, draw_side_by_side
+from napari_shadowinv.plotting._panels import QUIET_COLOUR, draw_side_by_side
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -74,8 +74,10 @@ def report_figure(
         panels[2].outline_caustics(inversion.caustic)
         reprojection = blank_masked(inversion.reprojection / mean)
         panels[3].draw_intensity(reprojection, "Re-projection", limits)
-        residual = next(fact for fact in facts if fact.key == "image_residual")
-        _draw_residual(panels[4], inversion, residual.short.capitalize())
+        fact = next(fact for fact in facts if fact.key == "image_residual")
+        residual = 100 * blank_masked(inversion.residual) / inversion.image[inversion.mask].mean()
+        label = "Difference (% of mean)"
+        panels[4].draw_differences(residual, fact.short.capitalize(), label, _MAX_RESIDUAL_PERCENT)
         panels[5].draw_cuts(field)
     return figure
 
@@ -161,10 +163,3 @@ def save_figure(path: str | Path, figure: Figure, overwrite: bool = False) -> Pa
     with replacing(path, overwrite) as temporary:
         figure.savefig(temporary, dpi=DOTS_PER_INCH)
     return Path(path)
-
-
-def _draw_residual(panel: Panel, inversion: Inversion, title: str) -> None:
-    """Show image minus re-projection in percent of the mean."""
-    residual = np.where(inversion.mask, inversion.residual, np.nan)
-    percent = 100 * residual / inversion.image[inversion.mask].mean()
-    panel.draw_differences(percent, title, "Difference (% of mean)", _MAX_RESIDUAL_PERCENT)
