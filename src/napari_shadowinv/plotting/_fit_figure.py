@@ -117,7 +117,7 @@ def _draw_fitted(
     contents = ["potential", "field", "error", "cuts"]
     if error is None:
         contents.remove("error")
-    contents = contents[-len(panels) :] if len(panels) < len(contents) else contents
+    contents = contents[-len(panels) :]
     for panel, content in zip(panels, contents, strict=False):
         if content == "potential":
             potential = np.where(fit.used, field.potential, np.nan)
@@ -176,11 +176,10 @@ def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figur
     shape = sides[0], sides[1]
     side_by_side = -(-count // _MAX_LEFT_OUT_ROWS)
     columns, rows = _PANELS_PER_IMAGE * side_by_side, -(-count // side_by_side)
-    sentence, *of_images = left_out.facts
+    first_fact, *of_images = left_out.facts
     setups = left_out.setups
-    grid, header, heading = _page(
-        shape, rows, columns, [(sentence.text, _panels.level_colour(sentence.level))], title
-    )
+    sentences = [_panels.headline_sentence(first_fact)]
+    grid, header, heading = _page(shape, rows, columns, sentences, title)
     scale = _panels.image_scale(shape, setups[0] if setups else None)
     text = "Each image as predicted by a fit of the others, without those that are not explained."
     footer = [(text, QUIET_COLOUR)]

@@ -188,28 +188,22 @@ def new_page(
         write_footer(figure, footer, grid)
 
 
-def level_colour(level: Level) -> str:
-    """Return the colour of sentences of a level."""
-    return GOOD_COLOUR if level is Level.SOUND else ALARM_COLOUR
-
-
 def wrapped(sentences: Iterable[tuple[str, str]], letters: int) -> list[tuple[str, str]]:
     """Wrap sentences, each with its colour, to lines of a number of letters."""
     return [(line, colour) for text, colour in sentences for line in textwrap.wrap(text, letters)]
 
 
-def headline_sentence(headline: Headline) -> tuple[str, str]:
-    """Return a headline with the colour of its level."""
-    return headline.text, level_colour(headline.level)
+def headline_sentence(headline: Headline | Fact) -> tuple[str, str]:
+    """Return a headline, or a fact in its place, with the colour of its level."""
+    return headline.text, GOOD_COLOUR if headline.level is Level.SOUND else ALARM_COLOUR
 
 
-_LEGENDS = {"masked": "hatched", "caustics": "outlined", "crossed_rays": "outlined"}
+_LEGENDS = {"masked": " (hatched)", "caustics": " (outlined)", "crossed_rays": " (outlined)"}
 
 
 def fact_line(facts: Iterable[Fact]) -> str:
     """Return facts as one line of text, to be wrapped."""
-    titles = {key: f" ({look})" for key, look in _LEGENDS.items()}
-    return "  ·  ".join(f"{fact.title}{titles.get(fact.key, '')}: {fact.text}" for fact in facts)
+    return "  ·  ".join(f"{fact.title}{_LEGENDS.get(fact.key, '')}: {fact.text}" for fact in facts)
 
 
 def footer_lines(facts: Iterable[Fact], headline: str, letters: int) -> list[tuple[str, str]]:
