@@ -165,6 +165,7 @@ _BIN_SHARE = 0.3  # of the blur's width: side of the pixels' bins
 _MIN_EDGE_CONTRAST = 0.4  # of the strongest contrast of the same sign
 _MAX_OPPOSITE_CONTRAST = 0.35  # of the contrast at an edge, at the opposite edge
 _MIN_SIGN_CONTRAST = 0.03  # of the strongest contrast
+_OPPOSITES = {"top": "bottom", "bottom": "top", "left": "right", "right": "left"}
 _CONTRAST_DEVIATIONS, _BEAM_DEVIATIONS = 7.0, 4.0
 
 # Cautions that decide the verdict, the gravest first.
@@ -571,18 +572,11 @@ def _cut_by_edge(prepared: Prepared, noise: ImageNoise, beam_difference: float) 
         largest = float(values.max())
         if largest < _MIN_SIGN_CONTRAST * strongest:
             continue
-        sides = {
-            "top": float(values[0].max()),
-            "bottom": float(values[-1].max()),
-            "left": float(values[:, 0].max()),
-            "right": float(values[:, -1].max()),
-        }
-        opposites = dict(zip(sides, ("bottom", "top", "right", "left"), strict=True))
-        for side, at_edge in sides.items():
-            if (
-                at_edge > max(_MIN_EDGE_CONTRAST * largest, least)
-                and sides[opposites[side]] < _MAX_OPPOSITE_CONTRAST * at_edge
-            ):
+        edges = values[0], values[-1], values[:, 0], values[:, -1]
+        peaks = {side: edge.max() for side, edge in zip(_OPPOSITES, edges, strict=True)}
+        for side, at_edge in peaks.items():
+            is_strong = at_edge > max(_MIN_EDGE_CONTRAST * largest, least)
+            if is_strong and peaks[_OPPOSITES[side]] < _MAX_OPPOSITE_CONTRAST * at_edge:
                 return (
                     f"the {side} edge of the image seems to cut the object: the image's contrast "
                     "is strong there and weak at the opposite edge, and what lies beyond is "
