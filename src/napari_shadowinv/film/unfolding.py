@@ -82,12 +82,9 @@ class Response:
         """
         stoppings = pack.stoppings()
         last = min(_MAX_ENERGY_MEV, *(stopping.energies[-1] for stopping in stoppings.values()))
-        inside = (
-            np.geomspace(_MIN_ENERGY_MEV, last, _N_ENERGIES)
-            if energies is None
-            else np.asarray(energies)
-        )
-        first = np.array(inside, dtype=np.float64)
+        if energies is None:
+            energies = np.geomspace(_MIN_ENERGY_MEV, last, _N_ENERGIES)
+        first = np.array(energies, dtype=np.float64)
         deposits, doses = [], []
         now = first
         for layer in pack.layers:

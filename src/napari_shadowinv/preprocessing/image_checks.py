@@ -312,10 +312,8 @@ class ReferencePair:
     @cached_property
     def is_negative(self) -> bool:
         """Whether the image is dark at its borders where its beam is bright."""
-        shot, beam, _ = self._blocks
-        if not self._has_border:
-            return False
-        return _correlation(shot[self._ring], beam[self._ring]) < _NEGATIVE_CORRELATION
+        shot, beam = (plane[self._ring] for plane in self._blocks[:2])
+        return self._has_border and _correlation(shot, beam) < _NEGATIVE_CORRELATION
 
     @cached_property
     def is_swapped(self) -> bool:
