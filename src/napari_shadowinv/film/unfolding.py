@@ -184,7 +184,6 @@ class _Basis(NamedTuple):
     to one energy, to the first order of the displacement.
     """
 
-    peaks: FloatArray  # (n,), MeV
     usual: FloatArray  # (n,), at the peaks
     kernel: FloatArray  # (n, m), dose in each film by the usual spectrum in each step of energy
     energies: FloatArray  # (m,)
@@ -212,7 +211,7 @@ class _Basis(NamedTuple):
             rows = np.arange(len(bends))
             bends[rows, rows] = 2 * apart[1:] / both
             bends[rows, rows + 2] = 2 * apart[:-1] / both
-        return cls(peaks, usual, kernel, energies, kernel @ np.array(shares).T, bends)
+        return cls(usual, kernel, energies, kernel @ np.array(shares).T, bends)
 
     def seen_energies(self, per_error: FloatArray, curvature: float) -> FloatArray:
         """Return energies with the mean displacement of the protons in each unfolded share."""
