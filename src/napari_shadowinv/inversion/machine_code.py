@@ -23,13 +23,10 @@ _REST = "from napari_shadowinv.inversion.compilation import compile_rest; compil
 @contextmanager
 def compiling_together() -> Iterator[None]:
     """Let another process compile the kernels that this one needs last, for it to load then."""
-    if is_compiled():
-        yield
-        return
     # Numba lets one thread of a process compile at a time.
     executable = Path(sys.executable or "")
     alone = available_threads(None) == 1 or not executable.stem.lower().startswith("python")
-    if alone or code_folder() is None:
+    if alone or is_compiled() or code_folder() is None:
         yield
         return
     import numba
