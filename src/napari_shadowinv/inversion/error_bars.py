@@ -398,7 +398,7 @@ def uncertainty(
     if instrument is not None:
         instrument = as_model(Instrument, instrument, "instrument")
     check_instance(plan, SitePlan, "plan")
-    quantities = _checked_quantities(quantities)
+    choose = _quantity_choice(quantities)
     if not isinstance(n, int | np.integer) or isinstance(n, bool) or n < 2:
         raise InputError(f"n is {n!r}, expected a whole number of samples, at least 2")
     if method not in ("linear", "resolve"):
@@ -464,7 +464,7 @@ def uncertainty(
     pairs, of_solved = None, []
     if method == "resolve":
         head = list(solve_samples(seeds[:_CHECKED], report))
-        functions.update(_functions(quantities, np.array([change[0] for change in head])))
+        functions.update(choose(np.array([change[0] for change in head])))
         changes = chain(head, solve_samples(seeds[_CHECKED:], report))
         scatter = reduce(add, (Scatter.of(change, asked) for change in changes))
     else:
@@ -478,7 +478,7 @@ def uncertainty(
         for block in _blocks(checked):
             linear = _in_thread(partial(response.changes, block), quietly)
             if not functions:
-                functions.update(_functions(quantities, linear[:, 0]))
+                functions.update(choose(linear[:, 0]))
             for pair in map(Pairs.of, linear, islice(solved, len(block))):
                 pairs = pair if pairs is None else pairs + pair
                 if asked is not None and draws is not None:
@@ -530,22 +530,19 @@ def uncertainty(
     )
 
 
-def _checked_quantities(quantities: Quantities | None) -> Quantities:
-    if quantities is None:
-        return {}
+def _quantity_choice(
+    quantities: Quantities | None,
+) -> Callable[[FloatArray], Mapping[str, QuantityOf]]:
+    """Return a function that chooses the quantities by changes of the potential."""
     if callable(quantities):
         return quantities
-    if not isinstance(quantities, Mapping) or not all(map(callable, quantities.values())):
+    functions = {} if quantities is None else quantities
+    if not isinstance(functions, Mapping) or not all(map(callable, functions.values())):
         raise InputError(
             f"quantities is {quantities!r}, expected a dictionary of functions of potential and "
             "displacement"
         )
-    return quantities
-
-
-def _functions(quantities: Quantities, changes: FloatArray) -> Mapping[str, QuantityOf]:
-    """Return the functions of all quantities, by changes of the potential if they depend on it."""
-    return quantities(changes) if callable(quantities) else quantities
+    return lambda _: functions
 
 
 def _measure(
