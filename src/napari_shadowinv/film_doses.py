@@ -40,6 +40,7 @@ _VARIABLES: dict[str, tuple[str, tuple[str, ...], str, str]] = {
     "by_images": ("by_images", ("layer",), "1", "Aligned on the image content"),
     "corners": ("corners", ("layer", "corner", "component"), PIXEL, "Corners on the scan"),
 }
+_BANDS = ("peak", "energy_low", "energy_high")  # columns of `FilmDoses.bands`
 _MIN_TIME_IN_NS = 1e-9  # s; shorter times are in ps
 
 
@@ -226,9 +227,7 @@ class FilmDoses:
             "layer": np.arange(1, len(self.energies) + 1),
             "film": ("layer", [layer.film for layer in self.pack.layers]),
             "energy": ("layer", self.energies, mega),
-            "peak": ("layer", self.bands[:, 0], mega),
-            "energy_low": ("layer", self.bands[:, 1], mega),
-            "energy_high": ("layer", self.bands[:, 2], mega),
+            **{name: ("layer", self.bands[:, k], mega) for k, name in enumerate(_BANDS)},
             "strength": ("layer", self.strengths, {"units": "1"}),
             **place_coordinates(self.dose.shape[1:], self.pixel_size, "film's plane"),
         }
@@ -257,7 +256,7 @@ class FilmDoses:
         InputError
             If a variable or attribute is missing or damaged.
         """
-        names = (*_VARIABLES, "energy", "peak", "energy_low", "energy_high")
+        names = (*_VARIABLES, "energy", *_BANDS)
         missing = [name for name in names if name not in dataset]
         if missing:
             raise InputError(
@@ -280,7 +279,7 @@ class FilmDoses:
             raise ValueError("its planes differ in shape")
         for name in ("usable", "by_images"):
             arrays[name] = arrays[name].astype(bool)
-        bands = [numbers_of(dataset, name) for name in ("peak", "energy_low", "energy_high")]
+        bands = [numbers_of(dataset, name) for name in _BANDS]
         setups = json.loads(attributes.get("setups", "[]"))
         size = attributes.get("scan_pixel_size")
         return cls(
