@@ -365,9 +365,14 @@ def test_a_megapixel_ends_at_the_look_that_asks(job: Any, tmp_path: Path) -> Non
 
 def test_a_shot_is_looked_at_before_the_books_count_it(shot: Array, tmp_path: Path) -> None:
     stack, out = np.stack([shot, shot]), tmp_path / "a.shadowinv.zarr"
-    job = StackJob(stack, out, Recipe(options=FEW), run_options=RunOptions(workers=1))
     counted: list[tuple[int | None, int]] = []
-    job.run(lambda _: None, lambda: False, lambda index: counted.append((index, job.status.ended)))
+
+    class CountingJob(StackJob):
+        def _update(self, index: int | None) -> None:
+            counted.append((index, self.status.ended))
+
+    job = CountingJob(stack, out, Recipe(options=FEW), run_options=RunOptions(workers=1))
+    job.run(lambda _: None, lambda: False)
     assert counted == [(0, 0), (1, 1)]
     assert job.status.ended == 2
 

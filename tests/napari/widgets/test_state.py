@@ -330,7 +330,7 @@ def test_a_source_mask_hides_the_object_from_the_estimate_alone(
 
 def the_masks(tool: Any) -> Any:
     """Return the object with the masks of a run."""
-    return tool.request().shot if isinstance(tool, InvertShot) else tool.request().job
+    return tool.request().shot if isinstance(tool, InvertShot) else tool.request()
 
 
 @pytest.mark.parametrize("kind", [InvertShot, InvertStack])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +20,7 @@ from napari_shadowinv._napari.layers import widen_limits
 from napari_shadowinv._napari.widgets._forms import PathEdit, labelled
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import column
-from napari_shadowinv._napari.widgets._results import Origins, result_frame
+from napari_shadowinv._napari.widgets._results import result_frame
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
@@ -39,8 +39,8 @@ def _empty_status() -> RunStatus:
 
 
 @dataclass(eq=False)
-class StackJob:
-    """Shots to invert into a store: the arguments of `stack.run_stack`, and the run's status."""
+class StackJob(Job):
+    """Shots to invert into a store, the status of the run, and the layers over the store."""
 
     shots: Any  # an array (shot, y, x), also a lazy one, files, or rows of a table
     out: Path
@@ -50,17 +50,22 @@ class StackJob:
     source_mask: BoolArray | None = None
     run_options: RunOptions = field(default_factory=RunOptions)
     scheduler: str = "threads"
+    image: Any = None  # the layer of the shots
+    companions: tuple[Any, ...] = ()  # layers that lie on the image
+    placement: Mapping[str, Any] = field(default_factory=dict)  # keywords of the layers
+    inputs: Sequence[tuple[str, str]] = ()  # rows of the report
+    attributes: Mapping[str, str] = field(default_factory=dict)  # origins that are saved
     status: RunStatus = field(default_factory=_empty_status)  # the window reads it at any time
     waiting: int = 0  # shots that have not ended, or files that have arrived
     note: str = ""
+    layer_data: list[FullLayerData] = field(default_factory=list)  # empty until a shot is finished
+    # Written by the run's thread; the window only reads them.
+    _limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    _earlier: dict[str, tuple[float, float]] = field(default_factory=dict)
+    _applied: set[tuple[float, float]] = field(default_factory=set)
 
-    def run(
-        self,
-        on_progress: OnProgress,
-        should_stop: ShouldStop,
-        on_done: Callable[[int | None], None] = lambda _: None,
-    ) -> RunStatus:
-        """Invert the pending shots; `on_done` gets each finished shot before the window does."""
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> RunStatus:
+        """Invert the pending shots, and describe the layers once one shot is done."""
 
         def update(status: RunStatus) -> None:
             if status.stage:
@@ -70,7 +75,7 @@ class StackJob:
             # The layers must be ready before the window reads the status.
             if self._changes_layers(status):
                 outcome = status.outcome
-                on_done(None if outcome is None or outcome.reason else outcome.index)
+                self._update(None if outcome is None or outcome.reason else outcome.index)
             self.status = status
             on_progress(self._progress(status))
 
@@ -99,27 +104,6 @@ class StackJob:
     def _progress(self, status: RunStatus) -> Progress:
         return Progress("shots", status.done + status.failed, status.total, status.text)
 
-
-@dataclass(frozen=True, eq=False)
-class StackRequest(Job):
-    """A run, and everything needed to show its results as layers over its store."""
-
-    job: StackJob
-    image: Any
-    companions: tuple[Any, ...]
-    placement: dict[str, Any]
-    origins: Origins
-    # Empty until a shot is finished.
-    layer_data: list[FullLayerData] = field(default_factory=list)
-    # Written by the run's thread; the window only reads them.
-    _limits: dict[str, tuple[float, float]] = field(default_factory=dict)
-    _earlier: dict[str, tuple[float, float]] = field(default_factory=dict)
-    _applied: set[tuple[float, float]] = field(default_factory=set)
-
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
-        """Invert the shots in a thread, and describe the layers once one shot is done."""
-        return self.job.run(on_progress, should_stop, self._update)
-
     def layers(self, content: RunStatus) -> list[FullLayerData]:
         """Return the layers described by the run, which grow with it."""
         return self.layer_data
@@ -127,17 +111,14 @@ class StackRequest(Job):
     def update_limits(self, layers: Sequence[Any]) -> None:
         """Extend limits that the user has not changed to the strongest shot so far."""
         for layer in filter(is_image, layers):
-            role = str(role_of(layer))
-            if role not in self._limits:
-                continue
-            limits = self._run_limits(role)
-            if limits == tuple(layer.contrast_limits):
-                continue
-            if tuple(layer.contrast_limits) in self._applied:
+            role, current = str(role_of(layer)), tuple(layer.contrast_limits)
+            if role in self._limits and current in self._applied:
+                limits = self._run_limits(role)
                 self._applied.add(limits)
-                layer.contrast_limits = limits
+                if limits != current:
+                    layer.contrast_limits = limits
 
-    def continue_from(self, earlier: StackRequest, layers: Sequence[Any]) -> None:
+    def continue_from(self, earlier: StackJob, layers: Sequence[Any]) -> None:
         """Take over the contrast of an earlier run into the same store."""
         self._applied.update(earlier._applied)
         current = {
@@ -161,9 +142,8 @@ class StackRequest(Job):
         """Describe the layers once a shot is done, and include each shot in the limits."""
         if not self.layer_data:
             self._describe()
-        if index is None:
-            return
-        self._include_shot(self.layer_data, index)
+        if index is not None:
+            self._include_shot(self.layer_data, index)
 
     def _include_shot(self, layer_data: Sequence[FullLayerData], index: int) -> None:
         """Extend the limits to one more shot."""
@@ -177,11 +157,11 @@ class StackRequest(Job):
         from napari_shadowinv._napari.stores import store_layers
 
         try:
-            layers = store_layers(self.job.out, shot=shot)
+            layers = store_layers(self.out, shot=shot)
         except (InputError, OSError):
             return []
         for _, keywords, _kind in layers:
-            keywords["metadata"][KEY]["made_from"] = self.origins.attributes()
+            keywords["metadata"][KEY]["made_from"] = dict(self.attributes)
         return layers
 
     def _describe(self, shot: int | None = None) -> None:
@@ -248,9 +228,14 @@ class FolderEdit(QtWidgets.QWidget):
 
 @dataclass(eq=False)
 class WatchJob(StackJob):
-    """A folder to watch, as `shots`: the arguments of `stack.watch_stack`, and the status."""
+    """A folder to watch, as `shots`; the layers grow as shots arrive."""
 
     watch_options: WatchOptions = field(default_factory=WatchOptions)
+    _reference_shot: int = 0  # decides on units and contrast
+    _new_shots: list[int] = field(default_factory=list)  # not in the limits yet
+    _updated_at: float = 0.0  # s
+    # With shots that the layers do not show yet; the window takes it from the run's thread.
+    _longer_data: list[FullLayerData] | None = None
 
     def _start(self, *args: Any, **keywords: Any) -> None:
         from napari_shadowinv.stack import watch_stack
@@ -265,26 +250,9 @@ class WatchJob(StackJob):
         note = f" ({self.note})" if self.note else ""
         return Progress(stage, status.ended, None, f"{status.text}{note}")
 
-
-@dataclass
-class _Growth:
-    """New shots for the layers: the run's thread writes them, the window reads them."""
-
-    reference_shot: int = 0  # decides on units and contrast
-    new_shots: list[int] = field(default_factory=list)  # not in the limits yet
-    updated_at: float = 0.0  # s
-    layer_data: list[FullLayerData] | None = None  # with shots that the layers do not show yet
-
-
-@dataclass(frozen=True, eq=False)
-class WatchRequest(StackRequest):
-    """A watched folder; the layers grow as shots arrive."""
-
-    growth: _Growth = field(default_factory=_Growth)
-
     def add_new_shots(self, layers: Sequence[Any]) -> int | None:
         """Add the shots that have arrived to the layers; return the newest, or None."""
-        layer_data, self.growth.layer_data = self.growth.layer_data, None
+        layer_data, self._longer_data = self._longer_data, None
         if layer_data is None:
             return None
         content = {role_of(keywords): (data, keywords) for data, keywords, _ in layer_data}
@@ -301,31 +269,30 @@ class WatchRequest(StackRequest):
 
     def _update(self, index: int | None) -> None:
         """Describe the longer layers from time to time, so that the shots need not wait."""
-        growth = self.growth
         if index is not None:
-            growth.new_shots.append(index)
+            self._new_shots.append(index)
         if not self.layer_data:
             self._begin(index)
         elif index is not None and not self._is_due():
             return
         else:
-            growth.layer_data = self._store_layers(growth.reference_shot) or None
-        current = growth.layer_data or self.layer_data
-        for number in growth.new_shots if current else ():
+            self._longer_data = self._store_layers(self._reference_shot) or None
+        current = self._longer_data or self.layer_data
+        for number in self._new_shots if current else ():
             self._include_shot(current, number)
-        growth.new_shots.clear()
-        growth.updated_at = time.monotonic()
+        self._new_shots.clear()
+        self._updated_at = time.monotonic()
 
     def _begin(self, index: int | None) -> None:
         from napari_shadowinv._napari.stores import first_shot
 
         with suppress(InputError, OSError):
-            self.growth.reference_shot = first_shot(self.job.out) if index is None else index
-            self._describe(self.growth.reference_shot)
+            self._reference_shot = first_shot(self.out) if index is None else index
+            self._describe(self._reference_shot)
 
     def _is_due(self) -> bool:
-        is_behind = isinstance(self.job, WatchJob) and self.job.waiting > 1
-        return not is_behind or time.monotonic() > self.growth.updated_at + _UPDATE_INTERVAL_S
+        is_behind = self.waiting > 1
+        return not is_behind or time.monotonic() > self._updated_at + _UPDATE_INTERVAL_S
 
 
 def shot_in_view(viewer: Any, layers: Sequence[Any]) -> int | None:

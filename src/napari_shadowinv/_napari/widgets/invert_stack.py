@@ -31,9 +31,7 @@ from napari_shadowinv._napari.widgets._results import ResultLayers, place_togeth
 from napari_shadowinv._napari.widgets._stack_jobs import (
     FolderEdit,
     StackJob,
-    StackRequest,
     WatchJob,
-    WatchRequest,
     is_newest_in_view,
     newest_shot,
     placement_on,
@@ -128,9 +126,8 @@ class ShotsPicker(RowPicker):
             },
         )
         self.layers.picked.connect(self.changed)
-        self.files.changed.connect(self.changed)
-        self.table.changed.connect(self.changed)
-        self.folder.changed.connect(self.changed)
+        for control in (self.files, self.table, self.folder):
+            control.changed.connect(self.changed)
 
     @property
     def layer(self) -> Any | None:
@@ -145,12 +142,9 @@ class ShotsPicker(RowPicker):
     @property
     def name(self) -> str:
         """The name of the shots, such as a path."""
-        if self.is_watched:
-            return self.folder.folder.path
-        if self.picker.kind == _FILES:
-            return self.files.path
-        if self.picker.kind == _TABLE:
-            return self.table.file.path
+        edits = {_FOLDER: self.folder.folder, _FILES: self.files, _TABLE: self.table.file}
+        if self.picker.kind in edits:
+            return edits[self.picker.kind].path
         return "" if self.layer is None else str(self.layer.name)
 
     def shots(self) -> Any:
@@ -241,7 +235,7 @@ class InvertStack(InversionInputs, ToolPanel):
         panel = RunPanel("Invert stack", "Run", tip, patience=math.inf)
         super().__init__(viewer, "invert-stack", panel)
         self.results = ResultLayers(viewer, self)
-        self._shown: StackRequest | None = None
+        self._shown: StackJob | None = None
         self._ended, self._resets_view = 0, False
         self._arrows: Any = None
         self._read_arrows: Callable[[], None] | None = None
@@ -274,7 +268,9 @@ class InvertStack(InversionInputs, ToolPanel):
         self.report = ReportTable()
         self.save_result = SaveButton(
             self,
-            lambda: shot_to_save(self.viewer, shown_result(self.viewer, self._fields_shown())),
+            lambda: shot_to_save(
+                self.viewer, shown_result(self.viewer, field_of(self.results.layers))
+            ),
             "Save the displayed shot to a separate file. The store already contains all shots.",
         )
         self.more_layers = MoreLayersButton(self, lambda: self.results)
@@ -302,37 +298,35 @@ class InvertStack(InversionInputs, ToolPanel):
         self.shots.picker.set_kind(_FOLDER)
         self.shots.folder.folder.choose()
 
-    def request(self) -> StackRequest:
+    def request(self) -> StackJob:
         layer = self.shots.layer
         recipe = self.recipe()
         mask = self.masks.usable(layer)
         self.source.check(mask)
-        inputs: dict[str, Any] = {
+        common: dict[str, Any] = {
             "out": self.store.store,
             "recipe": recipe,
             "source": self._source(layer),
             "mask": mask,
             "source_mask": self.hidden_from_source(layer),
+            "image": layer,
+            "companions": self.companions(layer),
+            "placement": {} if layer is None else placement_on(layer, recipe),
         }
+        origins = self.origins(layer, self.shots.name)
+        common |= {"inputs": origins.rows(), "attributes": origins.attributes()}
         choices: dict[str, Any] = {
             "overwrite": self.overwrite.isChecked(),
             "redo_failed": self.redo_failed.isChecked(),
         }
-        placement = {} if layer is None else placement_on(layer, recipe)
-        origins = self.origins(layer, self.shots.name)
         if self.shots.is_watched:
             folder = self.shots.folder
             watch = WatchOptions(pattern=folder.pattern.text().strip(), **choices)
-            job: StackJob = WatchJob(shots=folder.path, watch_options=watch, **inputs)
-            return WatchRequest(job, layer, self.companions(layer), placement, origins)
+            return WatchJob(shots=folder.path, watch_options=watch, **common)
         scheduler, workers = self.engine.engine()
         options = RunOptions(workers=workers, **choices)
         shots = self.shots.shots()
-        job = StackJob(shots=shots, run_options=options, scheduler=scheduler, **inputs)
-        return StackRequest(job, layer, self.companions(layer), placement, origins)
-
-    def _fields_shown(self) -> list[Any]:
-        return field_of(self.results.layers)
+        return StackJob(shots=shots, run_options=options, scheduler=scheduler, **common)
 
     def _source(self, layer: Any) -> ArrayLike | None:
         # A stack of sources has one for each shot.
@@ -348,32 +342,32 @@ class InvertStack(InversionInputs, ToolPanel):
         if progress.stage == "shots" or (progress.stage == "wait" and progress.step):
             self._show(self.panel.runner.tag)
 
-    def _show(self, request: StackRequest) -> None:
+    def _show(self, job: StackJob) -> None:
         # Once only: pressing Run again must not discard these shots.
         self.overwrite.setChecked(False)
         self.redo_failed.setChecked(False)
-        status = request.job.status
+        status = job.status
         if len(status.failures) != self.failures.count:
             self._show_failures(list(status.failures))
-        if request.layer_data and request is not self._shown:
-            self._show_layers(request)
+        if job.layer_data and job is not self._shown:
+            self._show_layers(job)
         elif status.ended > self._ended and not self._refresh_timer.isActive():
             self._refresh_timer.start()
         self._ended = status.ended
 
-    def _show_layers(self, request: StackRequest) -> None:
-        earlier, self._shown = self._shown, request
-        is_resumed = earlier is not None and earlier.job.out == request.job.out
-        setup = request.job.recipe.setup
-        if request.image is not None and setup is not None:
-            place_together(self.viewer, request.image, setup, request.companions)
+    def _show_layers(self, job: StackJob) -> None:
+        earlier, self._shown = self._shown, job
+        is_resumed = earlier is not None and earlier.out == job.out
+        setup = job.recipe.setup
+        if job.image is not None and setup is not None:
+            place_together(self.viewer, job.image, setup, job.companions)
         if earlier is not None and is_resumed:
-            request.continue_from(earlier, self.results.layers)
+            job.continue_from(earlier, self.results.layers)
         else:
             self.results = ResultLayers(self.viewer, self)
             self.results.complete.connect(self._on_layers)
-        self._resets_view = not is_resumed and request.image is None
-        layer_data = main_layers(request.layer_data, also=self.results.layer_keys)
+        self._resets_view = not is_resumed and job.image is None
+        layer_data = main_layers(job.layer_data, also=self.results.layer_keys)
         self.results.show(layer_data, select=not is_resumed)
 
     def _on_layers(self) -> None:
@@ -381,7 +375,7 @@ class InvertStack(InversionInputs, ToolPanel):
         if self._resets_view:
             self._resets_view = False
             self.viewer.reset_view()
-            if isinstance(self._shown, WatchRequest):
+            if isinstance(self._shown, WatchJob):
                 show_shot(self.viewer, newest_shot(self.results.layers))
         layers = self.results.layers
         arrows = next((layer for layer in layers if role_of(layer) == "arrows"), None)
@@ -391,7 +385,7 @@ class InvertStack(InversionInputs, ToolPanel):
         self._refresh_timer.start()
 
     def _refresh(self) -> None:
-        if isinstance(self._shown, WatchRequest):
+        if isinstance(self._shown, WatchJob):
             self._grow(self._shown)
         if self._shown is not None:
             self._shown.update_limits(self.results.layers)
@@ -400,7 +394,7 @@ class InvertStack(InversionInputs, ToolPanel):
         if self._read_arrows is not None:
             self._read_arrows()
 
-    def _grow(self, shown: WatchRequest) -> None:
+    def _grow(self, shown: WatchJob) -> None:
         """Add new shots to the layers; follow them only if the newest shot was in view."""
         if self.results.busy:
             self._refresh_timer.start()
@@ -421,13 +415,13 @@ class InvertStack(InversionInputs, ToolPanel):
 
     def _show_report(self) -> None:
         """Show the origins of the results, and the quantities of the shot in view."""
-        request = self._shown
-        if request is None or self.panel.runner.running:
+        job = self._shown
+        if job is None or self.panel.runner.running:
             return
-        rows = request.origins.rows()
+        rows = list(job.inputs)
         shot = shot_in_view(self.viewer, self.results.layers)
         with suppress(FileFormatError):  # a damaged shot
-            rows = rows if shot is None else [*rows, *shot_rows(request.job.out, shot)]
+            rows += [] if shot is None else shot_rows(job.out, shot)
         self.report.show_rows(rows)
 
     def _show_failures(self, failures: list[tuple[str, str]]) -> None:
@@ -436,21 +430,20 @@ class InvertStack(InversionInputs, ToolPanel):
 
     @notify_errors
     def _on_end(self, outcome: Outcome) -> None:
-        request: StackRequest = outcome.tag
-        status = request.job.status
+        job: StackJob = outcome.tag
+        status = job.status
         if not status.total:
-            if outcome.error is not None:
-                return  # the panel shows why
-            if self.shots.is_watched:
+            # The panel shows an error.
+            if outcome.error is None and self.shots.is_watched:
                 self.panel.say("Stopped: no shot has arrived.")
             return
-        self._show(request)
+        self._show(job)
         self._show_report()
         if outcome.cancelled:
             self.panel.say(f"Cancelled: {status.text}. Press Run to resume.")
         else:
-            self.panel.say(f"{status.text}, in {request.job.out.name}")
-        self.panel.status.setToolTip(str(request.job.out.absolute()))
+            self.panel.say(f"{status.text}, in {job.out.name}")
+        self.panel.status.setToolTip(str(job.out.absolute()))
 
     # Layers
 
