@@ -669,7 +669,7 @@ def test_refine_starts_from_the_last_inversion(
     tool.refine_section.button.click()
     assert "there is no inversion of this image" in messages.pop().lower()
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: hasattr(tool, "results"), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: bool(tool.results.layers), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     inversion = result_of(layer_of(window, "field")).content
     tool.refine_section.psf.setValue(0.5)
@@ -701,7 +701,7 @@ def test_refine_starts_from_the_last_inversion(
     assert any(name.startswith("|∫B×dz| (mT·m) – shot") for name in names), names
     refined = layer_of(window, "field", "refined")
     assert refined.data.shape == shot.shape
-    qtbot.waitUntil(lambda: not tool._refined.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.fit_view.results.busy, timeout=PATIENCE)
     assert refined.visible
     # A new inversion is not hidden by what was made of the one before.
     tool.panel.button.click()
@@ -731,7 +731,7 @@ def test_the_menu_refines_an_inversion_of_a_file(
     in_loop(refine)
     assert messages[-1].startswith("Invert shot is running")
     qtbot.waitUntil(lambda: "Verdict" in tool.fit_view.verdict.text(), timeout=PATIENCE)
-    qtbot.waitUntil(lambda: not tool._refined.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.fit_view.results.busy, timeout=PATIENCE)
     assert layer_of(window, "field", "shot refined").visible
     assert tool.fit_view.report.texts()["Start"] == "the inversion of 'shot'"
     window.layers.selection.active = layer_of(window, "field", "refined")
@@ -870,13 +870,14 @@ def test_a_refined_inversion_is_made_again(
     tool.setup.show_setup(SETUPS[0].model_dump())
     tool.steps.add("low-pass")
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: hasattr(tool, "results") and not tool.results.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: bool(tool.results.layers), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     tool.refine_section.psf.setValue(0.5)
     answers: list[Any] = []
     tool.panel.runner.ended.connect(answers.append)
     tool.refine_section.button.click()
     qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
-    qtbot.waitUntil(lambda: not tool._refined.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.fit_view.results.busy, timeout=PATIENCE)
     result = answers[0].value.content
     assert result.provenance.start.image.file == "fast.tif"
     save(window, result, tmp_path / "refined.shadowinv")

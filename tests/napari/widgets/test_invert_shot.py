@@ -145,7 +145,7 @@ def test_an_image_deleted_during_the_run_is_told_once(
     qtbot.waitUntil(lambda: tool.panel.button.text() == "Cancel", timeout=PATIENCE)
     window.layers.remove(window.layers["shot"])
     slow.set()
-    qtbot.waitUntil(lambda: hasattr(tool, "results"), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: bool(tool.results.layers), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     deleted, verdict = messages
     assert "was deleted" in deleted

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from napari.utils.notifications import show_warning
@@ -27,7 +27,7 @@ from napari_shadowinv._napari.widgets._forms import (
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, fact_rows
 from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Fact, Verdict
 from napari_shadowinv.fitting import Fit
 
 _REDRAW_MS = 500
@@ -69,7 +69,7 @@ class FitView(QWidget):
         self._job: FitJob | None = None
         self._result: Result[Any] | None = None
         self._alternative = ResultLayers(viewer, self)
-        self.results: ResultLayers | None = None
+        self.results = ResultLayers(viewer, self)
         self.curve = ObjectiveCurve()
         self.verdict = wrapping_label()
         self.solutions = SteadyComboBox()
@@ -94,29 +94,22 @@ class FitView(QWidget):
         self._solutions_row.setVisible(False)
         self.report.empty()
 
-    def show_result(self, job: FitJob, finished: Finished, last: LastResults) -> ResultLayers:
+    def show_result(self, job: FitJob, finished: Finished, last: LastResults) -> None:
         """Show the layers, verdict and report of a fit; notify unless the field is determined."""
         fit = finished.content
         moved = place_inputs(self._viewer, job)
-        self._show_verdict(fit)
+        self._show_report(fit, fit.facts_with_names(job.names), job.inputs)
         if fit.verdict is not Verdict.DETERMINED:
             text = fit.cautions[0].text
             show_warning(text[:1].upper() + text[1:])
-        input_warnings = {text for name, text in job.inputs if name == "Warning"}
-        texts = [caution.text for caution in fit.warnings]
-        rows = [("Warning", text) for text in texts if text not in input_warnings]
-        self.report.show_rows(
-            [*rows, *job.inputs, *fact_rows(fit.facts_with_names(job.names), details=None)]
-        )
         self._alternative.show([])
         self._job, self._result = job, finished.result
         self._list_solutions(fit)
-        results = last.layers_for_next((job.image, job.name))
-        results.show(main_layers(finished.layer_data, also=results.layer_keys), fit=moved)
-        self.results = results
-        return results
+        self.results = last.layers_for_next((job.image, job.name))
+        layer_data = main_layers(finished.layer_data, also=self.results.layer_keys)
+        self.results.show(layer_data, fit=moved)
 
-    def follow(self) -> None:
+    def follow(self, _: Any = None) -> None:
         """Show the verdict on the fit whose layer is selected, such as a layer from a file."""
         layer = self._viewer.layers.selection.active
         result = None if layer is None else result_of(layer)
@@ -125,11 +118,11 @@ class FitView(QWidget):
         if isinstance(result.content, Fit):
             self.empty()
             self._result = result
-            self._show_verdict(result.content)
-            rows = [("Warning", caution.text) for caution in result.content.warnings]
-            self.report.show_rows([*rows, *fact_rows(result.content.facts, details=None)])
+            self._show_report(result.content, result.content.facts)
 
-    def _show_verdict(self, fit: Fit) -> None:
+    def _show_report(
+        self, fit: Fit, facts: Iterable[Fact], inputs: Sequence[tuple[str, str]] = ()
+    ) -> None:
         is_determined = fit.verdict is Verdict.DETERMINED
         sentence = f"{fit.explanation[:1].upper()}{fit.explanation[1:]}."
         self.verdict.setText(
@@ -137,6 +130,9 @@ class FitView(QWidget):
         )
         self.verdict.setStyleSheet("" if is_determined else PROBLEM_STYLE)
         self.verdict.setVisible(True)
+        warnings = [("Warning", caution.text) for caution in fit.warnings]
+        rows = [row for row in warnings if row not in inputs]
+        self.report.show_rows([*rows, *inputs, *fact_rows(facts, details=None)])
 
     def _list_solutions(self, fit: Fit) -> None:
         with QSignalBlocker(self.solutions):

@@ -111,7 +111,10 @@ class ResultLayers(QObject):
         self._before = self._viewer.layers.selection.active
         present = self.layers
         self._order = [layer_key(keywords) for _, keywords, _ in layer_data]
-        self._remove_all_but(set(self._order))
+        for key in [key for key in self._layers if key not in self._order]:
+            layer = self._layers.pop(key)
+            if layer in present:
+                self._viewer.layers.remove(layer)
         waiting = []
         for data, keywords, kind in layer_data:
             layer = self._layers.get(layer_key(keywords))
@@ -145,13 +148,6 @@ class ResultLayers(QObject):
         """Take the layers of an earlier result, to update them with the next one."""
         earlier._timer.stop()
         self._layers, earlier._layers = earlier._layers, {}
-
-    def _remove_all_but(self, keys: set[str]) -> None:
-        for key, layer in list(self._layers.items()):
-            if key not in keys:
-                del self._layers[key]
-                if layer in self._viewer.layers:
-                    self._viewer.layers.remove(layer)
 
     def hide(self) -> None:
         for layer in self.layers:
@@ -205,10 +201,8 @@ class LastResults:
 
     def shot_of(self, layer: Any) -> Any | None:
         """Return the shot to whose last result a layer belongs, or None."""
-        for shot, last in self._last:
-            if layer in last.layers and shot in self._viewer.layers:
-                return shot
-        return None
+        shots = (shot for shot, last in self._last if layer in last.layers)
+        return next((shot for shot in shots if shot in self._viewer.layers), None)
 
     def layers_for_next(self, shot: Any) -> ResultLayers:
         """Return the layers for the next result of a shot, which is an image layer or a name."""
@@ -223,7 +217,7 @@ class LastResults:
 
 @dataclass(frozen=True)
 class Origins:
-    """Origins of an inversion's inputs, in words; empty without a mask or setup."""
+    """Origins of the inputs of an inversion or fit, in words; empty without a mask or setup."""
 
     image: str
     source: str
@@ -231,6 +225,7 @@ class Origins:
     source_mask: str
     setup: str
     setup_origin: str
+    steps: str = ""  # of a fit
 
     def attributes(self) -> dict[str, str]:
         """Return the origins that are saved with a result, without the names of files."""
@@ -239,6 +234,7 @@ class Origins:
             "mask_origin": self.mask,
             "source_mask_origin": self.source_mask,
             "setup_origin": self.setup_origin,
+            "steps": self.steps,
         }
         return {name: text for name, text in texts.items() if text}
 
@@ -250,6 +246,7 @@ class Origins:
             ("Source mask", self.source_mask),
             ("Mask", self.mask),
             ("Setup", self.setup),
+            ("Steps", self.steps),
         ]
         return [(name, text) for name, text in rows if text]
 

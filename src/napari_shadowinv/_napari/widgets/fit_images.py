@@ -37,7 +37,7 @@ from napari_shadowinv._napari.widgets._inputs import (
 )
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._qt import side_by_side, while_alive
-from napari_shadowinv._napari.widgets._results import LastResults, result_frame
+from napari_shadowinv._napari.widgets._results import LastResults, Origins, result_frame
 from napari_shadowinv._napari.widgets._tables import ImageRow, ImageTable, beam_column
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
@@ -121,7 +121,9 @@ class FitImages(ToolPanel):
         self.view = FitView(self.viewer, self.panel)
         self.save_result = SaveButton(
             self,
-            lambda: result_to_save(self.viewer, shown_result(self.viewer, self._fields_shown())),
+            lambda: result_to_save(
+                self.viewer, shown_result(self.viewer, field_of(self.view.results.layers))
+            ),
             "Save the selected or last fit: complete with its layers (.shadowinv), or its field "
             "for other programs (.h5).",
         )
@@ -145,7 +147,7 @@ class FitImages(ToolPanel):
         )
 
     def _connect(self) -> None:
-        while_alive(self, self.viewer.layers.selection, "active", self._on_active)
+        while_alive(self, self.viewer.layers.selection, "active", self.view.follow)
         self.images.reference_changed.connect(self._on_reference)
         self.images.reference_beam_entered.connect(self._set_beam)
         self.images.changed.connect(self._show_beams)
@@ -262,19 +264,15 @@ class FitImages(ToolPanel):
         images = [
             f"{row.name}: {_beam_summary(shot)}" for row, shot in zip(rows, shots, strict=True)
         ]
-        origins = {
-            "images": "; ".join(images),
-            "source_origin": self.source.summary,
-            "mask_origin": self.masks.summary(first.layer),
-            "setup_origin": self.setup.origin,
-            "steps": "; ".join(step.summary for step in recipe.steps),
-        }
-        input_rows = [
-            ("Source", self.source.summary),
-            ("Mask", origins["mask_origin"]),
-            ("Setup", self.setup.summary),
-            ("Steps", origins["steps"]),
-        ]
+        origins = Origins(
+            image="",  # the report has no row for several images
+            source=self.source.summary,
+            mask=self.masks.summary(first.layer),
+            source_mask="",
+            setup=self.setup.summary,
+            setup_origin=self.setup.origin,
+            steps="; ".join(step.summary for step in recipe.steps),
+        )
         used_layers = (*(row.layer for row in rows), self.masks.layer, self.source.layer)
         return FitJob(
             recipe=recipe,
@@ -282,8 +280,8 @@ class FitImages(ToolPanel):
             names=tuple(row.name for row in rows),
             name=f"{first.layer.name} fit",
             frame=result_frame(first.layer, recipe),
-            inputs=[(name, text) for name, text in (*input_rows, *_warnings_of(rows)) if text],
-            attributes={name: text for name, text in origins.items() if text},
+            inputs=[*origins.rows(), *_warnings_of(rows)],
+            attributes={"images": "; ".join(images), **origins.attributes()},
             image=first.layer,
             companions=tuple(
                 layer for layer in used_layers if layer is not None and layer is not first.layer
@@ -310,12 +308,10 @@ class FitImages(ToolPanel):
         )
 
     def show_result(self, finished: Finished, job: FitJob) -> None:
-        self.results = self.view.show_result(job, finished, self._last)
+        self.view.show_result(job, finished, self._last)
+        self.results = self.view.results
         self.reveal(self.view.verdict)
         self._show_cost()
-
-    def _fields_shown(self) -> list[Any]:
-        return [] if self.view.results is None else field_of(self.view.results.layers)
 
     def _show_cost(self) -> None:
         """Show the estimated time."""
@@ -377,9 +373,6 @@ class FitImages(ToolPanel):
         setup = self._shown_setup()
         if self._ready and row is not None and row.setup not in (None, setup):
             self.setup.suggest(row.setup, about.setup_origin_of(row.layer))
-
-    def _on_active(self, _: Any = None) -> None:
-        self.view.follow()
 
     def _reference_layer(self) -> Any | None:
         row = self.images.reference

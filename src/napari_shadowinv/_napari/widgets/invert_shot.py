@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -73,7 +72,7 @@ from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Level, ResultKind
+from napari_shadowinv.facts import Level
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
@@ -169,22 +168,23 @@ class InvertShot(InversionInputs, LivePanel):
         self.cost, self._pace = wrapping_label(), 1.0
         self.refine_section = RefineSection(self.refine)
         self.fit_view = FitView(self.viewer, self.panel)
-        self._refined = ResultLayers(self.viewer, self)
+        self.results = ResultLayers(self.viewer, self)
         self.verdict, self.report = VerdictLine(), FoldedReport()
         self._reported: Result[Any] | None = None
-        save = SaveButton(
+        self.save_result = SaveButton(
             self,
-            lambda: result_to_save(self.viewer, shown_result(self.viewer, self._result_layers())),
+            lambda: result_to_save(
+                self.viewer, shown_result(self.viewer, field_of(self._last_results().layers))
+            ),
             "Save the selected or last result: complete with its layers (.shadowinv), for other "
             "programs (.h5), or its sites (.csv).",
         )
-        self.save_result = save
         self.more_layers = MoreLayersButton(self, self._last_results)
         crop = with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
         self.add(labelled("Image", self.image), *self.beam, labelled("Crop", crop))
         self.add(*self.settings, self.live, self.keep_earlier, self.cost, self.panel)
-        self.add(self.verdict, side_by_side((save, 1), (self.more_layers, 1)), self.report)
-        self.add(self.refine_section, self.fit_view)
+        self.add(self.verdict, side_by_side((self.save_result, 1), (self.more_layers, 1)))
+        self.add(self.report, self.refine_section, self.fit_view)
 
     def _connect(self) -> None:
         self.image.picked.connect(self._on_image)
@@ -266,7 +266,7 @@ class InvertShot(InversionInputs, LivePanel):
             self._show_inversion(finished, job)
             return
         self.previewed.hide()
-        self._refined = self.fit_view.show_result(job, finished, self._last)
+        self.fit_view.show_result(job, finished, self._last)
         self.reveal(self.fit_view.verdict)
 
     def _on_start(self) -> None:
@@ -279,13 +279,9 @@ class InvertShot(InversionInputs, LivePanel):
         self.verdict.empty()
         self.report.empty()
 
-    def _last_results(self) -> ResultLayers | None:
+    def _last_results(self) -> ResultLayers:
         """Return the layers of the last refinement or inversion."""
-        return self._refined if self._refined.layers else getattr(self, "results", None)
-
-    def _result_layers(self) -> list[Any]:
-        results = self._last_results()
-        return [] if results is None else field_of(results.layers)
+        return self.fit_view.results if self.fit_view.results.layers else self.results
 
     def _follow_result(self, _: Any = None) -> None:
         """Show the report of the inversion whose layer is selected, such as a layer from a file."""
@@ -293,22 +289,14 @@ class InvertShot(InversionInputs, LivePanel):
         result = None if layer is None else result_of(layer)
         if result is None or result is self._reported or self.panel.runner.running:
             return
-        actions: dict[ResultKind, Callable[[Result[Any]], None]] = {
-            ResultKind.FIT: self._follow_fit,
-            ResultKind.INVERSION: self._follow_inversion,
-        }
-        if result.content.kind in actions:
-            actions[result.content.kind](result)
-
-    def _follow_fit(self, result: Result[Fit]) -> None:
-        self._empty_report()
-        self.fit_view.follow()
-
-    def _follow_inversion(self, result: Result[Inversion]) -> None:
-        self.fit_view.empty()
-        self._report(result.content, result.setup, [])
-        self._reported = result
-        self.reveal(self.verdict)
+        if isinstance(result.content, Fit):
+            self._empty_report()
+            self.fit_view.follow()
+        elif isinstance(result.content, Inversion):
+            self.fit_view.empty()
+            self._report(result.content, result.setup, [])
+            self._reported = result
+            self.reveal(self.verdict)
 
     def _report(
         self, inversion: Inversion, setup: Setup | None, input_rows: list[tuple[str, str]]
@@ -335,7 +323,7 @@ class InvertShot(InversionInputs, LivePanel):
         self.reveal(self.verdict)
         self._learn_pace(inversion)
         # They refine an earlier result and would cover the new one.
-        self._refined.hide()
+        self.fit_view.results.hide()
         self.show_layers(job.image, finished.layer_data, preview=False, fit=moved)
 
     def on_change(self) -> None:
@@ -408,25 +396,22 @@ class SourceJob(Job):
     def layers(self, content: FloatArray) -> list[FullLayerData]:
         """Describe the source as a layer over its image."""
         layer: Any = self.image
-        layer_data = (
-            content,
-            {
-                "name": f"{layer.name} source{' preview' if self.preview else ''}",
-                "metadata": metadata_for(
-                    SOURCE,
-                    "",
-                    setup_of(layer),
-                    setup_origin=setup_origin_of(layer),
-                    made_from=self.made_from,
-                    source_mask=self.shot.source_mask,
-                ),
-                "colormap": layer.colormap.name,
-                "contrast_limits": tuple(layer.contrast_limits),
-                **frame_of(layer).keywords(),
-            },
-            "image",
+        metadata = metadata_for(
+            SOURCE,
+            "",
+            setup_of(layer),
+            setup_origin=setup_origin_of(layer),
+            made_from=self.made_from,
+            source_mask=self.shot.source_mask,
         )
-        return [layer_data]
+        keywords = {
+            "name": f"{layer.name} source{' preview' if self.preview else ''}",
+            "metadata": metadata,
+            "colormap": layer.colormap.name,
+            "contrast_limits": tuple(layer.contrast_limits),
+            **frame_of(layer).keywords(),
+        }
+        return [(content, keywords, "image")]
 
 
 class EstimateSource(LivePanel):
