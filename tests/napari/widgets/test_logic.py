@@ -19,8 +19,8 @@ from napari_shadowinv import (
     InversionOptions,
 )
 from napari_shadowinv._napari.widgets._editors import format_number, parse_number
-from napari_shadowinv._napari.widgets._grid_files import GridFile
 from napari_shadowinv._napari.widgets._layers import crop_of, image_of, mask_of
+from napari_shadowinv._napari.widgets._objects import GridFile
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
 from napari_shadowinv._napari.widgets.forward_model import ForwardJob
 from napari_shadowinv._napari.widgets.invert_shot import SourceJob, estimate_cost

@@ -19,18 +19,16 @@ from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
 from napari_shadowinv._napari.widgets._files import IMAGE_FORMATS, Savable, SaveButton
-from napari_shadowinv._napari.widgets._grid_files import GRID, GRID_KIND, GridFile, GridFileEdit
-from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, shown_plane
-from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
+from napari_shadowinv._napari.widgets._objects import GRID, LAYER, GridFile, ObjectPanel
+from napari_shadowinv._napari.widgets._panels import RunPanel
 from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side
-from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
+from napari_shadowinv.physics.phantom_models import PhantomRecipe
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.inversion_run import plane_of
@@ -87,53 +85,29 @@ class ForwardJob(Job):
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
     ) -> Prediction:
         from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
+        from napari_shadowinv.pipeline.traced_file import trace_file
 
-        report = Reporter(on_progress, should_stop)
-        report("field", 0, None)
+        Reporter(on_progress, should_stop)("field", 0, None)
+        keywords: dict[str, Any] = {"on_progress": on_progress, "should_stop": should_stop}
         if isinstance(self.field, GridFile):
-            return self._trace(self.field, on_progress, should_stop)
-        displacement, assumption = self._transfer(self._displacement())
-        source, shadow = self._source(displacement.shape[1:])
-        image = synthetic_image(
-            displacement, source, on_progress=on_progress, should_stop=should_stop
-        )
+            source, shadow = self._source(self.shape)
+            keywords |= {"shape": self.shape, "view": self.field.view, "source": source}
+            traced = trace_file(Path(self.field.path), self.setup, **keywords)
+            image, displacement = traced.image, np.nan_to_num(traced.displacement)
+            flux = traced.source.sum()
+            doubts = [fact.text for fact in traced.facts if fact.level is not Level.SOUND]
+            assumption = " ".join(f"{text[0].upper()}{text[1:]}." for text in doubts)
+        else:
+            displacement, assumption = self._transfer(self._displacement())
+            source, shadow = self._source(displacement.shape[1:])
+            image = synthetic_image(displacement, source, **keywords)
+            flux = image.size if source is None else source.sum()
         caustic = jacobian_determinant(displacement) < self.caustic_jacobian
         if shadow is not None:
             caustic &= ~shadow
-        flux = image.size if source is None else source.sum()
         flux_inside = float(image.sum() / flux) if flux else 1.0
         return Prediction(
             image, displacement, source, float(caustic.mean()), flux_inside, assumption
-        )
-
-    def _trace(
-        self, grid: GridFile, on_progress: OnProgress | None, should_stop: ShouldStop | None
-    ) -> Prediction:
-        """Trace particles through a 3-D field."""
-        from napari_shadowinv.physics.forward import jacobian_determinant
-        from napari_shadowinv.pipeline.traced_file import trace_file
-
-        source = None if self.source is None else plane_of(self.source, "the source")
-        traced = trace_file(
-            Path(grid.path),
-            self.setup,
-            shape=self.shape,
-            view=grid.view,
-            source=source,
-            on_progress=on_progress,
-            should_stop=should_stop,
-        )
-        displacement = np.nan_to_num(traced.displacement)
-        caustic = jacobian_determinant(displacement) < self.caustic_jacobian
-        doubts = [fact.text for fact in traced.facts if fact.level is not Level.SOUND]
-        flux = traced.source.sum()
-        return Prediction(
-            traced.image,
-            displacement,
-            source,
-            float(caustic.mean()),
-            float(traced.image.sum() / flux) if flux else 1.0,
-            "".join(f"{text[0].upper()}{text[1:]}. " for text in doubts).strip(),
         )
 
     def layers(self, content: Prediction) -> list[FullLayerData]:
@@ -194,7 +168,6 @@ class ForwardJob(Job):
 
 
 _FIELDS = ("field", "field y", "field x")
-_LAYER = "layer"
 _MAX_SIDE_PX = 20_000
 
 
@@ -257,24 +230,14 @@ def input_field(layer: Any | None, point: Any, setup: Any) -> InputField:
     return InputField(potential, to_px2, field_setup, f"A potential in {unit}.")
 
 
-class ForwardModel(ToolPanel):
+class ForwardModel(ObjectPanel):
     """Choose an object or a potential, and predict its image."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         panel = RunPanel(
             "Forward model", "Simulate", "Trace the beam through the object and show the image."
         )
-        super().__init__(viewer, "forward-model", panel)
-        self.object = forms.ModelPicker(
-            "Object",
-            {
-                **forms.kinds_of(PHANTOMS),
-                **GRID_KIND,
-                _LAYER: ("a result or potential", None),
-            },
-        )
-        self.object.choice.setToolTip("Object that deflects the beam.")
-        self.file = GridFileEdit()
+        super().__init__(viewer, "forward-model", panel, "a result or potential")
         self.potential = LayerPicker(
             viewer,
             ("image",),
@@ -292,7 +255,6 @@ class ForwardModel(ToolPanel):
             "experiment, when the setup differs from the result's setup.</qt>"
         )
         self.height_px, self.width_px = _side("Height"), _side("Width")
-        self.setup = SetupPicker()
         tip = "Image layer of the undisturbed beam."
         self.source = LayerPicker(viewer, ("image",), tip, "uniform", about.may_be_source)
         self.warning = forms.wrapping_label(style=forms.PROBLEM_STYLE)
@@ -301,22 +263,18 @@ class ForwardModel(ToolPanel):
             self._image_to_save,
             "Save the predicted image with its pixel size (.tif, .npy or .png).",
         )
-        self.results: ResultLayers | None = None
         self._potential_rows = (
             forms.labelled("Layer", self.potential),
             self.interpretation,
             forms.labelled("Deflected by", self.deflector),
         )
-        self._file_row = forms.labelled("File", self.file)
-        self._last = LastResults(viewer, self)
         size = side_by_side((self.width_px, 1), (QLabel("×"), 0), (self.height_px, 1))
         self._size_row = forms.labelled("Size (px)", size)
-        self.add(self.object, self._file_row, *self._potential_rows, self._size_row, self.setup)
+        self.add(self.object, self.file_row, *self._potential_rows, self._size_row, self.setup)
         self.add(forms.labelled("Source", self.source), self._last.keep_earlier)
         self.add(self.panel, self.warning, self.save_result)
         self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
         self.object.changed.connect(self._on_change)
-        self.file.changed.connect(self.keep)
         self.potential.picked.connect(self._follow_potential)
         self.setup.changed.connect(self._on_change)
         for side in (self.height_px, self.width_px):
@@ -334,22 +292,16 @@ class ForwardModel(ToolPanel):
                 f"{name} is selected: select the field or the potential of a result, or an image "
                 "of a potential"
             )
-        self.object.set_kind(_LAYER)
+        self.object.set_kind(LAYER)
         self.potential.layer = layer
 
     def state(self) -> dict[str, Any]:
-        return {
-            "object": self.object.state(),
-            "file": self.file.path,
-            "setup": {**self.setup.state(), "kind": self.setup.picker.kind},
-            "size": [self.height_px.value(), self.width_px.value()],
-        }
+        size = [self.height_px.value(), self.width_px.value()]
+        return {**super().state(), "size": size}
 
     def restore(self, state: Any) -> None:
-        self.setup.restore(state.get("setup", {}))
-        self.object.restore(state.get("object", {}))
-        self.file.edit.setText(str(state.get("file", "")))
-        if self.object.kind != _LAYER:
+        super().restore(state)
+        if self.object.kind != LAYER:
             self.setup.choose_kind(str(state.get("setup", {}).get("kind", "proton")))
         size = state.get("size", [200, 200])
         self.height_px.setValue(int(size[0]))
@@ -360,7 +312,7 @@ class ForwardModel(ToolPanel):
         source = None if self.source.layer is None else image_of(self.source.layer)
         unit = about.unit_of(self.source.layer or {})
         common: dict[str, Any] = {"source": source, "unit": unit, "setup_origin": self.setup.origin}
-        if self.object.kind == _LAYER:
+        if self.object.kind == LAYER:
             layer: Any = self.potential.layer
             field = input_field(layer, self.viewer.dims.point, setup)
             return ForwardJob(
@@ -374,49 +326,38 @@ class ForwardModel(ToolPanel):
                 subject=layer,
                 **common,
             )
-        recipe: Any = self.object.model()
-        title = "" if self.object.kind == GRID else type(recipe).title
-        if self.object.kind == GRID:
-            recipe = self.file.grid_file(recipe)
-            title = recipe.title
+        simulated = self.simulated_object()
         shape = (self.height_px.value(), self.width_px.value())
         if source is not None:
             shape = source.shape
         return ForwardJob(
-            recipe,
+            simulated,
             shape=shape,
             setup=setup,
-            name=f"{title} image",
+            name=f"{simulated.title} image",
             frame=frame_for(shape, setup),
-            subject=title,
+            subject=simulated.title,
             **common,
         )
 
     def _image_to_save(self) -> Savable:
-        layers = [] if self.results is None else self.results.layers
-        if not layers:
+        if not self.results.layers:
             raise InputError("there is no predicted image yet: press Simulate first")
-        (layer,) = layers
+        (layer,) = self.results.layers
         return Savable(layer.name, np.asarray(layer.data), IMAGE_FORMATS, about.setup_of(layer))
 
     def forget(self) -> None:
         self.warning.setVisible(False)
 
     def _on_object(self) -> None:
-        """Select the kind of setup that an object requires, keeping its entries."""
-        if self.object.kind == _LAYER and self._ready:
+        if self.object.kind == LAYER and self._ready:
             self._select_field()
         self._follow_potential()
-        if self.object.kind == GRID and self._ready:
-            self.setup.choose_kind("proton")
-        recipe = PHANTOMS.get(self.object.kind)
-        if recipe is None or not recipe.probe or not self._ready:
-            return
-        self.setup.choose_kind(recipe.probe)
+        self.choose_setup()
 
     def _follow_potential(self) -> None:
         """Show the setup of a potential's result, or the user's setup for an object."""
-        layer = self.potential.layer if self.object.kind == _LAYER else None
+        layer = self.potential.layer if self.object.kind == LAYER else None
         self.setup.follow(layer, store=False)
         if self._ready:
             self._on_change()
@@ -430,11 +371,11 @@ class ForwardModel(ToolPanel):
                 self.potential.layer = fields[-1]
 
     def _on_change(self) -> None:
-        is_layer = self.object.kind == _LAYER
+        is_layer = self.object.kind == LAYER
         for row in self._potential_rows:
             row.setVisible(is_layer)
         self._size_row.setVisible(not is_layer)
-        self._file_row.setVisible(self.object.kind == GRID)
+        self.file_row.setVisible(self.object.kind == GRID)
         if is_layer:
             self._show_interpretation()
         self.keep()

@@ -17,12 +17,11 @@ from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _panels as panels
-from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
-from napari_shadowinv._napari.widgets._grid_files import GRID, GRID_KIND, GridFile, GridFileEdit
-from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
+from napari_shadowinv._napari.widgets._editors import parse_number
+from napari_shadowinv._napari.widgets._inputs import ChoiceBox, InstrumentForm
 from napari_shadowinv._napari.widgets._layers import LayerPicker
+from napari_shadowinv._napari.widgets._objects import GRID, LAYER, GridFile, ObjectPanel
 from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
-from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
@@ -43,7 +42,6 @@ from napari_shadowinv.pipeline.traced_file import object_of_file
 if TYPE_CHECKING:
     import napari
 
-_LAYER = "layer"
 _NOTHING = ""
 _PLOT_HEIGHT_PX = 260
 _LOG_RANGE = 8.0
@@ -140,7 +138,7 @@ class PlanPlot(Plot):
         self.draw()
 
 
-class PlanExperiment(panels.ToolPanel):
+class PlanExperiment(ObjectPanel):
     """Choose an object and an experiment, and see whether its field would be determined."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
@@ -150,37 +148,24 @@ class PlanExperiment(panels.ToolPanel):
             "Simulate shots with random imperfections, retrieve their fields, and compare these "
             "with the object.",
         )
-        super().__init__(viewer, "plan-experiment", panel)
-        self.object = forms.ModelPicker(
-            "Object",
-            {
-                **forms.kinds_of(PHANTOMS),
-                **GRID_KIND,
-                _LAYER: ("the field of a result", None),
-            },
-        )
-        self.object.choice.setToolTip("Object that deflects the beam.")
+        super().__init__(viewer, "plan-experiment", panel, "the field of a result")
         self.field = LayerPicker(
             viewer, ("image",), "A layer of a result, whose field is the object.", suits=_has_field
         )
-        self.file = GridFileEdit()
-        self._file_row = forms.labelled("File", self.file)
         self._field_row = forms.labelled("Result", self.field)
-        self.setup = SetupPicker()
-        self.energies = _line(
+        self.energies = _LineEdit(
             "14.7, 30",
             "Energies of several images of a shot in MeV (of light: wavelengths in m), separated "
             "by commas. Empty: one image with the setup's.",
         )
-        self.side = _line("200 x 200", "Height and width of an image in px, such as 200 x 200.")
+        self.side = _LineEdit("200 x 200", "Height and width of an image in px, such as 200 x 200.")
         self.instrument = InstrumentForm()
         self.options = forms.ModelForm(ExperimentOptions)
-        self.quantity = SteadyComboBox()
-        self.quantity.addItem("nothing", _NOTHING)
-        for key, swept in SWEPT.items():
-            self.quantity.addItem(swept.title, key)
-        self.quantity.setToolTip("Quantity of the experiment that is varied.")
-        self.values = _line(
+        self.quantity = ChoiceBox(
+            {_NOTHING: "nothing", **{key: swept.title for key, swept in SWEPT.items()}},
+            "Quantity of the experiment that is varied.",
+        )
+        self.values = _LineEdit(
             "100, 300, 1000", "Values of the quantity, separated by commas, in its unit."
         )
         self._values_row = forms.labelled("Values", self.values)
@@ -189,11 +174,9 @@ class PlanExperiment(panels.ToolPanel):
             panels.FoldedReport(),
             PlanPlot(),
         )
-        self._last = LastResults(viewer, self)
-        self.results: ResultLayers | None = None
         self.add(
             self.object,
-            self._file_row,
+            self.file_row,
             self._field_row,
             forms.labelled("Size (px)", self.side),
             self.setup,
@@ -209,7 +192,6 @@ class PlanExperiment(panels.ToolPanel):
             self.report,
         )
         self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
-        self.file.changed.connect(self.keep)
         self.quantity.currentIndexChanged.connect(lambda _: self._on_change())
         for part in (self.object, self.setup, self.instrument, self.options):
             part.changed.connect(self._on_change)
@@ -219,34 +201,24 @@ class PlanExperiment(panels.ToolPanel):
         self._ready = True
         self._on_object()
 
-    def state(self) -> dict[str, Any]:
+    def parts(self) -> dict[str, Any]:
         return {
-            "object": self.object.state(),
-            "file": self.file.path,
-            "setup": {**self.setup.state(), "kind": self.setup.picker.kind},
-            "energies": self.energies.text(),
-            "size": self.side.text(),
-            "options": self.options.values(),
-            "quantity": self.quantity.currentData(),
-            "values": self.values.text(),
+            **super().parts(),
+            "energies": self.energies,
+            "size": self.side,
+            "options": self.options,
+            "quantity": self.quantity,
+            "values": self.values,
         }
 
     def restore(self, state: Any) -> None:
-        self.object.restore(state.get("object", {}))
-        self.file.edit.setText(str(state.get("file", "")))
-        self.setup.restore(state.get("setup", {}))
+        super().restore(state)
         if kind := state.get("setup", {}).get("kind"):
             self.setup.picker.set_kind(str(kind))
-        self.options.set_values(state.get("options", {}))
-        self.energies.setText(str(state.get("energies", "")))
-        self.side.setText(str(state.get("size", "")))
-        self.values.setText(str(state.get("values", "")))
-        index = self.quantity.findData(str(state.get("quantity", _NOTHING)))
-        self.quantity.setCurrentIndex(max(index, 0))
 
     def request(self) -> PlanJob:
         setup = self.setup.setup()
-        quantity, size = str(self.quantity.currentData()), self.side.text().strip()
+        quantity, size = self.quantity.state(), self.side.text().strip()
         options: Any = self.options.model()
         return PlanJob(
             object=self._object(),
@@ -277,9 +249,8 @@ class PlanExperiment(panels.ToolPanel):
         self.reveal(self.report)
 
     def _object(self) -> PhantomRecipe | PlannedObject | GridFile:
-        if self.object.kind != _LAYER:
-            recipe: Any = self.object.model()
-            return self.file.grid_file(recipe) if self.object.kind == GRID else recipe
+        if self.object.kind != LAYER:
+            return self.simulated_object()
         layer = self.field.layer
         if layer is None:
             raise InputError(
@@ -303,21 +274,15 @@ class PlanExperiment(panels.ToolPanel):
         )
 
     def _on_object(self) -> None:
-        """Show the kind of setup that an object requires."""
-        recipe = PHANTOMS.get(self.object.kind)
-        probe = recipe.probe if recipe is not None else None
-        if self.object.kind == GRID:
-            probe = "proton"
-        if self._ready and probe:
-            self.setup.choose_kind(probe)
+        self.choose_setup()
         self._on_change()
 
     def _on_change(self) -> None:
         is_phantom = self.object.kind in PHANTOMS
         self.side.setPlaceholderText("200 x 200" if is_phantom else "that of the field")
-        self._file_row.setVisible(self.object.kind == GRID)
-        self._field_row.setVisible(self.object.kind == _LAYER)
-        self._values_row.setVisible(bool(self.quantity.currentData()))
+        self.file_row.setVisible(self.object.kind == GRID)
+        self._field_row.setVisible(self.object.kind == LAYER)
+        self._values_row.setVisible(bool(self.quantity.state()))
         self.keep()
 
 
@@ -325,11 +290,19 @@ def _has_field(layer: Any) -> bool:
     return about.displacement_of(layer) is not None
 
 
-def _line(example: str, tip: str) -> QLineEdit:
-    line = QLineEdit()
-    line.setPlaceholderText(example)
-    line.setToolTip(f"<qt>{tip}</qt>")
-    return line
+class _LineEdit(QLineEdit):
+    """An entry that is saved between sessions."""
+
+    def __init__(self, example: str, tip: str) -> None:
+        super().__init__()
+        self.setPlaceholderText(example)
+        self.setToolTip(f"<qt>{tip}</qt>")
+
+    def state(self) -> str:
+        return str(self.text())
+
+    def restore(self, text: Any) -> None:
+        self.setText(str(text))
 
 
 def _numbers(name: str, text: str, unit: str = "") -> Sequence[float]:
