@@ -45,6 +45,8 @@ from napari_shadowinv.analysis.outlines import Outlined
 from napari_shadowinv.analysis.product import BANDS
 from napari_shadowinv.analysis.series import shot_times
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io import write
+from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, RESULT, SITES
 from napari_shadowinv.io.store_shots import open_shots
 from napari_shadowinv.physics.units import prefix_for
 from napari_shadowinv.plotting import make_logarithmic, products_figure, save_figure
@@ -60,7 +62,7 @@ _ROUND = 0.02  # largest difference of the axes of a circle
 _OPACITIES = (0.35, 0.18)  # of the bands
 _BY_SETUP = "unit of the setup"
 _TIMES, _SHOTS = "Times", "Shots"  # labels of the rows of a store
-_OPEN_SHAPES = ("line", "path")
+OPEN_SHAPES = ("line", "path")
 _PANEL_HEIGHT_PX = 180
 _MAX_COLUMN = 3  # entries of a legend inside the axes; longer ones are above
 
@@ -69,24 +71,19 @@ _MAX_COLUMN = 3  # entries of a legend inside the axes; longer ones are above
 class _Request:
     """A product of a result to be measured, and the layer of the result."""
 
-    result: Result[Any]
+    origin: Result[Any]
     layer: Any
     product: Product
     unit: str | None
     samples: int
 
-    @property
-    def origin(self) -> Any:
-        """The result, by which requests are compared."""
-        return self.result
-
     def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
         return analyse(
-            self.result.content,
+            self.origin.content,
             self.product,
             samples=self.samples,
             unit=self.unit,
-            setup=self.result.setup,
+            setup=self.origin.setup,
             on_progress=on_progress,
             should_stop=should_stop,
         )
@@ -96,20 +93,15 @@ class _Request:
 class _SeriesRequest:
     """A product to be followed through the shots of a store, and a layer of the store."""
 
-    store: Path
+    origin: Path
     layer: Any
     product: Product
     unit: str | None
     shots: str | None
     times: str
 
-    @property
-    def origin(self) -> Any:
-        """The store, by which requests are compared."""
-        return self.store
-
     def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
-        stack = open_shots(self.store, self.shots)
+        stack = open_shots(self.origin, self.shots)
         series = analyse_shots(
             stack,
             self.product,
@@ -246,16 +238,12 @@ class ProductForm(QtWidgets.QWidget):
             forms.labelled("Width, samples", numbers),
             self.panel,
         )
-        content = QtWidgets.QWidget()
         files = qt.side_by_side((self.export, 1), (self.picture, 1))
         buttons = qt.side_by_side((self.save, 1), (self.clear, 0))
-        outputs = (self.plot, self.report, files, buttons)
-        qt.column(content, *rows, *outputs, margin=6).addStretch(1)
-        area = QtWidgets.QScrollArea()
-        area.setWidgetResizable(True)
-        area.setFrameShape(QtWidgets.QFrame.Shape.NoFrame)
-        area.setWidget(content)
-        qt.column(self, area)
+        _, layout = qt.scrolling_column(self)
+        for row in (*rows, self.plot, self.report, files, buttons):
+            layout.addWidget(row)
+        layout.addStretch(1)
         self.result.picked.connect(self._on_result)
         self.product.currentIndexChanged.connect(lambda _: self._enable())
         self._on_result()
@@ -322,21 +310,18 @@ class ProductForm(QtWidgets.QWidget):
                 f"there is no shape for the {self.kind.title}: press ✎ and draw one on the image"
             )
         is_closed = issubclass(self.kind, Outlined)
-        suitable = [
-            index
-            for index, kind in enumerate(shapes.shape_type)
-            if is_closed != (kind in _OPEN_SHAPES) or (is_closed and kind == "path")
-        ]
-        if not suitable:
+        index = selected_shape(
+            shapes,
+            lambda kind: is_closed != (kind in OPEN_SHAPES) or (is_closed and kind == "path"),
+        )
+        if index is None:
             expected = "a closed shape, such as an ellipse" if is_closed else "a line or a path"
             raise InputError(
                 f"'{shapes.name}' has no shape for the {self.kind.title}, expected {expected}: "
                 "press ✎ and draw one"
             )
-        selected = [index for index in suitable if index in shapes.selected_data] or suitable
-        index, to_pixels = selected[-1], pixel_mapper(layer)
-        world = np.array([shapes.data_to_world(c)[-2:] for c in shapes.data[index]])
-        return shape_fields(shapes.shape_type[index], to_pixels(world))
+        to_pixels = pixel_mapper(layer)
+        return shape_fields(shapes.shape_type[index], to_pixels(world_corners(shapes, index)))
 
     def choose(self, layer: Any) -> None:
         """Select the result that a layer belongs to, or raise an `InputError`."""
@@ -411,19 +396,10 @@ class ProductForm(QtWidgets.QWidget):
 
     @qt.notify_errors
     def _export(self) -> None:
-        from napari_shadowinv.io.formats import SITES
-
-        name, _ = QtWidgets.QFileDialog.getSaveFileName(
-            self, "Export CSV", "products.csv", "CSV (*.csv)"
-        )
-        if name:
-            text = products_table(self.results)
-            show_info(f"Wrote {forms.save_text(text, name, SITES.suffix)}")
+        export_csv(self, "products.csv", products_table(self.results))
 
     @qt.notify_errors
     def _save_figure(self) -> None:
-        from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG
-
         filters = ";;".join(f"{suffix[1:].upper()} (*{suffix})" for suffix in FIGURE_SUFFIXES)
         name, selected = QtWidgets.QFileDialog.getSaveFileName(
             self, "Save figure", f"products{PNG.suffix}", filters
@@ -439,16 +415,13 @@ class ProductForm(QtWidgets.QWidget):
 
     @qt.notify_errors
     def _save(self) -> None:
-        from napari_shadowinv.io import write
-        from napari_shadowinv.io.formats import RESULT
-
         assert isinstance(self._measured, _Request)
         name, _ = QtWidgets.QFileDialog.getSaveFileName(
             self, "Save with result", f"products{RESULT.suffix}", f"Result (*{RESULT.suffix})"
         )
         if not name:
             return
-        result = self._measured.result
+        result = self._measured.origin
         content: Any = result.content
         has_setup = result.setup is not None and content.setup is None
         dataset = content.to_dataset(result.setup) if has_setup else content.to_dataset()
@@ -459,6 +432,25 @@ def _store_of(layer: Any) -> Path | None:
     """Return the store of shots that a layer shows, or None."""
     store = metadata_of(layer).get("store")
     return None if store is None else Path(store)
+
+
+def export_csv(parent: QtWidgets.QWidget, name: str, text: str) -> None:
+    """Ask for a file, offering a name, and write a table."""
+    path, _ = QtWidgets.QFileDialog.getSaveFileName(parent, "Export CSV", name, "CSV (*.csv)")
+    if path:
+        show_info(f"Wrote {forms.save_text(text, path, SITES.suffix)}")
+
+
+def selected_shape(shapes: Any, suits: Callable[[str], bool]) -> int | None:
+    """Return the index of the selected shape of a suitable type, or else of the last one."""
+    suitable = [index for index, kind in enumerate(shapes.shape_type) if suits(kind)]
+    selected = [index for index in suitable if index in shapes.selected_data]
+    return next(reversed(selected or suitable), None)
+
+
+def world_corners(shapes: Any, index: int) -> FloatArray:
+    """Return the corners (n, 2) of a shape in world coordinates."""
+    return np.array([shapes.data_to_world(corner)[-2:] for corner in shapes.data[index]])
 
 
 def shape_fields(shape_type: str, corners: FloatArray) -> dict[str, Any]:

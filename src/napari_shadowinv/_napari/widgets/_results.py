@@ -18,12 +18,12 @@ from napari_shadowinv._napari.layer_metadata import (
     layer_key,
     place_image,
 )
+from napari_shadowinv._napari.layers import FullLayerData, add_layers
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import timer
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.jobs import ImageJob
-    from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.preprocessing import Recipe
 
 _MIN_LIMITS_CHANGE = 0.02  # relative to their range
@@ -154,8 +154,6 @@ class ResultLayers(QObject):
             layer.visible = False
 
     def _add_next(self) -> None:
-        from napari_shadowinv._napari.layers import add_layers
-
         if self._waiting:
             layer = self._waiting.pop(0)
             key = layer_key(layer[1])

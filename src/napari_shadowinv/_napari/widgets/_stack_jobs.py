@@ -16,7 +16,8 @@ from qtpy.QtCore import Signal
 
 from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import KEY, role_of
-from napari_shadowinv._napari.layers import widen_limits
+from napari_shadowinv._napari.layers import FullLayerData, widen_limits
+from napari_shadowinv._napari.stores import first_shot, store_layers
 from napari_shadowinv._napari.widgets._forms import PathEdit, labelled
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import column
@@ -28,7 +29,6 @@ from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 from napari_shadowinv.preprocessing import Recipe
 
 if TYPE_CHECKING:
-    from napari_shadowinv._napari.layers import FullLayerData
     from napari_shadowinv.stack import RunStatus
 
 
@@ -154,8 +154,6 @@ class StackJob(Job):
 
     def _store_layers(self, shot: int | None) -> list[FullLayerData]:
         """Describe the layers of the store; none if that has to wait for the next shot."""
-        from napari_shadowinv._napari.stores import store_layers
-
         try:
             layers = store_layers(self.out, shot=shot)
         except (InputError, OSError):
@@ -284,8 +282,6 @@ class WatchJob(StackJob):
         self._updated_at = time.monotonic()
 
     def _begin(self, index: int | None) -> None:
-        from napari_shadowinv._napari.stores import first_shot
-
         with suppress(InputError, OSError):
             self._reference_shot = first_shot(self.out) if index is None else index
             self._describe(self._reference_shot)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from napari.utils.notifications import show_info
 from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, Qt
 
@@ -15,7 +14,14 @@ from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._layers import LayerPicker, kind_of, new_shapes, shown_plane
-from napari_shadowinv._napari.widgets._products import ProductForm, pixel_mapper
+from napari_shadowinv._napari.widgets._products import (
+    OPEN_SHAPES,
+    ProductForm,
+    export_csv,
+    pixel_mapper,
+    selected_shape,
+    world_corners,
+)
 from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.paths import (
@@ -33,7 +39,6 @@ if TYPE_CHECKING:
 
 _REDRAW_MS = 40  # while the line moves
 _LAYER_ROLE = Qt.ItemDataRole.UserRole
-_LINE_SHAPES = ("line", "path")
 _PIXELS = "px"
 _MAX_WIDTH = 1e6
 _MAX_NAME_LENGTH = 34
@@ -240,11 +245,8 @@ class Analyse(qt.Docked):
         shapes = self.lines.layer
         if shapes is None:
             return None
-        lines = [n for n, kind in enumerate(shapes.shape_type) if kind in _LINE_SHAPES]
-        selected = [n for n in lines if n in shapes.selected_data] or lines
-        if not selected:
-            return None
-        return np.array([shapes.data_to_world(corner)[-2:] for corner in shapes.data[selected[-1]]])
+        line = selected_shape(shapes, lambda kind: kind in OPEN_SHAPES)
+        return None if line is None else world_corners(shapes, line)
 
     def _schedule_plot(self, _: Any = None) -> None:
         self._watch()
@@ -295,11 +297,4 @@ class Analyse(qt.Docked):
 
     @qt.notify_errors
     def _export(self) -> None:
-        from napari_shadowinv.io.formats import SITES
-
-        text = self.table()
-        name, _ = QtWidgets.QFileDialog.getSaveFileName(
-            self, "Export CSV", "profile.csv", "CSV (*.csv)"
-        )
-        if name:
-            show_info(f"Wrote {forms.save_text(text, name, SITES.suffix)}")
+        export_csv(self, "profile.csv", self.table())

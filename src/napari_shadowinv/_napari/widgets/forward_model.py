@@ -28,10 +28,13 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
-from napari_shadowinv.physics.setup import deflector_titles
+from napari_shadowinv.physics.projection import default_deflector, transferred_displacement
+from napari_shadowinv.physics.setup import deflector_titles, displacement_from_potential
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.inversion_run import plane_of
+from napari_shadowinv.pipeline.traced_file import trace_file
 
 if TYPE_CHECKING:
     import napari
@@ -84,9 +87,6 @@ class ForwardJob(Job):
     def run(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
     ) -> Prediction:
-        from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
-        from napari_shadowinv.pipeline.traced_file import trace_file
-
         Reporter(on_progress, should_stop)("field", 0, None)
         keywords: dict[str, Any] = {"on_progress": on_progress, "should_stop": should_stop}
         if isinstance(self.field, GridFile):
@@ -141,8 +141,6 @@ class ForwardJob(Job):
 
     def _transfer(self, displacement: FloatArray) -> tuple[FloatArray, str]:
         """Return the displacement in the chosen setup, and the assumption behind it."""
-        from napari_shadowinv.physics.projection import default_deflector, transferred_displacement
-
         field_setup, setup = self.field_setup, self.setup
         if field_setup is None or setup is None or field_setup == setup:
             return displacement, ""
@@ -157,8 +155,6 @@ class ForwardJob(Job):
         )
 
     def _displacement(self) -> FloatArray:
-        from napari_shadowinv.physics.setup import displacement_from_potential
-
         if isinstance(self.field, PhantomRecipe):
             return self.field.phantom(self.shape, self.setup).displacement
         values: Any = self.field
