@@ -11,10 +11,7 @@ from napari.utils.notifications import show_warning
 from qtpy.QtCore import QSignalBlocker, Qt
 from qtpy.QtWidgets import QDoubleSpinBox, QPushButton, QWidget
 
-from napari_shadowinv._napari.fit_layers import (
-    alternative_layers,
-    start_name,
-)
+from napari_shadowinv._napari.fit_layers import alternative_layers, start_name
 from napari_shadowinv._napari.jobs import Finished, FitJob
 from napari_shadowinv._napari.layer_metadata import Result, main_layers, result_of
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox

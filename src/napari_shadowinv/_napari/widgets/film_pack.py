@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from functools import partial
+from functools import lru_cache, partial
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,7 +46,7 @@ from napari_shadowinv.film.pack import FILM_TYPES
 from napari_shadowinv.film.scans import checked_corners
 from napari_shadowinv.io import write
 from napari_shadowinv.io.formats import RESULT
-from napari_shadowinv.io.images import Scan, read_scan
+from napari_shadowinv.io.images import read_scan
 from napari_shadowinv.pipeline import read_pack, write_layers
 from napari_shadowinv.pipeline.film_files import (
     PACK_FILE,
@@ -167,7 +167,7 @@ class CornerEditor(QObject):
         self._doses: Any = None
         self._plane = 0
         self._moved: dict[int, FloatArray] = {}  # by plane
-        self._read: tuple[Path | None, Scan | None] = None, None
+        self._read_scan = lru_cache(maxsize=1)(read_scan)
         self.scan: Any = None
         self.polygon: Any = None
         self._settle_timer = qt.timer(self, _SETTLE_MS, self._follow, once=True)
@@ -267,11 +267,7 @@ class CornerEditor(QObject):
     def _scan_of(self, plane: int) -> AnyArray:
         """Return the pixels of a film's scan with eight bits."""
         path = self._doses.pack.layers[plane].file or self._doses.pack.scan
-        if path != self._read[0] or self._read[1] is None:
-            self._read = path, read_scan(path)
-        scan = self._read[1]
-        assert scan is not None
-        pixels = scan.pixels
+        pixels = self._read_scan(path).pixels
         return pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
 
     def _on_step(self, _: Any = None) -> None:

@@ -96,7 +96,7 @@ class FitImages(ToolPanel):
         )
         self.masks = layers.MaskPicker(
             self.viewer,
-            self._reference_layer,
+            self.chosen_image,
             ("labels", "shapes"),
             "Labels or shapes on bad detector pixels, for all images. The fit ignores masked "
             "pixels.",
@@ -154,17 +154,10 @@ class FitImages(ToolPanel):
         self.source.changed.connect(self.images.fill)
         self.setup.changed.connect(self._on_setup)
         self.brightness.currentIndexChanged.connect(self._show_beams)
-        for signal in (
-            self.source.changed,
-            self.instrument.changed,
-            self.options.changed,
-            self.setup.changed,
-            self.steps.changed,
-            self.masks.changed,
-            self.fields.currentIndexChanged,
-            self.brightness.currentIndexChanged,
-            self.noise.currentIndexChanged,
-        ):
+        choices = (self.fields, self.brightness, self.noise)
+        changes = [choice.currentIndexChanged for choice in choices]
+        changes += [part.changed for part in self.parts().values() if part not in choices]
+        for signal in changes:
             signal.connect(lambda *_: self.keep())
             signal.connect(lambda *_: self._show_cost())
         for signal in (self.images.changed, self.images.reference_changed):
@@ -207,8 +200,9 @@ class FitImages(ToolPanel):
     # Recipes
 
     def chosen_image(self) -> Any | None:
-        """Return the layer to which masks and source of a recipe belong."""
-        return self._reference_layer()
+        """Return the layer of the reference, to which masks and source of a recipe belong."""
+        row = self.images.reference
+        return None if row is None else row.layer
 
     def common_psf(self) -> float | None:
         """Return the common point spread of all images; None if they differ."""
@@ -373,10 +367,6 @@ class FitImages(ToolPanel):
         setup = self._shown_setup()
         if self._ready and row is not None and row.setup not in (None, setup):
             self.setup.suggest(row.setup, about.setup_origin_of(row.layer))
-
-    def _reference_layer(self) -> Any | None:
-        row = self.images.reference
-        return None if row is None else row.layer
 
     def _may_be_image(self, layer: Any) -> bool:
         return about.may_be_shot(layer) and layer is not self.source.layer

@@ -12,7 +12,7 @@ from qtpy.QtWidgets import QLineEdit
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
-from napari_shadowinv._napari.layer_metadata import Frame, frame_for
+from napari_shadowinv._napari.layer_metadata import frame_for
 from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.widgets import _forms as forms
@@ -82,13 +82,12 @@ class PlanJob(Job):
         """Describe the image of the first draw."""
         plan = content.plans[content.best] if isinstance(content, ExperimentSweep) else content
         setup = plan.setups[0] if plan.setups else None
-        frame = frame_for(plan.shape, setup) if setup is not None else Frame()
         keywords = {
             "name": f"{plan.title}, planned",
             "metadata": about.metadata_for(about.SHOT, "counts", setup),
             "colormap": colour_map("image"),
             "contrast_limits": intensity_limits(plan.images[0]),
-            **frame.keywords(),
+            **frame_for(plan.shape, setup).keywords(),
         }
         return [(plan.images[0], keywords, "image")]
 
@@ -169,11 +168,8 @@ class PlanExperiment(ObjectPanel):
             "100, 300, 1000", "Values of the quantity, separated by commas, in its unit."
         )
         self._values_row = forms.labelled("Values", self.values)
-        self.verdict, self.report, self.plot = (
-            panels.VerdictLine(),
-            panels.FoldedReport(),
-            PlanPlot(),
-        )
+        self.verdict, self.report = panels.VerdictLine(), panels.FoldedReport()
+        self.plot = PlanPlot()
         self.add(
             self.object,
             self.file_row,
