@@ -130,10 +130,10 @@ class Analyse(qt.Docked):
 
     def _connect(self) -> None:
         self._timer = qt.timer(self, _REDRAW_MS, self.update_plot, once=True)
-        self._watched: list[Any] = []
         changes = ("inserted", "removed", "reordered")
         qt.while_alive(self, self.viewer.layers, changes, self._fill)
         qt.while_alive(self, self.viewer.dims, "current_step", self._schedule_plot)
+        qt.layers_while_alive(self, self.viewer.layers, "set_data", self._on_layer)
         self.lines.picked.connect(self._schedule_plot)
         for signal in (
             self.layers.itemChanged,
@@ -249,16 +249,8 @@ class Analyse(qt.Docked):
         return None if line is None else world_corners(shapes, line)
 
     def _schedule_plot(self, _: Any = None) -> None:
-        self._watch()
         if not self._timer.isActive():
             self._timer.start()
-
-    def _watch(self) -> None:
-        for layer in [self.lines.layer, *self.checked()]:
-            if layer is None or any(layer is watched for watched in self._watched):
-                continue
-            self._watched.append(layer)
-            qt.while_alive(self, layer, "set_data", self._on_layer)
 
     def _on_layer(self, changed: Any) -> None:
         if any(changed is layer for layer in (self.lines.layer, *self.checked())):

@@ -313,18 +313,17 @@ class InvertShot(InversionInputs, LivePanel):
         self._reported = finished.result
         if job.preview:
             self.verdict.show_headline(headline, "Preview: ")
-            self.show_layers(job.image, finished.layer_data, preview=True, fit=moved)
             residual = next(f for f in inversion.facts if f.key == "image_residual")
             self.panel.say(f"{residual.title} {residual.text}")
-            return
-        self._report(inversion, inversion.setup, list(job.inputs))
-        if headline.level is not Level.SOUND:
-            show_caution(f"{headline.level.value.capitalize()}: {headline.text}")
-        self.reveal(self.verdict)
-        self._learn_pace(inversion)
-        # They refine an earlier result and would cover the new one.
-        self.fit_view.results.hide()
-        self.show_layers(job.image, finished.layer_data, preview=False, fit=moved)
+        else:
+            self._report(inversion, inversion.setup, list(job.inputs))
+            if headline.level is not Level.SOUND:
+                show_caution(f"{headline.level.value.capitalize()}: {headline.text}")
+            self.reveal(self.verdict)
+            self._learn_pace(inversion)
+            # They refine an earlier result and would cover the new one.
+            self.fit_view.results.hide()
+        self.show_layers(job.image, finished.layer_data, job.preview, fit=moved)
 
     def on_change(self) -> None:
         super().on_change()
