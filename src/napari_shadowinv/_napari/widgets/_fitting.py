@@ -106,16 +106,17 @@ class FitView(QWidget):
         layer_data = main_layers(finished.layer_data, also=self.results.layer_keys)
         self.results.show(layer_data, fit=moved)
 
-    def follow(self, _: Any = None) -> None:
-        """Show the verdict on the fit whose layer is selected, such as a layer from a file."""
+    def follow(self, _: Any = None) -> bool:
+        """Show the verdict on the fit whose layer is selected; return False without a fit."""
         layer = self._viewer.layers.selection.active
         result = None if layer is None else result_of(layer)
-        if result is None or result is self._result or self._panel.runner.running:
-            return
-        if isinstance(result.content, Fit):
+        if result is None or self._panel.runner.running or not isinstance(result.content, Fit):
+            return False
+        if result is not self._result:
             self.empty()
             self._result = result
             self._show_report(result.content, result.content.facts)
+        return True
 
     def _show_report(
         self, fit: Fit, facts: Iterable[Fact], inputs: Sequence[tuple[str, str]] = ()

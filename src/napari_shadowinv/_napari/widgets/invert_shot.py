@@ -73,7 +73,6 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
-from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.pipeline import Cache
@@ -284,15 +283,15 @@ class InvertShot(InversionInputs, LivePanel):
         return self.fit_view.results if self.fit_view.results.layers else self.results
 
     def _follow_result(self, _: Any = None) -> None:
-        """Show the report of the inversion whose layer is selected, such as a layer from a file."""
+        """Show the report of the result whose layer is selected, such as a layer from a file."""
+        if self.fit_view.follow():
+            self._empty_report()
+            return
         layer = self.viewer.layers.selection.active
         result = None if layer is None else result_of(layer)
         if result is None or result is self._reported or self.panel.runner.running:
             return
-        if isinstance(result.content, Fit):
-            self._empty_report()
-            self.fit_view.follow()
-        elif isinstance(result.content, Inversion):
+        if isinstance(result.content, Inversion):
             self.fit_view.empty()
             self._report(result.content, result.setup, [])
             self._reported = result
