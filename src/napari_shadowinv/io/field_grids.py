@@ -43,7 +43,7 @@ def is_field_grid(path: Path) -> bool:
     with h5py.File(path, "r") as content:
         return "openPMD" in content.attrs or any(
             _COMPONENT.fullmatch(name) and getattr(item, "ndim", 0) >= len(AXES)
-            for name, item in members(path, content)
+            for name, item in members(content)
         )
 
 
@@ -124,16 +124,13 @@ def _choose_iteration(path: Path, content: Any, iteration: str | int | None) -> 
     names = [] if parent is None else [name for name in parent if name.isdigit()]
     if not names:
         raise InputError(f"{path} has no iteration in {base!r}: expected an openPMD file with data")
+    listed = ", ".join(sorted(names, key=int)[:_MAX_LISTED])
     if iteration is None and len(names) > 1:
-        listed = sorted(names, key=int)[:_MAX_LISTED]
         more = ", …" if len(names) > _MAX_LISTED else ""
-        raise InputError(f"{path} has the iterations {', '.join(listed)}{more}: choose one of them")
+        raise InputError(f"{path} has the iterations {listed}{more}: choose one of them")
     number = names[0] if iteration is None else str(iteration)
     if number not in names:
-        raise InputError(
-            f"{path} has no iteration {number}: expected one of "
-            f"{', '.join(sorted(names, key=int)[:_MAX_LISTED])}"
-        )
+        raise InputError(f"{path} has no iteration {number}: expected one of {listed}")
     return member(path, parent, number)
 
 
@@ -152,7 +149,8 @@ def _read_mesh(path: Path, record: Any, symbol: str) -> tuple[FloatArray, FloatA
                 f"{path} has no {name} for {symbol}: expected a grid with its unit, as openPMD "
                 "requires"
             )
-    unit = _metres(record.attrs["gridUnitSI"], 3)
+    # One number before version 2, then one for each axis.
+    unit = np.broadcast_to(np.ravel(record.attrs["gridUnitSI"]).astype(float), len(AXES))
     spacing = np.ravel(record.attrs["gridSpacing"]).astype(float) * unit
     offset = np.ravel(record.attrs["gridGlobalOffset"]).astype(float) * unit
     step = -1 if _text(record.attrs.get("dataOrder", "C")) == "F" else 1
@@ -216,12 +214,6 @@ def _collocate(parts: Sequence[AnyArray], places: FloatArray) -> tuple[list[AnyA
                     "0 to 0.5, as in a staggered mesh"
                 )
     return parts, place
-
-
-def _metres(unit: Any, count: int) -> FloatArray:
-    """Return the unit of each axis, which is one number before version 2."""
-    values = np.ravel(unit).astype(float)
-    return np.full(count, values[0]) if values.size == 1 else values
 
 
 def _text(value: Any) -> str:

@@ -69,7 +69,7 @@ def _refuse_other_file(path: Path, name: str, origin: str) -> None:
     )
 
 
-def members(path: Path, group: Any) -> Iterator[tuple[str, Any]]:
+def members(group: Any) -> Iterator[tuple[str, Any]]:
     """Yield names and items of a group, except items in other files."""
     import h5py
 
@@ -262,7 +262,7 @@ def _find_array(path: Path, file: Any, name: str) -> tuple[Any, int | None]:
         item = _member_or_default(path, file, match["name"])
         index = tuple(map(int, match["index"].split(",")))
     if item is None or not _is_numeric(item):
-        content = ", ".join(list_arrays(path, file)) or "none"
+        content = ", ".join(list_arrays(file)) or "none"
         raise InputError(f"{path} has no array {name!r}: it holds {content}")
     if index is None:
         return item, None
@@ -282,8 +282,7 @@ def _member_or_default(path: Path, file: Any, name: str) -> Any | None:
     for _ in range(_MAX_LINKS):
         if not isinstance(item, h5py.Group):
             break
-        defaults = (item.attrs[key] for key in _DEFAULTS if key in item.attrs)
-        default = next(defaults, None)
+        default = next((item.attrs[key] for key in _DEFAULTS if key in item.attrs), None)
         default = default.decode() if isinstance(default, bytes) else default
         item = member(path, item, default) if isinstance(default, str) else None
     return item if isinstance(item, h5py.Dataset) else None
@@ -332,9 +331,9 @@ def _check_filters(path: Path, dataset: Any) -> None:
         )
 
 
-def list_arrays(path: Path, file: Any) -> list[str]:
+def list_arrays(file: Any) -> list[str]:
     """List the first images of an open file and its groups, with shape and type."""
-    arrays = itertools.islice(_iterate_named_datasets(path, file), 10 * _MAX_LISTED)
+    arrays = itertools.islice(_iterate_named_datasets(file), 10 * _MAX_LISTED)
     images = [
         f"{name!r} ({'×'.join(map(str, item.shape))} {item.dtype})"
         for name, item in arrays
@@ -343,17 +342,16 @@ def list_arrays(path: Path, file: Any) -> list[str]:
     return images if len(images) <= _MAX_LISTED else [*images[:_MAX_LISTED], "…"]
 
 
-def _iterate_named_datasets(
-    path: Path, group: Any, prefix: str = "", depth: int = 0
-) -> Iterator[tuple[str, Any]]:
+def _iterate_named_datasets(group: Any, depth: int = 0) -> Iterator[tuple[str, Any]]:
     """Yield the datasets of a group and of groups in it, as deep as files usually go."""
     import h5py
 
-    for name, item in members(path, group):
+    for name, item in members(group):
         if isinstance(item, h5py.Dataset):
-            yield f"{prefix}{name}", item
+            yield name, item
         elif isinstance(item, h5py.Group) and depth < _MAX_DEPTH:
-            yield from _iterate_named_datasets(path, item, f"{prefix}{name}/", depth + 1)
+            for path, dataset in _iterate_named_datasets(item, depth + 1):
+                yield f"{name}/{path}", dataset
 
 
 def _is_numeric(item: Any) -> bool:

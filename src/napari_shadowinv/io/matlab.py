@@ -81,7 +81,7 @@ def is_matlab(path: Path) -> bool:
         # By name: walking all attributes of a damaged file may never end.
         if any(mark in file.attrs for mark in _FOREIGN_MARKS):
             return False
-        return is_named or any("MATLAB_class" in item.attrs for _, item in members(path, file))
+        return is_named or any("MATLAB_class" in item.attrs for _, item in members(file))
 
 
 def read_mat(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[str, Any]]:

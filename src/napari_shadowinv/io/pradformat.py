@@ -23,10 +23,7 @@ from napari_shadowinv._system.safety import as_file_errors, check_regular
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
-from napari_shadowinv.inversion.variables import (
-    dataset_from_field,
-    setup_from_dataset,
-)
+from napari_shadowinv.inversion.variables import dataset_from_field, setup_from_dataset
 from napari_shadowinv.io.hdf5 import hdf5_in_memory, list_arrays, load_dataset, member
 from napari_shadowinv.io.read_write import require
 from napari_shadowinv.provenance import Provenance
@@ -112,7 +109,7 @@ def read_pradformat(path: Path) -> tuple[AnyArray, dict[str, Any]] | xarray.Data
         return _read_inversion(path, attributes)
     object_type = f"the object type {kind!r}" if kind else "no attribute 'object_type'"
     with h5py.File(path, "r") as file:
-        names = ", ".join(list_arrays(path, file))
+        names = ", ".join(list_arrays(file))
     advice = f"name one of its arrays with variable, of {names}" if names else "export it as TIFF"
     raise FileFormatError(
         f"{path} is an HDF5 file with {object_type}: expected a pradformat radiograph or "
@@ -130,29 +127,27 @@ def _read_datasets(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray]:
 
 def _read_geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[str, Any]:
     """Return the fields of a particle setup that the attributes contain."""
-    geometry: dict[str, Any] = {"kind": "proton"}
     source, image = _read_distances(attributes)
     species = {symbol: name for name, symbol in _SYMBOLS.items()}.get(
         attributes.get("spec_name", _SYMBOLS["proton"])
     )
     energy = attributes.get("spec_energy")
     pixel = "pixel_size" if width == "dr" else "detector_pixel_size"
-    for name, value in (
-        ("source_object_distance", source),
-        ("object_image_distance", image),
-        (pixel, attributes.get(width)),
-        ("species", species if "spec_name" in attributes else None),
+    geometry = {
+        "kind": "proton",
+        "source_object_distance": source,
+        "object_image_distance": image,
+        pixel: attributes.get(width),
+        "species": species if "spec_name" in attributes else None,
         # The energy of a species that nobody here knows gives no field.
-        ("energy", energy / _EV_PER_MEV if energy is not None and species else None),
-    ):
-        if value is not None:
-            geometry[name] = value
+        "energy": energy / _EV_PER_MEV if energy is not None and species else None,
+    }
     first, second = attributes.get(width), attributes.get(f"{width}_ax2")
     if first is not None and second is not None and not np.isclose(first, second, rtol=1e-6):
         raise FileFormatError(
             f"{path} has pixels of {first:g} m by {second:g} m: expected square pixels; resample it"
         )
-    return geometry
+    return {name: value for name, value in geometry.items() if value is not None}
 
 
 def _read_distances(attributes: dict[str, Any]) -> tuple[float | None, float | None]:
@@ -171,13 +166,14 @@ def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
 
     setup = setup_from_dict(_read_geometry(path, attributes, "dr"), str(path))
     arrays = _read_datasets(path, ("phi", "defl_ax1", "defl_ax2"))
-    if "phi" not in arrays and not {"defl_ax1", "defl_ax2"} <= arrays.keys():
+    has_angles = {"defl_ax1", "defl_ax2"} <= arrays.keys()
+    if "phi" not in arrays and not has_angles:
         raise FileFormatError(
             f"{path} is a pradformat inversion without data: expected 'phi' or both 'defl_ax1' "
             "and 'defl_ax2'; export it again"
         )
     potential = -setup.normalized_potential(arrays["phi"]) if "phi" in arrays else None
-    if "defl_ax1" in arrays and "defl_ax2" in arrays:
+    if has_angles:
         displacement = setup.displacement(np.stack([arrays["defl_ax1"], arrays["defl_ax2"]]))
     else:
         displacement = displacement_from_potential(-setup.normalized_potential(arrays["phi"]))

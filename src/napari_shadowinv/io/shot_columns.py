@@ -234,7 +234,7 @@ def _read_hdf5_columns(path: Path, name: str) -> tuple[list[str], Iterator[list[
             values = load_dataset(path, item)
             columns = {field: _texts(values[field]) for field in item.dtype.names}
         elif isinstance(item, h5py.Group):
-            for key, column in members(path, item):
+            for key, column in members(item):
                 if isinstance(column, h5py.Dataset) and column.ndim == 1:
                     columns[_title(key, column)] = _texts(load_dataset(path, column))
     if not columns:
