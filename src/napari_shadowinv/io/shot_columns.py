@@ -23,7 +23,7 @@ from napari_shadowinv._system.tables import is_number, read_table
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.frames import split_address
 from napari_shadowinv.io.hdf5 import load_dataset, member, members
-from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, Column
+from napari_shadowinv.io.store_columns import Column
 
 JOINED = "shot_table"  # attribute of a store: the columns that it has of a shot table (JSON)
 PREFIX = "table."  # of the entries of these columns in the reports of shots
@@ -120,7 +120,6 @@ def _column(key: str, title: str, unit: str, kind: type) -> Column:
         key,
         title if unit == "1" else f"{title} ({unit})",
         title,
-        stores=(INVERSIONS, ROWS, FITS),
         unit=unit,
         kind=kind,
         format=_FORMATS[kind],

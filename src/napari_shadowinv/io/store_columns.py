@@ -37,7 +37,7 @@ class Column:
     long_name : str
         Label of the array.
     stores : tuple of str
-        Kinds of stores that have the column.
+        Kinds of stores that have the column. Default: all.
     unit : str
         Unit of the array.
     kind : type
@@ -56,7 +56,7 @@ class Column:
     key: str
     title: str
     long_name: str
-    stores: tuple[str, ...]
+    stores: tuple[str, ...] = (INVERSIONS, ROWS, FITS)
     unit: str = "1"
     kind: type = float
     value: Callable[[Any], Any] | None = None
@@ -112,7 +112,6 @@ COLUMNS: tuple[Column, ...] = (
         "seconds",
         "Time its worker spent on the shot",
         unit="s",
-        stores=(INVERSIONS, ROWS, FITS),
         format=".1f",
     ),
     Column(
@@ -120,7 +119,6 @@ COLUMNS: tuple[Column, ...] = (
         "verdict",
         "Whether the field may be believed",
         kind=str,
-        stores=(INVERSIONS, ROWS, FITS),
         value=lambda result: str(result.verdict),
         format="s",
         width=len("determined"),  # not broken into letters
@@ -153,7 +151,6 @@ COLUMNS: tuple[Column, ...] = (
         "total_error",
         "errors",
         "Error of the displacement, r.m.s., as a share of it",
-        stores=(INVERSIONS, ROWS, FITS),
         value=attrgetter("total_error"),
     ),
     Column(
@@ -161,7 +158,6 @@ COLUMNS: tuple[Column, ...] = (
         "limited by",
         "Largest part of the error, as a share of the displacement",
         kind=str,
-        stores=(INVERSIONS, ROWS, FITS),
         value=attrgetter("limited_by"),
         format="s",
         width=len("beam 12 %"),
@@ -171,7 +167,6 @@ COLUMNS: tuple[Column, ...] = (
         "converged",
         "Whether the solver converged",
         kind=bool,
-        stores=(INVERSIONS, ROWS, FITS),
         value=attrgetter("report.converged"),
     ),
     Column(
