@@ -48,19 +48,18 @@ def to_grey(array: AnyArray, channel: str | int | None, where: str | Path) -> Fl
     if array.ndim == 2:
         return np.ascontiguousarray(array, dtype=np.float64)
     colours = array[..., : {2: 1, 4: 3}.get(array.shape[-1], array.shape[-1])]
+    count = colours.shape[-1]
     if (colours == colours[..., :1]).all():
         return np.ascontiguousarray(colours[..., 0], dtype=np.float64)
     if channel is None:
         raise InputError(
-            f"{where} is a colour image with {colours.shape[-1]} channels: if it is a scan of "
-            "film, which darkens with dose, convert it to dose first "
-            "(napari_shadowinv.film); "
-            'otherwise choose a channel that is linear in fluence, "red", "green", "blue" or '
-            '"mean", or its number'
+            f"{where} is a colour image with {count} channels: if it is a scan of film, which "
+            "darkens with dose, convert it to dose first (napari_shadowinv.film); otherwise choose "
+            'a channel that is linear in fluence, "red", "green", "blue" or "mean", or its number'
         )
     if channel == "mean":
         return np.ascontiguousarray(colours.mean(axis=-1, dtype=np.float64))
-    text, count = str(channel), colours.shape[-1]
+    text = str(channel)
     index = CHANNELS.index(text) if text in CHANNELS else int(text) if text.isdecimal() else -1
     if not 0 <= index < count:
         raise InputError(
@@ -150,11 +149,10 @@ _TIFF_RATIO = 3 * DEFLATE_RATIO  # LZW at its best packs two and a half times as
 
 
 _SMALL_STRIP = 50_000_000  # bytes, which do not matter
-_UNPACKERS: dict[str, Callable[[bytes, int], bytes]] = {
-    name: lambda packed, most: zlib.decompressobj().decompress(packed, most)
-    for name in ("ADOBE_DEFLATE", "DEFLATE")
+_UNPACKERS: dict[str, Callable[[], Any]] = {
+    **dict.fromkeys(("ADOBE_DEFLATE", "DEFLATE"), zlib.decompressobj),
+    "LZMA": lzma.LZMADecompressor,
 }
-_UNPACKERS["LZMA"] = lambda packed, most: lzma.LZMADecompressor().decompress(packed, most)
 
 
 def _check_picture(path: Path, name: str, array: AnyArray) -> None:
@@ -274,8 +272,8 @@ def _check_strips(path: Path, page: Any) -> None:
             if count * _TIFF_RATIO <= most:
                 continue
             file.seek(offset)
-            unpacked = len(_UNPACKERS[page.compression.name](file.read(count), most + 1))
-            if unpacked > most:
+            unpacker = _UNPACKERS[page.compression.name]()
+            if len(unpacker.decompress(file.read(count), most + 1)) > most:
                 raise FileFormatError(
                     f"{path} is damaged: a strip of {count} bytes unpacks to more than {most} "
                     f"bytes, expected {pixels}; save it again"

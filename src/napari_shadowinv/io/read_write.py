@@ -27,25 +27,13 @@ from napari_shadowinv.io.files import check_output, replacing, sha256
 from napari_shadowinv.io.formats import (
     CPSA,
     IMAGE_WRITERS,
-    Format,
     format_of,
     formats_for,
     function,
     suffixes_for,
 )
-from napari_shadowinv.io.frames import (
-    Frame,
-    find_frames,
-    lazy_frames,
-    read_frame,
-    split_address,
-)
-from napari_shadowinv.io.hdf5 import (
-    check_arrays,
-    check_hdf5_seal,
-    hdf5_in_memory,
-    opened_netcdf,
-)
+from napari_shadowinv.io.frames import Frame, find_frames, lazy_frames, read_frame, split_address
+from napari_shadowinv.io.hdf5 import check_arrays, check_hdf5_seal, hdf5_in_memory, opened_netcdf
 from napari_shadowinv.io.images import film_warnings, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
 from napari_shadowinv.preprocessing import Radiograph
@@ -141,16 +129,6 @@ def _read_file(
     if not isinstance(content, tuple):
         return content
     array, metadata = content
-    return _make_radiograph(path, file_format, array, metadata, channel)
-
-
-def _make_radiograph(
-    path: Path,
-    file_format: Format,
-    array: AnyArray,
-    metadata: dict[str, Any],
-    channel: str | int | None,
-) -> Radiograph:
     facts: dict[str, Any] = {
         "kind": file_format.name,
         "dtype": str(array.dtype),
