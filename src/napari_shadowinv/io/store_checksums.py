@@ -60,7 +60,6 @@ class CheckedStore(LocalStore):
     def __init__(self, root: Path, *, read_only: bool = True) -> None:
         super().__init__(root, read_only=True)
         self._chunks: dict[str, _Chunk] = {}
-        self._layout: tuple[Layout | None] | None = None
         # Distinguishes this store from the shorter one before it grew, where dask keeps both.
         self._opened = time.time_ns()
 
@@ -97,18 +96,16 @@ class CheckedStore(LocalStore):
     ) -> Buffer | None:
         """Return the bytes read from a chunk once they have matched its checksum."""
         name, is_chunk, place = key.partition(_CHUNKS)
-        if buffer is not None and is_chunk and byte_range is None:
-            layout = self._sealed_layout()
-            if layout is not None:
-                index = int(place.partition("/")[0])
-                check_content(layout, key, name, index, buffer.to_bytes())
+        if buffer is not None and is_chunk and byte_range is None and self._layout is not None:
+            index = int(place.partition("/")[0])
+            check_content(self._layout, key, name, index, buffer.to_bytes())
         return buffer
 
     def _check(self, key: str) -> None:
         path = self.root / key
         name, is_chunk, place = key.partition(_CHUNKS)
-        if is_chunk and (layout := self._sealed_layout()) is not None:
-            check_chunk(layout, key, name, int(place.partition("/")[0]))
+        if is_chunk and self._layout is not None:
+            check_chunk(self._layout, key, name, int(place.partition("/")[0]))
         if path.is_dir() or not path.exists():
             return
         check_regular(path, "a file of the store")
@@ -121,14 +118,13 @@ class CheckedStore(LocalStore):
         else:
             check_size(path, path.stat().st_size)
 
-    def _sealed_layout(self) -> Layout | None:
-        """Return the layout of the store's checksums, or None without checksums."""
-        if self._layout is None:
-            file = self.root / _METADATA
-            document = _json(file) if file.exists() else {}
-            check_seal(file, document)
-            self._layout = (Layout.of(self.root, document),)
-        return self._layout[0]
+    @cached_property
+    def _layout(self) -> Layout | None:
+        """The layout of the store's checksums, or None without checksums."""
+        file = self.root / _METADATA
+        document = _json(file) if file.exists() else {}
+        check_seal(file, document)
+        return Layout.of(self.root, document)
 
     def _metadata(self, name: str) -> dict[str, Any]:
         """Return the description of an array, from the folder's own copy where there is one."""
