@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -77,14 +78,12 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
             "the dataset has no fields of a series of shots: expected one from invert_stack, "
             "run_stack or a .shadowinv.zarr store"
         )
+    # By selection: NaN in their place would make every pixel of a mean a special case.
+    chosen = np.flatnonzero(stack["status"].values == DONE) if "status" in stack else slice(None)
     variables: dict[str, Any] = {}
     for name in names:
         field = stack[name]
-        done = field
-        if "status" in stack:
-            # By selection: NaN in their place would make every pixel of a mean a special case.
-            done = field.isel(shot=np.flatnonzero(stack["status"].values == DONE))
-        done = done.astype(np.float64)
+        done = field.isel(shot=chosen).astype(np.float64)
         variables[f"{name}_mean"] = _labelled(
             done.mean("shot", skipna=False), field, "mean of shots"
         )
@@ -264,9 +263,12 @@ class _Graph:
         tasks: dict[Any, Any] = {
             (self._inverted, index): self._task(index, task.key) for index in range(len(shots))
         }
-        self._shots = HighLevelGraph.from_collections(
+        graph = HighLevelGraph.from_collections(
             self._inverted, tasks, dependencies=[*dependencies, task]
         )
+        da: Any = import_module("dask.array")
+        # The block of a shot is the dictionary of its variables.
+        self._records = da.Array(graph, self._inverted, ((1,) * len(shots),), dtype=object)
 
     def _task(self, index: int, task: Any) -> tuple[Any, ...]:
         stack = self._stack
@@ -303,22 +305,13 @@ class _Graph:
         return dataset if setups is None else with_places(dataset)
 
     def _per_shot_array(self, name: str, dims: tuple[str, ...], dtype: Any = None) -> Any:
-        from dask.highlevelgraph import HighLevelGraph
-
-        sizes = self._stack.sizes
-        layer = f"{name}-{self._token}"
-        zeros = (0,) * len(dims)
-        tasks: dict[Any, Any] = {
-            (layer, index, *zeros): (_pick, (self._inverted, index), name, True)
-            for index in range(sizes["shot"])
-        }
-        graph = HighLevelGraph(
-            {**self._shots.layers, layer: tasks},
-            {**self._shots.dependencies, layer: {self._inverted}},
+        return self._records.map_blocks(
+            partial(_pick, name=name, with_shot=True),
+            name=f"{name}-{self._token}",
+            chunks=(*self._records.chunks, *((self._stack.sizes[dim],) for dim in dims)),
+            new_axis=list(range(1, 1 + len(dims))),
+            meta=np.empty((0,) * (1 + len(dims)), dtype or dtype_of(name)),
         )
-        da: Any = import_module("dask.array")
-        chunks = ((1,) * sizes["shot"], *((sizes[dim],) for dim in dims))
-        return da.Array(graph, layer, chunks, dtype=dtype or dtype_of(name))
 
     def _shared_array(self, name: str, dims: tuple[str, ...]) -> Any:
         from dask.delayed import delayed
