@@ -133,8 +133,8 @@ class WorkerDiedError(Exception):
 class _Threads:
     """Threads of this process; `_Cluster` has the same methods."""
 
-    stop: threading.Event | None  # set to end tasks that run, if they share this process
-    workers: int | None  # if all of them are on this machine
+    stop: threading.Event  # set to end tasks that run; None where they have their own process
+    workers: int  # None where they may be on other machines
 
     def __init__(self, pool: ThreadPoolExecutor, workers: int) -> None:
         self.name = f"{workers} thread{'s' if workers > 1 else ''}"
@@ -144,7 +144,7 @@ class _Threads:
 
     def window(self, *, files: bool) -> int:
         """Return the number of tasks to submit ahead."""
-        return _TASKS_PER_SLOT * (self.workers or 1)
+        return _TASKS_PER_SLOT * self.workers
 
     def share(self, value: Any, name: str) -> Any:
         """Send a value to the workers, and return its representative for tasks."""
@@ -332,8 +332,7 @@ def _threads(count: int) -> Iterator[Engine]:
     try:
         yield engine
     except BaseException:
-        if engine.stop is not None:
-            engine.stop.set()
+        engine.stop.set()
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)

@@ -138,9 +138,11 @@ class Arrivals:
             return list(self._ready)[:count]
 
     def put_back(self, name: str) -> None:
-        """Wait again for a file that changed while it was read."""
+        """Wait until a file no longer changes, such as one that changed while it was read."""
         with self._changed:
-            self._settle_later(name)
+            stamp_now = self._stamp(name)
+            if stamp_now is not None:
+                self._settling[name] = (stamp_now, time.monotonic())
 
     def matches(self, name: str) -> bool:
         """Return whether a name belongs to a shot."""
@@ -187,11 +189,10 @@ class Arrivals:
             self._ready.setdefault(name)
 
     def _on_writing(self, name: str) -> None:
-        self._ready.pop(name, None)
-        self._settling.pop(name, None)
+        self._drop(name)
         # A file that was linked here is never closed.
         if not self._reports_closing or _is_link(self.folder / name):
-            self._settle_later(name)
+            self.put_back(name)
 
     def _drop(self, path: str) -> None:
         name = os.path.basename(path)
@@ -199,11 +200,6 @@ class Arrivals:
         self._settling.pop(name, None)
 
     # With the lock held
-
-    def _settle_later(self, name: str) -> None:
-        stamp_now = self._stamp(name)
-        if stamp_now is not None:
-            self._settling[name] = (stamp_now, time.monotonic())
 
     def _settle_some(self) -> float:
         """Complete files that have not changed for long enough; return the next time to check."""

@@ -43,19 +43,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Shard:
-    """Part of a stack's shots.
+    """Part of a stack's shots."""
 
-    Attributes
-    ----------
-    number, count : int
-        Its number, from 1, and the number of all shards.
-    files : str
-        Checksum of the places of all shots' files, which all shards must share.
-    """
-
-    number: int
-    count: int
-    files: str
+    number: int  # from 1
+    count: int  # of all shards
+    files: str  # checksum of the places of all shots' files, which all shards must share
 
     @classmethod
     def of(cls, part: tuple[int, int] | None, shots: Shots, out: Path) -> Self | None:
@@ -91,23 +83,22 @@ def _shard_numbers(shots: int, count: int, group: int) -> AnyArray:
 def check_shard(store: StackStore, shard: Shard | None) -> None:
     """Refuse to continue a store in other shards, or without a shard before they are merged."""
     count = store.attributes.get(SHARDS)
-    if shard is None and count is not None:
+    if count == (None if shard is None else shard.count):
+        return
+    if shard is None:
         raise InputError(
             f"{store.path} is written in {count} shards: merge them before you continue without "
             "shards, overwrite the store, or choose another name"
         )
-    if shard is None:
-        return
     if count is None:
         raise InputError(
             f"{store.path} was written without shards, or its shards are merged: continue without "
             "a shard, or choose another name"
         )
-    if count != shard.count:
-        raise InputError(
-            f"{store.path} is written in {count} shards, received shard {shard.number} of "
-            f"{shard.count}: use the same number of shards, or choose another name"
-        )
+    raise InputError(
+        f"{store.path} is written in {count} shards, received shard {shard.number} of "
+        f"{shard.count}: use the same number of shards, or choose another name"
+    )
 
 
 def check_shots(store: StackStore, shard: Shard, shots: int) -> None:

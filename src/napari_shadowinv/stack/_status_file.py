@@ -33,14 +33,7 @@ _RATE_S = 60.0  # of which the rate is the mean
 class StatusFile:
     """A file that is replaced after shots and once a second, in a thread, while its block lasts.
 
-    Parameters
-    ----------
-    path : Path
-    arrivals : Arrivals
-        Of the watched folder.
-    store : Path
-    on_note : callable
-        Receives a sentence if the file cannot be written, once.
+    `on_note` receives a sentence if it cannot be written, once.
     """
 
     def __init__(
