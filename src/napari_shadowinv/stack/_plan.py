@@ -6,7 +6,7 @@ Its number of sites follows from the accuracy: `choose_sites`.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -24,7 +24,6 @@ from napari_shadowinv._system.arrays import (
 )
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.safety import check_memory
-from napari_shadowinv._system.validation import check_instance
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion import count_sites
@@ -121,11 +120,6 @@ class Stack:
         rows = zip(self.shots.items, table.rows_of(self.shots.names), strict=True)
         items = [replace(shot, entries=entries) for shot, entries in rows]
         return replace(self, shots=replace(self.shots, items=items), columns=table.columns)
-
-    @property
-    def rows(self) -> list[Mapping[str, Any]]:
-        """The row of a shot table that each shot has."""
-        return [shot.entries for shot in self.shots.items]
 
     def with_sites(self, n_sites: int) -> Stack:
         """Return the stack with the number of sites derived from the accuracy."""
@@ -265,7 +259,6 @@ def describe_stack(
         raise InputError(
             f"warm start is {warm_start}: expected a number of shots, or 1 to disable it"
         )
-    check_instance(recipe, Recipe, "recipe")
     resolved = Recipe() if recipe is None else recipe
     if isinstance(source, Estimate):
         resolved = resolved.model_copy(update={"source": source})
@@ -425,9 +418,8 @@ def _describe_inputs(
     )
     inputs.recipe.check(inputs.shot)
     if inputs.recipe.estimate is not None:
-        inputs.recipe.estimate.adapt_to(
-            inputs.recipe.setup, stack_shots.shape
-        )  # refuses a wrong setup
+        # It refuses a wrong setup.
+        inputs.recipe.estimate.adapt_to(inputs.recipe.setup, stack_shots.shape)
     if isinstance(source, (str, Path)):
         path, variable = split_address(source, measured.variable)
         origin = Origin(
@@ -436,8 +428,7 @@ def _describe_inputs(
             variable=variable,
             shape=stack_shots.shape,
         )
-        provenance = inputs.provenance.with_image(source=origin)
-        inputs = replace(inputs, provenance=provenance)
+        inputs = replace(inputs, provenance=inputs.provenance.with_image(source=origin))
     return stack_shots, replace(inputs, shot=replace(inputs.shot, source=None)), sources
 
 
@@ -468,13 +459,12 @@ def _describe_table(
     shape: tuple[int, int] | None,
 ) -> tuple[Shots, Setup | None]:
     """Return the shots of a table, and the setup of the first image."""
-    part = getattr(reader, "keywords", {})
     if getattr(reader, "func", reader) is not read_shot:
         raise InputError(
             f"received a reader for the table {table}, which names files: leave the reader out"
         )
-    parts = part.get("channel"), part.get("variable")
-    items = table_shots(table, recipe, *parts)
+    part = getattr(reader, "keywords", {})
+    items = table_shots(table, recipe, part.get("channel"), part.get("variable"))
     if recipe.fit is not None:
         image = first_image(items)
         assert isinstance(image.image, Radiograph)

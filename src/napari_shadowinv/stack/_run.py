@@ -66,7 +66,7 @@ from napari_shadowinv.stack._plan import (
     values_of_beam,
 )
 from napari_shadowinv.stack._shards import Shard, check_shard, check_shots, numbers_of
-from napari_shadowinv.stack._shots import Reader, checksum, read_shot
+from napari_shadowinv.stack._shots import Reader, checksum, differences, read_shot
 from napari_shadowinv.stack._worker import InvertTask, ShotOutcome, TaskContext, run_shots
 
 if TYPE_CHECKING:
@@ -256,7 +256,8 @@ def run_stack(
                 remove_unfinished(path)
             store = reopen_damaged(store)
             if stack.columns:
-                store = join_columns(store, stack.columns, stack.rows)
+                rows = [shot.entries for shot in stack.shots.items]
+                store = join_columns(store, stack.columns, rows)
             arrived = len(stack.shots) > len(store.names)
             if not arrived and not np.isin(store.statuses(), again).any():
                 _Run(stack, store, (), on_progress, should_stop).report("nothing to do")
@@ -500,12 +501,11 @@ def _coordinates(stack: Stack) -> dict[str, Variable]:
 
 
 def _stored_coordinate(coordinate: Any) -> Variable:
-    if isinstance(coordinate, tuple):
-        dim, values, attributes = coordinate
-        dims: tuple[str, ...] = (dim,)
-    else:
-        dims, values, attributes = coordinate.dims, coordinate.values, dict(coordinate.attrs)
-    values = np.asarray(values)
+    import xarray as xr
+
+    labelled = xr.as_variable(coordinate)
+    dims = tuple(map(str, labelled.dims))
+    values, attributes = labelled.values, dict(labelled.attrs)
     if values.dtype.kind in "UO":
         return Variable(dims, str, attributes, values.astype(object))
     if values.dtype.kind in "mM":
@@ -641,10 +641,7 @@ def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:
 
 def _difference(before: str, now: str) -> str:
     try:
-        old, new = json.loads(before or "{}"), json.loads(now or "{}")
-        names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
-        pairs = [(name, old.get(name, "default"), new.get(name, "default")) for name in names]
-        return ", ".join(f"{name}: {stored} there, {asked} now" for name, stored, asked in pairs)
+        return differences(json.loads(before or "{}"), json.loads(now or "{}"), "default")
     except (ValueError, AttributeError, TypeError):
         return f"{shorten(before or 'none', 80)} there, {shorten(now or 'none', 80)} now"
 

@@ -157,11 +157,9 @@ class RowsReference(ImageReference):
 
     def __dask_tokenize__(self) -> tuple[Any, ...]:
         # A changed file is another input, so dask must not reuse its result.
-        files = [(name, path) for row in self.rows for name, path in row.files.items()]
-        stamps = [stamp(path) for _, path in files if path.exists()]
-        setup = "" if self.setup is None else self.setup.model_dump_json()
-        content = json.dumps([self._summaries(), [(name, str(path)) for name, path in files]])
-        return content, json.dumps(stamps), setup, str(self.channel), str(self.variable)
+        stamps = [stamp(path) for path in self._files().values() if path.exists()]
+        content = self.identity(Path("/"))
+        return content, json.dumps(stamps), str(self.channel), str(self.variable)
 
     def load(self) -> tuple[tuple[FitShot, ...], dict[str, Any]]:
         """Return the images, and the files of their rows."""
@@ -201,14 +199,14 @@ class RowsReference(ImageReference):
         (row,) = self.rows
         (before,) = origin.get("rows") or ({},)
         if before != row.summary:
-            return _differences(before, row.summary)
+            return differences(before, row.summary)
         entries = origin.get("provenance", {}).get("recipe", {}).get("setup")
         setup_before = None if entries is None else setup_from_dict(entries)
         # The setup of a row may have been in an image that was removed.
         if setup_before == self.setup or (self.setup is None and not row.file.exists()):
             return ""
         setups = (setup_before, self.setup)
-        return _differences(*({} if setup is None else setup.model_dump() for setup in setups))
+        return differences(*({} if setup is None else setup.model_dump() for setup in setups))
 
     def identity(self, folder: Path) -> str:
         files = {name: _relative_text(path, folder) for name, path in self._files().items()}
@@ -235,9 +233,10 @@ def _relative_text(path: Path, folder: Path) -> str:
         return text_of(path)
 
 
-def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+def differences(before: Mapping[str, Any], now: Mapping[str, Any], missing: Any = None) -> str:
+    """Describe the entries that differ; `missing` stands for one that is not there."""
     return ", ".join(
-        f"{name}: {before.get(name)} there, {now.get(name)} now"
+        f"{name}: {before.get(name, missing)} there, {now.get(name, missing)} now"
         for name in {**before, **now}
         if before.get(name) != now.get(name)
     )
@@ -387,7 +386,8 @@ def find_shots(
     if isinstance(shots, Shots):
         return replace(shots, shape=shape or usual_shape(shots.items))
     if isinstance(shots, (str, Path)):
-        return _from_path(str(shots), reader, shape)
+        items = _shots_at(str(shots), reader)
+        return Shots(items, shape or usual_shape(items))
     if hasattr(shots, "dims") and hasattr(shots, "coords"):
         return _from_xarray(shots)
     if isinstance(shots, Sequence) and all(isinstance(item, (str, Path)) for item in shots):
@@ -412,11 +412,6 @@ def find_shots(
     return _from_array(shots)
 
 
-def _from_path(text: str, reader: Reader, shape: tuple[int, int] | None) -> Shots:
-    items = _shots_of(find_frames(text, **_parts_of(text, reader)), reader)
-    return Shots(items, shape or usual_shape(items))
-
-
 def _parts_of(text: str, reader: Reader) -> dict[str, Any]:
     """Return the array that a reader selects, and whether it can select frames."""
     keywords = inspect.signature(reader).parameters
@@ -427,6 +422,10 @@ def _parts_of(text: str, reader: Reader) -> dict[str, Any]:
         )
     variable = getattr(reader, "keywords", {}).get("variable")
     return {"variable": variable, "numbered": "page" in keywords}
+
+
+def _shots_at(path: str, reader: Reader) -> list[Shot]:
+    return _shots_of(find_frames(path, **_parts_of(path, reader)), reader)
 
 
 def _shots_of(frames: Sequence[Frame], reader: Reader) -> list[Shot]:
@@ -523,16 +522,15 @@ def _from_array(shots: Any, coordinate: Any = None, labels: Any = None) -> Shots
             f"shots have the unknown shape {shots.shape}: call compute_chunk_sizes() first"
         )
     mask = _common_mask(shots)
-    images: Sequence[ImageReference]
-    if isinstance(shots, da.Array):
-        array = shots.rechunk((1, -1, -1))
-        images = [BlockReference(array, index) for index in range(count)]
-    elif isinstance(shots, np.ndarray):
-        array = da.from_array(np.asarray(shots), chunks=(1, -1, -1))
-        images = [ArrayReference(plane) for plane in np.asarray(shots)]
-    else:  # of h5py or zarr
-        array = da.from_array(shots, chunks=(1, -1, -1))
-        images = [BlockReference(array, index) for index in range(count)]
+    is_in_memory = isinstance(shots, np.ndarray)
+    values = np.asarray(shots) if is_in_memory else shots
+    if isinstance(values, da.Array):
+        array = values.rechunk((1, -1, -1))
+    else:  # of numpy, h5py or zarr
+        array = da.from_array(values, chunks=(1, -1, -1))
+    images: Sequence[ImageReference] = [BlockReference(array, index) for index in range(count)]
+    if is_in_memory:
+        images = [ArrayReference(plane) for plane in values]
     numbers = range(count) if coordinate is None else coordinate
     names = map(str, numbers if labels is None else labels)
     items = [Shot(name, image) for name, image in zip(names, images, strict=True)]
@@ -563,9 +561,9 @@ def find_source(source: Any, *, reader: Reader = read_shot) -> AnyArray | Shots 
     if source is None:
         return None
     if isinstance(source, (str, Path)):
-        frames = find_frames(source, **_parts_of(str(source), reader))
-        if len(frames) == 1:
-            return _shots_of(frames, reader)[0].images.read()[0]
+        items = _shots_at(str(source), reader)
+        if len(items) == 1:
+            return items[0].images.read()[0]
     if getattr(source, "ndim", None) == 2:
         return np.asarray(source)
     sources = find_shots(source, reader=reader)

@@ -433,16 +433,13 @@ AnyTask = InvertTask | FitTask
 
 def _with_sites_reason(inversion: Inversion) -> Inversion:
     """Add the reason for the number of sites, and a warning if it does not suffice."""
-    caution, errors = None, inversion.errors
-    if errors is not None:
-        why = "with the sites of the first shots"
-        caution = errors.accuracy_caution(inversion.options.accuracy, why)
-    report = replace(
-        inversion.report,
-        sites_reason="as many as the first shots needed for the accuracy",
-        warnings=(*inversion.report.warnings, *filter(None, [caution])),
-    )
-    return replace(inversion, report=report)
+    reason = "as many as the first shots needed for the accuracy"
+    inversion = replace(inversion, report=replace(inversion.report, sites_reason=reason))
+    if inversion.errors is None:
+        return inversion
+    why = "with the sites of the first shots"
+    caution = inversion.errors.accuracy_caution(inversion.options.accuracy, why)
+    return inversion.with_warnings(filter(None, [caution]))
 
 
 def _divide_by_mean(image: AnyArray, mask: BoolArray | None) -> AnyArray:
