@@ -19,7 +19,7 @@ import numpy as np
 from napari_shadowinv._system.safety import as_file_errors, check_memory, check_regular
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.hdf5 import check_arrays, load_dataset, member, members
+from napari_shadowinv.io.hdf5 import check_arrays, load_dataset, member, members, open_hdf5
 from napari_shadowinv.physics.field_grid import AXES, FieldGrid, field_grid
 
 _HDF5_MARK = b"\x89HDF\r\n\x1a\n"
@@ -33,14 +33,12 @@ _BYTES_PER_NODE = 100  # six components, twice in double precision
 @as_file_errors
 def is_field_grid(path: Path) -> bool:
     """Return whether a file holds fields on a 3-D grid; false for a file that cannot be read."""
-    import h5py
-
     if not path.is_file():
         return False
     with path.open("rb") as file:
         if file.read(len(_HDF5_MARK)) != _HDF5_MARK:
             return False
-    with h5py.File(path, "r") as content:
+    with open_hdf5(path) as content:
         return "openPMD" in content.attrs or any(
             _COMPONENT.fullmatch(name) and getattr(item, "ndim", 0) >= len(AXES)
             for name, item in members(content)
@@ -73,13 +71,11 @@ def read_field_grid(path: Path, *, iteration: str | int | None = None) -> FieldG
     InputError
         If it holds no Cartesian 3-D field, several iterations, or no units.
     """
-    import h5py
-
     check_regular(path, _EXPECTED)
     with path.open("rb") as file:
         if file.read(len(_HDF5_MARK)) != _HDF5_MARK:
             raise FileFormatError(f"{path} is no HDF5 file: expected {_EXPECTED}")
-    with h5py.File(path, "r") as content:
+    with open_hdf5(path) as content:
         if "openPMD" in content.attrs:
             return _read_openpmd(path, content, iteration)
     if iteration is not None:

@@ -2,7 +2,8 @@
 
 - the array that the user names: `read_hdf5`, as an image `read_plane`; the choice: `list_arrays`
 - one of many frames in an array: `read_hdf5_frame`; their number: `count_frames`
-- for callers that know the layout: an item, `member`; its values, `load_dataset`; `check_arrays`
+- for callers that know the layout: `open_hdf5`; an item, `member`; its values, `load_dataset`
+- refuse a file whose arrays are elsewhere or too large: `check_arrays`
 - a NetCDF4 file, for xarray: `opened_netcdf`
 - write one: `hdf5_in_memory`; compare its checksum: `check_hdf5_seal`
 
@@ -39,6 +40,13 @@ _BLOCK_BYTES = 1 << 20
 _MAX_LINKS = 16
 _INDEX = re.compile(r"(?P<name>.+)\[(?P<index>\d+(,\d+)*)\]")
 _DEFAULTS = ("signal", "default")  # attributes of a NeXus group: its array, or the group to look in
+
+
+def open_hdf5(path: Path) -> Any:
+    """Open an HDF5 file for reading."""
+    import h5py
+
+    return h5py.File(path, "r")
 
 
 def member(path: Path, group: Any, name: str, depth: int = 0) -> Any | None:
@@ -114,10 +122,8 @@ def _chunk_bytes(path: Path, dataset: Any) -> int:
 
 def check_arrays(path: Path) -> None:
     """Refuse a file whose arrays are in other files or do not fit into memory together."""
-    import h5py
-
     total = 0
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         for dataset in _iterate_datasets(path, file):
             total += _memory_bytes(path, dataset)
             check_size(path, total)
@@ -209,9 +215,7 @@ def check_hdf5_seal(path: Path) -> None:
 @as_file_errors
 def read_hdf5(path: Path, name: str) -> AnyArray:
     """Read one array by its name with groups: ``shots/3/image``."""
-    import h5py
-
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         dataset, number = _find_array(path, file, name)
         if number is not None:
             return _load_frame(path, dataset, number)
@@ -234,9 +238,7 @@ def read_plane(path: Path, name: str) -> tuple[AnyArray, dict[str, Any]]:
 @as_file_errors
 def count_frames(path: Path, name: str) -> tuple[int, ...]:
     """Return the lengths of the axes before the last two of an array; none if it is one image."""
-    import h5py
-
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         dataset, number = _find_array(path, file, name)
         if dataset.ndim < 2 or 0 in dataset.shape:
             raise FileFormatError(
@@ -249,9 +251,7 @@ def count_frames(path: Path, name: str) -> tuple[int, ...]:
 @as_file_errors
 def read_hdf5_frame(path: Path, name: str, number: int) -> AnyArray:
     """Read frame `number` of an array, counted over all its axes before the last two."""
-    import h5py
-
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         return _load_frame(path, _find_array(path, file, name)[0], number)
 
 

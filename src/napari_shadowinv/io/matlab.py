@@ -29,7 +29,7 @@ from napari_shadowinv._system.safety import as_file_errors, check_size
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
-from napari_shadowinv.io.hdf5 import load_dataset, member, members
+from napari_shadowinv.io.hdf5 import load_dataset, member, members, open_hdf5
 
 _HDF5_OFFSET = 512
 # Attributes of pradformat and of .shadowinv, which MATLAB's save does not write.
@@ -77,7 +77,7 @@ def is_matlab(path: Path) -> bool:
         is_named = file.read(6) == b"MATLAB"
     if is_named and not h5py.is_hdf5(path):
         return True
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         # By name: walking all attributes of a damaged file may never end.
         if any(mark in file.attrs for mark in _FOREIGN_MARKS):
             return False
@@ -129,9 +129,7 @@ def _choose_image(path: Path, variables: list[Variable], name: str | None) -> Va
 
 
 def _variables_73(path: Path) -> list[Variable]:
-    import h5py
-
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         # Names that begin with # are MATLAB's own.
         names = [name for name in file if not name.startswith("#")]
         return [_describe_variable(path, name, member(path, file, name)) for name in names]
@@ -154,9 +152,7 @@ def _describe_variable(path: Path, name: str, item: Any) -> Variable:
 
 
 def _load_73(path: Path, name: str) -> AnyArray:
-    import h5py
-
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         return load_dataset(path, member(path, file, name)).T
 
 

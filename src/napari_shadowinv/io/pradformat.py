@@ -24,7 +24,13 @@ from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.inversion.variables import dataset_from_field, setup_from_dataset
-from napari_shadowinv.io.hdf5 import hdf5_in_memory, list_arrays, load_dataset, member
+from napari_shadowinv.io.hdf5 import (
+    hdf5_in_memory,
+    list_arrays,
+    load_dataset,
+    member,
+    open_hdf5,
+)
 from napari_shadowinv.io.read_write import require
 from napari_shadowinv.provenance import Provenance
 
@@ -73,9 +79,7 @@ _ATTRIBUTES = """
 
 
 def _root_attributes(path: Path) -> dict[str, Any]:
-    import h5py
-
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         names = [name for name in _ATTRIBUTES.split() if name in file.attrs]
         return {name: _as_python_value(file.attrs[name]) for name in names}
 
@@ -91,8 +95,6 @@ def _as_python_value(value: Any) -> Any:
 
 def read_pradformat(path: Path) -> tuple[AnyArray, dict[str, Any]] | xarray.Dataset:
     """Read a radiograph, with its ``geometry``, or the dataset of an inversion of any code."""
-    import h5py
-
     attributes = _root_attributes(path)
     kind = attributes.get("object_type")
     if kind == "radiograph":
@@ -108,7 +110,7 @@ def read_pradformat(path: Path) -> tuple[AnyArray, dict[str, Any]] | xarray.Data
     if kind == "inversion":
         return _read_inversion(path, attributes)
     object_type = f"the object type {kind!r}" if kind else "no attribute 'object_type'"
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         names = ", ".join(list_arrays(file))
     advice = f"name one of its arrays with variable, of {names}" if names else "export it as TIFF"
     raise FileFormatError(
@@ -118,9 +120,7 @@ def read_pradformat(path: Path) -> tuple[AnyArray, dict[str, Any]] | xarray.Data
 
 
 def _read_datasets(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray]:
-    import h5py
-
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         items = {name: member(path, file, name) for name in names}
         return {name: load_dataset(path, item) for name, item in items.items() if item is not None}
 

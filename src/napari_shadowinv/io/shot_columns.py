@@ -22,7 +22,7 @@ from napari_shadowinv._system.safety import as_file_errors, check_regular, check
 from napari_shadowinv._system.tables import is_number, read_table
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.frames import split_address
-from napari_shadowinv.io.hdf5 import load_dataset, member, members
+from napari_shadowinv.io.hdf5 import load_dataset, member, members, open_hdf5
 from napari_shadowinv.io.store_columns import Column
 
 JOINED = "shot_table"  # attribute of a store: the columns that it has of a shot table (JSON)
@@ -226,7 +226,7 @@ def _read_hdf5_columns(path: Path, name: str) -> tuple[list[str], Iterator[list[
     """Return the titles and the rows of cells of a compound dataset or a group of columns."""
     import h5py
 
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         item = member(path, file, name)
         columns: dict[str, list[str]] = {}
         if isinstance(item, h5py.Dataset) and item.dtype.names and item.ndim == 1:
