@@ -123,36 +123,33 @@ def find_frames(
                 f"no file matches {file}: expected shots; check the folder and pattern"
             )
     elif numbered and variable is None:
-        return _pages_of(file)
+        return _frames_of_file(file)
     else:
         files = [file]
     if not numbered or variable is None:
         return [Frame(each, text_of(each.name), variable=variable) for each in files]
     if len(files) == 1:
-        return _frames_of_array(files[0], variable)
+        return _frames_of_file(files[0], variable)
     return [frame for each in files for frame in _readable_frames(each, variable)]
 
 
 def _readable_frames(path: Path, variable: str) -> list[Frame]:
     """Return the frames of one file among many, which fails alone if it cannot be read."""
     try:
-        return _frames_of_array(path, variable)
+        return _frames_of_file(path, variable)
     except (OSError, ValueError):
         return [Frame(path, text_of(path.name), variable=variable)]
 
 
-def _pages_of(path: Path) -> list[Frame]:
-    name = text_of(path.name)
-    count = tiff_pages(path) if format_of(path) is TIFF else 1
-    if count == 1:
-        return [Frame(path, name)]
-    return [Frame(path, f"{name}[{page}]", page) for page in range(count)]
-
-
-def _frames_of_array(path: Path, variable: str) -> list[Frame]:
-    name = text_of(path.name)
-    axes = count_frames(path, variable) if format_of(path) in (PRADFORMAT, RESULT) else ()
-    if math.prod(axes) <= 1:
+def _frames_of_file(path: Path, variable: str | None = None) -> list[Frame]:
+    """Return the pages of a TIFF, or the frames of an array."""
+    name, file_format = text_of(path.name), format_of(path)
+    axes: tuple[int, ...] = ()
+    if variable is None:
+        axes = (tiff_pages(path),) if file_format is TIFF else ()
+    elif file_format in (PRADFORMAT, RESULT):
+        axes = count_frames(path, variable)
+    if math.prod(axes) == 1:
         return [Frame(path, name, variable=variable)]
     return [
         Frame(path, f"{name}[{','.join(map(str, index))}]", number, variable)

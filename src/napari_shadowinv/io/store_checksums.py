@@ -299,24 +299,30 @@ def chunk_file(root: Path, array: Any, index: int) -> Path:
     return Path(root, array.basename, key)
 
 
-def has_checksums(array: Any) -> bool:
+def _has_checksums(array: Any) -> bool:
     """Return whether the chunks of an open Zarr array end with their checksums."""
-    names: list[str] = [codec.to_dict()["name"] for codec in array.metadata.codecs]
-    return _CODEC in names
+    return any(codec.to_dict()["name"] == _CODEC for codec in array.metadata.codecs)
+
+
+def fields_of(arrays: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of the open Zarr arrays that hold a chunk of values for each shot."""
+    return tuple(
+        name
+        for name, array in arrays.items()
+        if is_along_shots(array) and array.chunks[0] == 1 and name not in RECORD
+    )
 
 
 def note_shot(
     root: Path, store_id: str, arrays: Mapping[str, Any], index: int, labels: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return a shot's place, labels and the checksums of its written chunks, for its report."""
-    chunks: dict[str, str | None] = {}
-    for name, array in arrays.items():
-        if not is_along_shots(array) or name in RECORD:
-            continue
-        if not has_checksums(array):
-            return {}
-        if array.chunks[0] == 1:
-            chunks[name] = stored_checksum(chunk_file(root, array, index))
+    fields = {name: arrays[name] for name in fields_of(arrays)}
+    if not all(map(_has_checksums, fields.values())):
+        return {}
+    chunks = {
+        name: stored_checksum(chunk_file(root, array, index)) for name, array in fields.items()
+    }
     return {CHUNKS: chunks, LABELS: dict(labels), PLACE: [store_id, index]}
 
 

@@ -50,6 +50,7 @@ from napari_shadowinv.io.store import (
 from napari_shadowinv.io.store_checksums import (
     FIXED,
     chunk_file,
+    fields_of,
     fixed_keys,
     is_along_shots,
     note_shot,
@@ -123,7 +124,7 @@ class ShotWriter:
             )
         group = self.arrays()
         with _as_store_errors(self.path):
-            for name in _fields_of(group):
+            for name in fields_of(group):
                 if name in arrays:
                     group[name][index : index + 1] = np.asarray(arrays[name])[np.newaxis]
                 else:
@@ -144,7 +145,7 @@ class ShotWriter:
         group = self.arrays()
         with _as_store_errors(self.path):
             group["status"][index : index + 1] = np.int8(PENDING)
-            for name in ("report", *_fields_of(group)):
+            for name in ("report", *fields_of(group)):
                 self._erase(group[name], index)
 
     def _erase(self, array: Any, index: int) -> None:
@@ -153,15 +154,6 @@ class ShotWriter:
 
     def arrays(self) -> dict[str, Any]:
         return self.opened or _open_arrays(self.path, self.store_id, self.shots)
-
-
-def _fields_of(arrays: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names of the arrays that hold a chunk of values for each shot."""
-    return tuple(
-        name
-        for name, array in arrays.items()
-        if is_along_shots(array) and array.chunks[0] == 1 and name not in ("status", "report")
-    )
 
 
 def _open_to_write(path: Path) -> dict[str, Any]:
