@@ -285,21 +285,19 @@ def describe_stack(
     else:
         task, beam = _plan_inversion(stack_shots, inputs, image, resolved, variables, warm_start)
         common = image if task.by_row else None
-    if shot_sources is not None or (common is not None and beam is None):
-        alone = None if common is None else Shot("", ArrayReference(common))
-        stack_shots = _with_sources(stack_shots, shot_sources, alone, by_row=task.by_row)
+    own_sources = None if shot_sources is None else shot_sources.items
+    if common is not None and beam is None:
+        own_sources = [Shot("", ArrayReference(common))] * len(stack_shots)
+    if own_sources is not None:
+        stack_shots = _with_sources(stack_shots, own_sources, by_row=task.by_row)
     return Stack(stack_shots, task, beam, common, reader_text(reader), warm_start)
 
 
-def _with_sources(
-    shots: Shots, sources: Shots | None, alone: Shot | None, *, by_row: bool
-) -> Shots:
-    """Return the shots with a source of each, or one alone, except rows that name their own."""
+def _with_sources(shots: Shots, sources: Sequence[Shot], *, by_row: bool) -> Shots:
+    """Return the shots with the source of each, except rows that name their own."""
     items = [
-        shot
-        if by_row and shot.rows[0].source is not None
-        else replace(shot, source=alone if sources is None else sources.items[index])
-        for index, shot in enumerate(shots.items)
+        shot if by_row and shot.rows[0].source is not None else replace(shot, source=source)
+        for shot, source in zip(shots.items, sources, strict=True)
     ]
     return replace(shots, items=items)
 

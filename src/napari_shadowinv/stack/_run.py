@@ -347,10 +347,7 @@ class _Run:
         self._should_stop = should_stop
         statuses, reports = store.statuses(), store.reports()
         self._todo = {int(index) for index in np.flatnonzero(np.isin(statuses, again))}
-        self._counts = {
-            status: 0 if status in again else int((statuses == status).sum())
-            for status in (DONE, FAILED)
-        }
+        self._done = int((statuses == DONE).sum())
         self._doubtful = sum(
             status == DONE and bool(report.get("warnings"))
             for status, report in zip(statuses, reports, strict=True)
@@ -369,18 +366,18 @@ class _Run:
         name = "" if outcome is None else shots.items[outcome.index].name
         if outcome is not None:
             self._ended += 1
-            self._counts[outcome.status] += 1
+            self._done += outcome.status == DONE
             self._doubtful += outcome.warnings > 0
             self._failures += [(name, outcome.reason)] if outcome.reason else []
         if self._on_progress is None:
             return
-        done, failed = self._counts[DONE], self._counts[FAILED]
+        failed = len(self._failures)
         status = RunStatus(
             total=self._total,
-            done=done,
+            done=self._done,
             failed=failed,
             doubtful=self._doubtful,
-            waiting=self._total - done - failed,
+            waiting=self._total - self._done - failed,
             ended=self._ended,
             seconds=time.monotonic() - self._began,
             engine=engine,
