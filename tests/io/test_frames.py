@@ -11,7 +11,8 @@ import tifffile
 
 from napari_shadowinv import FileFormatError, InputError, read
 from napari_shadowinv.io import hdf5, read_radiograph
-from napari_shadowinv.io.frames import find_frames, read_frame
+from napari_shadowinv.io.frames import Frame, find_frames
+from napari_shadowinv.io.read_write import read_frame
 
 CUBE = np.arange(2 * 3 * 5 * 7, dtype=np.uint16).reshape(2, 3, 5, 7)
 
@@ -108,10 +109,10 @@ def test_frame_that_is_not_written_yet_is_refused(tmp_path):
         data[:2] = 7
         data[2, :4] = 7
         file.create_dataset("never", (4, 8, 8), "u2")
-    assert read_frame(path, 1, variable="data")[0].min() == 7
+    assert read_frame(Frame(path, "data[1]", 1, "data")).image.min() == 7
     for number, name in ((2, "data"), (3, "data"), (0, "never")):
         with pytest.raises(FileFormatError, match=f"does not hold frame {number} of '/{name}' yet"):
-            read_frame(path, number, variable=name)
+            read_frame(Frame(path, name, number, name))
 
 
 def test_filter_that_is_not_installed_is_named(tmp_path, monkeypatch):

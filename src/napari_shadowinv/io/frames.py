@@ -2,7 +2,7 @@
 
 - all frames that a path stands for: `find_frames`; the images of a folder: `images_in`
 - an array of an HDF5 file as ``file.h5::/entry/data/data``: `split_address`
-- one frame: `read_frame`; all of them as a lazy dataset: `lazy_frames`
+- all of them as a lazy dataset: `lazy_frames`
 
 Any axes of an array before the last two count frames. At most one frame is in memory at a time.
 """
@@ -22,16 +22,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._typing import AnyArray, FloatArray
-from napari_shadowinv.cautions import Caution
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order, text_of
 from napari_shadowinv.io.formats import PRADFORMAT, RADIOGRAPH_SUFFIXES, RESULT, TIFF, format_of
-from napari_shadowinv.io.hdf5 import count_frames, read_hdf5_frame
-from napari_shadowinv.io.images import read_tiff_page, tiff_pages, to_grey
+from napari_shadowinv.io.hdf5 import count_frames
+from napari_shadowinv.io.images import tiff_pages
 
 if TYPE_CHECKING:
     import xarray
+
+    from napari_shadowinv.preprocessing import Radiograph
 
 _GLOB = re.compile(r"[*?\[]")
 _ADDRESS = "::"  # between a file and the name of an array in it
@@ -157,23 +158,14 @@ def _frames_of_file(path: Path, variable: str | None = None) -> list[Frame]:
     ]
 
 
-def read_frame(
-    path: Path, number: int, *, channel: str | int | None = None, variable: str | None = None
-) -> tuple[FloatArray, tuple[Caution, ...]]:
-    """Read a page of a TIFF or a frame of an HDF5 array, with warnings as of a `Radiograph`."""
-    if variable is None:
-        return read_tiff_page(path, number, channel=channel)
-    return to_grey(read_hdf5_frame(path, variable, number), channel, path), ()
-
-
-def lazy_frames(frames: Sequence[Frame], read: Callable[[Frame], AnyArray]) -> xarray.Dataset:
+def lazy_frames(frames: Sequence[Frame], read: Callable[[Frame], Radiograph]) -> xarray.Dataset:
     """Describe frames as a dataset whose images dask reads on demand.
 
     Parameters
     ----------
     frames : sequence of Frame
     read : callable
-        Returns the image of a frame, shape (H, W). The first is read now.
+        Returns a frame. The first is read now.
 
     Returns
     -------
@@ -184,7 +176,7 @@ def lazy_frames(frames: Sequence[Frame], read: Callable[[Frame], AnyArray]) -> x
     from dask.base import tokenize
 
     da: Any = import_module("dask.array")
-    first = read(frames[0])
+    first = read(frames[0]).image
     stamps = {frame.path: frame.path.stat().st_mtime_ns for frame in frames}
     layer = f"frames-{tokenize([repr(frame) for frame in frames], *stamps.values())}"
     tasks = {
@@ -202,9 +194,9 @@ def lazy_frames(frames: Sequence[Frame], read: Callable[[Frame], AnyArray]) -> x
 
 
 def _read_block(
-    read: Callable[[Frame], AnyArray], frame: Frame, shape: tuple[int, ...]
+    read: Callable[[Frame], Radiograph], frame: Frame, shape: tuple[int, ...]
 ) -> AnyArray:
-    image = read(frame)
+    image = read(frame).image
     if image.shape != shape:
         raise FileFormatError(
             f"{frame.name} has {' × '.join(map(str, image.shape))} pixels, the first frame "

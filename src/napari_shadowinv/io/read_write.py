@@ -2,6 +2,7 @@
 
 - any file: `read`, whose content decides on the format, not its name; where only one kind makes
   sense: `read_radiograph`, `read_dataset`
+- one frame of many: `read_frame`
 - a scan of CR-39, with the ranges of the tracks to count: `read_cpsa`
 - a file with options or a setup: `read_toml`
 - a result or an image, whole or not at all: `write`; a result becomes one NetCDF4 file,
@@ -32,9 +33,15 @@ from napari_shadowinv.io.formats import (
     function,
     suffixes_for,
 )
-from napari_shadowinv.io.frames import Frame, find_frames, lazy_frames, read_frame, split_address
-from napari_shadowinv.io.hdf5 import check_arrays, check_hdf5_seal, hdf5_in_memory, opened_netcdf
-from napari_shadowinv.io.images import film_warnings, to_grey
+from napari_shadowinv.io.frames import Frame, find_frames, lazy_frames, split_address
+from napari_shadowinv.io.hdf5 import (
+    check_arrays,
+    check_hdf5_seal,
+    hdf5_in_memory,
+    opened_netcdf,
+    read_hdf5_frame,
+)
+from napari_shadowinv.io.images import film_warnings, read_tiff_page, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
 from napari_shadowinv.preprocessing import Radiograph
 
@@ -104,15 +111,19 @@ def read(
         return read_stack(path)
     frames = find_frames(path, variable)
     if len(frames) > 1:
-        return lazy_frames(frames, partial(_image_of, channel=channel))
+        return lazy_frames(frames, partial(read_frame, channel=channel))
     return _read_file(frames[0].path, channel, frames[0].variable)
 
 
-def _image_of(frame: Frame, channel: str | int | None) -> AnyArray:
+def read_frame(frame: Frame, *, channel: str | int | None = None) -> Radiograph:
+    """Read one of the frames that a path stands for, with the errors of `read_radiograph`."""
     if frame.number is None:
-        return read_radiograph(frame.path, channel=channel, variable=frame.variable).image
-    image, _ = read_frame(frame.path, frame.number, channel=channel, variable=frame.variable)
-    return image
+        return read_radiograph(frame.path, channel=channel, variable=frame.variable)
+    if frame.variable is None:
+        image, warnings = read_tiff_page(frame.path, frame.number, channel=channel)
+        return Radiograph(image, warnings=warnings)
+    array = read_hdf5_frame(frame.path, frame.variable, frame.number)
+    return Radiograph(to_grey(array, channel, frame.path))
 
 
 @as_file_errors

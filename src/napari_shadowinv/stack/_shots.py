@@ -30,8 +30,8 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.formats import PRADFORMAT, TEXT, kind_of
-from napari_shadowinv.io.frames import Frame, find_frames, read_frame, split_address
-from napari_shadowinv.io.read_write import read_radiograph
+from napari_shadowinv.io.frames import Frame, find_frames, split_address
+from napari_shadowinv.io.read_write import read_frame
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
 from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import read_row_images, row_setup
@@ -296,11 +296,7 @@ def read_shot(
     -------
     ndarray, shape (H, W)
     """
-    if page is None:
-        shot = read_radiograph(path, channel=channel, variable=variable)
-    else:
-        image, file_warnings = read_frame(path, page, channel=channel, variable=variable)
-        shot = Radiograph(image, warnings=file_warnings)
+    shot = read_frame(Frame(path, str(path), page, variable), channel=channel)
     if warnings is not None:
         warnings.extend(file_doubts(shot))
     return shot.image
