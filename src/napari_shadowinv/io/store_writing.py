@@ -494,24 +494,21 @@ class GrowingStore:
         self._columns = store.columns
         self._numbers = {name: index for index, name in enumerate(store.names)}
         self._statuses = bytearray(store.statuses().astype(np.uint8).tobytes())
-        self._counts = [self._statuses.count(status) for status in range(len(STATUS_NAMES))]
 
     def __len__(self) -> int:
         return len(self._statuses)
 
     def count(self, status: int) -> int:
         """Return how many shots are pending, done or failed."""
-        return self._counts[status]
+        return self._statuses.count(status)
 
     def number(self, name: str) -> int | None:
         """Return the number of a shot, None if it is not there yet."""
         return self._numbers.get(name)
 
     def done_names(self) -> Iterator[str]:
-        """Yield the names of the shots that are done."""
-        for name, index in self._numbers.items():
-            if self._statuses[index] == DONE:
-                yield name
+        """Return the names of the shots that are done, one by one."""
+        return (name for name, index in self._numbers.items() if self._statuses[index] == DONE)
 
     def status(self, index: int) -> int:
         return self._statuses[index]
@@ -529,7 +526,6 @@ class GrowingStore:
         grow_store(self.path, values, self._attributes, self._writer.arrays(), _ROOM)
         self._numbers.update(zip(names, numbers, strict=True))
         self._statuses.extend([PENDING] * len(names))
-        self._counts[PENDING] += len(names)
         return numbers[-1]
 
     def close(self) -> None:
@@ -546,30 +542,25 @@ class GrowingStore:
             self.append(*new)
         for name in names:
             self._writer.skip(self._numbers[name])
-            self._set_status(self._numbers[name], SKIPPED)
+            self._statuses[self._numbers[name]] = SKIPPED
 
     def reopen(self, index: int) -> None:
         """Mark a shot as pending that is to be done again, and forget its fields."""
         self._writer.reopen(index)
-        self._set_status(index, PENDING)
+        self._statuses[index] = PENDING
 
     def write(self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
         """As `ShotWriter.write`; the shot's numbers are there as soon as it is done."""
         self._gather(index, report)
         self._writer.write(index, arrays, report)
-        self._set_status(index, DONE)
+        self._statuses[index] = DONE
 
     def fail(self, index: int, report: Mapping[str, Any]) -> None:
         """As `ShotWriter.fail`."""
         self._gather(index, report)
         self._writer.fail(index, report)
-        self._set_status(index, FAILED)
+        self._statuses[index] = FAILED
 
     def _gather(self, index: int, report: Mapping[str, Any]) -> None:
         shot = slice(index, index + 1)
         _write_columns(self.path, self._writer.arrays(), self._columns, [report], shot)
-
-    def _set_status(self, index: int, status: int) -> None:
-        self._counts[self._statuses[index]] -= 1
-        self._counts[status] += 1
-        self._statuses[index] = status
