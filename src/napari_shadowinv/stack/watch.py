@@ -569,7 +569,20 @@ def watch_stack(
         loop = Watch(
             path, np.dtype(watch.dtype), stacks, arrivals, on_progress, should_stop, watch.latest
         )
-        return _run_watch(loop, path, arrivals, watch, should_stop)
+        try:
+            ensure_compiled(
+                lambda news: loop.report(stage=f"compiling, {news.message}"), should_stop
+            )
+        except InversionCancelled:
+            return None
+        with clear_up_when_terminated(), locked(path):
+            loop.open(overwrite=watch.overwrite, redo_failed=watch.redo_failed)
+            remove_unfinished(path)
+            with observing(
+                arrivals, polling=watch.polling, on_note=lambda text: loop.report(note=text)
+            ):
+                loop.run(watch.idle, watch.max_shots)
+        return None if loop.store is None else read_stack(path)
 
 
 def _with_status_file(
@@ -589,24 +602,3 @@ def _with_status_file(
             on_progress(status)
 
     return update
-
-
-def _run_watch(
-    loop: Watch,
-    path: Path,
-    arrivals: Arrivals,
-    watch: WatchOptions,
-    should_stop: ShouldStop | None,
-) -> xarray.Dataset | None:
-    try:
-        ensure_compiled(lambda news: loop.report(stage=f"compiling, {news.message}"), should_stop)
-    except InversionCancelled:
-        return None
-    with clear_up_when_terminated(), locked(path):
-        loop.open(overwrite=watch.overwrite, redo_failed=watch.redo_failed)
-        remove_unfinished(path)
-        with observing(
-            arrivals, polling=watch.polling, on_note=lambda text: loop.report(note=text)
-        ):
-            loop.run(watch.idle, watch.max_shots)
-    return read_stack(path) if loop.store is not None else None
