@@ -41,24 +41,13 @@ FRAMES_FORMAT = "shadowinv frames"
 
 @dataclass(frozen=True)
 class Frame:
-    """One image of a file.
-
-    Attributes
-    ----------
-    path : Path
-    name : str
-        For messages and tables.
-    number : int or None
-        Page of a TIFF or frame of an HDF5 array, counted over all leading axes; None if the file
-        holds one image.
-    variable : str or None
-        Name of the array in an HDF5 file.
-    """
+    """One image of a file."""
 
     path: Path
-    name: str
+    name: str  # for messages and tables
+    # Page of a TIFF, or frame of an array over all its leading axes; None if there is one image.
     number: int | None = None
-    variable: str | None = None
+    variable: str | None = None  # name of the array in an HDF5 file
 
 
 def split_address(path: str | Path, variable: str | None = None) -> tuple[Path, str | None]:

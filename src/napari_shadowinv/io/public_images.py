@@ -16,27 +16,13 @@ _TIMEOUT_S = 10.0
 
 @dataclass(frozen=True)
 class PublicFile:
-    """A file in a public repository, at a fixed commit, whose licence allows its use.
+    """A file in a public repository, at a fixed commit, whose licence allows its use."""
 
-    Parameters
-    ----------
-    name : str
-        Path in the cache, such as `rcf/HDV2.tif`.
-    size : int
-        Bytes.
-    sha256 : str
-        Checksum, hexadecimal.
-    licence : str
-        Licence of the repository, as an SPDX identifier.
-    address : str
-        URL.
-    """
-
-    name: str
-    size: int
-    sha256: str
-    licence: str
-    address: str
+    name: str  # path in the cache, such as rcf/HDV2.tif
+    size: int  # in bytes
+    sha256: str  # checksum, hexadecimal
+    licence: str  # of the repository, as an SPDX identifier
+    address: str  # URL
 
 
 def _read_list() -> dict[str, PublicFile]:

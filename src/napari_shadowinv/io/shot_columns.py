@@ -39,20 +39,11 @@ _MAX_EXACT = 2**53  # whole numbers that a float represents
 
 @dataclass(frozen=True)
 class ShotTable:
-    """Columns of a shot table.
-
-    Attributes
-    ----------
-    path : Path
-    columns : tuple of Column
-        The number of the shot first.
-    rows : mapping of int to dict
-        Values by the columns' entries in a report, by the number of the shot. Empty cells are left
-        out.
-    """
+    """Columns of a shot table."""
 
     path: Path
-    columns: tuple[Column, ...]
+    columns: tuple[Column, ...]  # the number of the shot first
+    # Values by the columns' entries in a report, by the shot's number; without empty cells.
     rows: Mapping[int, Mapping[str, Any]]
 
     def rows_of(self, names: Sequence[str]) -> list[Mapping[str, Any]]:
