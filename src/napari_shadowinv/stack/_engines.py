@@ -84,29 +84,22 @@ def _dask_settings(environment: dict[str, Any]) -> dict[str, Any]:
 @contextmanager
 def _without_variable(name: str, value: Any) -> Iterator[None]:
     """Remove a variable from the environment if an earlier cluster has left it there."""
-    if os.environ.get(name) != str(value):
+    with ExitStack() as opened:
+        if os.environ.get(name) == str(value):
+            opened.callback(os.environ.setdefault, name, os.environ.pop(name))
         yield
-        return
-    value_before = os.environ.pop(name)
-    try:
-        yield
-    finally:
-        os.environ.setdefault(name, value_before)
 
 
 @contextmanager
 def _hidden_from_workers() -> Iterator[None]:
     """Keep Ctrl-C, which a terminal sends to all processes, from those that the block starts."""
-    if not hasattr(signal, "pthread_sigmask"):
+    with ExitStack() as opened:
+        if hasattr(signal, "pthread_sigmask"):
+            # They inherit the mask. Starting the very first process unblocks it: that happens here.
+            resource_tracker.ensure_running()
+            mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            opened.callback(signal.pthread_sigmask, signal.SIG_SETMASK, mask)
         yield
-        return
-    # They inherit the mask. Starting the very first process unblocks it, so that happens here.
-    resource_tracker.ensure_running()
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def dask_setup(worker: Any) -> None:
@@ -300,15 +293,11 @@ def engine_for(
 @contextmanager
 def _quiet_dask() -> Iterator[None]:
     """Keep dask's tracebacks of a lost connection from the terminal: `EngineError` reports it."""
-    loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL)
-    try:
+    with ExitStack() as opened:
+        for logger in map(logging.getLogger, ("distributed", "distributed.client")):
+            opened.callback(logger.setLevel, logger.level)
+            logger.setLevel(logging.CRITICAL)
         yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
 
 
 def is_local(scheduler: Any) -> bool:

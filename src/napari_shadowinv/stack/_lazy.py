@@ -227,9 +227,8 @@ def _invert(
     }
 
 
-def _pick(record: dict[str, Any], name: str, with_shot: bool) -> AnyArray:
-    value = np.asarray(record[name])
-    return value[np.newaxis] if with_shot else value
+def _pick(record: dict[str, Any], name: str) -> AnyArray:
+    return np.asarray(record[name])[np.newaxis]
 
 
 class _Graph:
@@ -306,7 +305,7 @@ class _Graph:
 
     def _per_shot_array(self, name: str, dims: tuple[str, ...], dtype: Any = None) -> Any:
         return self._records.map_blocks(
-            partial(_pick, name=name, with_shot=True),
+            partial(_pick, name=name),
             name=f"{name}-{self._token}",
             chunks=(*self._records.chunks, *((self._stack.sizes[dim],) for dim in dims)),
             new_axis=list(range(1, 1 + len(dims))),
@@ -316,8 +315,7 @@ class _Graph:
     def _shared_array(self, name: str, dims: tuple[str, ...]) -> Any:
         from dask.delayed import delayed
 
-        beam = delayed(values_of_beam, pure=True)(self._beam, self._stack.task.recipe.options)
-        value = delayed(_pick, pure=True)(beam, name, False)
+        values = delayed(values_of_beam, pure=True)(self._beam, self._stack.task.recipe.options)
         da: Any = import_module("dask.array")
         shape = tuple(self._stack.sizes[dim] for dim in dims)
-        return da.from_delayed(value, shape, dtype=dtype_of(name))
+        return da.from_delayed(values[name], shape, dtype=dtype_of(name))

@@ -409,8 +409,8 @@ class _Run:
         batches = self._batches()
         is_file = self._stack.shots.array is None
         try:
-            window = engine.window(files=is_file)
             while True:
+                window = engine.window(files=is_file)
                 while len(running) < window and (batch := next(batches, None)) is not None:
                     future = self._start(engine, batch, beam, context)
                     running[future] = batch
@@ -418,7 +418,6 @@ class _Run:
                 if not running:
                     return
                 future = self._wait(engine, ended)
-                window = engine.window(files=is_file) if engine.workers is None else window
                 if future is None:
                     continue
                 if self._end(engine, future, running[future]):
