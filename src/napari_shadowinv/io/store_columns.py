@@ -26,43 +26,20 @@ FITS = "fits"
 
 @dataclass(frozen=True)
 class Column:
-    """Quantity of each shot of a store.
+    """Quantity of each shot of a store."""
 
-    Attributes
-    ----------
-    key : str
-        Name of its array and of its entry in a shot's report.
-    title : str
-        Heading of tables for people.
-    long_name : str
-        Label of the array.
-    stores : tuple of str
-        Kinds of stores that have the column. Default: all.
-    unit : str
-        Unit of the array.
-    kind : type
-        `bool`, `int`, `float` or `str`.
-    value : callable, optional
-        Returns the value of an `Inversion` or a `Fit`, None if this result has none. Without it,
-        the value comes from the run.
-    format : str
-        Format specification in tables for people, which omit columns without one.
-    width : int
-        Least number of characters of a table's column.
-    entry : str
-        Name of its entry in a shot's report, if it is not the key.
-    """
-
-    key: str
-    title: str
-    long_name: str
-    stores: tuple[str, ...] = (INVERSIONS, ROWS, FITS)
-    unit: str = "1"
-    kind: type = float
+    key: str  # name of its array and of its entry in a shot's report
+    title: str  # heading of tables for people
+    long_name: str  # label of the array
+    stores: tuple[str, ...] = (INVERSIONS, ROWS, FITS)  # kinds of stores that have the column
+    unit: str = "1"  # of the array
+    kind: type = float  # or bool, int or str
+    # Returns the value of an `Inversion` or a `Fit`, None if this result has none. Without it, the
+    # value comes from the run.
     value: Callable[[Any], Any] | None = None
-    format: str = ""
-    width: int = 0
-    entry: str = ""
+    format: str = ""  # specification in tables for people, which omit columns without one
+    width: int = 0  # least number of characters of a table's column
+    entry: str = ""  # name of its entry in a shot's report, if it is not the key
 
     @property
     def fill(self) -> Any:
