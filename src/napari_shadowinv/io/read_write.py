@@ -379,8 +379,11 @@ def write(
     """
     if isinstance(result, np.ndarray):
         check_output(path, overwrite, suffixes=IMAGE_WRITERS)
+        if result.ndim != 2 or result.size == 0:
+            raise InputError(f"image has shape {result.shape}: expected (height, width)")
+        pixel_size = None if setup is None else setup.object_pixel_size
         with replacing(path, overwrite) as temporary:
-            _write_image(temporary, result, setup)
+            function(IMAGE_WRITERS[temporary.suffix.lower()])(temporary, result, pixel_size)
         return Path(path)
     dataset = _as_dataset(result, setup)
     kind = ResultKind.of(dataset.attrs)
@@ -409,10 +412,3 @@ def _as_dataset(
 
 def _is_dataset(result: Any) -> TypeGuard[xarray.Dataset]:
     return hasattr(result, "data_vars")  # without waiting for xarray's import
-
-
-def _write_image(path: Path, plane: AnyArray, setup: Setup | None) -> None:
-    if plane.ndim != 2 or plane.size == 0:
-        raise InputError(f"image has shape {plane.shape}: expected (height, width)")
-    pixel_size = None if setup is None else setup.object_pixel_size
-    function(IMAGE_WRITERS[path.suffix.lower()])(path, plane, pixel_size)

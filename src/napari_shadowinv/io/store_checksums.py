@@ -196,7 +196,9 @@ def seal(document: dict[str, Any]) -> dict[str, Any]:
     """Return the description of a store with its checksum."""
     attributes = {k: v for k, v in document["attributes"].items() if k != SEAL}
     content = {**document, "attributes": attributes}
-    return {**document, "attributes": {**attributes, SEAL: _digest(content)}}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    checksum = hashlib.sha256(text.encode()).hexdigest()
+    return {**document, "attributes": {**attributes, SEAL: checksum}}
 
 
 def reseal(document: dict[str, Any]) -> dict[str, Any]:
@@ -216,11 +218,6 @@ def check_seal(path: Path, document: dict[str, Any]) -> None:
             f"{path} is damaged: its content does not match its checksum; copy the store again, or "
             "repeat the run with overwriting"
         )
-
-
-def _digest(document: Mapping[str, Any]) -> str:
-    text = json.dumps(document, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 @dataclass(frozen=True)
