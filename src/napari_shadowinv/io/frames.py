@@ -67,9 +67,7 @@ def images_in(folder: Path) -> list[Path]:
         if path.suffix.lower() in RADIOGRAPH_SUFFIXES and path.is_file() and path.name[0] != "."
     ]
     counts = Counter(path.suffix.lower() for path in files)
-    if not counts:
-        return []
-    most_frequent = max(sorted(counts), key=lambda suffix: counts[suffix])
+    most_frequent = max(sorted(counts), key=lambda suffix: counts[suffix], default="")
     return in_counting_order(path for path in files if path.suffix.lower() == most_frequent)
 
 

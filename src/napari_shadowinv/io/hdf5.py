@@ -88,7 +88,7 @@ def members(group: Any) -> Iterator[tuple[str, Any]]:
 
 def load_dataset(path: Path, dataset: Any) -> AnyArray:
     """Return the values of an array, refusing missing ones, which HDF5 would replace by zeros."""
-    check_size(path, _memory_bytes(path, dataset))
+    check_size(path, _memory_bytes(path, dataset, dataset.size))
     _check_filters(path, dataset)
     _check_promise(path, dataset)
     return np.asarray(dataset[()])
@@ -100,14 +100,8 @@ def _check_promise(path: Path, dataset: Any) -> None:
     check_promise(path, "HDF5", dataset.nbytes, DEFLATE_RATIO * stored if is_packed else stored)
 
 
-def _memory_bytes(path: Path, dataset: Any) -> int:
-    """Return the bytes in memory of an array, which must be in the file itself."""
-    array_bytes = dataset.size * max(8, dataset.dtype.itemsize)
-    return int(max(_chunk_bytes(path, dataset), array_bytes))
-
-
-def _chunk_bytes(path: Path, dataset: Any) -> int:
-    """Return the bytes in memory of a chunk of an array, which must be in the file itself."""
+def _memory_bytes(path: Path, dataset: Any, count: int) -> int:
+    """Return the bytes in memory of values of an array, which must be in the file itself."""
     layout = dataset.id.get_create_plist()
     if layout.get_external_count():
         external_file = layout.get_external(0)[0].decode(errors="replace")
@@ -116,8 +110,10 @@ def _chunk_bytes(path: Path, dataset: Any) -> int:
         source_files = sorted({source.file_name for source in dataset.virtual_sources()})
         names = ", ".join(map(repr, source_files))
         _refuse_other_file(path, dataset.name, f"as a virtual array from {names}")
+    itemsize = int(dataset.dtype.itemsize)
     # One chunk may be far larger than what is used of it.
-    return int(np.prod(dataset.chunks or (0,), dtype=float)) * int(dataset.dtype.itemsize)
+    chunk_bytes = int(np.prod(dataset.chunks or (0,), dtype=float)) * itemsize
+    return int(max(chunk_bytes, count * max(8, itemsize)))
 
 
 def check_arrays(path: Path) -> None:
@@ -125,7 +121,7 @@ def check_arrays(path: Path) -> None:
     total = 0
     with open_hdf5(path) as file:
         for dataset in _iterate_datasets(path, file):
-            total += _memory_bytes(path, dataset)
+            total += _memory_bytes(path, dataset, dataset.size)
             check_size(path, total)
             # The length of a dimension without coordinates is an array without values.
             if dataset.id.get_storage_size() or "CLASS" not in dataset.attrs:
@@ -291,8 +287,7 @@ def _member_or_default(path: Path, file: Any, name: str) -> Any | None:
 def _load_frame(path: Path, dataset: Any, number: int) -> AnyArray:
     """Return one frame, refusing a missing one, which HDF5 would replace by zeros."""
     index = tuple(map(int, np.unravel_index(number, dataset.shape[:-2])))
-    frame_bytes = math.prod(dataset.shape[-2:]) * max(8, dataset.dtype.itemsize)
-    check_size(path, max(_chunk_bytes(path, dataset), frame_bytes))
+    check_size(path, _memory_bytes(path, dataset, math.prod(dataset.shape[-2:])))
     _check_filters(path, dataset)
     if not _is_written(dataset, index):
         raise FileFormatError(

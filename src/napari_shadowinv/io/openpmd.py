@@ -62,19 +62,17 @@ def write_openpmd(path: Path, shot: xarray.Dataset, setup: Setup, series: str, n
     units = {field.name: field.unit for field in setup.si_fields} | {"image": "1"}
     with hdf5_in_memory(path) as content, h5py.File(content, "w") as file:
         file.attrs.update(
-            {
-                **_texts(
-                    openPMD="1.1.0",
-                    basePath="/data/%T/",
-                    meshesPath="meshes/",
-                    iterationEncoding="fileBased",
-                    iterationFormat=series,
-                    software="napari-shadowinv",
-                    softwareVersion=__version__,
-                    date=datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S %z"),
-                ),
-                "openPMDextension": np.uint32(0),
-            }
+            _texts(
+                openPMD="1.1.0",
+                basePath="/data/%T/",
+                meshesPath="meshes/",
+                iterationEncoding="fileBased",
+                iterationFormat=series,
+                software="napari-shadowinv",
+                softwareVersion=__version__,
+                date=datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S %z"),
+            ),
+            openPMDextension=np.uint32(0),
         )
         iteration = file.create_group(f"data/{number}")
         # A shot is one moment, and when it was is not known.
@@ -95,15 +93,13 @@ def _write_mesh(meshes: Any, field: xarray.DataArray, unit: str, pixel_size: flo
         component = record.create_dataset(key, data=plane, compression="gzip", compression_opts=4)
         component.attrs.update({"unitSI": 1.0, "position": np.zeros(len(_PLANE))})
     meshes[name].attrs.update(
-        {
-            **_texts(geometry="cartesian", dataOrder="C", comment=str(field.attrs["long_name"])),
-            "axisLabels": np.array([label.encode() for label in _PLANE]),
-            "gridSpacing": np.full(len(_PLANE), pixel_size),
-            "gridGlobalOffset": np.zeros(len(_PLANE)),
-            "gridUnitSI": 1.0,
-            "unitDimension": np.array(_DIMENSIONS[unit], dtype=np.float64),
-            "timeOffset": 0.0,
-        }
+        _texts(geometry="cartesian", dataOrder="C", comment=str(field.attrs["long_name"])),
+        axisLabels=np.array([label.encode() for label in _PLANE]),
+        gridSpacing=np.full(len(_PLANE), pixel_size),
+        gridGlobalOffset=np.zeros(len(_PLANE)),
+        gridUnitSI=1.0,
+        unitDimension=np.array(_DIMENSIONS[unit], dtype=np.float64),
+        timeOffset=0.0,
     )
 
 

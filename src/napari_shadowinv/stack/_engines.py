@@ -270,8 +270,6 @@ def engine_for(
     scheduler: Any = None, workers: int | None = None, should_stop: ShouldStop | None = None
 ) -> Iterator[Engine]:
     """Start or find an engine; an engine that was started here is closed at the end."""
-    if workers is not None and workers < 1:
-        raise InputError(f"workers is {workers}: expected 1 or more")
     scheduler = _resolve_scheduler(scheduler)
     count = workers or available_threads(None)
     if scheduler in ("threads", "synchronous"):
