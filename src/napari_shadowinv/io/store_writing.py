@@ -502,31 +502,30 @@ class GrowingStore:
         """Return how many shots are pending, done or failed."""
         return self._statuses.count(status)
 
-    def number(self, name: str) -> int | None:
-        """Return the number of a shot, None if it is not there yet."""
-        return self._numbers.get(name)
-
     def done_names(self) -> Iterator[str]:
         """Return the names of the shots that are done, one by one."""
         return (name for name, index in self._numbers.items() if self._statuses[index] == DONE)
 
-    def status(self, index: int) -> int:
-        return self._statuses[index]
+    def status(self, name: str) -> int | None:
+        """Return the status of a shot, None if it is not there yet."""
+        index = self._numbers.get(name)
+        return None if index is None else self._statuses[index]
 
-    def report(self, index: int) -> dict[str, Any]:
+    def report(self, name: str) -> dict[str, Any]:
         """Return the report of a shot that has ended."""
-        text = str(self._writer.arrays()["report"][index])
+        text = str(self._writer.arrays()["report"][self._numbers[name]])
         return dict(json.loads(text or "{}"))
 
     def append(self, *names: str) -> int:
-        """Make room for more shots, pending, and return the number of the last."""
-        first = len(self)
-        numbers = range(first, first + len(names))
-        values = {"shot": np.array(numbers), "name": np.array(names, dtype=object)}
-        grow_store(self.path, values, self._attributes, self._writer.arrays(), _ROOM)
-        self._numbers.update(zip(names, numbers, strict=True))
-        self._statuses.extend([PENDING] * len(names))
-        return numbers[-1]
+        """Make room for shots that are not there yet, pending; return the number of the last."""
+        new = [name for name in names if name not in self._numbers]
+        if new:
+            numbers = range(len(self), len(self) + len(new))
+            values = {"shot": np.array(numbers), "name": np.array(new, dtype=object)}
+            grow_store(self.path, values, self._attributes, self._writer.arrays(), _ROOM)
+            self._numbers.update(zip(new, numbers, strict=True))
+            self._statuses.extend([PENDING] * len(new))
+        return self._numbers[names[-1]]
 
     def close(self) -> None:
         """Give the arrays their final length, which programs may read that ignore the folder's."""
@@ -537,9 +536,8 @@ class GrowingStore:
 
     def skip(self, names: Collection[str], *following: str) -> None:
         """Mark shots that have not ended as skipped; they and those following get their numbers."""
-        new = [name for name in (*names, *following) if name not in self._numbers]
-        if new:
-            self.append(*new)
+        if names or following:
+            self.append(*names, *following)
         for name in names:
             self._writer.skip(self._numbers[name])
             self._statuses[self._numbers[name]] = SKIPPED

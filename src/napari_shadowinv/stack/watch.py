@@ -303,8 +303,7 @@ class Watch:
         """Note shots that are not inverted, unless an earlier version of them was."""
         store, running = self.store, {text_of(shot.name) for shot in self._running}
         for name in map(text_of, names):
-            index = None if store is None else store.number(name)
-            is_stored = store is not None and index is not None and store.status(index) == SKIPPED
+            is_stored = store is not None and store.status(name) == SKIPPED
             if not is_stored and name not in running and self._previous_report(name) is None:
                 self._skipped[name] = None
 
@@ -399,11 +398,11 @@ class Watch:
     def _previous_report(self, name: str) -> dict[str, Any] | None:
         """Return the report of a shot that has ended before; None if it has not."""
         store = self.store
-        index = None if store is None else store.number(name)
-        if store is None or index is None or name in self._early:
+        status = None if store is None else store.status(name)
+        if store is None or status is None or name in self._early:
             return self._early.get(name)
-        pending = name in self._redo or store.status(index) in (PENDING, SKIPPED)
-        return None if pending else store.report(index)
+        pending = name in self._redo or status in (PENDING, SKIPPED)
+        return None if pending else store.report(name)
 
     def _submit(self, name: str, lane: int) -> Future[Attempt]:
         shot = self._stacks.shot(name)
@@ -462,15 +461,13 @@ class Watch:
             return ShotOutcome(len(early) - 1, FAILED, attempt.seconds, attempt.failure)
         store = self.store or self._create_store([*early, *self._skipped, name])
         for early_name in list(early):
-            index = store.number(early_name)
             report = early.pop(early_name)
             if early_name != name:
-                store.fail(store.append(early_name) if index is None else index, report)
+                store.fail(store.append(early_name), report)
         if self._skipped:
             self._store_skipped(store)
-        number = store.number(name)
-        index = store.append(name) if number is None else number
-        if store.status(index) == DONE:
+        index = store.append(name)
+        if store.status(name) == DONE:
             store.reopen(index)
         assert self._task is not None
         return write_shot(store, self._task, index, attempt)
