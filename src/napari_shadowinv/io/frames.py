@@ -2,7 +2,7 @@
 
 - all frames that a path stands for: `find_frames`; the images of a folder: `images_in`
 - an array of an HDF5 file as ``file.h5::/entry/data/data``: `split_address`
-- all of them as a lazy dataset: `lazy_frames`
+- frames as a lazy dataset: `lazy_frames`
 
 Any axes of an array before the last two count frames. At most one frame is in memory at a time.
 """

@@ -242,25 +242,24 @@ class Layout:
         return int(self.arrays["status"]["shape"][0])
 
     @cached_property
+    def _lengths(self) -> dict[str, int]:
+        """Number of shots in a chunk of each array with values of shots."""
+        return {
+            name: int(array["chunk_grid"]["configuration"]["chunk_shape"][0])
+            for name, array in self.arrays.items()
+            if _has_shots(array)
+        }
+
+    @cached_property
     def of_each_shot(self) -> tuple[str, ...]:
         """Arrays with a chunk for each shot, but for its record."""
-        return tuple(
-            name
-            for name in self.arrays
-            if _has_shots(self.arrays[name]) and self._together(name) == 1 and name not in RECORD
-        )
+        lengths = self._lengths.items()
+        return tuple(name for name, length in lengths if length == 1 and name not in RECORD)
 
     @cached_property
     def of_many_shots(self) -> tuple[str, ...]:
         """Arrays with the values of many shots in one chunk."""
-        return tuple(
-            name
-            for name in self.arrays
-            if _has_shots(self.arrays[name]) and self._together(name) > 1
-        )
-
-    def _together(self, name: str) -> int:
-        return int(self.arrays[name]["chunk_grid"]["configuration"]["chunk_shape"][0])
+        return tuple(name for name, length in self._lengths.items() if length > 1)
 
     def key(self, name: str, index: int) -> str:
         """Return the key of a chunk by its first number; along other axes there is one."""
@@ -269,7 +268,7 @@ class Layout:
     @property
     def keys_of_many(self) -> list[str]:
         """Keys of chunks with the values of many shots."""
-        counts = {name: -(-self.shots // self._together(name)) for name in self.of_many_shots}
+        counts = {name: -(-self.shots // self._lengths[name]) for name in self.of_many_shots}
         return [self.key(name, index) for name in counts for index in range(counts[name])]
 
 

@@ -581,8 +581,7 @@ def table_shots(
     rows, unused = rows_to_invert(table)
     shots = []
     files = [Frame(row.file, text_of(row.file.name)) for row in rows]
-    for name, row in zip(_distinct_names(files), rows, strict=True):
-        (row,) = _with_absolute_paths([row])
+    for name, row in zip(_distinct_names(files), _with_absolute_paths(rows), strict=True):
         setup = row_setup(row, _read_geometry(row, channel, variable), recipe)
         images = RowsReference((row,), recipe, channel, variable, True, setup, unused)
         shots.append(Shot(name, images))
