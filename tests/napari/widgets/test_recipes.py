@@ -336,6 +336,23 @@ def test_the_selected_result_is_repeated_from_its_files(
     assert f"the image {shot_file.name} differs" in said[1]
 
 
+def test_the_window_of_stacks_repeats_the_result_of_a_shot(
+    viewer: ViewerModel, opened: Any, image: Any, run: Any, qtbot: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    said: list[str] = []
+    monkeypatch.setattr(_files, "show_info", said.append)
+    run(opened(InvertShot))
+    stack = opened(InvertStack)
+    (field,) = [layer for layer in viewer.layers if role_of(layer) == "field"]
+    viewer.layers.selection.active = field
+    stack.recipes.repeat()
+    with qtbot.captureExceptions() as exceptions:
+        qtbot.waitUntil(lambda: bool(said), timeout=PATIENCE)
+    assert exceptions == []
+    assert said == ["Difference: none: the same result, bit for bit. Changed: nothing"]
+
+
 def test_the_window_does_what_the_command_saves(
     viewer: ViewerModel, opened: Any, image: Any, shot: Array, shot_file: Path, tmp_path: Path,
     proton_setup: ProtonSetup,

@@ -430,7 +430,9 @@ class InvertStack(InversionInputs, ToolPanel):
 
     @notify_errors
     def _on_end(self, outcome: Outcome) -> None:
-        job: StackJob = outcome.tag
+        job = outcome.tag
+        if not isinstance(job, StackJob):  # but the repetition of a result
+            return
         status = job.status
         if not status.total:
             # The panel shows an error.
