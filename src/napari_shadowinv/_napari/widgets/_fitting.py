@@ -17,9 +17,9 @@ from napari_shadowinv._napari.layer_metadata import Result, main_layers, result_
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import (
     PROBLEM_STYLE,
+    WrappingLabel,
     labelled,
     section,
-    wrapping_label,
 )
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, fact_rows
 from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, timer
@@ -68,7 +68,7 @@ class FitView(QWidget):
         self._alternative = ResultLayers(viewer, self)
         self.results = ResultLayers(viewer, self)
         self.curve = ObjectiveCurve()
-        self.verdict = wrapping_label()
+        self.verdict = WrappingLabel()
         self.solutions = SteadyComboBox()
         self.solutions.setToolTip(
             "<qt>Alternative solutions from other starting points. Select one to show it next to "

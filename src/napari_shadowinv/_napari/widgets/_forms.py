@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
 from qtpy.QtGui import QColor
@@ -62,21 +61,26 @@ def section(title: str, *widgets: QtWidgets.QWidget) -> QCollapsible:
 def titled_section(*widgets: QtWidgets.QWidget) -> QCollapsible:
     """Create a section for a title that summarises it; a long title does not widen the window."""
     folded = section("", *widgets)
-    policy = QtWidgets.QSizePolicy.Policy
-    folded.toggleButton().setSizePolicy(policy.Ignored, policy.Fixed)
+    folded.toggleButton().setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
     return folded
 
 
-def wrapping_label(text: str = "", style: str = "") -> QtWidgets.QLabel:
-    """Create a label that wraps at the available width."""
-    label = QtWidgets.QLabel(text)
-    label.setWordWrap(True)
-    label.setMinimumWidth(0)
-    label.setSizePolicy(QtWidgets.QSizePolicy.Policy.Ignored, QtWidgets.QSizePolicy.Policy.Minimum)
-    label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-    label.setStyleSheet(style)
-    label.setVisible(bool(text))
-    return label
+class WrappingLabel(QtWidgets.QLabel):
+    """A label that wraps at the available width, and is hidden without text."""
+
+    def __init__(self, text: str = "", style: str = "") -> None:
+        super().__init__()
+        self.setWordWrap(True)
+        self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Minimum)
+        self.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.show_text(text, style)
+
+    def show_text(self, text: str, style: str | None = None) -> None:
+        """Show another text, by default in the same style."""
+        self.setText(text)
+        if style is not None:
+            self.setStyleSheet(style)
+        self.setVisible(bool(text))
 
 
 class PathEdit(QtWidgets.QWidget):
@@ -112,6 +116,7 @@ class ModelForm(QtWidgets.QWidget):
     """Editors for a model's fields; `initial` holds the first values of optional fields."""
 
     changed = Signal()
+    leaves_empty = False  # whether fields are empty until they are set, instead of their defaults
 
     def __init__(
         self, model_class: type[BaseModel], initial: Mapping[str, Any] | None = None
@@ -131,7 +136,8 @@ class ModelForm(QtWidgets.QWidget):
             if get_origin(field.annotation) is Literal and len(get_args(field.annotation)) == 1:
                 self._fixed[name] = get_args(field.annotation)[0]
                 continue
-            editor = self._make_editor(field, (initial or {}).get(name))
+            initial_value = (initial or {}).get(name)
+            editor = editor_for(field, initial_value, leave_empty=self.leaves_empty)
             title = field.title or name
             unit = unit_in_title(title) if editor.shows_unit else ""
             label = QtWidgets.QLabel(title.removesuffix(f" ({unit})"))
@@ -141,21 +147,15 @@ class ModelForm(QtWidgets.QWidget):
             rows.addRow(label, editor)
             editor.changed.connect(self._on_change)
             self.editors[name] = editor
-        self._problem = wrapping_label(style=PROBLEM_STYLE)
+        self._problem = WrappingLabel(style=PROBLEM_STYLE)
         layout.addWidget(self._problem)
 
     @property
     def is_empty(self) -> bool:
-        """Whether all required fields are empty."""
+        """Whether there are required fields, all of them empty."""
         fields = self._model_class.model_fields
-        required = [name for name in self.editors if fields[name].is_required()]
-        return all(self.editors[name].value() in (None, "") for name in required)
-
-    @property
-    def _is_blank(self) -> bool:
-        fields = self._model_class.model_fields
-        has_required = any(fields[name].is_required() for name in self.editors)
-        return has_required and self.is_empty
+        required = [editor for name, editor in self.editors.items() if fields[name].is_required()]
+        return bool(required) and all(editor.value() in (None, "") for editor in required)
 
     def values(self) -> dict[str, Any]:
         """Return the values as in a TOML file, without unset fields."""
@@ -166,7 +166,9 @@ class ModelForm(QtWidgets.QWidget):
         """Show values; missing fields get their defaults."""
         with QSignalBlocker(self):
             for name, editor in self.editors.items():
-                default = self._default_of(name)
+                field = self._model_class.model_fields[name]
+                has_default = not (self.leaves_empty or field.is_required())
+                default = field.get_default() if has_default else None
                 value = values.get(name, default)
                 if value is None and default is not None:
                     continue
@@ -185,23 +187,15 @@ class ModelForm(QtWidgets.QWidget):
         name = getattr(self._model_class, "title", "options")
         return validate(self._model_class, self.values(), name, labels_of(self._model_class))
 
-    def _make_editor(self, field: FieldInfo, initial: Any) -> Editor:
-        return editor_for(field, initial)
-
-    def _default_of(self, name: str) -> Any:
-        field = self._model_class.model_fields[name]
-        return None if field.is_required() else field.get_default()
-
     def _on_change(self) -> None:
         self._keep_one_alternative()
+        problem = ""
         try:
             self.model()
         except InputError as error:
-            self._problem.setText(str(error))
             # A form without any entries is not an error yet.
-            self._problem.setVisible(not self._is_blank)
-        else:
-            self._problem.setVisible(False)
+            problem = "" if self.is_empty else str(error)
+        self._problem.show_text(problem)
         self.changed.emit()
 
     def _keep_one_alternative(self) -> None:

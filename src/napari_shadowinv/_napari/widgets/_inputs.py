@@ -10,7 +10,6 @@ from types import MappingProxyType
 from typing import Any
 
 from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QWidget
 
@@ -21,9 +20,7 @@ from napari_shadowinv._napari.shots import radiograph_of, source_of_shot
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._editors import (
-    Editor,
     SteadyComboBox,
-    editor_for,
     format_number,
 )
 from napari_shadowinv._napari.widgets._files import RecipeButton
@@ -46,6 +43,7 @@ from napari_shadowinv.physics.setup import (
     Setup,
     deflector_titles,
     geometry_text,
+    setup_from_dict,
     setup_warnings,
 )
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
@@ -99,9 +97,9 @@ class SetupPicker(QWidget):
             "<qt>With a setup, results are in SI units. Lengths can be entered as 1.3 mm or "
             "0.0013.</qt>"
         )
-        self.geometry_label = forms.wrapping_label()
-        self.warning_label = forms.wrapping_label(style=forms.PROBLEM_STYLE)
-        self.note = forms.wrapping_label()
+        self.geometry_label = forms.WrappingLabel()
+        self.warning_label = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
+        self.note = forms.WrappingLabel()
         self.files = forms.TomlButtons("setup", self._to_save, self.load)
         column(self, self.picker, self.geometry_label, self.warning_label, self.note, self.files)
         self._state = self.picker.state()
@@ -230,8 +228,8 @@ class SetupPicker(QWidget):
         self._state = self.picker.state()
         form = self.picker.form
         is_filled = form is not None and not form.is_empty
-        self.note.setText(f"{self.origin[:1].upper()}{self.origin[1:]}." if is_filled else "")
-        self.note.setVisible(is_filled)
+        origin = f"{self.origin[:1].upper()}{self.origin[1:]}."
+        self.note.show_text(origin if is_filled else "")
         self._show_geometry()
 
     def _show_geometry(self) -> None:
@@ -244,15 +242,9 @@ class SetupPicker(QWidget):
         if self._layer is not None and not getattr(self._layer, "rgb", False):
             height, width = self._layer.data.shape[-2:]
             shape = height, width
-        line = "" if setup is None else geometry_text(setup, shape)
         cautions = () if setup is None else setup_warnings(setup, shape)
-        warnings = [caution.text for caution in cautions]
-        for label, text in (
-            (self.geometry_label, line),
-            (self.warning_label, "\n".join(warnings)),
-        ):
-            label.setText(text)
-            label.setVisible(bool(text))
+        self.geometry_label.show_text("" if setup is None else geometry_text(setup, shape))
+        self.warning_label.show_text("\n".join(caution.text for caution in cautions))
 
     def _to_save(self) -> dict[str, object]:
         setup = self.setup()
@@ -260,8 +252,6 @@ class SetupPicker(QWidget):
 
     def load(self, entries: dict[str, Any], path: str) -> None:
         """Show a setup from the entries of a file."""
-        from napari_shadowinv.physics.setup import setup_from_dict
-
         values = setup_from_dict(entries, path).model_dump()
         owner = self._typed_origin().removeprefix("typed")
         self.show_setup(values, f"loaded from {Path(path).name}{owner}")
@@ -496,6 +486,8 @@ class OptionsForm(forms.ModelForm):
 class InstrumentForm(forms.ModelForm):
     """A form of an instrument; its empty numbers show their defaults in grey."""
 
+    leaves_empty = True
+
     def __init__(self) -> None:
         super().__init__(Instrument)
         for kind in _INSTRUMENT_KINDS:
@@ -509,12 +501,6 @@ class InstrumentForm(forms.ModelForm):
         super().set_values(values)
 
     restore = set_values
-
-    def _make_editor(self, field: FieldInfo, initial: Any) -> Editor:
-        return editor_for(field, initial, leave_empty=True)
-
-    def _default_of(self, name: str) -> Any:
-        return None
 
     def _show_defaults(self) -> None:
         """Show the defaults of the chosen detector and beam source, with their names."""

@@ -28,8 +28,8 @@ from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._forms import (
     PROBLEM_COLOUR,
     PROBLEM_STYLE,
+    WrappingLabel,
     section,
-    wrapping_label,
 )
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
@@ -263,7 +263,7 @@ class RunPanel(QtWidgets.QWidget):
         self.bar.setVisible(False)
         # A bar with a range is not animated by the style of napari or the system.
         self.bar.setRange(0, 1)
-        self.status = wrapping_label()
+        self.status = WrappingLabel()
         qt.column(self, self.button, self.bar, self.status)
         self._activity = _Activity()
         self._quiet, self._status = False, ("", False)
@@ -292,9 +292,7 @@ class RunPanel(QtWidgets.QWidget):
         if (text, problem) == self._status:
             return
         self._status = (text, problem)
-        self.status.setText(text)
-        self.status.setStyleSheet(PROBLEM_STYLE if problem else "")
-        self.status.setVisible(bool(text))
+        self.status.show_text(text, PROBLEM_STYLE if problem else "")
 
     def refuse(self, error: BaseException) -> None:
         """Report an error of the user; the text stays when the notification is gone."""
@@ -447,29 +445,20 @@ class FoldedReport(QtWidgets.QWidget):
         return self.table.texts() | self._details.texts()
 
 
-class VerdictLine(QtWidgets.QLabel):
+class VerdictLine(WrappingLabel):
     """A coloured line below Run with level of trust, warnings in a few words, and peak."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.setWordWrap(True)
-        self.setSizePolicy(
-            QtWidgets.QSizePolicy.Policy.Ignored, QtWidgets.QSizePolicy.Policy.Minimum
-        )
-        self.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-        self.empty()
 
     def show_headline(self, headline: Headline, prefix: str = "") -> None:
         """Show a headline after a prefix, such as ``"Preview: "``."""
         level = headline.level.value.capitalize()
         text = html.escape(headline.text)
-        self.setText(f"<b>{html.escape(prefix)}{level}</b><br>{text[:1].upper()}{text[1:]}")
-        self.setStyleSheet(_LEVEL_STYLES[headline.level])
-        self.setVisible(True)
+        self.show_text(
+            f"<b>{html.escape(prefix)}{level}</b><br>{text[:1].upper()}{text[1:]}",
+            _LEVEL_STYLES[headline.level],
+        )
 
     def empty(self) -> None:
-        self.clear()
-        self.setVisible(False)
+        self.show_text("")
 
 
 class ToolPanel(qt.Docked):

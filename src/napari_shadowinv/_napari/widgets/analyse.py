@@ -100,13 +100,13 @@ class Analyse(qt.Docked):
                 "averaged.</qt>"
             )
         self.plot = ProfilePlot()
-        self.measures = forms.wrapping_label()
+        self.measures = forms.WrappingLabel()
         self.measures.setToolTip(
             "<qt>Peak: value of largest magnitude. Width: full width at half of the peak, relative "
             "to zero. Area: integral along the line.</qt>"
         )
-        self.hint = forms.wrapping_label("Press ✎ and draw a line on the image.")
-        self.problem = forms.wrapping_label(style=forms.PROBLEM_STYLE)
+        self.hint = forms.WrappingLabel("Press ✎ and draw a line on the image.")
+        self.problem = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
         self.export = qt.push_button("Export CSV…", "Save the profile as a table.", self._export)
         lines = qt.with_button(self.lines, "✎", "Draw a new line.", self._draw)
         width = qt.side_by_side((self.width_edit, 2), (self.width_unit, 1))

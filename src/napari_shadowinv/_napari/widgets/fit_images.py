@@ -117,7 +117,7 @@ class FitImages(ToolPanel):
         self.instrument = InstrumentForm()
         self.options = OptionsForm(FitOptions, {"smoothness": 1.0, "margin": 16, "threads": 1})
         self.recipes = FitRecipeButton(self)
-        self.cost = forms.wrapping_label()
+        self.cost = forms.WrappingLabel()
         self.view = FitView(self.viewer, self.panel)
         self.save_result = SaveButton(
             self,

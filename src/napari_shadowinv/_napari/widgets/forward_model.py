@@ -241,7 +241,7 @@ class ForwardModel(ObjectPanel):
             "stack, the shot in view.</qt>",
             suits=may_be_field,
         )
-        self.interpretation = forms.wrapping_label()
+        self.interpretation = forms.WrappingLabel()
         self.deflector = SteadyComboBox()
         self.deflector.addItem("default for the beam", None)
         for name in deflector_titles().values():
@@ -253,7 +253,7 @@ class ForwardModel(ObjectPanel):
         self.height_px, self.width_px = _side("Height"), _side("Width")
         tip = "Image layer of the undisturbed beam."
         self.source = LayerPicker(viewer, ("image",), tip, "uniform", about.may_be_source)
-        self.warning = forms.wrapping_label(style=forms.PROBLEM_STYLE)
+        self.warning = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
         self.save_result = SaveButton(
             self,
             self._image_to_save,

@@ -29,7 +29,7 @@ class ImageSetup(qt.Docked):
             suits=lambda layer: not about.belongs_to_result(layer),
         )
         self.setup = SetupPicker()
-        self.status = forms.wrapping_label()
+        self.status = forms.WrappingLabel()
         self.apply_button = qt.push_button(
             "Apply", "Store the setup with the image, and show the image at its scale.", self.apply
         )

@@ -39,9 +39,9 @@ from napari_shadowinv._napari.widgets._fitting import FitView, RefineSection
 from napari_shadowinv._napari.widgets._forms import (
     PROBLEM_STYLE,
     ModelPicker,
+    WrappingLabel,
     kinds_of,
     labelled,
-    wrapping_label,
 )
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._layers import (
@@ -164,7 +164,7 @@ class InvertShot(InversionInputs, LivePanel):
         self.live.setToolTip(
             f"<qt>Update the field after each change, with at most {PREVIEW_SITES:,} sites.</qt>"
         )
-        self.cost, self._pace = wrapping_label(), 1.0
+        self.cost, self._pace = WrappingLabel(), 1.0
         self.refine_section = RefineSection(self.refine)
         self.fit_view = FitView(self.viewer, self.panel)
         self.results = ResultLayers(self.viewer, self)
