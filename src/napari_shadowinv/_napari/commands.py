@@ -118,19 +118,15 @@ def crop(
         layer = next(reversed(drawn_for or images), None)
     selection = _select_image(layer, viewer, about.may_be_source)
     image_of(layer)
-    region = crop_of(shapes[-1], layer) if shapes else None
-    if region is None:
+    step = crop_of(shapes[-1], layer) if shapes else None
+    if step is None:
         if viewer is None or not viewer_sync.in_event_loop():
             raise InputError("there is no rectangle to crop to: draw one in a shapes layer")
         new_shapes(viewer, layer, "crop", "add_rectangle")
         show_info(f"Draw a rectangle on '{selection.name}', then choose this again")
         return []
-    from napari_shadowinv.preprocessing import Crop
-
-    rows, columns = region
-    size = f"{columns.stop - columns.start} × {rows.stop - rows.start} px"
-    step = Crop(y=(rows.start, rows.stop), x=(columns.start, columns.stop))
-    return [_moved_layer(selection, layer, step, f"cropped to {size}")]
+    height, width = step.shape_after(selection.shot.shape)
+    return [_moved_layer(selection, layer, step, f"cropped to {width} × {height} px")]
 
 
 @viewer_sync.notify_errors(otherwise=list)
@@ -325,17 +321,8 @@ def _moved_layer(
     )
     moved = step.apply(shot)
     frame = selection.frame.beneath(step.matrix(shot.shape))
-    return shot_layer(
-        moved.image,
-        f"{selection.name} {title}",
-        moved.setup,
-        intensity_limits(moved.image),
-        selection.role,
-        frame=frame,
-        setup_origin=selection.setup_origin or None,
-        source=moved.source,
-        usable=moved.mask,
-    )
+    selection = replace(selection, shot=moved, frame=frame, setup=moved.setup)
+    return _filtered_layer(selection, moved.image, title, source=moved.source, usable=moved.mask)
 
 
 def _filtered_layer(

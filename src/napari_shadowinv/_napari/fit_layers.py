@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
 from napari_shadowinv._napari.layer_metadata import (
-    KEY,
     KINDS,
     Frame,
     Result,
@@ -20,6 +18,7 @@ from napari_shadowinv._napari.layer_metadata import (
 from napari_shadowinv._napari.layers import (
     FullLayerData,
     dataset_layers,
+    shared_metadata,
     significance_variables,
     symmetric_limits,
 )
@@ -30,7 +29,6 @@ from napari_shadowinv.physics.units import intensity_limits
 
 if TYPE_CHECKING:
     from napari_shadowinv.fitting import Basin, Fit, FittedField
-    from napari_shadowinv.physics.setup import Setup
 
 # Of alternative solutions only these are shown.
 _ALTERNATIVE_ROLES = ("field", "arrows")
@@ -45,15 +43,14 @@ def fit_layers(
 
     With `alone`, as for a file, they include the images and all alternative solutions.
     """
-    fit = result.content
-    facts = _facts(result, fit, name)
+    fit, facts = result.content, _facts(result, name)
     layers = _image_layers(fit, frame, name, facts, with_images=alone)
     if alone:
         for number in range(len(fit.basins) - 1, 0, -1):
             for layer in alternative_layers(result, number, frame, name):
                 layer[1]["visible"] = False
                 layers.append(layer)
-    for number, field in reversed(list(enumerate(fit.fields))):
+    for m, field in reversed(list(enumerate(fit.fields))):
         variables: dict[str, Any] = {
             "potential": (("y", "x"), field.potential),
             "displacement": (("component", "y", "x"), field.displacement),
@@ -65,12 +62,8 @@ def fit_layers(
         if field.uncertainty is not None:
             variables["displacement_uncertainty"] = ("component", "y", "x"), field.uncertainty
         title = f"{_field_title(name, fit, field)}{verdict_suffix(fit)}"
-        layer_data = _field_layers(variables, field, fit.setup, frame, title, facts)
-        if number:
-            _set_part(layer_data, field.name)
-        for _, keywords, _ in layer_data:
-            keywords["visible"] &= number == 0
-        layers += layer_data
+        part = {"part": field.name} if m else {}
+        layers += _field_layers(variables, fit, m, frame, title, facts | part)
     return layers
 
 
@@ -78,23 +71,16 @@ def alternative_layers(
     result: Result[Fit], number: int, frame: Frame, name: str
 ) -> list[FullLayerData]:
     """Describe the fields of an alternative solution, the fit's basin `number`."""
-    fit = result.content
+    fit, facts = result.content, _facts(result, name)
     basin = fit.basins[number]
     layers: list[FullLayerData] = []
     for m, field in reversed(list(enumerate(fit.fields))):
         displacement = _full_size(basin.displacement[m], field.potential.shape)
-        layer_data = _field_layers(
-            {"displacement": (("component", "y", "x"), displacement)},
-            field,
-            fit.setup,
-            frame,
-            _field_title(f"{name} {start_name(basin)}", fit, field),
-            _facts(result, fit, name),
-        )
-        layer_data = [layer for layer in layer_data if role_of(layer[1]) in _ALTERNATIVE_ROLES]
-        for _, keywords, _ in layer_data:
-            keywords["visible"] &= m == 0
-        layers += _set_part(layer_data, f"{field.name} {number}")
+        variables = {"displacement": (("component", "y", "x"), displacement)}
+        title = _field_title(f"{name} {start_name(basin)}", fit, field)
+        part = {"part": f"{field.name} {number}"}
+        layer_data = _field_layers(variables, fit, m, frame, title, facts | part)
+        layers += [layer for layer in layer_data if role_of(layer[1]) in _ALTERNATIVE_ROLES]
     return layers
 
 
@@ -110,15 +96,11 @@ def verdict_suffix(fit: Fit) -> str:
     return "" if fit.verdict is Verdict.DETERMINED else f" ({fit.verdict.value})"
 
 
-def _facts(result: Result[Fit], fit: Fit, name: str) -> dict[str, Any]:
+def _facts(result: Result[Fit], name: str) -> dict[str, Any]:
     """Collect the metadata that all layers of a fit share."""
-    return {
-        "result": result,
-        "name": name,
-        "made_from": dict(result.attributes),
-        "verdict": fit.verdict.value,
-        "explanation": fit.explanation,
-    }
+    fit = result.content
+    verdict = {"verdict": fit.verdict.value, "explanation": fit.explanation}
+    return shared_metadata(result, name) | verdict
 
 
 def _field_title(name: str, fit: Fit, field: FittedField) -> str:
@@ -126,27 +108,18 @@ def _field_title(name: str, fit: Fit, field: FittedField) -> str:
 
 
 def _field_layers(
-    variables: dict[str, Any],
-    field: FittedField,
-    setup: Setup | None,
-    frame: Frame,
-    name: str,
-    facts: dict[str, Any],
+    variables: dict[str, Any], fit: Fit, m: int, frame: Frame, title: str, facts: dict[str, Any]
 ) -> list[FullLayerData]:
+    """Describe the layers of the field number `m`; only the layers of the first are visible."""
     import xarray as xr
 
     facts = {**facts, "displacement": variables["displacement"][1]}
+    deflector = deflector_titles()[fit.fields[m].name]
     dataset = xr.Dataset(variables)
-    return dataset_layers(
-        dataset, setup, frame, name, facts, deflector=deflector_titles()[field.name]
-    )
-
-
-def _set_part(layer_data: Sequence[FullLayerData], part: str) -> list[FullLayerData]:
-    """Distinguish layers from the layers of the first field."""
+    layer_data = dataset_layers(dataset, fit.setup, frame, title, facts, deflector=deflector)
     for _, keywords, _ in layer_data:
-        keywords["metadata"][KEY]["part"] = part
-    return list(layer_data)
+        keywords["visible"] &= m == 0
+    return layer_data
 
 
 def _image_layers(

@@ -345,19 +345,17 @@ def _load(shot: FitShot, name: str) -> FitShot:
 class Refinement(FitJob):
     """A fit to the image of an inversion, starting from the inversion."""
 
-    inversion: Inversion | None = None
-    setup: Setup | None = None
+    inversion: Inversion
+    setup: Setup | None
 
     @property
     def shape(self) -> tuple[int, ...]:
-        assert self.inversion is not None
         return self.inversion.image.shape
 
     def compute(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
     ) -> Fit:
         """Fit, starting from the inversion."""
-        assert self.inversion is not None
         return run_refinement(
             self.inversion,
             self.setup,

@@ -163,7 +163,7 @@ def field_layers(
     field = field.assign(
         significance_variables(content.displacement, content.pixel_errors, content.structures)
     )
-    return dataset_layers(field, result.setup, frame, name, _shared_metadata(result, name))
+    return dataset_layers(field, result.setup, frame, name, shared_metadata(result, name))
 
 
 def significance_variables(
@@ -179,7 +179,8 @@ def significance_variables(
     }
 
 
-def _shared_metadata(result: Result[AnyResult], name: str) -> dict[str, Any]:
+def shared_metadata(result: Result[AnyResult], name: str) -> dict[str, Any]:
+    """Return the metadata that all layers of a result share."""
     return {"result": result, "made_from": dict(result.attributes), "name": name}
 
 
@@ -202,7 +203,7 @@ def result_layers(
         result.setup,
         frame,
         name,
-        _shared_metadata(result, name),
+        shared_metadata(result, name),
         cells=diagram,
         suffix=trust_label(content),
     )
@@ -295,9 +296,9 @@ class _View:
     def masked(self) -> Any | None:
         """Pixels without data in the shot, or lazily in all shots; None if there are none."""
         mask = self.dataset.get("mask")
-        if mask is None or (self.shot is not None and "shot" not in mask.dims and mask.all()):
+        if mask is None or ("shot" not in mask.dims and mask.all()):
             return None
-        return None if self.shot is None and bool(mask.all()) else ~mask.data.astype(bool)
+        return ~mask.data.astype(bool)
 
     @cached_property
     def used(self) -> BoolArray:

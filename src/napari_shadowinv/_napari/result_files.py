@@ -142,9 +142,7 @@ def _shown_inputs(viewer: Any, result: Result[AnyResult] | None) -> set[str]:
     recipe = getattr(getattr(content, "provenance", None), "recipe", None)
     if recipe is None or recipe.steps:
         return set()
-    planes: Any = getattr(content, "images", None)  # of a fit
-    if planes is None:
-        planes = getattr(content, "image", None)
+    planes: Any = getattr(content, "images", getattr(content, "image", None))
     shape = () if planes is None else tuple(planes.shape[-2:])
     inputs = {SHOT: "image", SOURCE: "source", None: "image"}
     return {
@@ -267,11 +265,11 @@ def _warn_of_changes(layers: Sequence[FullLayerData], result: Result[AnyResult])
     """Warn about layers whose data differ from the file."""
     images = [layer for layer in layers if layer[2] == "image"]
     originals = {layer_key(layer[1]): layer[0] for layer in layers_of_result(result, Frame())}
-    changed = [
-        _name(layer)
-        for layer in images
-        if not _has_data(layer[0], originals.get(layer_key(layer[1])))
-    ]
+    changed = []
+    for layer in images:
+        original: Any = originals.get(layer_key(layer[1]))
+        if layer[0] is not original and not np.array_equal(layer[0], original, equal_nan=True):
+            changed.append(_name(layer))
     if changed:
         from napari.utils.notifications import show_warning
 
@@ -279,12 +277,6 @@ def _warn_of_changes(layers: Sequence[FullLayerData], result: Result[AnyResult])
             f"{_quote_names(changed)} changed since the result was computed: the file contains the "
             "original result; save the changed layers separately, as images"
         )
-
-
-def _has_data(shown: Any, original: Any) -> bool:
-    if shown is original:
-        return True
-    return original is not None and np.array_equal(shown, original, equal_nan=True)
 
 
 def _name(layer: FullLayerData) -> str:

@@ -95,10 +95,9 @@ def shot_of_store(path: Path, index: int) -> xarray.Dataset:
             "a finished shot"
         )
     shot = read_stack(path).isel(shot=index)
-    labels = {name: str(shot[name].values) for name in ("name", "report") if name in shot}
-    planes = [str(name) for name in shot.data_vars if "y" in shot[name].dims]
-    result: xarray.Dataset = shot[planes].drop_vars("shot", errors="ignore").compute()
-    return result.assign_attrs(shot=labels.get("name", str(index)))
+    name = str(shot["name"].values) if "name" in shot else str(index)
+    planes = [str(variable) for variable in shot.data_vars if "y" in shot[variable].dims]
+    return shot[planes].drop_vars("shot", errors="ignore").compute().assign_attrs(shot=name)
 
 
 @as_file_errors
@@ -125,8 +124,7 @@ def _finished_shots(dataset: xarray.Dataset) -> Sequence[int]:
     from napari_shadowinv.io.store import DONE
 
     if "status" in dataset and "shot" in dataset["status"].dims:
-        finished: list[int] = np.flatnonzero(dataset["status"].values == DONE).tolist()
-        return finished
+        return np.flatnonzero(dataset["status"].values == DONE).tolist()
     return range(dataset.sizes["shot"])
 
 

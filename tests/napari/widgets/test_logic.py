@@ -461,9 +461,9 @@ def test_painted_pixels_are_unusable_or_the_only_usable_ones() -> None:
 def test_a_drawn_crop_follows_the_scale_of_its_image() -> None:
     image = Image(np.ones((20, 30)), scale=(2.0, 2.0), translate=(10.0, 0.0))
     rectangle = Shapes([np.array([[14, 8], [14, 40], [30, 40], [30, 8]])], shape_type="rectangle")
-    assert crop_of(rectangle, image) == (slice(2, 11), slice(4, 21))
+    assert crop_of(rectangle, image) == Crop(y=(2, 11), x=(4, 21))
     beyond = Shapes([np.array([[-90, -90], [-90, 90], [90, 90], [90, -90]])])
-    assert crop_of(beyond, image) == (slice(0, 20), slice(0, 30))
+    assert crop_of(beyond, image) == Crop(y=(0, 20), x=(0, 30))
     assert crop_of(Shapes(ndim=2), image) is None
 
 

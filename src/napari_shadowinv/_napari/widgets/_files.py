@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from napari.utils.notifications import show_info
 from qtpy.QtWidgets import QFileDialog, QMenu, QMessageBox, QPushButton, QSizePolicy
 
+from napari_shadowinv._napari.jobs import name_of_result
 from napari_shadowinv._napari.layer_metadata import (
     Frame,
     Result,
@@ -63,7 +64,6 @@ from napari_shadowinv.preprocessing import (
     Recipe,
     UniformEstimate,
 )
-from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.widgets._panels import ToolPanel
@@ -88,11 +88,7 @@ class _Repetition:
         result = None if layer is None else result_of(layer)
         if result is None:
             raise InputError("select a layer of the result to repeat")
-        content: Any = result.content
-        attributes = getattr(content, "attrs", None)
-        provenance: Provenance | None = (
-            content.provenance if attributes is None else Provenance.of(attributes)
-        )
+        provenance = result.content.provenance
         paths = [metadata_of(each).get("path") or each.source.path for each in viewer.layers]
         by_name = {Path(path).name: Path(path) for path in paths if path}
         origins = () if provenance is None else provenance.images
@@ -105,7 +101,7 @@ class _Repetition:
             by_name.get(measured[0]) if measured else None,
             files[0].parent if files else Path(),
             frame_of(layer),
-            f"{metadata_of(layer).get('name') or layer.name} repeated",
+            f"{name_of_result(layer)} repeated",
         )
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> None:
@@ -219,8 +215,7 @@ class RecipeButton(QPushButton):
         write_recipe(path, recipe.model_copy(update=changes), overwrite=overwrite)
 
     def _recipe(self) -> Recipe:
-        recipe: Recipe = self._tool.recipe()
-        return recipe
+        return self._tool.recipe()
 
     def _masks(self, image: Any) -> dict[str, BoolArray | None]:
         """Return the masks of layers, by their keys in a recipe."""
@@ -229,10 +224,8 @@ class RecipeButton(QPushButton):
 
     def _beam(self, recipe: Recipe, image: Any) -> Radiograph | None:
         """Return a measured source that a command would not find, else None."""
-        if _is_in_file(recipe, image, self._tool.source):
-            return None
-        beam: Radiograph | None = self._tool.source.measured(image)
-        return beam
+        source = self._tool.source
+        return None if _is_in_file(recipe, image, source) else source.measured(image)
 
 
 class FitRecipeButton(RecipeButton):
@@ -279,8 +272,7 @@ class FitRecipeButton(RecipeButton):
                 f"'{source.layer.name}' has a source for each image, but a recipe has one source "
                 "for all: choose one plane (right click on the layer → Split Stack)"
             )
-        beams: list[Radiograph | None] = source.measured_for_each([Radiograph(image.data)])
-        return beams[0]
+        return source.measured_for_each([Radiograph(image.data)])[0]
 
 
 def _refuse_estimates(recipe: Recipe, path: Path) -> None:
@@ -374,8 +366,7 @@ def result_to_save(viewer: Any, layer: Any) -> Savable:
         raise InputError(f"'{layer.name}' shows no result: select a layer of a result")
     layer_data = [each.as_layer_data_tuple() for each in viewer.layers if result_of(each) is result]
     formats = _formats_for(result.content.kind, result.setup)
-    name = str(metadata_of(layer).get("name") or layer.name)
-    return Savable(name, dataset_to_save(layer_data), formats)
+    return Savable(name_of_result(layer), dataset_to_save(layer_data), formats)
 
 
 def shot_to_save(viewer: Any, layer: Any) -> Savable:

@@ -566,12 +566,9 @@ class InversionInputs:
 
     def all_steps(self) -> tuple[preprocessing.Step, ...]:
         """Return the preprocessing steps, the crop first, or raise an `InputError`."""
-        region = None if self.crop is None else layers.crop_of(self.crop.layer, self.chosen_image())
-        if region is None:
-            return self.steps.steps()
-        rows, columns = region
-        crop = preprocessing.Crop(y=(rows.start, rows.stop), x=(columns.start, columns.stop))
-        return (crop, *self.steps.steps())
+        crop = None if self.crop is None else layers.crop_of(self.crop.layer, self.chosen_image())
+        steps = self.steps.steps()
+        return steps if crop is None else (crop, *steps)
 
     def hidden_from_source(self, image: Any) -> BoolArray | None:
         """Return the source mask, False on the object; None without one or an estimate."""

@@ -20,12 +20,13 @@ from napari_shadowinv._napari.widgets._qt import (
     while_alive,
     with_button,
 )
-from napari_shadowinv._system.arrays import blocks_of
+from napari_shadowinv._system.arrays import blocks_of, join_masks
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import SCAN_SUFFIXES
 from napari_shadowinv.io.images import film_warnings
+from napari_shadowinv.preprocessing import Crop
 
 
 def kind_of(layer: Any) -> str:
@@ -61,8 +62,7 @@ def stack_of(layer: Any | None) -> Any:
     from dask import array
 
     # Data on disk are read when a shot is needed.
-    stack = array.asanyarray(data)  # type: ignore[no-untyped-call]
-    return stack
+    return array.asanyarray(data)  # type: ignore[no-untyped-call]
 
 
 def shown_plane(layer: Any, point: Any) -> Any:
@@ -128,19 +128,19 @@ def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> BoolArr
     return ~painted if painted_is_unusable else painted
 
 
-def crop_of(layer: Any | None, image: Any) -> tuple[slice, slice] | None:
-    """Return rows and columns of an image inside the selected shape, or else the last one."""
+def crop_of(layer: Any | None, image: Any) -> Crop | None:
+    """Return the crop of an image to the selected shape, or else the last one."""
     if layer is None or not len(layer.data):
         return None
     selected = max(layer.selected_data, default=len(layer.data) - 1)
     corners = _corners_in_pixels(layer, image)[selected]
     least = np.ceil(corners.min(axis=0)).astype(int)
     most = np.floor(corners.max(axis=0)).astype(int) + 1
-    rows, columns = (
-        slice(int(np.clip(a, 0, side)), int(np.clip(b, 0, side)))
+    y, x = (
+        (int(np.clip(a, 0, side)), int(np.clip(b, 0, side)))
         for a, b, side in zip(least, most, image_of(image).shape, strict=True)
     )
-    return rows, columns
+    return Crop(y=y, x=x)
 
 
 def _rasterise(layer: Any, image: Any, shape: tuple[int, ...]) -> BoolArray:
@@ -363,10 +363,7 @@ class MaskPicker(QWidget):
     def usable(self, image: Any) -> BoolArray | None:
         """Return the usable pixels of an image layer, of a stack's planes, or of files (None)."""
         painted = mask_of(self.layer, image, self.painted_is_unusable.isChecked())
-        supplied = None if image is None else about.usable_of(image)
-        if painted is None or supplied is None:
-            return supplied if painted is None else painted
-        return painted & supplied
+        return join_masks(painted, None if image is None else about.usable_of(image))
 
     def summary(self, image: Any) -> str:
         """Return the layer's name and the share of excluded pixels; empty if there are none."""
