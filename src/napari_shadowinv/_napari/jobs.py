@@ -323,9 +323,7 @@ class FitJob(ImageJob):
         result = Result(content, content.setup, dict(self.attributes))
         return fit_layers(result, self.frame, self.name)
 
-    def compute(
-        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
-    ) -> Fit:
+    def compute(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
         """Load the images, apply the recipe's steps, and fit."""
         names = [f"'{name}'" for name in self.names]
         shots = [_load(shot, name) for shot, name in zip(self.shots, names, strict=True)]
@@ -352,9 +350,7 @@ class Refinement(FitJob):
     def shape(self) -> tuple[int, ...]:
         return self.inversion.image.shape
 
-    def compute(
-        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
-    ) -> Fit:
+    def compute(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
         """Fit, starting from the inversion."""
         return run_refinement(
             self.inversion,

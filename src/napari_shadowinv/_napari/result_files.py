@@ -161,7 +161,7 @@ def dataset_of_layers(layers: Sequence[FullLayerData], result: Result[AnyResult]
     content = result.content
     looks = {layer_key(keywords): _look(keywords, kind) for _, keywords, kind in layers}
     name = next((metadata_of(keywords).get("name") for _, keywords, _ in layers), None)
-    attributes = {**result.attributes, _LOOKS: json.dumps(looks)}
+    attributes = {**result.attributes, _LOOKS: json.dumps(looks, default=_plain)}
     if name is not None:
         attributes[_NAME] = name
     if not isinstance(content, Inversion):
@@ -174,23 +174,19 @@ def dataset_of_layers(layers: Sequence[FullLayerData], result: Result[AnyResult]
 
 def _look(keywords: dict[str, Any], kind: str) -> dict[str, Any]:
     names = (*_COMMON_KEYWORDS, *_SAVED_KEYWORDS.get(kind, ()))
-    return {name: _plain(keywords[name]) for name in names if keywords.get(name) is not None}
+    look = {name: keywords[name] for name in names if keywords.get(name) is not None}
+    return {
+        name: _colormap_look(value) if isinstance(value, dict) else value
+        for name, value in look.items()
+    }
 
 
 def _plain(value: Any) -> Any:
-    """Convert a keyword to JSON types."""
-    if isinstance(value, dict):
-        return _plain_colormap(value)
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return value.item()
-    return value if isinstance(value, (bool, int, float)) else str(value)
+    """Convert a value that JSON does not have."""
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else str(value)
 
 
-def _plain_colormap(colormap: dict[str, Any]) -> Any:
+def _colormap_look(colormap: dict[str, Any]) -> Any:
     """Return the name of one of napari's colour maps, or else its colours."""
     from napari.utils.colormaps import AVAILABLE_COLORMAPS, ensure_colormap
 
@@ -199,8 +195,7 @@ def _plain_colormap(colormap: dict[str, Any]) -> Any:
         ensure_colormap(name).colors, colormap["colors"]
     ):
         return name
-    keys = ("name", "colors", "controls")
-    return {key: _plain(colormap[key]) for key in keys if key in colormap}
+    return {key: colormap[key] for key in ("name", "colors", "controls") if key in colormap}
 
 
 def write_result(path: str, layers: Sequence[FullLayerData]) -> list[str]:

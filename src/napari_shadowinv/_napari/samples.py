@@ -32,7 +32,9 @@ _RUN_LENGTH = 20
 
 def toroid() -> list[FullLayerData]:
     """Toroidal field of 97 MG µm, too weak for caustics, under a Gaussian beam."""
-    return _proton_shot("toroid", _toroid_of(97.0), _gaussian_beam())
+    y, x = _coordinates()
+    beam = 0.25 + np.exp(-((y - 0.1) ** 2 + (x + 0.15) ** 2) / 1.4)
+    return _proton_shot("toroid", _toroid_of(97.0), beam)
 
 
 def toroid_with_caustics() -> list[FullLayerData]:
@@ -42,8 +44,10 @@ def toroid_with_caustics() -> list[FullLayerData]:
 
 def four_toroids() -> list[FullLayerData]:
     """Four toroids of different strength and size under an uneven beam."""
-    setup = phantoms.paper_setup()
-    return _proton_shot("four toroids", phantoms.four_toroids(_SHAPE, setup, 0.8), _uneven_beam())
+    phantom = phantoms.four_toroids(_SHAPE, phantoms.paper_setup(), 0.8)
+    y, x = _coordinates()
+    beam = 1 + 0.3 * np.sin(2.3 * x + 0.4) * np.cos(1.7 * y - 0.3) + 0.15 * x
+    return _proton_shot("four toroids", phantom, beam)
 
 
 def coaxial_line() -> list[FullLayerData]:
@@ -117,16 +121,6 @@ def _coordinates(shape: tuple[int, int] = _SHAPE) -> tuple[AnyArray, AnyArray]:
     """Return coordinates from -1 to 1 on both axes."""
     y, x = (np.linspace(-1, 1, side) for side in shape)
     return y[:, None], x[None, :]
-
-
-def _gaussian_beam() -> FloatArray:
-    y, x = _coordinates()
-    return np.asarray(0.25 + np.exp(-((y - 0.1) ** 2 + (x + 0.15) ** 2) / 1.4))
-
-
-def _uneven_beam() -> FloatArray:
-    y, x = _coordinates()
-    return np.asarray(1 + 0.3 * np.sin(2.3 * x + 0.4) * np.cos(1.7 * y - 0.3) + 0.15 * x)
 
 
 def _wakefield_shot(shot: int) -> FloatArray:

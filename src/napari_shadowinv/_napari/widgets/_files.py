@@ -436,8 +436,8 @@ class SaveButton(QPushButton):
 
     def _write(self, content: Savable, path: Path) -> None:
         write(path, content.content, setup=content.setup, overwrite=True)
-        kind = next(form for form in content.formats if path.suffix.lower() in form.suffixes)
-        title = _TITLES[kind]
+        suffix = path.suffix.lower()
+        title = next(_TITLES[form] for form in content.formats if suffix in form.suffixes)
         text = f"Saved {title[:1].lower()}{title[1:]} in {path.absolute()}"
         self._tool.panel.say(text)
         show_info(text)

@@ -383,17 +383,14 @@ class StepForm(QWidget):
         line = side_by_side((self.title, 1), (self.up, 0), (self.down, 0), (self.remove, 0))
         line.layout().setSpacing(0)
         column(self, line, self.form)
-        self.form.changed.connect(self._on_change)
+        self.form.changed.connect(self._show_title)
+        self.form.changed.connect(self.changed)
         self.fold(False)
 
     def fold(self, folded: bool = True) -> None:
         self.form.setVisible(not folded)
         self.title.setArrowType(Qt.ArrowType.RightArrow if folded else Qt.ArrowType.DownArrow)
         self._show_title()
-
-    def _on_change(self) -> None:
-        self._show_title()
-        self.changed.emit()
 
     def _show_title(self) -> None:
         """Show the step's name; with a folded form also its parameters."""

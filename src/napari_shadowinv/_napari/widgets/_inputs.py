@@ -214,9 +214,8 @@ class SetupPicker(QWidget):
             setup = self.setup()
         except InputError:
             return  # incomplete: the image keeps its setup
-        if setup != about.setup_of(self._layer) or self.origin != about.setup_origin_of(
-            self._layer
-        ):
+        stored = about.setup_of(self._layer), about.setup_origin_of(self._layer)
+        if stored != (setup, self.origin):
             about.store_setup(self._layer, setup, self.origin)
 
     def _typed_origin(self) -> str:
@@ -448,10 +447,11 @@ class SourcePicker(forms.RowPicker):
         sources = [
             layer
             for layer in self.layers.offered
-            if about.role_of(layer) == about.SOURCE and about.result_of(layer) is None
+            if about.role_of(layer) == about.SOURCE
+            and about.result_of(layer) is None
+            and tuple(layer.data.shape[-2:]) == shape
         ]
-        fitting = [layer for layer in sources if tuple(layer.data.shape[-2:]) == shape]
-        return fitting[0] if len(fitting) == 1 else None
+        return sources[0] if len(sources) == 1 else None
 
 
 def _source_kind(kind: str) -> tuple[str, type[BaseModel] | None]:

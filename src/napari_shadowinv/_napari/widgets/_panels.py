@@ -336,17 +336,17 @@ class RunPanel(QtWidgets.QWidget):
             self.button.setText(self._run_text)
             self.button.setEnabled(True)
         self.say("Cancelled." if outcome.cancelled and not self._quiet else "")
-        if outcome.error is None:
+        error = outcome.error
+        if error is None:
             return
         # A notification disappears after seconds: the error stays here until the next run.
-        self.say(error_text(outcome.error), problem=True)
-        if not isinstance(outcome.error, USER_ERRORS):
+        self.say(error_text(error), problem=True)
+        if not isinstance(error, USER_ERRORS):
             from napari.utils.notifications import notification_manager
 
-            error = outcome.error
             notification_manager.receive_error(type(error), error, error.__traceback__)
         elif not self._quiet:
-            show_user_error(outcome.error)
+            show_user_error(error)
 
 
 def fact_rows(facts: Iterable[Fact], *, details: bool | None = False) -> list[tuple[str, str]]:

@@ -291,11 +291,9 @@ class ImageTable(QWidget):
             reference.store(**{self.beam.name: value})  # the planes of a stack share a setup
         self.table.set_columns((self.beam, *_IMAGE_COLUMNS))
         editable = Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsEditable
+        reference_beam = value if kind in SETUPS else 1.0
         for number, row in enumerate(self.rows):
-            is_reference = row == self._reference
-            beam = value if is_reference and kind in SETUPS else self._beam_of(row)
-            if is_reference and kind not in SETUPS:
-                beam = 1.0
+            beam = reference_beam if row == reference else self._beam_of(row)
             self.table.write(number, _BEAM, beam)
             for cell, spec in enumerate(_IMAGE_COLUMNS, _BRIGHTNESS):
                 self.table.write(number, cell, row.entries().get(spec.name, spec.default))
