@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from napari_shadowinv import preprocessing
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari import layers as results
 from napari_shadowinv._napari import viewer_sync
@@ -134,10 +135,8 @@ def bin_pixels(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
     """Sum blocks of 2 × 2 pixels of the selected image."""
-    from napari_shadowinv.preprocessing import Bin
-
     selection = _select_image(layer, viewer, about.may_be_source)
-    return [_moved_layer(selection, layer, Bin(factor=2), "binned 2 × 2")]
+    return [_moved_layer(selection, layer, preprocessing.Bin(factor=2), "binned 2 × 2")]
 
 
 @viewer_sync.notify_errors(otherwise=list)
@@ -148,10 +147,10 @@ def align_source(
     layer, viewer = without_proxy(layer), without_proxy(viewer)
     selection = _select_image(layer, viewer)
     source, name = _source_for(selection, layer, viewer)
-    from napari_shadowinv.preprocessing import align_source as fit_source
 
     def align(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
-        aligned = fit_source(selection.image, source, about.usable_of(layer))
+        usable = about.usable_of(layer)
+        aligned = preprocessing.align_source(selection.image, source, usable)
         (y, x), (y_error, x_error) = aligned.shift, aligned.error
         shift = f"y {y:+.2f} ± {y_error:.2f}, x {x:+.2f} ± {x_error:.2f} px"
         if not aligned.is_significant:
@@ -264,13 +263,12 @@ def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> lis
 
 def _invert(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
     from napari_shadowinv._napari.jobs import InversionJob
-    from napari_shadowinv.preprocessing import Recipe, UniformEstimate
 
     attributes = {"source_origin": "uniform"}
     if selection.setup_origin:
         attributes["setup_origin"] = selection.setup_origin
     job = InversionJob(
-        recipe=Recipe(source=UniformEstimate(), setup=selection.setup),
+        recipe=preprocessing.Recipe(source=preprocessing.UniformEstimate(), setup=selection.setup),
         name=selection.name,
         frame=selection.frame,
         attributes=attributes,
@@ -280,29 +278,19 @@ def _invert(selection: _Selection, should_stop: ShouldStop) -> list[results.Full
 
 
 def _repair(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
-    from napari_shadowinv.preprocessing import remove_hot_pixels as remove
-
-    image, hot, dead = remove(selection.image, should_stop=should_stop)
-    return [
-        _filtered_layer(selection, image, f"without {int((hot | dead).sum())} hot or dead pixels")
-    ]
+    image, hot, dead = preprocessing.remove_hot_pixels(selection.image, should_stop=should_stop)
+    title = f"without {int((hot | dead).sum())} hot or dead pixels"
+    return [_filtered_layer(selection, image, title)]
 
 
 def _high_pass(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
-    from napari_shadowinv.preprocessing import high_pass as apply_high_pass
-
     width = 0.15 * min(selection.image.shape)
-    return [
-        _filtered_layer(
-            selection, apply_high_pass(selection.image, width), f"high-pass σ={width:.3g} px"
-        )
-    ]
+    image = preprocessing.high_pass(selection.image, width)
+    return [_filtered_layer(selection, image, f"high-pass σ={width:.3g} px")]
 
 
 def _estimate_beam(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
-    from napari_shadowinv.preprocessing import total_variation_source
-
-    source = total_variation_source(selection.image, should_stop=should_stop)
+    source = preprocessing.total_variation_source(selection.image, should_stop=should_stop)
     made_from = {"image": selection.name, "estimate": "total variation"}
     selection = replace(selection, role=about.SOURCE)
     title = "source by total variation"

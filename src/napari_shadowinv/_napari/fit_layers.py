@@ -24,6 +24,7 @@ from napari_shadowinv._napari.layers import (
 )
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.facts import Verdict
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import intensity_limits
 
@@ -50,6 +51,7 @@ def fit_layers(
             for layer in alternative_layers(result, number, frame, name):
                 layer[1]["visible"] = False
                 layers.append(layer)
+    suffix = "" if fit.verdict is Verdict.DETERMINED else f" ({fit.verdict.value})"
     for m, field in reversed(list(enumerate(fit.fields))):
         variables: dict[str, Any] = {
             "potential": (("y", "x"), field.potential),
@@ -61,7 +63,7 @@ def fit_layers(
         variables |= significance_variables(field.displacement, errors, structures)
         if field.uncertainty is not None:
             variables["displacement_uncertainty"] = ("component", "y", "x"), field.uncertainty
-        title = f"{_field_title(name, fit, field)}{verdict_suffix(fit)}"
+        title = f"{_field_title(name, fit, field)}{suffix}"
         part = {"part": field.name} if m else {}
         layers += _field_layers(variables, fit, m, frame, title, facts | part)
     return layers
@@ -87,13 +89,6 @@ def alternative_layers(
 def start_name(basin: Basin) -> str:
     """Return the name of a solution's starting point; a given start is always an inversion."""
     return "from the inversion" if basin.start == "given" else basin.start
-
-
-def verdict_suffix(fit: Fit) -> str:
-    """Return the verdict as a suffix of names; empty if the fields are determined."""
-    from napari_shadowinv.facts import Verdict
-
-    return "" if fit.verdict is Verdict.DETERMINED else f" ({fit.verdict.value})"
 
 
 def _facts(result: Result[Fit], name: str) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import connect_viewer, show_scale_bar
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Level, Verdict
 from napari_shadowinv.inversion.variables import VARIABLES
 from napari_shadowinv.io.store import of_each_setup
 from napari_shadowinv.physics.significance import PixelErrors, Structures, significance
@@ -217,8 +218,6 @@ def result_layers(
 
 def trust_label(inversion: Inversion) -> str:
     """Return the verdict, or the doubt, as a suffix of layers' names; empty for a sound result."""
-    from napari_shadowinv.facts import Level, Verdict
-
     level, verdict = inversion.headline.level, inversion.verdict
     if level is Level.SOUND:
         return ""
@@ -317,11 +316,6 @@ class _View:
     def magnitude(self) -> FloatArray:
         return self.field.magnitude
 
-    @property
-    def per_pixel(self) -> float:
-        """Strength of the field, in its unit, for a displacement of 1 px."""
-        return _ratio(self.magnitude, np.hypot(*self.plane("displacement")))
-
     @cached_property
     def vectors(self) -> Any:
         """Components (y, x) of the field, in its unit."""
@@ -367,7 +361,8 @@ def _image(view: _View, kind: Kind) -> Content:
     data = view.dataset[kind.variable].data
     if kind.role == "uncertainty":
         # A field is proportional to its displacement.
-        data = view.per_pixel * np.hypot(*view.plane(kind.variable))
+        strength_per_pixel = _ratio(view.magnitude, np.hypot(*view.plane("displacement")))
+        data = strength_per_pixel * np.hypot(*view.plane(kind.variable))
         words = {"unit": view.field.unit, "symbol": view.field.symbol}
         limits = 0.0, float(np.percentile(data[view.used], _LIMITS_PERCENTILE))
     elif kind.role == "significance":
@@ -537,7 +532,9 @@ def _ratio(values: FloatArray, plane: FloatArray) -> float:
 
 def symmetric_limits(residual: AnyArray) -> Limits:
     """Return limits around 0 that ignore a few extreme pixels at caustics."""
-    limit = float(np.nanpercentile(np.abs(_sample(residual)), _LIMITS_PERCENTILE))
+    # A large image is sampled.
+    step = max(1, int(np.sqrt(residual.size / _LIMITS_SAMPLE_SIZE)))
+    limit = float(np.nanpercentile(np.abs(residual[::step, ::step]), _LIMITS_PERCENTILE))
     return _nonempty((-limit, limit))
 
 
@@ -549,12 +546,6 @@ def widen_limits(limits: Limits, plane: AnyArray) -> Limits:
     symmetric = limits[0] == -limits[1]
     low, high = symmetric_limits(plane) if symmetric else (float(finite.min()), float(finite.max()))
     return min(limits[0], low), max(limits[1], high)
-
-
-def _sample(plane: AnyArray) -> AnyArray:
-    """Sample enough pixels of a large image for its limits."""
-    step = max(1, int(np.sqrt(plane.size / _LIMITS_SAMPLE_SIZE)))
-    return plane[::step, ::step]
 
 
 def _nonempty(limits: Limits) -> Limits:

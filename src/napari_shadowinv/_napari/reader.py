@@ -7,7 +7,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from napari_shadowinv._napari.viewer_sync import notify_errors, show_caution
+from napari_shadowinv._napari.layer_metadata import main_layers, result_of
+from napari_shadowinv._napari.viewer_sync import (
+    connect_viewer,
+    notify_errors,
+    select_once_added,
+    show_caution,
+)
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.formats import PRADFORMAT, RADIOGRAPH_SUFFIXES, RESULT, STORE
@@ -58,7 +64,6 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
     if not isinstance(path, str):
         return list(stack_layers([Path(item) for item in path]))
     if path.rstrip("/").endswith(STORE.suffix):
-        from napari_shadowinv._napari.layer_metadata import main_layers
         from napari_shadowinv._napari.stores import follow_once_added, store_layers
 
         layers = main_layers(store_layers(Path(path)))
@@ -84,7 +89,6 @@ def _matches(pattern: str) -> list[Path]:
 
 @as_file_errors
 def _read_file(path: Path) -> list[FullLayerData]:
-    from napari_shadowinv._napari.layer_metadata import result_of
     from napari_shadowinv._napari.result_files import layers_of_dataset
     from napari_shadowinv._napari.shots import frame_layers, radiograph_layers
     from napari_shadowinv.io import Radiograph, read
@@ -108,7 +112,6 @@ def _read_file(path: Path) -> list[FullLayerData]:
 def _show_in_window(layers: Sequence[FullLayerData]) -> None:
     """Show colour bar and scale bar of an opened result in a window, and select its field."""
     from napari_shadowinv._napari.stores import viewer_in_window
-    from napari_shadowinv._napari.viewer_sync import connect_viewer, select_once_added
 
     viewer = viewer_in_window()
     if viewer is not None:

@@ -33,7 +33,9 @@ from napari_shadowinv._napari.layers import FullLayerData, field_layers, result_
 from napari_shadowinv._napari.packs import pack_layers
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
+from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
+from napari_shadowinv.io import write
 from napari_shadowinv.io.formats import PRADFORMAT, RESULT, SITES, Format
 from napari_shadowinv.results import result_from_dataset
 
@@ -156,8 +158,6 @@ def _shown_inputs(viewer: Any, result: Result[AnyResult] | None) -> set[str]:
 
 def dataset_of_layers(layers: Sequence[FullLayerData], result: Result[AnyResult]) -> xarray.Dataset:
     """Return the dataset of a result with its layers' appearance and painted caustics."""
-    from napari_shadowinv.inversion import Inversion
-
     content = result.content
     looks = {layer_key(keywords): _look(keywords, kind) for _, keywords, kind in layers}
     name = next((metadata_of(keywords).get("name") for _, keywords, _ in layers), None)
@@ -214,8 +214,6 @@ def write_sites(path: str, layers: Sequence[FullLayerData]) -> list[str]:
 
 
 def _write(path: str, layers: Sequence[FullLayerData], form: Format) -> list[str]:
-    from napari_shadowinv.io import write
-
     try:
         target = Path(path)
         has_suffix = target.suffix.lower() in form.suffixes

@@ -24,7 +24,15 @@ from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.formats import RESULT
-from napari_shadowinv.io.store import columns_of_store, open_dataset, with_own_setups
+from napari_shadowinv.io.store import (
+    DONE,
+    STATUS_NAMES,
+    StackStore,
+    columns_of_store,
+    open_dataset,
+    read_stack,
+    with_own_setups,
+)
 
 if TYPE_CHECKING:
     import xarray
@@ -85,8 +93,6 @@ def _open(path: Path) -> xarray.Dataset:
 @as_file_errors
 def shot_of_store(path: Path, index: int) -> xarray.Dataset:
     """Read a shot of a store as the dataset of a single result; an `InputError` if not done."""
-    from napari_shadowinv.io.store import DONE, STATUS_NAMES, StackStore, read_stack
-
     store = StackStore(path)
     status = store.statuses()[index]
     if status != DONE:
@@ -121,8 +127,6 @@ def _first_done(dataset: xarray.Dataset, path: Path) -> int:
 
 
 def _finished_shots(dataset: xarray.Dataset) -> Sequence[int]:
-    from napari_shadowinv.io.store import DONE
-
     if "status" in dataset and "shot" in dataset["status"].dims:
         return np.flatnonzero(dataset["status"].values == DONE).tolist()
     return range(dataset.sizes["shot"])

@@ -230,7 +230,8 @@ class ImageTable(QWidget):
     def __init__(self, viewer: Any, suits: Callable[[Any], bool]) -> None:
         super().__init__()
         self._viewer, self._suits = viewer, suits
-        self._reference: ImageRow | None = None
+        # The first image in use, whose pixels and units the fields have.
+        self.reference: ImageRow | None = None
         self.beam = beam_column("")
         self.rows: list[ImageRow] = []
         self.stacks = LayerPicker(
@@ -253,11 +254,6 @@ class ImageTable(QWidget):
     def used(self) -> list[ImageRow]:
         """The checked rows, the reference first."""
         return [row for number, row in enumerate(self.rows) if self.table.is_checked(number)]
-
-    @property
-    def reference(self) -> ImageRow | None:
-        """The first image in use, whose pixels and units the fields have."""
-        return self._reference
 
     def fill(self, _: Any = None) -> None:
         """Show the viewer's current images."""
@@ -286,7 +282,7 @@ class ImageTable(QWidget):
     def show_beams(self, kind: str, value: Any, is_brightness_known: bool) -> None:
         """Fill the cells; `value` is the reference's energy or wavelength in the shown setup."""
         self.beam = beam_column(kind)
-        reference = self._reference
+        reference = self.reference
         if reference is not None and reference.plane is not None and isinstance(value, float):
             reference.store(**{self.beam.name: value})  # the planes of a stack share a setup
         self.table.set_columns((self.beam, *_IMAGE_COLUMNS))
@@ -328,9 +324,9 @@ class ImageTable(QWidget):
         entry = row.entries().get(self.beam.name)
         if entry is not None or row.plane is not None:
             return entry
-        if self.beam.name == "strength" and self._reference is not None:
+        if self.beam.name == "strength" and self.reference is not None:
             own_strength, first_strength = (
-                about.metadata_of(image.layer).get("strength") for image in (row, self._reference)
+                about.metadata_of(image.layer).get("strength") for image in (row, self.reference)
             )
             return own_strength / first_strength if own_strength and first_strength else None
         return getattr(row.setup, self.beam.name, None)
@@ -343,7 +339,7 @@ class ImageTable(QWidget):
             return
         name = self.beam.name if column == _BEAM else _IMAGE_COLUMNS[column - _BRIGHTNESS].name
         value = self.table.enter(item)
-        is_setup = column == _BEAM and name != "strength" and row == self._reference
+        is_setup = column == _BEAM and name != "strength" and row == self.reference
         if is_setup and isinstance(value, float):
             self.reference_beam_entered.emit(value)
         else:
@@ -352,9 +348,9 @@ class ImageTable(QWidget):
 
     def _on_use(self) -> None:
         used = self.used
-        old_reference = self._reference
-        self._reference = used[0] if used else None
-        if self._reference != old_reference:
+        old_reference = self.reference
+        self.reference = used[0] if used else None
+        if self.reference != old_reference:
             self.reference_changed.emit()
         self.changed.emit()
 
