@@ -138,12 +138,10 @@ def _image_layers(
             "name": layer_name(kind.title, name),
             "metadata": metadata_for(role, kind.unit, setup, **facts, main=role != "reprojection"),
             "visible": False,
-            **frame.keywords(stacked=data.ndim == 3),
+            **frame.keywords(stacked=data.ndim == 3, stack_axis="image"),
             "colormap": colour_map(kind.colormap),
             "contrast_limits": limits or symmetric_limits(planes[0]),
         }
-        if data.ndim == 3:
-            keywords["axis_labels"] = ("image", "y", "x")
         layers.append((data, keywords, "image"))
     return layers
 

@@ -56,13 +56,13 @@ class Frame:
             rotate=matrix_of(rotate),
         )
 
-    def keywords(self, *, stacked: bool = False) -> dict[str, Any]:
+    def keywords(self, *, stacked: bool = False, stack_axis: str = "shot") -> dict[str, Any]:
         """Return the keywords that place a layer; `stacked` if an axis of shots comes first."""
         keywords: dict[str, Any] = {
             "scale": (1.0, *self.scale) if stacked else self.scale,
             "translate": (0.0, *self.translate) if stacked else self.translate,
             "units": ("pixel", *self.units) if stacked else self.units,
-            "axis_labels": ("shot", "y", "x") if stacked else ("y", "x"),
+            "axis_labels": (stack_axis, "y", "x") if stacked else ("y", "x"),
         }
         upright = Frame()
         if self.rotate != upright.rotate:

@@ -106,9 +106,8 @@ def pack_layers(
             "name": f"{name} {kind.title}".strip(),
             "metadata": metadata_for(kind.role, kind.unit, result.setup, **metadata),
             "visible": kind.visible,
-            **frame.keywords(stacked=True),
+            **frame.keywords(stacked=True, stack_axis="layer"),
             **look,
-            "axis_labels": ("layer", "y", "x"),
         }
         layers.append((data, keywords, kind.type))
     return layers

@@ -62,22 +62,18 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
     from napari_shadowinv.io.frames import images_in
 
     if not isinstance(path, str):
-        return list(stack_layers([Path(item) for item in path]))
+        return stack_layers([Path(item) for item in path])
     if path.rstrip("/").endswith(STORE.suffix):
         from napari_shadowinv._napari.stores import follow_once_added, store_layers
 
         layers = main_layers(store_layers(Path(path)))
         follow_once_added(layers)
         _show_in_window(layers)
-        return list(layers)
+        return layers
     if "*" in path:
-        return list(stack_layers(_matches(path)))
+        return stack_layers(_matches(path))
     if Path(path).is_dir():
-        folder = Path(path)
-        images = images_in(folder)
-        if not images:
-            raise FileFormatError(f"{folder} contains no image: expected a folder of radiographs")
-        return list(stack_layers(images, folder.name))
+        return stack_layers(images_in(Path(path)), Path(path).name)
     return _read_file(Path(path))
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
+import tomli_w
 from pydantic import BaseModel
 from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
@@ -24,6 +25,7 @@ from napari_shadowinv._napari.widgets._qt import (
 )
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io import read_toml, replacing
 from napari_shadowinv.physics.beam import unit_in_title
 from napari_shadowinv.preprocessing import STEPS, Step
 
@@ -306,15 +308,11 @@ class RowPicker(QtWidgets.QWidget):
 
 
 def dump_toml(values: dict[str, object], path: str | Path) -> Path:
-    import tomli_w
-
     return save_text(tomli_w.dumps(values), path, ".toml")
 
 
 def save_text(text: str, name: str | Path, suffix: str) -> Path:
     """Write a file; a name without a suffix gets one, and then replaces no file."""
-    from napari_shadowinv.io import replacing
-
     entered = Path(name)
     path = entered if entered.suffix else entered.with_suffix(suffix)
     with replacing(path, overwrite=path == entered) as unfinished:
@@ -342,8 +340,6 @@ class TomlButtons(QtWidgets.QWidget):
 
     @notify_errors
     def _load(self) -> None:
-        from napari_shadowinv.io import read_toml
-
         path, _ = QtWidgets.QFileDialog.getOpenFileName(self, f"Load {self._subject}", "", TOML)
         if path:
             self._load_values(read_toml(path), path)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from napari.layers import Layer, Shapes
 from qtpy.QtCore import QObject, QSignalBlocker, Signal
 from qtpy.QtWidgets import QCheckBox, QWidget
 
@@ -146,11 +147,8 @@ def crop_of(layer: Any | None, image: Any) -> Crop | None:
 def _rasterise(layer: Any, image: Any, shape: tuple[int, ...]) -> BoolArray:
     if not len(layer.data):
         return np.zeros(shape, bool)
-    from napari.layers import Shapes
-
     on_pixels = Shapes(_corners_in_pixels(layer, image), shape_type=list(layer.shape_type))
-    masks: BoolArray = np.asarray(on_pixels.to_masks(mask_shape=shape), dtype=np.bool_)
-    return np.asarray(masks.any(axis=0))
+    return on_pixels.to_masks(mask_shape=shape).astype(np.bool_).any(axis=0)
 
 
 def _corners_in_pixels(layer: Any, image: Any) -> list[FloatArray]:
@@ -194,8 +192,6 @@ def new_shapes(viewer: Any, image: Any, title: str, mode: str) -> Any:
 
 
 def _add_layer(viewer: Any, image: Any, kind: str, data: Any, title: str, **keywords: Any) -> Any:
-    from napari.layers import Layer
-
     keywords["name"] = title
     if image is not None:  # None for files
         keywords |= {"name": f"{image.name} {title}", **frame_of(image).keywords()}

@@ -13,6 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from napari.utils import progress as activity
+from napari.utils.notifications import notification_manager
 from qtpy import QtWidgets
 from qtpy.QtCore import QObject, Qt, Signal
 
@@ -342,8 +343,6 @@ class RunPanel(QtWidgets.QWidget):
         # A notification disappears after seconds: the error stays here until the next run.
         self.say(error_text(error), problem=True)
         if not isinstance(error, USER_ERRORS):
-            from napari.utils.notifications import notification_manager
-
             notification_manager.receive_error(type(error), error, error.__traceback__)
         elif not self._quiet:
             show_user_error(error)

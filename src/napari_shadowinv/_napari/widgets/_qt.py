@@ -196,9 +196,8 @@ class Docked(QWidget):
         self._dock = dock
         dock.visibilityChanged.connect(self._on_visibility)
         side = window.dockWidgetArea(dock)
-        if dock.isFloating() or side == Qt.DockWidgetArea.NoDockWidgetArea:
-            return
-        if window.tabifiedDockWidgets(dock):
+        is_docked = not dock.isFloating() and side != Qt.DockWidgetArea.NoDockWidgetArea
+        if not is_docked or window.tabifiedDockWidgets(dock):
             return
         for neighbour in window.findChildren(QDockWidget):
             is_on_side = neighbour is not dock and window.dockWidgetArea(neighbour) == side
