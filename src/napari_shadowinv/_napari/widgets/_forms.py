@@ -80,7 +80,8 @@ class WrappingLabel(QtWidgets.QLabel):
     def show_text(self, text: str, style: str | None = None) -> None:
         """Show another text, by default in the same style."""
         self.setText(text)
-        if style is not None:
+        # A new style redraws the whole window, with its canvas.
+        if style not in (None, self.styleSheet()):
             self.setStyleSheet(style)
         self.setVisible(bool(text))
 

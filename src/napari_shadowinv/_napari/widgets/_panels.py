@@ -267,7 +267,7 @@ class RunPanel(QtWidgets.QWidget):
         self.status = WrappingLabel()
         qt.column(self, self.button, self.bar, self.status)
         self._activity = _Activity()
-        self._quiet, self._status = False, ("", False)
+        self._quiet = False
         self._progress: Progress | None = None
         self._start = 0.0
         self._poll_timer = qt.timer(self, _POLL_MS, self._show_progress)
@@ -289,10 +289,6 @@ class RunPanel(QtWidgets.QWidget):
             self.say("")
 
     def say(self, text: str, problem: bool = False) -> None:
-        # Redrawing a window with a canvas takes time: only for new text.
-        if (text, problem) == self._status:
-            return
-        self._status = (text, problem)
         self.status.show_text(text, PROBLEM_STYLE if problem else "")
 
     def refuse(self, error: BaseException) -> None:
