@@ -322,11 +322,9 @@ def belongs_to_result(layer: Any) -> bool:
 
 def displacement_of(layer: Any) -> FloatArray | None:
     """Return the displacement in px behind a layer of a result, or None."""
-    result, displacement = result_of(layer), metadata_of(layer).get("displacement")
-    if displacement is not None or result is None:
-        return displacement
-    content: Any = result.content
-    displacement = getattr(content, "displacement", None)  # a film pack has none
+    content = getattr(result_of(layer), "content", None)
+    common = getattr(content, "displacement", None)  # a film pack has none, a fit several
+    displacement = metadata_of(layer).get("displacement", common)
     return None if displacement is None else np.asarray(displacement)
 
 

@@ -18,6 +18,7 @@ from napari_shadowinv._napari.jobs import name_of_result
 from napari_shadowinv._napari.layer_metadata import (
     Frame,
     Result,
+    belongs_to_result,
     frame_of,
     main_layers,
     metadata_of,
@@ -353,8 +354,7 @@ def shown_result(viewer: Any, preferred: Iterable[Any] = ()) -> Any:
     """
     visible = [layer for layer in reversed(viewer.layers) if layer.visible]
     for layer in (viewer.layers.selection.active, *preferred, *visible):
-        metadata = {} if layer is None else metadata_of(layer)
-        if metadata.get("result") is not None or metadata.get("store") is not None:
+        if layer is not None and belongs_to_result(layer):
             return layer
     raise InputError("there is no result yet: press Run first, or select a layer of a result")
 

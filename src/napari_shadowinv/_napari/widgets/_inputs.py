@@ -405,9 +405,8 @@ class SourcePicker(forms.RowPicker):
 
     def check(self, mask: BoolArray | None) -> None:
         """Refuse a mask over the object that the source layer's estimate excluded."""
-        beyond_object = None
-        if self.layer is not None:
-            beyond_object = about.metadata_of(self.layer).get("source_mask")
+        metadata = {} if self.layer is None else about.metadata_of(self.layer)
+        beyond_object = metadata.get("source_mask")
         if beyond_object is not None and mask is not None and beyond_object.shape == mask.shape:
             preprocessing.check_masks(mask, beyond_object)
 

@@ -99,12 +99,9 @@ def warnings_of(layer: Any) -> tuple[Caution, ...]:
     """Return the warnings of a grey image's reader, or that it looks like scanned film."""
     metadata = about.metadata_of(layer)
     path = str(layer.source.path or "").lower()
+    may_be_scan = path.endswith(tuple(SCAN_SUFFIXES)) and isinstance(layer.data, np.ndarray)
     # Other metadata, such as a setup, may come from the user.
-    if (
-        about.role_of(layer)
-        or not path.endswith(tuple(SCAN_SUFFIXES))
-        or not isinstance(layer.data, np.ndarray)
-    ):
+    if about.role_of(layer) or not may_be_scan:
         return tuple(metadata.get("warnings", ()))
     return film_warnings(layer.data, None)
 
@@ -374,12 +371,9 @@ class MaskPicker(QWidget):
     def follow(self, image: Any) -> None:
         """Select the mask that came with an image's file, if there is one."""
         path = about.metadata_of(image).get("path")
-        for layer in self._viewer.layers:
-            if (
-                path
-                and about.role_of(layer) == about.MASK
-                and about.metadata_of(layer).get("path") == path
-            ):
+        for layer in self._viewer.layers if path else ():
+            metadata = about.metadata_of(layer)
+            if metadata.get("role") == about.MASK and metadata.get("path") == path:
                 self.layer = layer
                 self.painted_is_unusable.setChecked(True)
 
