@@ -261,12 +261,10 @@ class Prior:
         shape, fields = self.rays.shape, range(len(self.smoothness))
         rough = [self.root_of_smoothness(m, rng.normal(size=shape)) for m in fields]
         potentials = np.stack(rough)
-        steps_y, steps_x = self._steps(potentials)
-        in_y, in_x = (rng.normal(size=steps.shape) for steps in (steps_y, steps_x))
-        along_y, along_x = self._in_pad
         root = np.sqrt(self.tie)
-        potentials -= root * _differences(in_y * along_y, 1)
-        potentials -= root * _differences(in_x * along_x, 2)
+        for axis, in_pad in enumerate(self._in_pad, 1):
+            steps = rng.normal(size=(len(potentials), *in_pad.shape)) * in_pad
+            potentials -= root * np.diff(steps, axis=axis, prepend=0, append=0)
         potentials += root * np.sqrt(self._fading) * rng.normal(size=potentials.shape)
         if self.fiducials is not None:
             errors = self.fiducials.errors[:, None]
@@ -279,7 +277,7 @@ class Prior:
 
     def root_of_smoothness(self, field: int, values: FloatArray) -> FloatArray:
         """Return values per cosine times the root of the roughness penalty."""
-        waves = np.sqrt(self.of_rough[field].sum(axis=0)) * values
+        waves = np.sqrt(self.roughness[field]) * values
         return np.asarray(idctn(waves, norm="ortho"))
 
     @cached_property
@@ -349,11 +347,6 @@ class Prior:
     def _fading(self) -> FloatArray:
         return np.where(self._within, 0.0, (KNOT / self.decay) ** 2)
 
-    def _steps(self, potentials: FloatArray) -> tuple[FloatArray, FloatArray]:
-        along_y, along_x = self._in_pad
-        in_y = (potentials[:, 1:] - potentials[:, :-1]) * along_y
-        return in_y, (potentials[:, :, 1:] - potentials[:, :, :-1]) * along_x
-
     @cached_property
     def _splines_there(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Rows and columns of coefficients around each fiducial; displacement by each, (y, x)."""
@@ -378,14 +371,3 @@ class Prior:
         total = np.zeros(self.rays.shape)
         np.add.at(total, (rows, columns), np.einsum("ncij,nc->nij", tables, pulls))
         potentials += self.strengths[:, None, None] * total
-
-
-def _differences(steps: FloatArray, axis: int) -> FloatArray:
-    """Differences of neighbours along an axis, with zeros beyond the ends."""
-    shape = list(steps.shape)
-    shape[axis] += 1
-    differences = np.zeros(shape)
-    along = differences.swapaxes(0, axis)
-    along[:-1] = steps.swapaxes(0, axis)
-    along[1:] -= steps.swapaxes(0, axis)
-    return differences
