@@ -355,18 +355,12 @@ class RayModel:
 
     def _to_pixels(self, frame: FloatArray) -> FloatArray:
         """A frame about the image's corner, that gives pixels of a guarded detector."""
-        turned = self._from_corner(frame)
+        y, x = self._middle
         # From a pixel's edge to its middle: a ray there is shared with none.
         offset = self.beyond + _GUARD - 0.5
-        turned[0] += self._middle[0] + offset
-        turned[3] += self._middle[1] + offset
-        return turned
-
-    def _from_corner(self, frame: FloatArray) -> FloatArray:
-        y, x = self._middle
         turned = np.array(frame, dtype=np.float64)
-        turned[0] -= frame[1] * y + frame[2] * x
-        turned[3] -= frame[4] * y + frame[5] * x
+        turned[[0, 3]] -= frame[1] * y + frame[2] * x, frame[4] * y + frame[5] * x
+        turned[[0, 3]] += y + offset, x + offset
         return turned
 
     def _about_middle(self, pulls: FloatArray) -> FloatArray:
