@@ -196,7 +196,7 @@ def assess_verdict(
             f"the object sends {lost:.0%} of the rays past the image, and one image does not show "
             "which; record a larger field of view, or take another energy"
         )
-    if single and (meeting := _share_meeting(jacobian, displacement)) > _FEW:
+    if single and (meeting := _share_squeezed(jacobian, displacement, _MEETING)) > _FEW:
         return Verdict.AMBIGUOUS, (
             f"rays meet or cross over {meeting:.0%} of the object, and one image does not show "
             "which came from where: the same bright lines come from fields with other folds; take "
@@ -263,7 +263,7 @@ def assess_verdict(
     if at_edge:
         return Verdict.EDGE, at_edge
     unchecked = "" if np.isfinite(uncertainty) else "; error bars were not worked out"
-    if np.isfinite(uncertainty) and _share_folded(jacobian, displacement) > _DEEP_FOLDS:
+    if np.isfinite(uncertainty) and _share_squeezed(jacobian, displacement, 0.0) > _DEEP_FOLDS:
         times = _BARS_DEEP_FOLDS_AND_BEAM if beam_unknown else _BARS_DEEP_FOLDS
         unchecked += f"; beyond deep folds the error bars are about {times:g} times too small"
     if pattern.correlation > 0:
@@ -320,16 +320,10 @@ def _edge_text(displacement: FloatArray, used: BoolArray, free: bool) -> str:
     )
 
 
-def _share_meeting(jacobian: FloatArray, displacement: FloatArray) -> float:
-    """The share of an object, where it displaces rays, that is squeezed or turned over."""
+def _share_squeezed(jacobian: FloatArray, displacement: FloatArray, least: float) -> float:
+    """The share of an object, where it displaces rays, with less of a Jacobian; at 0, folded."""
     size = np.hypot(*displacement)
-    return float((jacobian < _MEETING).sum() / max((size > _OBJECT * size.max()).sum(), 1))
-
-
-def _share_folded(jacobian: FloatArray, displacement: FloatArray) -> float:
-    """The share of an object, where it displaces rays, that is turned over."""
-    size = np.hypot(*displacement)
-    return float((jacobian < 0).sum() / max((size > _OBJECT * size.max()).sum(), 1))
+    return float((jacobian < least).sum() / max((size > _OBJECT * size.max()).sum(), 1))
 
 
 def _share_lost(displacement: FloatArray) -> float:
