@@ -73,8 +73,8 @@ class SoftModes:
         if not chosen.size:
             return
         mixing = mixing[:, chosen]
-        vectors = np.einsum("mk,mn->kn", mixing, history.turned()[:-1])
-        residuals = history.residuals()
+        vectors = np.einsum("mk,mn->kn", mixing, np.array(history.turned[:-1], dtype=np.float64))
+        residuals = np.array(history.residuals, dtype=np.float64)
         untouched = np.einsum("mk,mn->kn", mixing, residuals[:-1])
         images = np.einsum("mk,mn->kn", _tridiagonal_times(matrix, mixing), residuals)
         # Eigenvectors in the space of these vectors, of which rounding makes some twice.
@@ -134,8 +134,8 @@ class _History:
     def __init__(self, size: int) -> None:
         most = _MOST_NUMBERS // size
         self.size, self._most = size, most if most >= _WORTH_STEPS else 0
-        self._residuals: list[AnyArray] = []
-        self._turned: list[AnyArray] = []
+        self.residuals: list[AnyArray] = []  # Lanczos vectors
+        self.turned: list[AnyArray] = []  # the same preconditioned
         self._shares: list[float] = []
         self._ratios: list[float] = []
 
@@ -148,18 +148,10 @@ class _History:
         """Add a step: a residual, the same preconditioned, their product, and coefficients."""
         if len(self) < self._most:
             scale = (-1.0) ** len(self) / np.sqrt(square)
-            self._residuals.append((scale * residual).astype(np.float32))
-            self._turned.append((scale * turned).astype(np.float32))
+            self.residuals.append((scale * residual).astype(np.float32))
+            self.turned.append((scale * turned).astype(np.float32))
             self._shares.append(share)
             self._ratios.append(ratio)
-
-    def residuals(self) -> FloatArray:
-        """Return the m Lanczos vectors."""
-        return np.array(self._residuals, dtype=np.float64)
-
-    def turned(self) -> FloatArray:
-        """Return the preconditioned Lanczos vectors."""
-        return np.array(self._turned, dtype=np.float64)
 
     def matrix(self) -> FloatArray:
         """Return the tridiagonal matrix between them."""
