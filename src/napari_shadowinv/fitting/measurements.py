@@ -257,7 +257,7 @@ def collect_data(
         size=(height, width),
         units=units,
         brightness=factors,
-        counted=_is(noise, "poisson"),
+        counted=isinstance(noise, str) and noise == "poisson",
         single=single,
         assumed=is_assumed,
         common=is_common,
@@ -557,7 +557,9 @@ def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
             )
         means = np.stack([_smoothed(*plane) for plane in zip(data, used, strict=True)])
         if noise == "proportional":
-            return _shares(data, used, means)[:, None, None] * means
+            relative = zip(data / means, used, strict=True)
+            shares = np.array([estimated_noise(plane, use) for plane, use in relative])
+            return shares[:, None, None] * means
         if (data[used] < 0).any():
             raise InputError("images have negative pixels, so they are no counts: give the noise")
         return np.asarray(np.sqrt(np.maximum(means, _LEAST_COUNTS)))
@@ -587,10 +589,6 @@ def _refuse_hopeless_noise(deviations: FloatArray, used: BoolArray, names: Seque
             )
 
 
-def _is(value: object, kind: str) -> bool:
-    return isinstance(value, str) and value == kind
-
-
 def _smoothed(image: FloatArray, used: BoolArray) -> FloatArray:
     """Means over the used pixels around each, at least a fraction of the overall mean."""
     sums = uniform_filter(np.where(used, image, 0.0), _SMOOTHED)
@@ -598,16 +596,6 @@ def _smoothed(image: FloatArray, used: BoolArray) -> FloatArray:
         sums, uniform_filter(used.astype(np.float64), _SMOOTHED), out=sums * 0, where=used
     )
     return np.asarray(np.maximum(means, _DARKEST * image[used].mean()))
-
-
-def _shares(data: FloatArray, used: BoolArray, means: FloatArray) -> FloatArray:
-    """Standard deviation of the noise over the mean, one for each image."""
-    return np.array(
-        [
-            estimated_noise(image / mean, use)
-            for image, mean, use in zip(data, means, used, strict=True)
-        ]
-    )
 
 
 def _checked_start(start: ArrayLike | None, size: tuple[int, int]) -> FloatArray | None:

@@ -209,7 +209,12 @@ def join_shots(shots: Sequence[FitShot], of_all: Mapping[str, Any]) -> dict[str,
         joined[keyword] = common_values(names, values, attribute)
     if joined["strengths"] is not None and of_all["strengths"] is None:
         joined["setups"] = of_all["setups"]  # the strengths of images precede their setups
-        _check_lengths(joined["strengths"])
+        lengths = [len(row) for row in joined["strengths"]]
+        if len(set(lengths)) > 1:
+            raise InputError(
+                f"strengths have {', '.join(map(str, lengths))} numbers: expected one for each "
+                "field in all images"
+            )
     if isinstance(joined["noise"], tuple):
         joined["noise"] = _common_noise(joined["noise"])
     if isinstance(joined["source"], tuple) and any(shot.beam_unknown for shot in shots):
@@ -217,14 +222,6 @@ def join_shots(shots: Sequence[FitShot], of_all: Mapping[str, Any]) -> dict[str,
         common_values(names, flags, "unknown source")
         joined["source"] = "unknown"
     return joined
-
-
-def _check_lengths(strengths: Sequence[Sequence[float]]) -> None:
-    if len(set(map(len, strengths))) > 1:
-        raise InputError(
-            f"strengths have {', '.join(str(len(row)) for row in strengths)} numbers: expected "
-            "one for each field in all images"
-        )
 
 
 def _common_noise(noises: Sequence[Any]) -> Any:
