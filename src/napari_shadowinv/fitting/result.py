@@ -89,6 +89,8 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
         "Displacement where a start has led, at every other pixel",
     ),
 }
+# Those with the name of their attribute.
+_OF_IMAGES = "images", "source", "reprojection", "residual", "mask", "chi2", "brightness"
 _LINEAR_ENOUGH, _SPREAD_ENOUGH = 0.5, 0.3
 _ATTRIBUTES = ("options", "report", "verdict", "explanation", "folded", "setups")
 
@@ -580,8 +582,7 @@ class Fit:
             name, as in ``displacement_B``, unless there is only one field. Options, report,
             verdict and setups are in the attributes; `from_dataset` finds all of the fit in it.
         """
-        import xarray as xr
-
+        names = [field.name for field in self.fields]
         history = {
             "format": self.kind.value,
             "options": self.options.model_dump_json(),
@@ -590,37 +591,14 @@ class Fit:
             "verdict": self.verdict.value,
             "explanation": self.explanation,
             "folded": self.folded,
-            "fields": json.dumps([field.name for field in self.fields]),
+            "fields": json.dumps(names),
             "setups": json.dumps([each.model_dump(mode="json") for each in self.setups]),
         }
         if self.provenance is not None:
             history["provenance"] = self.provenance.to_json()
-        merged = xr.Dataset()
-        for field in self.fields:
-            part = dataset_from_field(field.displacement, field.potential, self.setup)
-            part = part.drop_vars(
-                [name for name in part.data_vars if not belongs(name, field.name)]
-            )
-            if field.uncertainty is not None:
-                vectors, *words = UNCERTAINTY
-                part["displacement_uncertainty"] = vectors, field.uncertainty, label(*words)
-            if field.beam_uncertainty is not None:
-                vectors, *words = BEAM_UNCERTAINTY
-                part["displacement_beam_uncertainty"] = (
-                    vectors,
-                    field.beam_uncertainty,
-                    label(*words),
-                )
-            if field.samples is not None:
-                planes, *words = POTENTIAL_SAMPLES
-                part["potential_samples"] = planes, field.samples, label(*words)
-            attrs = part.attrs
-            if len(self.fields) > 1:
-                part = part.rename({name: f"{name}_{field.name}" for name in part.data_vars})
-            merged = merged.assign_coords(part.coords).assign(part.data_vars)
-            merged.attrs.update(attrs)
+        merged = merge_fields(names, [field_dataset(field, self.setup) for field in self.fields])
         merged.attrs.update(history | dict(attributes or {}))
-        merged["field"] = ("field", [field.name for field in self.fields])
+        merged["field"] = ("field", names)
         merged["basin"] = ("basin", [basin.start for basin in self.basins])
         for name, values in self._arrays().items():
             dims, units, text = _VARIABLES[name]
@@ -669,16 +647,10 @@ class Fit:
             )
         ]
         return cls(
-            images=arrays["images"],
-            mask=arrays["mask"],
+            **{name: arrays[name] for name in _OF_IMAGES},
             strengths=arrays["strength"],
             fields=tuple(fields),
-            source=arrays["source"],
-            brightness=arrays["brightness"],
             frames=arrays["frame"],
-            reprojection=arrays["reprojection"],
-            residual=arrays["residual"],
-            chi2=arrays["chi2"],
             basins=tuple(basins),
             folded=float(attributes["folded"]),
             verdict=Verdict(attributes["verdict"]),
@@ -686,10 +658,7 @@ class Fit:
             report=FitReport(**{name: content[name] for name in fit_fields & content.keys()}),
             options=FitOptions.model_validate_json(attributes["options"]),
             instrument=Instrument.model_validate_json(attributes.get("instrument", "{}")),
-            setups=tuple(
-                setup_from_dict(values, "the dataset's setups")
-                for values in json.loads(attributes["setups"])
-            ),
+            setups=setups_in(dataset),
             provenance=Provenance.of(attributes),
             noise=noise_in(dataset, "noise"),
         )
@@ -697,13 +666,7 @@ class Fit:
     def _arrays(self) -> dict[str, AnyArray]:
         """The values of `_VARIABLES`."""
         return {
-            "images": self.images,
-            "source": self.source,
-            "reprojection": self.reprojection,
-            "residual": self.residual,
-            "mask": self.mask,
-            "chi2": self.chi2,
-            "brightness": self.brightness,
+            **{name: getattr(self, name) for name in _OF_IMAGES},
             "strength": self.strengths,
             "frame": self.frames,
             "smoothness": np.array([field.smoothness for field in self.fields]),
@@ -731,6 +694,39 @@ def normalise_residual(
 def noise_variable(noise: FloatArray) -> tuple[tuple[str, ...], FloatArray, dict[str, str]]:
     """Return the variable of the noise of images, or of their pixels, in a dataset."""
     return _IMAGES[: noise.ndim], noise, label(FLUX_DENSITY, "Standard deviation of the noise")
+
+
+def setups_in(dataset: xarray.Dataset) -> tuple[Setup, ...]:
+    """Return the setups of the images in the dataset of a fit."""
+    setups = json.loads(dataset.attrs.get("setups", "[]"))
+    return tuple(setup_from_dict(values, "the dataset's setups") for values in setups)
+
+
+def field_dataset(field: FittedField, setup: Setup | None) -> xarray.Dataset:
+    """Return a field with its errors and samples, in the units of its setup as well."""
+    part = dataset_from_field(field.displacement, field.potential, setup)
+    part = part.drop_vars([name for name in part.data_vars if not belongs(name, field.name)])
+    for name, values, (dims, *words) in (
+        ("displacement_uncertainty", field.uncertainty, UNCERTAINTY),
+        ("displacement_beam_uncertainty", field.beam_uncertainty, BEAM_UNCERTAINTY),
+        ("potential_samples", field.samples, POTENTIAL_SAMPLES),
+    ):
+        if values is not None:
+            part[name] = dims, values, label(*words)
+    return part
+
+
+def merge_fields(names: Sequence[str], parts: Sequence[xarray.Dataset]) -> xarray.Dataset:
+    """Return datasets of fields as one; of several, each variable ends with its field's name."""
+    import xarray as xr
+
+    merged = xr.Dataset()
+    for name, part in zip(names, parts, strict=True):
+        if len(names) > 1:
+            part = part.rename({variable: f"{variable}_{name}" for variable in part.data_vars})
+        merged = merged.assign_coords(part.coords).assign(part.data_vars)
+        merged.attrs.update(part.attrs)
+    return merged
 
 
 def noise_in(dataset: xarray.Dataset, name: str) -> FloatArray | None:

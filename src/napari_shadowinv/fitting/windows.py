@@ -6,9 +6,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,17 +17,18 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level, Verdict
 from napari_shadowinv.fitting.result import (
     Fit,
+    field_dataset,
+    merge_fields,
     noise_in,
     noise_variable,
     normalise_residual,
+    setups_in,
 )
-from napari_shadowinv.inversion.variables import UNCERTAINTY, belongs, dataset_from_field
 from napari_shadowinv.physics.setup import (
     BeamQuantity,
     Setup,
     beam_values,
     deflector_titles,
-    setup_from_dict,
 )
 from napari_shadowinv.physics.units import PIXEL, label, shown_fields
 from napari_shadowinv.provenance import Provenance
@@ -196,7 +196,7 @@ class LeaveOneOut:
         return cls(
             **arrays,
             explanation=str(dataset.attrs[_SENTENCE]),
-            setups=_setups_of(dataset),
+            setups=setups_in(dataset),
             names=names if all(names) else (),
             noise=noise_in(dataset, _NOISE),
         )
@@ -268,12 +268,6 @@ def _listed(texts: Sequence[str]) -> str:
     return f"{', '.join(most)} and {last}" if most else last
 
 
-def _setups_of(dataset: xarray.Dataset) -> tuple[Setup, ...]:
-    """Setups of the images in the dataset of a fit."""
-    setups = json.loads(dataset.attrs.get("setups", "[]"))
-    return tuple(setup_from_dict(values, "the dataset's setups") for values in setups)
-
-
 PREFIX = "window_"
 """What the variables begin with in the dataset of a fit."""
 
@@ -289,7 +283,7 @@ def window_facts(dataset: xarray.Dataset) -> tuple[Fact, ...]:
     if f"{PREFIX}chi2" not in dataset:
         return ()
     numbers = dataset[f"{PREFIX}image_number"].values - 1
-    setups, fields = _setups_of(dataset), [str(name) for name in dataset["field"].values]
+    setups, fields = setups_in(dataset), [str(name) for name in dataset["field"].values]
     beams = beam_values(setups)
     means, times = (
         dataset[variable].values if variable in dataset.variables else None
@@ -437,13 +431,11 @@ class FitWindows:
         import xarray as xr
 
         names = [field.name for field in self.fits[0].fields]
-        merged = xr.Dataset()
-        for m, name in enumerate(names):
-            part = xr.concat([self._of(w, m) for w in range(len(self.fits))], dim="window")
-            if len(names) > 1:
-                part = part.rename({variable: f"{variable}_{name}" for variable in part.data_vars})
-            merged = merged.assign_coords(part.coords).assign(part.data_vars)
-            merged.attrs.update(part.attrs)
+        parts = [
+            xr.concat([self._of(w, m) for w in range(len(self.fits))], dim="window")
+            for m in range(len(names))
+        ]
+        merged = merge_fields(names, parts)
         members = ("window", "member")
         merged["image_number"] = members, np.array(self.numbers) + 1, label("1", "Image")
         chi2 = np.array([fit.chi2 for fit in self.fits])
@@ -462,17 +454,16 @@ class FitWindows:
     def _of(self, window: int, field: int) -> xarray.Dataset:
         """A field of a group."""
         fitted, strength = self.fits[window].fields[field], self.strengths[window, field]
-        part = dataset_from_field(
-            fitted.displacement / strength, fitted.potential / strength, self.setup
+        errors = fitted.uncertainty
+        in_first = replace(
+            fitted,
+            displacement=fitted.displacement / strength,
+            potential=fitted.potential / strength,
+            uncertainty=None if errors is None else errors / abs(strength),
+            beam_uncertainty=None,
+            samples=None,
         )
-        part = part.drop_vars([name for name in part.data_vars if not belongs(name, fitted.name)])
-        if fitted.uncertainty is not None:
-            vectors, *words = UNCERTAINTY
-            part["displacement_uncertainty"] = (
-                vectors,
-                fitted.uncertainty / abs(strength),
-                label(*words),
-            )
+        part = field_dataset(in_first, self.setup)
         for variable in part.data_vars.values():
             if PIXEL in variable.attrs["units"]:
                 variable.attrs["long_name"] += ", in the image displaced most"
