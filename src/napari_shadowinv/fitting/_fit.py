@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any, Literal
 
 import numpy as np
@@ -73,7 +74,7 @@ from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["collect_starts", "compare", "fit", "reweight_counts"]
+__all__ = ["collect_starts", "compare", "fit", "report_steps", "reweight_counts"]
 
 _FROM_FAR = ((4, 2.0), (4, 1.0), (2, 1.0))
 _FROM_NEAR = ((4, 2.0), (2, 2.0), (2, 1.0))
@@ -173,7 +174,6 @@ def fit(
     True
     """
     options = as_model(FitOptions, options, "options")
-    report = Reporter(on_progress, should_stop)
     seconds: dict[str, float] = {}
     rng = np.random.default_rng(options.seed)
     data = collect_data(
@@ -190,24 +190,18 @@ def fit(
     )
     ensure_compiled(on_progress, should_stop)
     scene = data.scene_with(options.smoothness)
-    steps = 0
-
-    def on_step(stage: str, objective: float) -> None:
-        nonlocal steps
-        steps += 1
-        report("fit", steps, None, stage, objective)
-
+    on_step = report_steps("fit", on_progress, should_stop)
     with _timed("starts", seconds):
         rough = replace(scene, held=_HELD_IN_SEARCH)
         if data.single:
             rough = replace(scene, imperfect=EXACT)
         minima = search(rough, collect_starts(data, on_step, should_stop), on_step)
-        if data.instrument.absorption:
-            scene = _with_absorption(data, scene, minima[0])
         imperfect = scene.imperfect
-        if data.single:
-            # One image cannot tell the instrument from the object: its numbers stay at 0.
-            scene = replace(scene, imperfect=EXACT)
+        if data.instrument.absorption:
+            transmission = _absorption(data, minima[0], data.instrument.absorption)
+            imperfect = replace(imperfect, shapes=(*imperfect.shapes, transmission))
+        # One image cannot tell the instrument from the object: its numbers stay at 0.
+        scene = replace(scene, imperfect=EXACT if data.single else imperfect)
         minima = [_with_numbers(scene, minimum) for minimum in minima]
         if scene.imperfect.parts and min(data.size) < SMALL_PX and data.near is None:
             # In pixels of two, λ and the errors of the instrument's numbers come out too small.
@@ -253,21 +247,22 @@ def fit(
             cause = name_cause(scene, best, fields, data.setups, on_step)
             pattern = replace(pattern, cause=cause)
     with _timed("samples", seconds):
-        samples, pairs, by_part = openness.samples, openness.pairs, openness.by_part
-        errors, by_beam = openness.errors, openness.by_beam
+        samples, pairs, errors = openness.samples, openness.pairs, openness.errors
         evidence = float("nan")
         if options.evidence:
             evidence = log_evidence(scene, best, fields, options, on_step)
         amplification = noise_amplification(pattern.correlation)
         potentials = None
         if errors is not None:
-            potentials = sampled_potentials(scene, samples, by_beam, data.size, options.seed)
-            amplified = _amplify_noise(errors, by_part, amplification)
+            potentials = sampled_potentials(
+                scene, samples, openness.by_beam, data.size, options.seed
+            )
+            amplified = _amplify_noise(errors, openness.by_part, amplification)
             ratio = product(amplified.ravel(), amplified.ravel()) / product(
                 errors.ravel(), errors.ravel()
             )
             potentials *= np.float32(np.sqrt(ratio))
-            errors = amplified
+            openness = replace(openness, errors=amplified)
     found_by = FitReport(
         objective=value,
         iterations=taken,
@@ -295,14 +290,20 @@ def fit(
         fields,
         options,
         basins,
-        errors,
+        openness,
         potentials,
-        by_part,
-        by_beam,
         found_by,
         blur_gain,
         pattern,
     )
+
+
+def report_steps(
+    task: str, on_progress: OnProgress | None, should_stop: ShouldStop | None
+) -> OnStep:
+    """Return a callback that reports each step of a task with its number."""
+    report, numbers = Reporter(on_progress, should_stop), count(1)
+    return lambda stage, objective: report(task, next(numbers), None, stage, objective)
 
 
 def compare(
@@ -476,14 +477,8 @@ def _transport_potential(
         return None
 
 
-def _with_absorption(data: FitData, scene: Scene, minimum: Minimum) -> Scene:
-    """Return the scene with an unknown transmission of the object that was found."""
-    shapes = _absorption(data, minimum, data.instrument.absorption)
-    imperfect = replace(scene.imperfect, shapes=(*scene.imperfect.shapes, shapes))
-    return replace(scene, imperfect=imperfect)
-
-
 def _absorption(data: FitData, minimum: Minimum, rms: float) -> Shapes:
+    """Return the unknown transmission of the object that was found."""
     height, width = data.size
     blocks = np.ones((1, minimum.bin, minimum.bin))
     displacement = np.kron(minimum.displacement.sum(axis=0), blocks)[:, :height, :width]
@@ -527,7 +522,7 @@ def _amplify_noise(
 def reweight_counts(data: FitData, scene: Scene, minimum: Minimum) -> Scene:
     """Return the weights of counts from the expected instead of the recorded counts."""
     unknowns = minimum.in_pixels(1)
-    expected = scene.model(unknowns, scene.ray_counts(unknowns))
+    expected = scene.model(unknowns)
     units = data.units[:, None, None]
     weights = units**2 / np.maximum(expected * units, 1.0)
     return replace(scene, weights=np.where(scene.weights > 0, weights, 0.0))
@@ -550,12 +545,9 @@ def _basins(
         )
         rival = replace(rival, unknowns=unknowns)
         ends.append(settle_minimum(scene, rival, on_step, "other starts"))
-    chi2 = [
-        middle.chi2(minimum.unknowns, middle.ray_counts(minimum.unknowns)).mean()
-        for minimum in ends
-    ]
+    chi2 = [float(middle.chi2(end.unknowns).mean()) for end in ends]
     return tuple(
-        Basin(end.start, end.value, float(each), best.distance(end), end.displacement)
+        Basin(end.start, end.value, each, best.distance(end), end.displacement)
         for end, each in zip(ends, chi2, strict=True)
     )
 
@@ -587,15 +579,14 @@ def _result(
     names: Sequence[str],
     options: FitOptions,
     basins: tuple[Basin, ...],
-    errors: FloatArray | None,
+    openness: _Openness,
     samples: FloatArray | None,
-    by_part: Mapping[str, FloatArray],
-    by_beam: BeamShifts | None,
     report: FitReport,
     blur_gain: float,
     pattern: Pattern,
 ) -> Fit:
     height, width = data.size
+    errors, by_beam = openness.errors, openness.by_beam
     counts = scene.ray_counts(unknowns)
     units = data.units[:, None, None]
     used = scene.weights[:, :height, :width] > 0
@@ -633,7 +624,7 @@ def _result(
             scale=data.beam.length,
             assumed=data.assumed,
         )
-    shares = {key: largest_share(each, displacements) for key, each in by_part.items()}
+    shares = {key: largest_share(each, displacements) for key, each in openness.by_part.items()}
     parts = dict(sorted(shares.items(), key=lambda part: -part[1]))
     report = replace(report, uncertainty=uncertainty, parts=parts, beam=beam)
     jacobians = [

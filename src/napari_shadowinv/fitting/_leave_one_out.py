@@ -14,17 +14,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from napari_shadowinv._system.machine import available_threads
-from napari_shadowinv._system.progress import (
-    OnProgress,
-    OnStep,
-    Reporter,
-    ShouldStop,
-    run_in_parallel,
-)
+from napari_shadowinv._system.progress import OnProgress, OnStep, ShouldStop, run_in_parallel
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting._fit import collect_starts, reweight_counts
+from napari_shadowinv.fitting._fit import collect_starts, report_steps, reweight_counts
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
 from napari_shadowinv.fitting.descent import coarser, finer, settle
@@ -111,15 +105,7 @@ def leave_one_out(
             "because that image is left out, too"
         )
     ensure_compiled(on_progress, should_stop)
-    report = Reporter(on_progress, should_stop)
-    steps = 0
-
-    def on_step(stage: str, objective: float) -> None:
-        nonlocal steps
-        steps += 1
-        report("leave one out", steps, None, stage, objective)
-
-    work = _Work(data, options, on_step)
+    work = _Work(data, options, report_steps("leave one out", on_progress, should_stop))
     first = work.search_all(should_stop)
     agreeing = work.find_agreeing(first)
     scene, common = work.estimate_smoothness(agreeing, first)
@@ -294,7 +280,7 @@ class _Work:
         if scene.only(members).images.size > _MAX_SAMPLED_PIXELS:
             return None
         _, fine, unknowns, _ = self._fit_densely(scene, common, members)
-        linear = fine.linear(unknowns, fine.ray_counts(unknowns))
+        linear = fine.linear(unknowns)
         return _JointFit(members, linear, finer(common.unknowns).with_images(members, unknowns))
 
     def _fit_densely(
@@ -366,9 +352,9 @@ class _Work:
             unknowns = _align_image(scene, unknowns, others[0], k)
         unknowns = unknowns.only([k])._replace(brightness=np.zeros(1))
         scene = scene.only([k])
-        (rough,) = scene.model(unknowns, scene.ray_counts(unknowns))
+        (rough,) = scene.model(unknowns)
         scene = replace(scene, spacing=_RAY_SPACING_RATIO * scene.spacing)
-        (image,) = scene.model(unknowns, scene.ray_counts(unknowns))
+        (image,) = scene.model(unknowns)
         brightness, weights = self._match_brightness(k, image, scene)
         chi2 = _chi2(brightness * image, scene.images[0], weights)
         variance = fit.variance_in(_linear_of(k, scene, unknowns, joint))
@@ -381,7 +367,7 @@ class _Work:
     def _fit_alone(self, k: int, scene: Scene, common: Minimum, joint: _JointFit | None) -> _OwnFit:
         fit = self._sample_fit(scene, common, [k], joint)
         unknowns = fit.unknowns.only([k])
-        chi2 = float(fit.scene.chi2(unknowns, fit.scene.ray_counts(unknowns))[0])
+        chi2 = float(fit.scene.chi2(unknowns)[0])
         # A field of an image's own follows the noise by as much as it is left open.
         variance = fit.variance_in(_linear_of(k, fit.scene, unknowns, joint))
         share = min(variance, _MAX_FITTED_SHARE)
@@ -415,14 +401,13 @@ class _Work:
     @staticmethod
     def _chi2_in_middle(scene: Scene, minimum: Minimum, members: list[int]) -> FloatArray:
         middle = replace(coarser(scene.only(members), MIDDLE), spacing=MIDDLE_SPACING)
-        unknowns = minimum.unknowns.only(members)
-        return middle.chi2(unknowns, middle.ray_counts(unknowns))
+        return middle.chi2(minimum.unknowns.only(members))
 
 
 def _linear_of(k: int, scene: Scene, unknowns: Unknowns, joint: _JointFit | None) -> Linear:
     """One image to first order, by a joint fit if it takes part in it."""
     linear = None if joint is None else joint.only([k])
-    return linear or scene.linear(unknowns, scene.ray_counts(unknowns))
+    return linear or scene.linear(unknowns)
 
 
 def _name(members: list[int]) -> str:
@@ -476,10 +461,7 @@ def _chi2(made: FloatArray, data: FloatArray | float, weights: AnyArray) -> floa
     return float(((made - data) ** 2 * weights).sum() / (weights > 0).sum())
 
 
-def _result(
-    data: FitData,
-    predictions: Sequence[_Prediction],
-) -> LeaveOneOut:
+def _result(data: FitData, predictions: Sequence[_Prediction]) -> LeaveOneOut:
     height, width = data.size
     units = data.units[:, None, None]
     used = data.scene.weights[:, :height, :width] > 0

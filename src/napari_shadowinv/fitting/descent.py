@@ -173,7 +173,7 @@ class Preconditioner:
             each = weights.mean() * (KNOT * squares) ** 2 * transfer
             data += each[..., None, None] * np.outer(strengths, strengths)
         of_data = np.moveaxis(np.diagonal(data, axis1=2, axis2=3), -1, 0)
-        rough = prior.of_rough.sum(axis=1)
+        rough = prior.roughness
         self._kept = np.divide(of_data, of_data + rough, out=np.ones_like(rough), where=rough > 0)
         of_prior = np.moveaxis(prior.of_potentials(), 0, -1)
         matrix = data + of_prior[..., None] * np.eye(of_prior.shape[-1])
@@ -410,12 +410,12 @@ def settle(
         now, value, slope = trial, trial_value, trial_slope
         is_as_expected = abs(gain - expected_gain) < _AS_EXPECTED * expected_gain
         if is_rough and is_as_expected:
-            return now, _value_afresh(scene, now), taken, True
+            return now, scene.value(now), taken, True
         # What the next step would gain is about the preconditioned square of the slope.
         after = scales.transpose_times(slope).flat()
         next_gain = product(after, modes.precondition(after)) / 2
         if gain < least_gain or (next_gain < _NEXT_GAIN * least_gain and is_scaled):
-            return now, _value_afresh(scene, now), taken, True
+            return now, scene.value(now), taken, True
         if taken == _TRIED_STEPS and value > hopeless:
             break
         if gain > _RENEWING_GAIN:
@@ -428,11 +428,6 @@ def settle(
         )
         taken += more
     return now, value, taken, taken < steps
-
-
-def _value_afresh(scene: Scene, unknowns: Unknowns) -> float:
-    """The objective with the numbers of rays that the unknowns need."""
-    return scene.value(unknowns, scene.ray_counts(unknowns))
 
 
 def binned(planes: FloatArray, factor: int) -> FloatArray:

@@ -164,13 +164,18 @@ class Scene:
         strengths = self.strengths_with(unknowns)
         return np.asarray(np.einsum("lm,myx->lyx", strengths, unknowns.potentials))
 
+    def displacement(self, unknowns: Unknowns) -> FloatArray:
+        """Return each field's displacement at the pixels, recorded px, shape (M, 2, H, W)."""
+        each = [self.rays.displacement(potential) for potential in unknowns.potentials]
+        return self.bin * np.stack(each)
+
     def ray_counts(self, unknowns: Unknowns) -> list[IntArray]:
         """Return how many rays each cell of each image needs; see `RayModel.ray_counts`."""
         return [self.rays.ray_counts(psi) for psi in self.potentials(unknowns)]
 
-    def model(self, unknowns: Unknowns, counts: list[IntArray]) -> FloatArray:
-        """Return the images that the unknowns make, shape (L, H, W)."""
-        lit = (self._lit(unknowns, shot) for shot in self._shots(unknowns, counts))
+    def model(self, unknowns: Unknowns, counts: list[IntArray] | None = None) -> FloatArray:
+        """Return the images that the unknowns make, shape (L, H, W), by `ray_counts` or others."""
+        lit = (self._seen(unknowns, shot).image for shot in self._shots(unknowns, counts))
         return np.stack([np.exp(log) * f for log, f in zip(unknowns.brightness, lit, strict=True)])
 
     def beam(self, unknowns: Unknowns) -> FloatArray:
@@ -180,13 +185,13 @@ class Scene:
         beams = np.stack([shape * self._light(unknowns, k) for k in range(len(self.beams))])
         return np.asarray(beams[:, self.pad : self.pad + height, self.pad : self.pad + width])
 
-    def chi2(self, unknowns: Unknowns, counts: list[IntArray]) -> FloatArray:
+    def chi2(self, unknowns: Unknowns, counts: list[IntArray] | None = None) -> FloatArray:
         """Return the mean of ((f - I) / σ)² over each image's used pixels, shape (L,)."""
         misfit = (self.model(unknowns, counts) - self.images) ** 2 * self.weights
         return np.asarray(misfit.sum(axis=(1, 2)) / (self.weights > 0).sum(axis=(1, 2)))
 
-    def value(self, unknowns: Unknowns, counts: list[IntArray]) -> float:
-        """Return the objective at fixed numbers of rays."""
+    def value(self, unknowns: Unknowns, counts: list[IntArray] | None = None) -> float:
+        """Return the objective, at fixed numbers of rays if these are given."""
         value, _ = self._priors(unknowns)
         shots = list(self._shots(unknowns, counts))
         for _, _, residual in self._of_each(partial(self._misfit, unknowns), shots):
@@ -255,12 +260,11 @@ class Scene:
 
     def with_free_beam(self, modes: int, variation: float) -> Scene:
         """Return the scene with an unknown beam that differs from the known one by an r.m.s."""
-        order = np.arange(modes)
-        square = order[:, None] ** 2 + order**2
-        used = (square > 0) & (square < modes**2)
+        weights = replace(self, beam_modes=modes, beam_spread=1.0).prior.beam_weights
+        is_wavy = np.arange(modes) > 0
         # Mean square of cos cos, and of cos alone.
-        means = np.where((order[:, None] > 0) & (order > 0), 0.25, 0.5)
-        total = np.sqrt((means / np.maximum(square, 1))[used].sum())
+        means = np.where(is_wavy[:, None] & is_wavy, 0.25, 0.5)
+        total = np.sqrt((means[weights > 0] / weights[weights > 0]).sum())
         return replace(self, beam_modes=modes, beam_spread=float(variation / total))
 
     def beam_changes(self, change: Unknowns) -> FloatArray:
@@ -276,13 +280,13 @@ class Scene:
         """
         changes = np.empty_like(self.images)
         for k, shot in enumerate(self._shots(unknowns, counts)):
-            changed = self._bare(unknowns, shot._replace(beam=variations[k] * shot.beam))
             slope = self._seen(unknowns, shot).slope if self.imperfect.gamma else 1.0
-            bare = slope * changed
+            changed = shot._replace(beam=variations[k] * shot.beam)
+            bare = slope * self._spread(k, self.rays.image(*changed[1:]), unknowns)
             changes[k] = np.sqrt(self.weights[k]) * np.exp(unknowns.brightness[k]) * bare
         return changes
 
-    def linear(self, unknowns: Unknowns, counts: list[IntArray]) -> Linear:
+    def linear(self, unknowns: Unknowns, counts: list[IntArray] | None = None) -> Linear:
         """Return the scene to first order around unknowns."""
         shots = list(self._shots(unknowns, counts))
         of_beam, of_frame = self._has_beam, bool(self.free_frames.any())
@@ -314,7 +318,7 @@ class Scene:
         units = []
         for part, k in self._response_numbers():
             unit = self.nothing().zeros()
-            (unit.common if part.is_common else unit.separate[k])[part.places] = 1
+            part.of(unit.common, unit.separate[k])[:] = 1
             units.append(unit)
         return units
 
@@ -354,12 +358,9 @@ class Scene:
                 )
             else:
                 curvature = np.einsum("lyx,lyx->l", weights, changes[part.key] ** 2)[:, None]
-            if part.is_common:
-                common[part.places] = 1 / np.sqrt(1 + curvature.sum(axis=0))
-            else:
-                separate[:, part.places] = 1 / np.sqrt(1 + curvature)
-            if part.key in self.held:
-                (common if part.is_common else separate)[..., part.places] = 0
+            curvature = curvature.sum(axis=0) if part.is_common else curvature
+            is_held = part.key in self.held
+            part.of(common, separate)[...] = 0 if is_held else 1 / np.sqrt(1 + curvature)
         return common, separate
 
     @property
@@ -367,8 +368,9 @@ class Scene:
         """Whether light that enters is unknown."""
         return bool(self.beam_modes) or self.imperfect.changes_beam
 
-    def _shots(self, unknowns: Unknowns, counts: list[IntArray]) -> Iterator[_Shot]:
+    def _shots(self, unknowns: Unknowns, counts: list[IntArray] | None) -> Iterator[_Shot]:
         shape = self._beam_shape(unknowns)
+        counts = counts or self.ray_counts(unknowns)
         for k, psi in enumerate(self.potentials(unknowns)):
             beam = self._light(unknowns, k) * shape
             yield _Shot(k, psi, counts[k], beam, unknowns.frames[k])
@@ -379,25 +381,15 @@ class Scene:
         light = self.imperfect.entering(self.beams[k], *numbers)
         return np.asarray(light * self.imperfect.excess(*numbers))
 
-    def _bare(self, unknowns: Unknowns, shot: _Shot) -> FloatArray:
-        """The light of an image's rays, without its brightness."""
-        rays = self.rays.image(shot.potential, shot.counts, shot.beam, shot.frame)
-        return self._inner(self._spread(shot.number, rays, unknowns))
-
-    def _lit(self, unknowns: Unknowns, shot: _Shot) -> FloatArray:
-        """An image without its brightness: the light of its rays, and what adds to it."""
-        return self._seen(unknowns, shot).image
-
     def _seen(self, unknowns: Unknowns, shot: _Shot) -> _Seen:
         """An image without its brightness, and its derivatives."""
         imperfect, k = self.imperfect, shot.number
-        rays = self.rays.image(shot.potential, shot.counts, shot.beam, shot.frame)
-        bare = self._inner(self._spread(k, rays, unknowns))
-        image, slope = bare, np.ones(())
+        rays = self.rays.image(*shot[1:])
+        image, slope = self._spread(k, rays, unknowns), np.ones(())
         derivatives = {}
         if imperfect.gamma:
             exponent = imperfect.exponent(unknowns.common)
-            light = np.maximum(bare, DARKEST)
+            light = np.maximum(image, DARKEST)
             power = light ** (exponent - 1)
             image, slope = light * power, exponent * power
             derivatives["gamma"] = imperfect.gamma * image * np.log(light)
@@ -409,13 +401,10 @@ class Scene:
         if imperfect.background:
             image = image + imperfect.offset(unknowns.separate[k])
             derivatives["background"] = np.full(image.shape, imperfect.background)
-        places = {
-            part.key: (part.is_common, part.places.start)
-            for part in imperfect.parts
-            if part.key in derivatives
-        }
-        effects = [(*places[key], values) for key, values in derivatives.items()]
-        return _Seen(self._with_added(unknowns, k, image), bare, slope, effects)
+        effects = [
+            (part, derivatives[part.key]) for part in imperfect.parts if part.key in derivatives
+        ]
+        return _Seen(self._with_added(unknowns, k, image), slope, effects)
 
     def _variance(self, k: int) -> float:
         """Variance of a Gaussian point spread that an error of the blur adds to."""
@@ -458,8 +447,8 @@ class Scene:
         if self.imperfect.changes_beam:
             shaped = pull * entering.shaped
             for part, logarithm in entering.effects:
-                derivatives = slope.common if part.is_common else slope.separate[k]
-                derivatives[part.places] += np.einsum("yx,yx", shaped, logarithm)
+                derivatives = part.of(slope.common, slope.separate[k])
+                derivatives += np.einsum("yx,yx", shaped, logarithm)
             self.imperfect.pull_shapes(shaped, slope.common, slope.separate[k])
         return pull * entering.light
 
@@ -467,16 +456,10 @@ class Scene:
         frames = np.where(self.free_frames, slope.frames, 0.0)
         frames[0] = 0
         return slope._replace(
-            beam=np.where(self._free_modes, slope.beam, 0.0),
-            brightness=slope.brightness
-            if self.free_brightness
-            else np.zeros_like(slope.brightness),
+            beam=np.where(self.prior.beam_weights > 0, slope.beam, 0.0),
+            brightness=np.where(self.free_brightness, slope.brightness, 0.0),
             frames=frames,
         )
-
-    @cached_property
-    def _free_modes(self) -> BoolArray:
-        return np.asarray(self.prior.beam_weights > 0)
 
     @cached_property
     def _cosines(self) -> tuple[FloatArray, FloatArray]:
@@ -502,12 +485,13 @@ class Scene:
         return image[inner:-inner, inner:-inner] if inner else image
 
     def _spread(self, k: int, image: FloatArray, unknowns: Unknowns) -> FloatArray:
+        """Light spread by the instrument, without the strip around the image."""
         width, imperfect = self.psf[k], self.imperfect
-        if not imperfect.blur:
-            return _spread(image, width)
-        if not isinstance(width, float):
+        if not (imperfect.blur and isinstance(width, float)):
             image = _spread(image, width)
-        return widen(image, self._variance(k) + imperfect.variance(unknowns.common))
+        if imperfect.blur:
+            image = widen(image, self._variance(k) + imperfect.variance(unknowns.common))
+        return self._inner(image)
 
     def _spread_back(self, k: int, pull: FloatArray, unknowns: Unknowns) -> FloatArray:
         width, imperfect = self.psf[k], self.imperfect
@@ -541,28 +525,26 @@ class _Entering(NamedTuple):
 class _Seen:
     """An image without its brightness.
 
-    `bare` is its light before the response, `slope` the derivative of the response, `effects` are
-    the derivatives by numbers of the instrument, with their places: whether they are common, and
-    which.
+    `slope` is the derivative of the response, `effects` are the derivatives by the number of each
+    imperfection that acts where it is seen.
     """
 
     image: FloatArray
-    bare: FloatArray
     slope: FloatArray
-    effects: list[tuple[bool, int, FloatArray]]
+    effects: list[tuple[Part, FloatArray]]
 
     def push(self, common: FloatArray, separate: FloatArray) -> FloatArray:
         """Return the change of the image by changes of the instrument's numbers."""
         total = np.zeros(())
-        for is_common, place, values in self.effects:
-            total = total + (common if is_common else separate)[place] * values
+        for part, values in self.effects:
+            total = total + part.of(common, separate) * values
         return total
 
     def add_pulls(self, slope: Unknowns, k: int, pull: FloatArray) -> None:
         """Add the transpose of `push` times a pull."""
-        for is_common, place, values in self.effects:
-            derivatives = slope.common if is_common else slope.separate[k]
-            derivatives[place] += np.einsum("yx,yx", pull, values)
+        for part, values in self.effects:
+            derivatives = part.of(slope.common, slope.separate[k])
+            derivatives += np.einsum("yx,yx", pull, values)
 
 
 class _ShotPulls(NamedTuple):
@@ -637,7 +619,7 @@ class Linear:
         changes = np.empty_like(scene.images)
         for k, (jacobian, seen) in enumerate(zip(self.jacobians, self.seen, strict=True)):
             landed = scene.rays.push(jacobian, self._columns(change, potentials, k))
-            spread = scene._inner(scene._spread(k, landed, self.unknowns))
+            spread = scene._spread(k, landed, self.unknowns)
             image = seen.slope * spread + self._light_change(change, k)
             np.multiply(self._roots[k], image, out=changes[k])
         return changes
@@ -705,8 +687,7 @@ class Linear:
         scene, imperfect = self.scene, self.scene.imperfect
         total = scene._modes(change.beam) if scene.beam_modes else np.zeros(())
         for part, logarithm in self._entering[k].effects:
-            changes = change.common if part.is_common else change.separate[k]
-            total = total + changes[part.places] * logarithm
+            total = total + part.of(change.common, change.separate[k]) * logarithm
         if imperfect.shapes:
             total = total + imperfect.shape_changes(change.common, change.separate[k])
         return np.asarray(total)

@@ -48,6 +48,10 @@ class Part(NamedTuple):
     is_common: bool
     places: slice
 
+    def of(self, common: FloatArray, separate: FloatArray) -> FloatArray:
+        """Return a view of its numbers among the common ones and those of one image, or of each."""
+        return (common if self.is_common else separate)[..., self.places]
+
 
 @dataclass(frozen=True, eq=False)
 class ProductShapes:
@@ -195,9 +199,6 @@ class Imperfect:
     @cached_property
     def parts(self) -> tuple[Part, ...]:
         """All imperfections, with the places of their numbers."""
-        return tuple(self._parts())
-
-    def _parts(self) -> Iterator[Part]:
         sizes = [
             ("gamma", True, int(self.gamma > 0)),
             ("blur", True, int(self.blur > 0)),
@@ -205,11 +206,12 @@ class Imperfect:
             ("background", False, int(self.background > 0)),
             *((each.key, each.is_common, len(each)) for each in self.shapes),
         ]
-        ends = {True: 0, False: 0}
+        parts, ends = [], {True: 0, False: 0}
         for key, is_common, size in sizes:
             begin, ends[is_common] = ends[is_common], ends[is_common] + size
             if size:
-                yield Part(key, is_common, slice(begin, ends[is_common]))
+                parts.append(Part(key, is_common, slice(begin, ends[is_common])))
+        return tuple(parts)
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -231,11 +233,6 @@ class Imperfect:
         return self.keys & _OF_RESPONSE
 
     @property
-    def is_exact(self) -> bool:
-        """Whether there are no numbers."""
-        return not self.parts
-
-    @property
     def changes_beam(self) -> bool:
         """Whether the light that enters depends on the numbers."""
         return bool(self.gamma or self.background or self.shapes)
@@ -251,26 +248,23 @@ class Imperfect:
         shapes = tuple(each.coarsen(factor) for each in self.shapes)
         return replace(self, blur=self.blur / factor**2, shapes=shapes)
 
-    def number(self, key: str, common: FloatArray, separate: FloatArray) -> float:
-        """Return the one number of an imperfection of an image; 0 if it is exact."""
-        for part in self.parts:
-            if part.key == key:
-                return float((common if part.is_common else separate)[part.places][0])
-        return 0.0
+    def number(self, key: str, numbers: FloatArray) -> float:
+        """Return the one number of an imperfection among the numbers of its kind."""
+        return float(numbers[self.place(key)][0])
 
     def exponent(self, common: FloatArray) -> float:
         """Return the exponent of the response."""
         if not self.gamma:
             return 1.0
-        return max(1 + self.gamma * self.number("gamma", common, common), _LEAST_EXPONENT)
+        return max(1 + self.gamma * self.number("gamma", common), _LEAST_EXPONENT)
 
     def variance(self, common: FloatArray) -> float:
         """Return what adds to the variance of the point spread, px²."""
-        return self.blur * self.number("blur", common, common) if self.blur else 0.0
+        return self.blur * self.number("blur", common) if self.blur else 0.0
 
     def offset(self, separate: FloatArray) -> float:
         """Return the constant of an image, in units of its beam's mean."""
-        return self.background * self.number("background", separate, separate)
+        return self.background * self.number("background", separate) if self.background else 0.0
 
     def entering(self, beam: FloatArray, common: FloatArray, separate: FloatArray) -> FloatArray:
         """Return the light of a beam as recorded, without what the detector did to it."""
@@ -302,17 +296,13 @@ class Imperfect:
 
     def shape_changes(self, common: FloatArray, separate: FloatArray) -> FloatArray:
         """Return the sum of the shapes times their numbers."""
-        changes = [
-            each.sum((common if part.is_common else separate)[part.places])
-            for part, each in self._shape_parts()
-        ]
+        changes = (each.sum(part.of(common, separate)) for part, each in self._shape_parts())
         return np.asarray(sum(changes))
 
     def pull_shapes(self, pull: FloatArray, common: FloatArray, separate: FloatArray) -> None:
         """Add the transpose of `shape_changes` times a pull to derivatives by the numbers."""
         for part, each in self._shape_parts():
-            slope = common if part.is_common else separate
-            slope[part.places] += each.pull(pull)
+            part.of(common, separate)[:] += each.pull(pull)
 
     def _shape_parts(self) -> Iterator[tuple[Part, Shapes]]:
         places = {part.key: part for part in self.parts}
@@ -347,8 +337,7 @@ def numbers_in_units(
     report = {}
     for part in imperfect.parts:
         values, *spread = (
-            np.atleast_2d(each.common if part.is_common else each.separate)[:, part.places]
-            for each in (unknowns, *changes)
+            np.atleast_2d(part.of(each.common, each.separate)) for each in (unknowns, *changes)
         )
         deviation = np.sqrt(np.mean(np.square(spread), axis=0)) if spread else values * np.nan
         if part.key in shapes:

@@ -294,10 +294,8 @@ def find_pattern(
     )
 
 
-_WIDER_PX, _MUCH_WIDER_PX = (
-    1.5,
-    3.0,
-)  # images that are blurred by 1 px or more are then explained better
+# Images that are blurred by 1 px or more are then explained better.
+_WIDER_PX, _MUCH_WIDER_PX = 1.5, 3.0
 # A free beam lowers Σχ² by at most 19 where the beam was right, by 584 and more where it was off.
 _MIN_GAIN = 60.0
 _AS_LIKELY = 0.7  # of the largest gain
@@ -344,7 +342,7 @@ def name_cause(
         Receives the stage and the objective.
     """
     pixels = replace(coarser(scene, best.bin), spacing=MIDDLE_SPACING)
-    misfit = pixels.chi2(best.unknowns, pixels.ray_counts(best.unknowns)) - 1
+    misfit = pixels.chi2(best.unknowns) - 1
     excess = float((misfit * (pixels.weights > 0).sum(axis=(1, 2))).sum())
     rivals = list(_rivals(scene, best, names, setups))
 

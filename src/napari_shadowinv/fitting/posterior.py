@@ -82,15 +82,6 @@ class Sample:
     force: Unknowns
 
 
-class _Draw(NamedTuple):
-    """Noise, the force of the prior and held numbers, drawn for a sample, and their slope."""
-
-    noise: FloatArray
-    force: Unknowns
-    numbers: Unknowns
-    slope: Unknowns
-
-
 class Response(NamedTuple):
     """How well images determine n numbers of an instrument that change the response to fields.
 
@@ -132,17 +123,12 @@ class Posterior:
         modes: SoftModes | None = None,
         linear: Linear | None = None,
     ) -> None:
-        self._scene, self._unknowns, self._rng = scene, unknowns, rng
+        self.scene, self._unknowns, self._rng = scene, unknowns, rng
         self._counts = scene.ray_counts(unknowns)
         self._linear = linear or scene.linear(unknowns, self._counts)
         self._scales = Preconditioner(scene)
         self._after_step = after_step or (lambda: None)
         self._modes = SoftModes() if modes is None else modes
-
-    @property
-    def scene(self) -> Scene:
-        """The scene that is explained."""
-        return self._scene
 
     def reporting(self, after_step: Callable[[], None]) -> Posterior:
         """Return the same posterior with another callback after each step."""
@@ -153,7 +139,7 @@ class Posterior:
     @property
     def _deviations(self) -> FloatArray:
         """Standard deviations of the noise, 0 in pixels that are not used."""
-        roots = np.sqrt(self._scene.weights)
+        roots = np.sqrt(self.scene.weights)
         return np.divide(1, roots, out=np.zeros_like(roots), where=roots > 0)
 
     def likely_smoothness(self) -> tuple[FloatArray, float]:
@@ -162,10 +148,10 @@ class Posterior:
         Each holds as much against the field as there are coefficients that the data determine and
         it would. The change is the logarithm's, weighted with that number.
         """
-        prior, smoothness = self._scene.prior, self._scene.smoothness
+        prior, smoothness = self.scene.prior, self.scene.smoothness
         determined, energy = np.empty(smoothness.shape), np.empty(smoothness.shape)
         for m in range(len(smoothness)):
-            each, roughness = prior.of_rough[m], prior.of_rough[m].sum(axis=0)
+            each, roughness = prior.of_rough[m], prior.roughness[m]
             signs = self._rng.choice([-1.0, 1.0], roughness.shape)
             slope = self._unknowns.zeros()
             slope.potentials[m] = prior.root_of_smoothness(m, signs)
@@ -188,22 +174,23 @@ class Posterior:
         Numbers of the instrument that are held are drawn first; all other unknowns respond to them.
         """
         if tolerance is None:
-            tolerance = _IN_VALLEY if self._scene.has_free_numbers else _CLOSELY
+            tolerance = _IN_VALLEY if self.scene.has_free_numbers else _CLOSELY
         draws = [self._draw() for _ in range(count)]
-        changes = self._changes([draw.slope for draw in draws], tolerance)
+        changes = self._changes([slope for _, slope in draws], tolerance)
         return [
-            Sample(change.plus(draw.numbers), draw.noise, draw.force)
-            for draw, change in zip(draws, changes, strict=True)
+            replace(causes, change=change.plus(causes.change))
+            for (causes, _), change in zip(draws, changes, strict=True)
         ]
 
-    def _draw(self) -> _Draw:
-        noise = self._rng.normal(size=self._scene.images.shape)
+    def _draw(self) -> tuple[Sample, Unknowns]:
+        """Noise, the force of the prior and held numbers, drawn for a sample, and their slope."""
+        noise = self._rng.normal(size=self.scene.images.shape)
         numbers, residuals = self._unknowns.zeros(), noise
-        if self._scene.held:
+        if self.scene.held:
             numbers = self._draw_held()
             residuals = noise - self._linear.push(numbers)
-        force = self._scene.prior.draw(self._unknowns, self._rng)
-        return _Draw(noise, force, numbers, self._linear.pull(residuals).plus(force))
+        force = self.scene.prior.draw(self._unknowns, self._rng)
+        return Sample(numbers, noise, force), self._linear.pull(residuals).plus(force)
 
     def _changes(self, slopes: Sequence[Unknowns], tolerance: float) -> list[Unknowns]:
         """Solve for the change that undoes each slope, in threads.
@@ -218,7 +205,7 @@ class Posterior:
 
         first = [self._change(slope, tolerance) for slope in slopes[:1]]
         works = [partial(change_alone, slope) for slope in slopes[1:]]
-        threads = available_threads(self._scene.threads)
+        threads = available_threads(self.scene.threads)
         return first + run_in_parallel(works, threads, self._after_step)
 
     def solve(self, samples: Sequence[Sample], steps: int = _SOLVING_STEPS) -> list[Sample]:
@@ -227,7 +214,7 @@ class Posterior:
         Each minimises the objective for images with its noise, in at most `steps` steps from its
         change to first order (randomize then optimize); the best unknowns are settled before.
         """
-        scene = self._scene
+        scene = self.scene
 
         def settled(scene: Scene, start: Unknowns) -> Unknowns:
             end, *_ = settle(
@@ -250,15 +237,15 @@ class Posterior:
 
     def _draw_held(self) -> Unknowns:
         """Random numbers of the instrument: as uncertain as the scene says, or as stated."""
-        scene, numbers = self._scene, self._unknowns.zeros()
+        scene, numbers = self.scene, self._unknowns.zeros()
         if scene.spread is not None:
             units = np.stack([unit.flat() for unit in scene.response_units()])
             drawn = scene.spread @ self._rng.normal(size=len(units))
             return numbers.like(np.einsum("n,nx->x", drawn, units))
         for part in scene.imperfect.parts:
             if part.key in scene.held:
-                block = numbers.common if part.is_common else numbers.separate
-                block[..., part.places] = self._rng.normal(size=block[..., part.places].shape)
+                block = part.of(numbers.common, numbers.separate)
+                block[...] = self._rng.normal(size=block.shape)
         return numbers
 
     def response(self, pairs: int) -> Response:
@@ -272,7 +259,7 @@ class Posterior:
         Derivatives are taken along a number and what responds to it, so that it matters little
         whether the rest has settled; one linear step is enough for each of these fits.
         """
-        scene, unknowns = self._scene, self._unknowns
+        scene, unknowns = self.scene, self._unknowns
         rng = np.random.default_rng(_RESPONSE_SEED)
         units = scene.response_units()
         changes = [
@@ -317,12 +304,12 @@ class Posterior:
         """
         held = self._held
         numbers: dict[str, Unknowns] = {}
-        for part in self._scene.imperfect.parts:
+        for part in self.scene.imperfect.parts:
             # A change of all beams is common, or one of each.
             key = "beam" if part.key == "beam_between" else part.key
             moved = numbers.setdefault(key, sample.change.zeros())
-            name = "common" if part.is_common else "separate"
-            getattr(moved, name)[..., part.places] = getattr(sample.change, name)[..., part.places]
+            change = part.of(sample.change.common, sample.change.separate)
+            part.of(moved.common, moved.separate)[...] = change
         rest, effects = sample.change, {}
         for key, moved in numbers.items():
             pull = self._linear.pull(-self._linear.push(moved))
@@ -340,25 +327,21 @@ class Posterior:
         """
         respond = exact or self._held
         none = respond._unknowns.zeros()
-        displacements = self._displacements(self._unknowns)
+        displacements = self.scene.displacement(self._unknowns)
         keys, pulls = [], []
-        for part in self._scene.imperfect.parts:
+        for part in self.scene.imperfect.parts:
             numbers = self._unknowns.zeros()
-            values = numbers.common if part.is_common else numbers.separate
             size = part.places.stop - part.places.start
-            values[..., part.places] = rng.normal(size=size) if size > 1 else 1.0
+            block = part.of(numbers.common, numbers.separate)
+            block[...] = rng.normal(size=size) if size > 1 else 1.0
             keys.append(part.key)
             pull = self._linear.pull(-self._linear.push(numbers))
             pulls.append(pull._replace(common=none.common, separate=none.separate))
 
-        moved = map(self._displacements, respond._changes(pulls, _ROUGHLY))
+        moved = map(self.scene.displacement, respond._changes(pulls, _ROUGHLY))
         return {
             key: largest_share(each, displacements) for key, each in zip(keys, moved, strict=True)
         }
-
-    def _displacements(self, unknowns: Unknowns) -> FloatArray:
-        """Displacement of each field, (M, 2, H, W), px of the scene."""
-        return np.stack([self._scene.rays.displacement(each) for each in unknowns.potentials])
 
     @property
     def _held(self) -> Posterior:
@@ -369,7 +352,7 @@ class Posterior:
 
     def count_determined(self, rng: np.random.Generator) -> float:
         """Estimate how many numbers the data determine: so much of Σχ² the fit absorbs of noise."""
-        slope = self._linear.pull(rng.normal(size=self._scene.images.shape))
+        slope = self._linear.pull(rng.normal(size=self.scene.images.shape))
         return product(slope.flat(), self._change(slope, _ROUGHLY).flat())
 
     def moved_by_beams(self, variations: Sequence[FloatArray]) -> list[Unknowns]:
@@ -381,7 +364,7 @@ class Posterior:
             Differences as shares of the beams, of the shape of the scene's beams.
         """
         slopes = [
-            self._linear.pull(self._scene.changed_by_beams(self._unknowns, self._counts, each))
+            self._linear.pull(self.scene.changed_by_beams(self._unknowns, self._counts, each))
             for each in variations
         ]
         return self._changes(slopes, _MOVED_BY_BEAMS)
@@ -416,7 +399,7 @@ class Posterior:
 
         which is the response δ = -H⁻¹JᵀBθ to the sampled beam θ.
         """
-        freed = self._scene.with_free_beam(_BEAM_MODES, variation)
+        freed = self.scene.with_free_beam(_BEAM_MODES, variation)
         weights = freed.prior.beam_weights
         unknowns = self._unknowns._replace(beam=np.zeros(weights.shape))
         posterior = Posterior(freed, unknowns, rng, self._after_step)
@@ -437,7 +420,7 @@ class Posterior:
         # What is fixed has no scale, and no part in the volume; nor what nothing holds.
         ones = self._unknowns.like(np.ones(self._unknowns.flat().size))
         moved = self._scales.times(ones)._replace(potentials=ones.potentials)
-        if np.isinf(self._scene.decay):
+        if np.isinf(self.scene.decay):
             moved.potentials[:, 0, 0] = 0
         free = moved.flat() != 0
         is_potential = np.arange(free.size) < ones.potentials.size
@@ -461,7 +444,7 @@ class Posterior:
 
         `chances` are the random generators of the fields.
         """
-        value = self._scene.value(self._unknowns, self._counts)
+        value = self.scene.value(self._unknowns, self._counts)
         return -value - self.log_volume(chances)
 
     def _times(self, flat: FloatArray) -> FloatArray:
@@ -478,7 +461,7 @@ class Posterior:
 
     def _prior_times(self, flat: FloatArray) -> FloatArray:
         """The potentials' prior in scales in which it is about the identity."""
-        like, prior = self._unknowns, self._scene.prior
+        like, prior = self._unknowns, self.scene.prior
         scale = 1 / np.sqrt(prior.of_potentials())
         waves = scale * like.like(flat).potentials
         change = like.zeros()._replace(potentials=idctn(waves, axes=(1, 2), norm="ortho"))
@@ -490,26 +473,20 @@ class Posterior:
     ) -> float:
         """Estimate the trace of a matrix's logarithm from a probe."""
         size = float(np.abs(signs).sum())
-        diagonal, beside = self._lanczos(times, signs / np.sqrt(size))
-        values, vectors = eigh_tridiagonal(diagonal, beside)
-        return size * float((vectors[0] ** 2 * np.log(np.maximum(values, 1e-12))).sum())
-
-    def _lanczos(
-        self, times: Callable[[FloatArray], FloatArray], start: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Diagonal and off-diagonal of a matrix in the space of its first powers."""
-        vectors, diagonal, beside = [start], [], []
-        for k in range(_LANCZOS):
+        # Diagonal and off-diagonal of the matrix in the space of its first powers.
+        vectors, diagonal, beside = [signs / np.sqrt(size)], [], []
+        for _ in range(_LANCZOS):
             image = times(vectors[-1])
             diagonal.append(product(image, vectors[-1]))
             for vector in vectors:
                 image -= product(image, vector) * vector
             length = float(np.sqrt(product(image, image)))
-            if length < 1e-10 or k == _LANCZOS - 1:
+            if length < 1e-10:
                 break
             beside.append(length)
             vectors.append(image / length)
-        return np.array(diagonal), np.array(beside[: len(diagonal) - 1])
+        values, eigenvectors = eigh_tridiagonal(diagonal, beside[: len(diagonal) - 1])
+        return size * float((eigenvectors[0] ** 2 * np.log(np.maximum(values, 1e-12))).sum())
 
 
 _WAVES = 60
@@ -616,11 +593,10 @@ def errors_by_noise(
 
 def compare_samples(scene: Scene, linear: Sequence[Sample], solved: Sequence[Sample]) -> Pairs:
     """Return the displacements of samples to first order beside those that were solved."""
-
-    def moves(sample: Sample) -> FloatArray:
-        return np.stack([scene.rays.displacement(each) for each in sample.change.potentials])
-
-    return reduce(add, map(Pairs.of, map(moves, linear), map(moves, solved)))
+    moves, solved_moves = (
+        [scene.displacement(sample.change) for sample in samples] for samples in (linear, solved)
+    )
+    return reduce(add, map(Pairs.of, moves, solved_moves))
 
 
 def errors_by_part(
@@ -649,10 +625,7 @@ def _spread(
     height, across = size
     squares = np.zeros((scene.strengths.shape[1], 2, *scene.rays.size))
     for change in changes:
-        potentials = change.potentials
-        if potentials.shape[1:] != scene.rays.shape:
-            potentials = finer(change).potentials
-        squares += np.stack([scene.rays.displacement(p) for p in potentials]) ** 2
+        squares += scene.displacement(_in_pixels_of(scene, change)) ** 2
     smooth = gaussian_filter(squares / len(changes), (0, 0, width, width))
     return np.asarray(np.sqrt(smooth[..., :height, :across]))
 
@@ -753,12 +726,16 @@ def sampled_potentials(
     return np.stack(changes, axis=1).astype(np.float32)
 
 
+def _in_pixels_of(scene: Scene, change: Unknowns) -> Unknowns:
+    is_same = change.potentials.shape[1:] == scene.rays.shape
+    return change if is_same else finer(change)
+
+
 def _potentials_of(scene: Scene, change: Unknowns, size: tuple[int, int]) -> FloatArray:
     """Potential of each field at the pixels of an image, (M, H, W)."""
     height, width = size
-    if change.potentials.shape[1:] != scene.rays.shape:
-        change = finer(change)
-    planes = [scene.rays.values(each)[:height, :width] for each in change.potentials]
+    potentials = _in_pixels_of(scene, change).potentials
+    planes = [scene.rays.values(each)[:height, :width] for each in potentials]
     return np.stack([plane - border_mean(plane) for plane in planes])
 
 

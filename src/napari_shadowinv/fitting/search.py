@@ -198,7 +198,7 @@ def _start_minimum(scene: Scene, start: Start) -> Minimum:
     unknowns = scene.nothing()
     if start.potential is not None:
         unknowns.potentials[0] = _splines_of(scene, start.potential)
-    return Minimum(start.name, unknowns, np.inf, _displacement(scene, unknowns), scene.bin)
+    return Minimum(start.name, unknowns, np.inf, scene.displacement(unknowns), scene.bin)
 
 
 def _descend_stage(
@@ -214,12 +214,7 @@ def _descend_stage(
         least_gain=COARSE_GAIN,
         after_step=lambda now: on_step(minimum.start, now),
     )
-    return Minimum(minimum.start, unknowns, value, _displacement(now, unknowns), factor)
-
-
-def _displacement(scene: Scene, unknowns: Unknowns) -> FloatArray:
-    each = [scene.rays.displacement(potential) for potential in unknowns.potentials]
-    return scene.bin * np.stack(each)
+    return Minimum(minimum.start, unknowns, value, now.displacement(unknowns), factor)
 
 
 def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
@@ -227,7 +222,7 @@ def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
     if minimum.bin == 1:
         return minimum
     unknowns = _in_smaller_pixels(scene, minimum)
-    return Minimum(minimum.start, unknowns, minimum.value, _displacement(scene, unknowns), 1)
+    return Minimum(minimum.start, unknowns, minimum.value, scene.displacement(unknowns), 1)
 
 
 def _in_smaller_pixels(scene: Scene, minimum: Minimum) -> Unknowns:
@@ -342,11 +337,8 @@ def _mean_of_numbers(response: Response) -> tuple[FloatArray, FloatArray]:
 
 def _posterior(scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep) -> Posterior:
     middle = replace(coarser(scene, end.bin), spacing=MIDDLE_SPACING)
-
-    def after_step() -> None:
-        on_step("smoothness", end.value)
-
-    return Posterior(middle, end.unknowns, rng, after_step, end.modes)
+    report = partial(on_step, "smoothness", end.value)
+    return Posterior(middle, end.unknowns, rng, report, end.modes)
 
 
 def settle_minimum(
@@ -372,7 +364,7 @@ def settle_minimum(
         is_rough=is_rough,
     )
     return replace(
-        minimum, unknowns=unknowns, value=value, displacement=_displacement(middle, unknowns)
+        minimum, unknowns=unknowns, value=value, displacement=middle.displacement(unknowns)
     )
 
 
@@ -405,7 +397,7 @@ def refine_minimum(
             modes=modes,
         )
         steps += taken
-        chi2 = scene.chi2(unknowns, scene.ray_counts(unknowns))
+        chi2 = scene.chi2(unknowns)
         explained = not denser or bool(chi2.max() < _EXPLAINED)
         if steps >= options.max_iterations or (ended and explained):
             return scene, unknowns, value, steps, ended
