@@ -419,12 +419,11 @@ def _align_image(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknow
     pair = scene.only([first, k])
     weights = np.append(np.where(scene.free_frames, scene.prior.frame_weights, 0.0), 1.0)
     now = unknowns.only([first, k])
+    units = _unit_changes(now, scene.free_frames)
     for _ in range(_FRAME_STEPS):
         counts = pair.ray_counts(now)
         linear = pair.linear(now, counts)
-        columns = [
-            linear.push(change)[1].ravel() for change in _unit_changes(now, scene.free_frames)
-        ]
+        columns = [linear.push(unit)[1].ravel() for unit in units]
         misfit = (pair.model(now, counts) - pair.images)[1] * np.sqrt(pair.weights[1])
         matrix = np.array([[product(a, b) for b in columns] for a in columns])
         slope = np.array([product(column, misfit.ravel()) for column in columns])
@@ -433,11 +432,8 @@ def _align_image(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknow
         step = np.linalg.solve(
             matrix + np.diag(weights[free]), -slope - weights[free] * about_rest[free]
         )
-        for place, change in zip(np.flatnonzero(free), step, strict=True):
-            if place < len(scene.free_frames):
-                now.frames[1, place] += change
-            else:
-                now.brightness[1] += change
+        for unit, share in zip(units, step, strict=True):
+            now = now.plus(now.like(share * unit.flat()))
     return unknowns.with_images([k], now.only([1]))
 
 
