@@ -155,6 +155,7 @@ _RENEWING_GAIN = 5.0
 _TRIED_STEPS = 3  # before a search may be hopeless
 _AS_EXPECTED = 0.1  # of a gain
 _MOST_PIXELS = 2_000_000  # of all images
+_SCALE, _TRANSPOSE = "nmyx,nyx->myx", "nmyx,myx->nyx"  # sums over the fields of scales
 
 
 class Preconditioner:
@@ -216,7 +217,7 @@ class Preconditioner:
     def transpose_times(self, slope: Unknowns) -> Unknowns:
         """Return Sᵀ times derivatives: those with respect to scaled unknowns."""
         waves = dctn(slope.potentials, axes=(1, 2), norm="ortho")
-        potentials = self._transpose_of_potentials_times(waves)
+        potentials = self._potentials_times(waves, _TRANSPOSE)
         products = map(np.multiply, self._diagonals, slope.blocks[1:])
         return Unknowns.from_blocks([potentials, *products])
 
@@ -234,7 +235,7 @@ class Preconditioner:
         of_data = dctn(slope.potentials, axes=(1, 2), norm="ortho")
         of_data += prior.roughness * waves
         result = slope.flat()
-        result[:size] = self._transpose_of_potentials_times(of_data).ravel()
+        result[:size] = self._potentials_times(of_data, _TRANSPOSE).ravel()
         result[size:] += linear.weights_of_others * others
         result[size:] *= self._flat_diagonals
         return result
@@ -243,16 +244,11 @@ class Preconditioner:
     def _flat_diagonals(self) -> FloatArray:
         return np.concatenate([part.ravel() for part in self._diagonals])
 
-    def _potentials_times(self, scaled: FloatArray) -> FloatArray:
-        """Cosines of the potentials by scaled ones."""
-        if len(scaled) == 1:  # a product is faster than a sum over one field
-            return np.asarray(self._potentials[0] * scaled)
-        return np.asarray(np.einsum("nmyx,nyx->myx", self._potentials, scaled))
-
-    def _transpose_of_potentials_times(self, waves: FloatArray) -> FloatArray:
-        if len(waves) == 1:
+    def _potentials_times(self, waves: FloatArray, sums: str = _SCALE) -> FloatArray:
+        """Cosines of the potentials by scaled ones, or the transpose."""
+        if len(waves) == 1:  # a product is faster than a sum over one field
             return np.asarray(self._potentials[0] * waves)
-        return np.asarray(np.einsum("nmyx,myx->nyx", self._potentials, waves))
+        return np.asarray(np.einsum(sums, self._potentials, waves))
 
     def log_size(self) -> float:
         """Return log |det S| plus about half the log-determinant of the prior."""
@@ -330,14 +326,12 @@ def settle(
 
     Parameters
     ----------
-    scene, start
-        The images and the starting point.
+    scene, start, after_step
+        As for `descend`.
     steps : int
         Most steps.
     least_gain : float
         Ends where one step, or five of a descent, lower the objective by less, or the next would.
-    after_step : callable, optional
-        Receives the objective often.
     modes : SoftModes, optional
         Of the Hessians of this scene, from scenes of the same pixels and priors.
     linear : Linear, optional
