@@ -37,7 +37,6 @@ _OF_RESPONSE = frozenset({"gamma", "blur", "background", "other_field"})
 _FITTED_VARIANCE = 0.99999
 _DIMMEST = 1e-2  # of a beam's mean, for a relative change
 
-
 Around = tuple[tuple[int, int], tuple[int, int]]
 
 

@@ -28,7 +28,7 @@ from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.instrument import imperfect_instrument
+from napari_shadowinv.fitting.instrument import Around, imperfect_instrument
 from napari_shadowinv.fitting.rays import RayModel
 from napari_shadowinv.fitting.shots import (
     Images,
@@ -95,6 +95,7 @@ class FitData:
 
     scene: Scene
     size: tuple[int, int]
+    around: Around  # pixels by which beams reach beyond the images along y and x
     units: FloatArray
     brightness: FloatArray
     counted: bool
@@ -107,15 +108,6 @@ class FitData:
     names: tuple[str, ...] | None  # if the images have any
     start: FloatArray | None  # potential in px² of the first field
     near: NearField | None  # the only start, if there is one
-
-    @property
-    def around(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """Pixels by which beams reach beyond the images along y and x."""
-        pad, shape = self.scene.pad, self.scene.beams.shape[1:]
-        before_y, before_x = (
-            (pad, n - pad - side) for n, side in zip(shape, self.size, strict=True)
-        )
-        return before_y, before_x
 
     def noise_of(self, weights: FloatArray) -> FloatArray:
         """Return the standard deviation of each image's noise, or of each pixel's if it varies.
@@ -140,9 +132,8 @@ class FitData:
     def scene_with(self, smoothness: float | None) -> Scene:
         """Return the scene with λ as it was given, or none yet, for each field."""
         fields = self.scene.strengths.shape[1]
-        if self.near is not None:
-            return replace(self.scene, smoothness=np.tile(self.near.smoothness, (fields, 1)))
-        return replace(self.scene, smoothness=np.tile((smoothness or 0.0, 0.0), (fields, 1)))
+        each = (smoothness or 0.0, 0.0) if self.near is None else self.near.smoothness
+        return replace(self.scene, smoothness=np.tile(each, (fields, 1)))
 
 
 def collect_data(
@@ -255,6 +246,7 @@ def collect_data(
     return FitData(
         scene=scene,
         size=(height, width),
+        around=around,
         units=units,
         brightness=factors,
         counted=isinstance(noise, str) and noise == "poisson",
