@@ -148,7 +148,11 @@ def search(scene: Scene, starts: Sequence[Start], on_step: OnStep) -> list[Minim
     )
 
     def begin(start: Start) -> Minimum:
-        return _start_minimum(coarser(rough, start.stages[0][0]), start)
+        first = coarser(rough, start.stages[0][0])
+        unknowns = first.nothing()
+        if start.potential is not None:
+            unknowns.potentials[0] = _splines_of(first, start.potential)
+        return Minimum(start.name, unknowns, np.inf, first.displacement(unknowns), first.bin)
 
     firsts = {(start.stages[0], start.beam_held): start for start in starts if _is_shared(start)}
     descents = [_Descent(start, begin(start), start.stages[:1]) for start in firsts.values()]
@@ -192,13 +196,6 @@ def _distinct_minima(minima: list[Minimum]) -> list[Minimum]:
         if all(better.distance(candidate) > _SAME_FIELD for better in distinct):
             distinct.append(candidate)
     return [candidate for candidate in distinct if candidate.value < _HOPELESS * distinct[0].value]
-
-
-def _start_minimum(scene: Scene, start: Start) -> Minimum:
-    unknowns = scene.nothing()
-    if start.potential is not None:
-        unknowns.potentials[0] = _splines_of(scene, start.potential)
-    return Minimum(start.name, unknowns, np.inf, scene.displacement(unknowns), scene.bin)
 
 
 def _descend_stage(
