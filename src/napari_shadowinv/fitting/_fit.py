@@ -48,6 +48,7 @@ from napari_shadowinv.fitting.posterior import (
     errors_by_noise,
     errors_by_part,
     largest_share,
+    potentials_of,
     sampled_potentials,
     shifts_by_beam,
 )
@@ -71,7 +72,6 @@ from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.inversion.samples import Pairs
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions, KindOfNoise
 from napari_shadowinv.physics.forward import jacobian_determinant
-from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.physics.setup import Setup
 
 __all__ = ["collect_starts", "compare", "fit", "report_steps", "reweight_counts"]
@@ -595,25 +595,20 @@ def _result(
     brightness = np.exp(unknowns.brightness)
     beams = scene.beam(unknowns)[:, :height, :width] * units * brightness[:, None, None]
     chi2 = scene.chi2(unknowns, counts)
-    fields = []
-    for m, name in enumerate(names):
-        potential = scene.rays.values(unknowns.potentials[m])[:height, :width]
-        displacement = scene.rays.displacement(unknowns.potentials[m])[:, :height, :width]
-        error = None if errors is None else errors[m]
-        beam_error = None if by_beam is None else by_beam.errors[m]
-        smooth = (float(scene.smoothness[m, 0]), float(scene.smoothness[m, 1]))
-        fields.append(
-            FittedField(
-                name,
-                potential - border_mean(potential),
-                displacement,
-                error,
-                smooth,
-                beam_error,
-                None if samples is None else samples[m],
-            )
+    displacements = scene.displacement(unknowns)[..., :height, :width].copy()
+    potentials = potentials_of(scene, unknowns, data.size)
+    fields = [
+        FittedField(
+            name,
+            potentials[m],
+            displacements[m],
+            None if errors is None else errors[m],
+            (float(scene.smoothness[m, 0]), float(scene.smoothness[m, 1])),
+            None if by_beam is None else by_beam.errors[m],
+            None if samples is None else samples[m],
         )
-    displacements = np.stack([field.displacement for field in fields])
+        for m, name in enumerate(names)
+    ]
     uncertainty = float("nan") if errors is None else largest_share(errors, displacements)
     beam = None
     if by_beam is not None:

@@ -48,6 +48,7 @@ __all__ = [
     "draw_variations",
     "errors_by_noise",
     "largest_share",
+    "potentials_of",
     "sampled_potentials",
     "shifts_by_beam",
 ]
@@ -713,10 +714,10 @@ def sampled_potentials(
     ndarray of float32, shape (M, len(samples), H, W)
         Their mean over the border is 0.
     """
-    changes = [_potentials_of(scene, sample.change, size) for sample in samples]
+    changes = [potentials_of(scene, sample.change, size) for sample in samples]
     shifts = () if by_beam is None else by_beam.changes
     if shifts:
-        moves = np.stack([_potentials_of(scene, shift, size) for shift in shifts])
+        moves = np.stack([potentials_of(scene, shift, size) for shift in shifts])
         draws = np.random.default_rng([seed, _BEAM_SEED]).normal(size=(len(samples), len(shifts)))
         draws /= np.sqrt(len(shifts))
         changes = [
@@ -731,8 +732,8 @@ def _in_pixels_of(scene: Scene, change: Unknowns) -> Unknowns:
     return change if is_same else finer(change)
 
 
-def _potentials_of(scene: Scene, change: Unknowns, size: tuple[int, int]) -> FloatArray:
-    """Potential of each field at the pixels of an image, (M, H, W)."""
+def potentials_of(scene: Scene, change: Unknowns, size: tuple[int, int]) -> FloatArray:
+    """Return each field's potential at the pixels of an image, px², (M, H, W)."""
     height, width = size
     potentials = _in_pixels_of(scene, change).potentials
     planes = [scene.rays.values(each)[:height, :width] for each in potentials]
