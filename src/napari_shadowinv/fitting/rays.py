@@ -149,9 +149,8 @@ class RayModel:
         size = self._guarded
         corners = np.zeros((_BANDS, 4 * math.prod(size)))
         reached = np.zeros((_BANDS, 2), np.int64)
-        self._in_ranges(
-            kernels.deposit, _BANDS, potential, counts, beam, frame, size, corners, reached
-        )
+        model = potential, counts, beam, frame
+        self._in_ranges(kernels.deposit, _BANDS, model, size, corners, reached)
         image = np.zeros(self.seen)
         threads = available_threads(self.threads)
         in_ranges(
@@ -191,21 +190,9 @@ class RayModel:
         """
         pulls = Pulls(np.zeros((_BANDS, *self.shape)), np.zeros(beam.shape), np.zeros((_BANDS, 6)))
         size, slopes = self._guarded, _slopes_between_pixels(np.pad(pull, _GUARD))
-        self._in_ranges(
-            kernels.gather,
-            _BANDS,
-            potential,
-            counts,
-            beam,
-            frame,
-            size,
-            slopes,
-            pulls.potential,
-            pulls.beam,
-            of_beam,
-            pulls.frame,
-            of_frame,
-        )
+        model = potential, counts, beam, frame
+        sums = pulls.potential, pulls.beam, of_beam, pulls.frame, of_frame
+        self._in_ranges(kernels.gather, _BANDS, model, size, slopes, *sums)
         about_middle = self._about_middle(pulls.frame.sum(axis=0))
         return Pulls(pulls.potential.sum(axis=0), pulls.beam, about_middle)
 
@@ -235,7 +222,7 @@ class RayModel:
         size = self._guarded
         model = potential, counts, beam, frame
         reached = np.empty((*self.cells, 4), np.int64)
-        self._in_ranges(kernels.boxes, len(reached), *model, size, reached)
+        self._in_ranges(kernels.boxes, len(reached), model, size, reached)
         # The guard belongs to no pixel.
         first = np.maximum(reached[..., :2], _GUARD)
         behind = np.minimum(reached[..., 2:], np.array(self.seen) + _GUARD)
@@ -250,7 +237,7 @@ class RayModel:
         self._in_ranges(
             kernels.collect,
             len(reached),
-            *model,
+            model,
             size,
             reached,
             begins,
@@ -335,12 +322,11 @@ class RayModel:
         self,
         kernel: Callable[..., Any],
         ranges: int,
-        potential: FloatArray,
-        counts: IntArray,
-        beam: FloatArray,
-        frame: FloatArray | None,
+        model: tuple[FloatArray, IntArray, FloatArray, FloatArray | None],
         *rest: Any,
     ) -> None:
+        """Call a kernel for ranges, in threads; `model` are the arguments of `image`."""
+        potential, counts, beam, frame = model
         frame_px = self._to_pixels(at_rest() if frame is None else frame)
         threads = available_threads(self.threads)
         if (counts[0] * counts[1]).sum() < _WORTH_A_THREAD:
