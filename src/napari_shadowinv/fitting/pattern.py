@@ -107,10 +107,8 @@ def correlation_length(residual: FloatArray, used: BoolArray) -> float:
 
     Parameters
     ----------
-    residual : ndarray, shape (H, W)
-        Image minus model over the standard deviation of the noise in each pixel.
-    used : ndarray of bool, shape (H, W)
-        The pixels that were fitted.
+    residual, used : ndarray, shape (H, W)
+        As for `pattern_strength`.
     """
     near = _squared_difference(residual, used, _NEAR_PX)
     far = _squared_difference(residual, used, _FAR_PX)
@@ -182,8 +180,6 @@ def lack_of_noise(residuals: FloatArray, used: BoolArray) -> tuple[float, float]
 
 def _amplification_after(width: float, correlation: float) -> float:
     """Power of correlated noise after a Gaussian over the power of white noise."""
-    if correlation <= 0:
-        return 1.0
     squares = width**2 / (width**2 + correlation**2)
     return max(1.0, 4 * np.pi * correlation**2 * squares)
 
@@ -449,9 +445,7 @@ def _with_free_beam(scene: Scene, best: Minimum) -> Iterator[_Rival]:
     for modes, cause in causes.items():
         if modes <= scene.beam_modes:
             continue
-        beam = np.zeros((modes, modes))
-        old = scene.beam_modes
-        beam[:old, :old] = best.unknowns.beam
+        beam = np.pad(best.unknowns.beam, (0, modes - scene.beam_modes))
         freed = replace(scene, beam_modes=modes, beam_spread=_BEAM_SPREAD, free_brightness=True)
         free_numbers = int((freed.prior.beam_weights > 0).sum())
         yield _Rival(freed, best.unknowns._replace(beam=beam), free_numbers, cause)
