@@ -45,26 +45,18 @@ class Scene:
         Known flux of the beams, as `RayModel.around` returns it.
     psf : sequence of float or ndarray
         Standard deviation in px of each image's point spread, or its kernel.
-    smoothness, tie, decay, beam_modes, beam_spread, fiducials
+    smoothness, tie, decay, beam_modes, beam_spread, shift_spread, fiducials, added
         See `Prior`; smoothness has the shape (M, 2).
-    pad : int
-        Width in px of the strip around the image from which rays may enter.
+    pad, spacing, threads
+        See `RayModel`.
     free_brightness : bool
         Whether the brightness of each image is unknown.
     free_frames : ndarray of bool, shape (6,)
         Which numbers of a frame are unknown, but for the first image.
-    shift_spread : float
-        See `Prior`.
     blur : float
         Standard deviation in px by which residuals are blurred.
-    spacing : float
-        See `RayModel`.
     bin : int
         Side of a pixel in recorded pixels.
-    threads : int or None
-        Number of threads. Default: all cores. It does not affect the result.
-    added : tuple of AdditiveBlock
-        Unknown light that adds to each image.
     imperfect : Imperfect
         Standard deviations of an instrument that is not exact.
     held : frozenset of str
