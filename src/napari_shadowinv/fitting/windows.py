@@ -260,11 +260,7 @@ def _called(wrong: AnyArray, setups: Sequence[Setup] | None, names: Sequence[str
         quantity, values = beams
         text = quantity.text(*(values[k] for k in wrong), digits=6)
         return f"at {' and '.join(text.rsplit(', ', 1))}"
-    return _listed([names[k] if names else str(k + 1) for k in wrong])
-
-
-def _listed(texts: Sequence[str]) -> str:
-    *most, last = texts
+    *most, last = [names[k] if names else str(k + 1) for k in wrong]
     return f"{', '.join(most)} and {last}" if most else last
 
 
