@@ -262,10 +262,13 @@ class Prior:
         rough = [self.root_of_smoothness(m, rng.normal(size=shape)) for m in fields]
         potentials = np.stack(rough)
         root = np.sqrt(self.tie)
-        for axis, in_pad in enumerate(self._in_pad, 1):
-            steps = rng.normal(size=(len(potentials), *in_pad.shape)) * in_pad
+        inside = self._within
+        within = inside[1:] & inside[:-1], inside[:, 1:] & inside[:, :-1]
+        for axis, step_within in enumerate(within, 1):
+            steps = rng.normal(size=(len(potentials), *step_within.shape)) * ~step_within
             potentials -= root * np.diff(steps, axis=axis, prepend=0, append=0)
-        potentials += root * np.sqrt(self._fading) * rng.normal(size=potentials.shape)
+        fading = np.where(inside, 0.0, (KNOT / self.decay) ** 2)
+        potentials += root * np.sqrt(fading) * rng.normal(size=potentials.shape)
         if self.fiducials is not None:
             errors = self.fiducials.errors[:, None]
             self._add_there(potentials, rng.normal(size=(len(errors), 2)) / errors)
@@ -336,16 +339,6 @@ class Prior:
             for n, side in zip(self.rays.shape, self.rays.size, strict=True)
         ]
         return np.asarray(lines[0][:, None] & lines[1])
-
-    @cached_property
-    def _in_pad(self) -> tuple[BoolArray, BoolArray]:
-        """Which steps between coefficients along y and x lie in the pad."""
-        inside = self._within
-        return ~(inside[1:] & inside[:-1]), ~(inside[:, 1:] & inside[:, :-1])
-
-    @cached_property
-    def _fading(self) -> FloatArray:
-        return np.where(self._within, 0.0, (KNOT / self.decay) ** 2)
 
     @cached_property
     def _splines_there(self) -> tuple[IntArray, IntArray, FloatArray]:
