@@ -92,7 +92,9 @@ def pattern_strength(residual: FloatArray, used: BoolArray, correlation: float =
         # The kernel's square is a Gaussian, too, narrower by √2.
         density = 1 / (4 * np.pi * width**2)
         near = gaussian_filter(inside, width / np.sqrt(2), mode="constant")
-        amplified = _amplification_after(width, correlation)
+        # Power of correlated noise after the Gaussian over the power of white noise.
+        squares = width**2 / (width**2 + correlation**2)
+        amplified = max(1.0, 4 * np.pi * correlation**2 * squares)
         expected = amplified * density * float(near[used].sum())
         deviation = amplified * np.sqrt(density * pixels)
         strengths.append((power - expected) / deviation)
@@ -176,12 +178,6 @@ def lack_of_noise(residuals: FloatArray, used: BoolArray) -> tuple[float, float]
     if not details.size:
         return 0.0, np.inf
     return 1 - float((details**2).mean()), float(np.sqrt(2 / details.size))
-
-
-def _amplification_after(width: float, correlation: float) -> float:
-    """Power of correlated noise after a Gaussian over the power of white noise."""
-    squares = width**2 / (width**2 + correlation**2)
-    return max(1.0, 4 * np.pi * correlation**2 * squares)
 
 
 def _squared_difference(values: FloatArray, used: BoolArray, distance: int) -> float:
