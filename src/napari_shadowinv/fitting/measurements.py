@@ -205,6 +205,9 @@ def collect_data(
     is_common = all(np.allclose(beam, shapes[0], rtol=_SAME, atol=0) for beam in shapes[1:])
     is_assumed = source is None or not all(shot.measured for shot in shots)
     prior = instrument.beam_of(measured=not is_assumed)
+    # Displacement by an electric field that is equal to the field in image 1.
+    has_other = setups is not None and tuple(fields) == ("B",)
+    other_strengths = strengths_of(setups, ("E",), count) if has_other else matrix
     imperfect = imperfect_instrument(
         instrument,
         prior if instrument.has_numbers else BeamPrior(),
@@ -213,7 +216,7 @@ def collect_data(
         around,
         is_common=is_common,
         is_unknown=unknown,
-        other_strengths=_other_strengths(setups, fields, matrix),
+        other_strengths=other_strengths,
     )
     spread = np.linalg.norm(matrix, axis=1)
     single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
@@ -321,14 +324,6 @@ def strengths_of(
             for setup in setups
         ]
     )
-
-
-def _other_strengths(
-    setups: Sequence[Setup] | None, fields: Sequence[str], strengths: FloatArray
-) -> FloatArray:
-    """Return the displacement by an electric field that is equal to each field's in image 1."""
-    has_other = setups is not None and tuple(fields) == ("B",)
-    return strengths_of(setups, ("E",), len(strengths)) if has_other else strengths
 
 
 def estimated_noise(image: FloatArray, used: BoolArray) -> float:
