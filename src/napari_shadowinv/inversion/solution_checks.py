@@ -118,9 +118,18 @@ def inner_sides(displacement: FloatArray, mask: BoolArray) -> Sides | None:
         The pixels to use.
     """
     depth = max(2, round(_DEPTH * min(mask.shape)))
-    y, x = np.where(mask, displacement, np.nan)
-    outwards = -y[depth], y[-1 - depth], -x[:, depth], x[:, -1 - depth]
-    along = x[0], x[-1], y[:, 0], y[:, -1]
+    rows = slice(None)
+
+    def used(axis: int, *place: int | slice) -> FloatArray:
+        return np.where(mask[place], displacement[(axis, *place)], np.nan)
+
+    outwards = (
+        -used(0, depth),
+        used(0, -1 - depth),
+        -used(1, rows, depth),
+        used(1, rows, -1 - depth),
+    )
+    along = used(1, 0), used(1, -1), used(0, rows, 0), used(0, rows, -1)
     if any(np.isnan(side).mean() > _MAX_MASKED for side in (*outwards, *along)):
         return None
     return Sides(depth, outwards, along)
@@ -208,12 +217,16 @@ def find_cautions(
     `beam_difference` of image and source outside the object.
     """
     misfit_at_end = begin(partial(_misfit, prepared, reprojection, n_sites), options.threads)
+    is_closed = options.boundary == "closed"
+    if is_closed:
+        cut_by_edge = partial(_cut_by_edge, prepared, noise, beam_difference)
+        cut_at_end = begin(cut_by_edge, options.threads)
     square = np.einsum("cyx,cyx->yx", displacement, displacement)
     mask = prepared.mask
     rms = float(np.sqrt(square[mask].mean()))
     folds, masked_peak = _deep_folds(jacobian, mask), _peak_at_mask(displacement, mask)
     closed_edge = ""
-    if options.boundary == "closed":
+    if is_closed:
         peak = float(np.sqrt(square[mask].max()))
         closed_edge = _cut_off(displacement, mask, noise, rms, peak)
     misfit = misfit_at_end()
@@ -228,8 +241,8 @@ def find_cautions(
         "masked-peak": masked_peak,
         "closed-edge": closed_edge,
     }
-    if options.boundary == "closed" and not closed_edge:
-        texts["cut-object"] = _cut_by_edge(prepared, noise, beam_difference)
+    if is_closed and not closed_edge:
+        texts["cut-object"] = cut_at_end()
     return tuple(Caution(code, text) for code, text in texts.items() if text)
 
 
