@@ -8,9 +8,8 @@
 - fields side by side: `comparison_figure`; a figure's file: `save_figure`
 - a stack as a movie: `write_film`
 
-Each returns a `matplotlib.figure.Figure` with an Agg canvas; write it with `save_figure`. The
-figures use matplotlib's objects and no pyplot, so they neither need a window nor disturb the
-figures of a notebook.
+The figures use matplotlib's objects and no pyplot, so they neither need a window nor
+disturb the figures of a notebook.
 """
 
 from napari_shadowinv.plotting._film_figure import pack_figure

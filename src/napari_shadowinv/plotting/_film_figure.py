@@ -36,6 +36,11 @@ def pack_figure(doses: FilmDoses, *, title: str | None = None) -> Figure:
         Result of `run_film`.
     title : str, optional
         A heading, such as the pack's name.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure with an Agg canvas; write it with `save_figure`.
     """
     planes, usable = doses.dose, doses.usable
     count, *sides = planes.shape

@@ -48,6 +48,11 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
         With its setups, which give axes in metres and fields in SI units; pixels without.
     title : str, optional
         A heading, such as the images' names.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure with an Agg canvas; write it with `save_figure`.
     """
     count, *sides = fit.images.shape
     shape = sides[0], sides[1]
@@ -171,6 +176,11 @@ def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figur
         With its setups, which name the images and give axes in metres.
     title : str, optional
         A heading, such as the images' names.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure with an Agg canvas; write it with `save_figure`.
     """
     count, *sides = left_out.images.shape
     shape = sides[0], sides[1]
@@ -206,6 +216,11 @@ def windows_figure(windows: FitWindows, *, title: str | None = None) -> Figure:
         Its setups give axes in metres, fields in SI units, energies and times of flight.
     title : str, optional
         A heading, such as the images' names.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure with an Agg canvas; write it with `save_figure`.
     """
     displacement = windows.displacement
     count, fields = displacement.shape[:2]

@@ -36,6 +36,11 @@ def products_figure(results: Sequence[ProductResult], *, title: str | None = Non
     results : sequence of ProductResult
     title : str, optional
         A heading, such as the shot's name.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure with an Agg canvas; write it with `save_figure`.
     """
     panels = [(each, names) for each in results for names in _panels_of(each)]
     lines = _footer(results)

@@ -47,6 +47,11 @@ def report_figure(
         Gives axes in metres and the field in SI units. Default: the inversion's, or else pixels.
     title : str, optional
         A heading, such as the shot's name.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure with an Agg canvas; write it with `save_figure`.
     """
     setup = inversion.setup if setup is None else setup
     shape = inversion.potential.shape
