@@ -311,20 +311,21 @@ def nonnegative_fit(columns: FloatArray, values: FloatArray) -> tuple[FloatArray
     distance : float
         Root of the sum of squared residuals, in the values' unit.
     """
-    count = columns.shape[1]
-    scales = 1 / np.maximum(np.linalg.norm(columns, axis=0), np.finfo(np.float64).tiny)
-    best, least = np.zeros(count), float(np.linalg.norm(values))
-    for subset in itertools.product((True, False), repeat=count):
+    norms = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(np.float64).tiny)
+    scaled = columns / norms
+    best, least = np.zeros(len(norms)), float(np.linalg.norm(values))
+    for subset in itertools.product((True, False), repeat=len(norms)):
         used = np.flatnonzero(subset)
-        terms = np.zeros(count)
-        terms[used] = np.linalg.lstsq(columns[:, used] * scales[used], values, rcond=None)[0]
-        terms *= scales
-        distance = float(np.linalg.norm(values - columns @ terms))
-        if (terms >= 0).all() and distance < least:
-            best, least = terms, distance
-            if all(subset):  # no subset fits better than all
-                break
-    return best, least
+        terms = np.linalg.lstsq(scaled[:, used], values, rcond=None)[0]
+        if (terms < 0).any():
+            continue
+        distance = float(np.linalg.norm(values - scaled[:, used] @ terms))
+        if distance < least:
+            best, least = np.zeros(len(norms)), distance
+            best[used] = terms
+        if all(subset):  # no subset fits better than all
+            break
+    return best / norms, least
 
 
 def _weighted_fit(
