@@ -29,6 +29,7 @@ _T = TypeVar("_T")
 
 _SIGMAS = 4.0  # how far Gaussians reach
 _MOST_PIXELS_SIDE_BY_SIDE = 1 << 16  # more than one larger image at a time takes much memory
+_IMAGES_PER_THREAD = 2  # of fewer, the last one would leave threads without work
 
 
 @dataclass(frozen=True)
@@ -245,9 +246,11 @@ class Scene:
         return _ShotPulls(value, seen, scaled, np.einsum("yx,yx", pull, model), of_rays)
 
     def _of_each(self, function: Callable[[_Shot], _T], shots: Sequence[_Shot]) -> list[_T]:
-        """Call a function for each image, small ones side by side."""
+        """Call a function for each image, side by side if these are small and many."""
+        threads = available_threads(self.rays.threads)
         is_small = math.prod(self.rays.seen) <= _MOST_PIXELS_SIDE_BY_SIDE
-        threads = available_threads(self.rays.threads) if is_small else 1
+        if not is_small or len(shots) < _IMAGES_PER_THREAD * threads:
+            threads = 1  # here; the kernels have all of them
         return results_of([partial(function, shot) for shot in shots], threads)
 
     def with_free_beam(self, modes: int, variation: float) -> Scene:
