@@ -142,7 +142,10 @@ def in_ranges(
     # own pool they can be used from any number of callers at once.
     most = max(1, n // smallest)
     threads = max(1, min(threads, most))
-    ranges = min(_UNEVEN_RANGES * threads, most) if uneven and threads > 1 else threads
+    if threads == 1:
+        kernel(0, n, *args)
+        return
+    ranges = min(_UNEVEN_RANGES * threads, most) if uneven else threads
     bounds = [n * k // ranges for k in range(ranges + 1)]
     run_together([partial(kernel, *pair, *args) for pair in pairwise(bounds)], threads)
 
