@@ -94,6 +94,11 @@ def test_iteration_is_chosen_by_its_number(tmp_path):
     check_grid(read_field_grid(path, iteration=100))
 
 
+def test_a_group_that_is_no_number_is_no_iteration(tmp_path):
+    path = write_openpmd(tmp_path / "b.h5", iterations=(7, "²"))
+    check_grid(read_field_grid(path))
+
+
 def test_netcdf_dataset_is_read(tmp_path):
     mesh = np.meshgrid(*(places(axis) for axis in "zyx"), indexing="ij")
     dataset = xr.Dataset(

@@ -220,6 +220,15 @@ def test_no_shot_at_all_is_one_sentence(tmp_path: Path) -> None:
         read_paths(str(tmp_path))
 
 
+def test_a_folder_that_has_lost_its_images_is_one_sentence(run: Path) -> None:
+    read = get_reader(str(run))
+    assert read is not None
+    for file in run.iterdir():
+        file.unlink()
+    with pytest.raises(FileFormatError, match="contains no image: expected a folder"):
+        read(str(run))
+
+
 def test_a_pradformat_inversion_shows_its_field(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path
 ) -> None:

@@ -73,7 +73,11 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
     if "*" in path:
         return stack_layers(_matches(path))
     if Path(path).is_dir():
-        return stack_layers(images_in(Path(path)), Path(path).name)
+        folder = Path(path)
+        images = images_in(folder)
+        if not images:  # they may be gone since napari asked for a reader
+            raise FileFormatError(f"{folder} contains no image: expected a folder of radiographs")
+        return stack_layers(images, folder.name)
     return _read_file(Path(path))
 
 

@@ -134,8 +134,8 @@ def in_ranges(
 ) -> None:
     """Call ``kernel(start, stop, *args)`` on ranges of at least `smallest` items that cover n.
 
-    There is a range for each thread; more where items may take uneven times, so that a thread whose
-    ranges are light takes more of them.
+    There is one range for each thread. Where items take `uneven` times there are more, so that a
+    thread with light ranges takes more of them.
     """
     # The items are independent and a kernel writes only what belongs to them, so the cut cannot
     # change a result. Plain threads suffice because the kernels release the GIL; unlike numba's
@@ -169,7 +169,7 @@ def run_together(works: Sequence[Callable[[], Any]], threads: int) -> None:
 
 
 def results_of(works: Sequence[Callable[[], _T]], threads: int) -> list[_T]:
-    """Call functions in threads, which they share with the ranges of their kernels."""
+    """Call functions side by side, and return their results; their kernels share the threads."""
     crew, results = Crew(len(works), threads), {}
 
     def call(number: int) -> None:

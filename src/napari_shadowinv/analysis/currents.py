@@ -89,7 +89,7 @@ class _Enclosed(Outlined):
         return {self.name(): np.asarray(self._per_flux(frame) * outward * frame.pixel)}
 
     def _per_flux(self, frame: FieldFrame) -> float:
-        """Return the content of an outline by an outward flux of the displacement of 1 px · m."""
+        """Return current or charge in an outline per outward flux of the displacement, 1/(px m)."""
         raise NotImplementedError
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:

@@ -117,7 +117,7 @@ def _choose_iteration(path: Path, content: Any, iteration: str | int | None) -> 
     """Return the group of the only iteration, or of the chosen one."""
     base = _text(content.attrs.get("basePath", "/data/%T/"))
     parent = member(path, content, base.partition("%T")[0].strip("/"))
-    names = [] if parent is None else [name for name in parent if name.isdigit()]
+    names = [] if parent is None else [name for name in parent if name.isdecimal()]
     if not names:
         raise InputError(f"{path} has no iteration in {base!r}: expected an openPMD file with data")
     listed = ", ".join(sorted(names, key=int)[:_MAX_LISTED])

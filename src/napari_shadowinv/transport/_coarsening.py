@@ -98,7 +98,7 @@ def _sort_row(
     low: int,
     high: int,
 ) -> None:
-    """Complete the row of a node, which its entries are filled for: sort it, and sum it.
+    """Sort the entries of a node's row, and sum their conductances.
 
     The nodes from `low` to `high` are those of its block.
     """
@@ -158,7 +158,7 @@ def _read_blocks(
 
 
 def _close_gaps(network: Network, blocks: IntArray, spans: IntArray) -> None:
-    """Move the entries of blocks, which threads have filled, to the end of those before."""
+    """Move the entries of each block to the end of those of the block before."""
     end = int(spans[0, 1])
     for b, (first, last) in enumerate(spans[1:].tolist(), 1):
         if first > end:
@@ -288,7 +288,7 @@ def _contract(
 ) -> None:
     """Make each group one node, with the sums of the conductances between groups.
 
-    The groups of a block's nodes are the block's nodes; joined, all groups are those of one block.
+    Groups stay in the block of their nodes; if they are joined, all of them make one block.
     """
     spans = np.empty((len(nodes) - 1, 2), np.int64)
     contraction = nodes, fine, groups, coarse, blocks, joined, spans
