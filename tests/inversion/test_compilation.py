@@ -56,6 +56,7 @@ def test_a_first_inversion_has_the_help_of_a_second_process_which_ends_with_it(m
     monkeypatch.setattr(machine_code.subprocess, "Popen", Helper)
     invert(np.ones((20, 20)))
     assert helpers == []
+    monkeypatch.setattr(machine_code, "is_loaded", lambda: False)
     monkeypatch.setattr(machine_code, "is_compiled", lambda: False)
     invert(np.ones((20, 20)))
     (helper,) = helpers
@@ -234,3 +235,21 @@ print({f"scipy.{name}" for name in ("optimize", "integrate", "interpolate")} & s
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
     assert printed.stdout.strip() == "set()"
+
+
+def test_the_garbage_collector_does_not_search_what_a_first_inversion_loads():
+    script = """
+import gc
+from napari_shadowinv import invert
+
+print(len(gc.get_objects(0) + gc.get_objects(1)) < 5000)
+searches = []
+gc.callbacks.append(lambda phase, info: searches.append(phase))
+invert([[1, 1.1, 1, 1.2]] * 5)
+print(len(searches) < 5, len(gc.get_objects(0)) < 5000)
+print(gc.isenabled(), gc.get_freeze_count())
+"""
+    printed = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert printed.stdout.split() == ["True", "True", "True", "True", "0"]

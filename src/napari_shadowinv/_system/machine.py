@@ -1,12 +1,13 @@
 """Memory, threads and signals.
 
-- `physical_memory`, `available_threads`, `set_default_threads`
+- `physical_memory`, `available_threads`, `set_default_threads`, `paused_collector`
 - `in_ranges`, `run_together`, `results_of`, `begin`, `Crew`: work in threads
 - Ctrl-C, SIGTERM and SIGHUP: `defer_interrupts`, `clear_up_when_terminated`, `handling`
 """
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import threading
@@ -59,6 +60,26 @@ def _nested(name: str) -> list[Path]:
     """Return a group's path below the root, and the paths of the groups around it."""
     path = Path(name.lstrip("/"))
     return [path, *path.parents]
+
+
+@contextmanager
+def paused_collector() -> Iterator[None]:
+    """Pause the garbage collector while modules and kernels are loaded.
+
+    All that is loaded stays, so searching it for garbage takes time in vain.
+    """
+    if not gc.isenabled():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        if not gc.get_freeze_count():
+            # Objects that are frozen and thawed are old: the next short searches skip them.
+            gc.freeze()
+            gc.unfreeze()
+        gc.enable()
 
 
 _default_threads: int | None = None

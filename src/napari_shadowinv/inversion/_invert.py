@@ -30,7 +30,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import normalise
 from napari_shadowinv.inversion.budget import Budget, Errors
-from napari_shadowinv.inversion.machine_code import compiling_together
+from napari_shadowinv.inversion.machine_code import loading_kernels
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared, margin_around, prepare
 from napari_shadowinv.inversion.readout import read_out
@@ -176,7 +176,7 @@ def _measure_time(stage: str, seconds: dict[str, float]) -> Iterator[None]:
     seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
-@compiling_together()
+@loading_kernels()
 def invert(
     image: ArrayLike,
     *,

@@ -1,8 +1,8 @@
 """Machine code of the kernels, cached from one run to the next.
 
-- whether it is cached: `is_compiled`; its folder: `code_folder`
+- whether it is loaded or cached: `is_loaded`, `is_compiled`; its folder: `code_folder`
 - how often compilation delays a run, in words: `compilation_frequency`
-- share its work between two processes: `compiling_together`
+- load it, or compile it in two processes: `loading_kernels`
 """
 
 from __future__ import annotations
@@ -15,14 +15,26 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from napari_shadowinv._system.machine import available_threads
+from napari_shadowinv._system.machine import available_threads, paused_collector
 
 _REST = "from napari_shadowinv.inversion.compilation import compile_rest; compile_rest()"
 
 
 @contextmanager
-def compiling_together() -> Iterator[None]:
-    """Let another process compile the kernels that this one needs last, for it to load then."""
+def loading_kernels() -> Iterator[None]:
+    """Load kernels where this process has none, without the garbage collector.
+
+    Where none are cached, another process compiles those that this one needs last.
+    """
+    if is_loaded():
+        yield
+        return
+    with paused_collector(), _compiling_together():
+        yield
+
+
+@contextmanager
+def _compiling_together() -> Iterator[None]:
     # Numba lets one thread of a process compile at a time.
     executable = Path(sys.executable or "")
     alone = available_threads(None) == 1 or not executable.stem.lower().startswith("python")
@@ -61,11 +73,18 @@ def is_compiled() -> bool:
     """Return whether the machine code is loaded, or cached by an earlier process."""
     from napari_shadowinv.geometry.flips import build
 
-    if build.signatures:  # type: ignore[attr-defined]
+    if is_loaded():
         return True
     folder = code_folder()
     module = Path(build.py_func.__code__.co_filename).stem  # type: ignore[attr-defined]
     return folder is not None and any(folder.glob(f"{module}.build-*.nbi"))
+
+
+def is_loaded() -> bool:
+    """Return whether this process has loaded kernels of the triangulation."""
+    from napari_shadowinv.geometry.flips import build
+
+    return bool(build.signatures)  # type: ignore[attr-defined]
 
 
 def code_folder() -> Path | None:
