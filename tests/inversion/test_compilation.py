@@ -82,7 +82,7 @@ kernels = {
 }
 compiled = {kernel: len(kernel.signatures) for kernel in kernels}
 assert sum(compiled.values()) > 10
-for side in (40, 230):  # the latter needs blocks of nodes
+for side in (40, 900):  # the latter needs blocks of nodes on two levels
     y, x = np.indices((side, 240)) / 240
     invert(1 + y * x, source=1 + x, options=InversionOptions(n_sites=240 * side))
 print([kernel.py_func.__name__ for kernel in kernels if len(kernel.signatures) > compiled[kernel]])

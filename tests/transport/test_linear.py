@@ -173,19 +173,21 @@ def test_iterations_hardly_grow_with_size() -> None:
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-@pytest.mark.parametrize("blocks", [2, 7])
+@pytest.mark.parametrize("blocks", [2, 7, 28])  # the most make blocks on two levels
 def test_blocks_of_nodes_cost_hardly_an_iteration(name: str, blocks: int) -> None:
     laplacian = NETWORKS[name]()
     right = noise(laplacian.shape[0])
-    undivided = LaplacianSolver(laplacian, blocks=1).solve(right, 1e-3)
-    solution, iterations, _ = LaplacianSolver(laplacian, blocks=blocks).solve(right, 1e-3)
+    n = len(right)
+    undivided = LaplacianSolver(laplacian, nodes_per_block=n).solve(right, 1e-3)
+    solver = LaplacianSolver(laplacian, nodes_per_block=n // blocks)
+    solution, iterations, _ = solver.solve(right, 1e-3)
     assert iterations <= 1.15 * undivided[1] + 2
     assert residual(laplacian, solution, right) <= 1e-3
 
 
 def test_a_network_too_small_for_levels_is_one_block() -> None:
     laplacian, right = unit_delaunay(30), noise(30)
-    solution, iterations, _ = LaplacianSolver(laplacian, blocks=3).solve(right, 1e-8)
+    solution, iterations, _ = LaplacianSolver(laplacian, nodes_per_block=10).solve(right, 1e-8)
     assert iterations == 1
     assert residual(laplacian, solution, right) <= 1e-8
 
@@ -193,22 +195,25 @@ def test_a_network_too_small_for_levels_is_one_block() -> None:
 def test_threads_do_not_change_a_solution() -> None:
     laplacian = unit_delaunay(60_000)
     right = noise(60_000)
-    solutions = [LaplacianSolver(laplacian, threads=n).solve(right, 1e-4)[0] for n in (1, 2, 3)]
+    solvers = [LaplacianSolver(laplacian, nodes_per_block=5_000, threads=n) for n in (1, 2, 3)]
+    assert [len(blocks.bounds) - 1 for blocks in solvers[0]._blocks] == [8, 2]
+    solutions = [solver.solve(right, 1e-4)[0] for solver in solvers]
     np.testing.assert_array_equal(solutions[0], solutions[1])
     np.testing.assert_array_equal(solutions[0], solutions[2])
 
 
 def test_a_cycle_is_symmetric_where_blocks_meet() -> None:
-    solver = LaplacianSolver(unit_delaunay(400), blocks=3)
+    solver = LaplacianSolver(unit_delaunay(400), nodes_per_block=35)
     network = solver._hierarchy.network
-    assert len(solver._hierarchy.cuts.first) > 10
+    assert [len(blocks.bounds) - 1 for blocks in solver._blocks] == [8, 2]
+    assert all(len(blocks.cuts.first) > 5 for blocks in solver._blocks)
     # Without second steps, which make a cycle depend on the residual, it is a matrix.
     solver._hierarchy.twice[:] = False
     columns = []
     for k in range(400):
         solver._vectors.residual[:] = 0.0
         solver._vectors.residual[k] = 1.0
-        solver._precondition()
+        solver._correct(0)
         columns.append(solver._vectors.correction[:400].copy())
         assert solver._vectors.residual[:400].tolist() == np.eye(400)[k].tolist()
     cycle = np.stack(columns, axis=1)

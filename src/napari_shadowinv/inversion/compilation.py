@@ -25,7 +25,7 @@ def ensure_compiled(
         return
     from napari_shadowinv.geometry.density import Density
     from napari_shadowinv.geometry.power_diagram import PowerDiagram
-    from napari_shadowinv.geometry.triangulation import RegularTriangulation
+    from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
     from napari_shadowinv.inversion import invert
     from napari_shadowinv.transport.linear import LaplacianSolver
 
@@ -33,10 +33,11 @@ def ensure_compiled(
     y, x = np.indices((64, 64)) / 64  # enough sites for every kernel to be used
     uneven = np.exp(-4 * (y + x))
     invert(uneven * (1 + y * x), source=uneven, should_stop=should_stop)
-    # Kernels that only large networks need:
+    # Kernels that only large networks need, with blocks on two levels:
     sites = np.random.default_rng(0).uniform(0, 19, (_NODES, 2))
-    diagram = PowerDiagram(RegularTriangulation(sites), Density.from_image(np.ones((20, 20))))
-    LaplacianSolver(diagram.laplacian(), blocks=2).solve(diagram.masses)
+    triangulation = RegularTriangulation(sites[hilbert_order(sites)])
+    diagram = PowerDiagram(triangulation, Density.from_image(np.ones((20, 20))))
+    LaplacianSolver(diagram.laplacian(), nodes_per_block=_NODES // 10).solve(diagram.masses)
 
 
 def compile_rest() -> None:

@@ -1,11 +1,12 @@
 """Levels of the multigrid: ever fewer nodes, each a group of the level before.
 
-- all levels of a Laplacian: `build_hierarchy`, which returns a `Hierarchy` over one `Network`
+- all levels of a Laplacian: `build_hierarchy`, which returns a `Hierarchy` over one `Network`, and
+  the `Blocks` of its large levels
 - refuse a graph of several parts: `require_connected`
 
-Level 0 of a large network is cut into blocks of nodes, which threads sweep side by side. Groups do
-not cross the cuts, and the conductors that do, the `Cuts`, are few. The number of blocks follows
-from that of the nodes, so that results do not depend on the threads.
+Large levels are cut into blocks of nodes, which threads sweep side by side. Groups do not cross the
+cuts, and the conductors that do, the `Cuts`, are few. The number of blocks follows from that of the
+nodes, so that results do not depend on the threads.
 
 See `napari_shadowinv.transport.linear`.
 """
@@ -28,7 +29,8 @@ _MAX_COARSEST_NODES = 60
 _MIN_TIE = 0.2
 _MAX_PAIRED_SHARE = 0.75
 _LAST_SECOND_STEP = 3  # level; more of them hardly save an iteration
-_NODES_PER_BLOCK, _MOST_BLOCKS = 25_000, 8
+NODES_PER_BLOCK = 25_000
+_MOST_BLOCKS = 8
 _NOT_CONNECTED = (
     "the cells form several groups with no flux between them, so the relative weights of the "
     "groups are undetermined"
@@ -51,7 +53,7 @@ class Network(NamedTuple):
 
 
 class Cuts(NamedTuple):
-    """Conductors between blocks of level 0: their ends, `first` > `second`."""
+    """Conductors between blocks of a level: their ends, `first` > `second`."""
 
     first: Indices
     second: Indices
@@ -60,21 +62,25 @@ class Cuts(NamedTuple):
     saved: FloatArray  # room for a value of each
 
 
-class Hierarchy(NamedTuple):
-    """Data of one cycle: the nodes of level k are `bounds[k]` to `bounds[k + 1]`.
+class Blocks(NamedTuple):
+    """Blocks of a level: block b has the nodes from `bounds[b]` to `bounds[b + 1]`.
 
-    Those of level 0 in block b are `blocks[b]` to `blocks[b + 1]`, and their groups `groups[b]` to
-    `groups[b + 1]`.
+    Their groups, nodes of the next level, are `groups[b]` to `groups[b + 1]`.
     """
+
+    bounds: IntArray
+    groups: IntArray
+    cuts: Cuts
+
+
+class Hierarchy(NamedTuple):
+    """Data of one cycle: the nodes of level k are `bounds[k]` to `bounds[k + 1]`."""
 
     bounds: IntArray
     twice: BoolArray
     network: Network
     parents: Indices
     inverse: FloatArray
-    blocks: IntArray
-    groups: IntArray
-    cuts: Cuts
 
 
 def _empty_network(nodes: int, entries: int) -> Network:
@@ -171,17 +177,17 @@ def _close_gaps(network: Network, blocks: IntArray, spans: IntArray) -> None:
 
 
 @njit(nogil=True, cache=True)
-def _list_cuts(network: Network, n: int) -> Cuts:
-    """List the conductors between blocks of the first n nodes."""
+def _list_cuts(network: Network, start: int, stop: int) -> Cuts:
+    """List the conductors between blocks of the nodes of a level."""
     starts, _, ends, neighbors, conductances, _, _ = network
     count = 0
-    for i in range(n):
+    for i in range(start, stop):
         count += starts[i + 1] - ends[i]
     first, second = np.empty(count // 2, np.int32), np.empty(count // 2, np.int32)
     values = np.empty(count // 2)
     nodes = np.empty(count, np.int32)
     end = last = 0
-    for i in range(n):
+    for i in range(start, stop):
         if ends[i] < starts[i + 1]:
             nodes[last] = i
             last += 1
@@ -282,16 +288,17 @@ def _contract(
     groups: Indices,
     coarse: Network,
     blocks: IntArray,
+    joined: IntArray,
     threads: int,
-    *,
-    joined: bool = False,
 ) -> None:
     """Make each group one node, with the sums of the conductances between groups.
 
-    Groups stay in the block of their nodes; if they are joined, all of them make one block.
+    Groups stay in the block of their nodes, or in the union of several that has `joined` bounds.
     """
     spans = np.empty((len(nodes) - 1, 2), np.int64)
-    contraction = nodes, fine, groups, coarse, blocks, joined, spans
+    unions = joined.searchsorted(blocks[:-1], "right")
+    within = np.stack([joined[unions - 1], joined[unions]], axis=1)
+    contraction = nodes, fine, groups, coarse, blocks, within, spans
     in_ranges(_contract_blocks, len(spans), threads, *contraction, smallest=1)
     _close_gaps(coarse, blocks, spans)
 
@@ -305,7 +312,7 @@ def _contract_blocks(
     groups: Indices,
     coarse: Network,
     blocks: IntArray,
-    joined: bool,
+    within: IntArray,
     spans: IntArray,
 ) -> None:
     """Fill the rows of blocks of the coarse network."""
@@ -316,9 +323,8 @@ def _contract_blocks(
         low, high = blocks[b], blocks[b + 1]
         begins, members = _list_members(nodes[b], nodes[b + 1], groups, low, high)
         spans[b, 0] = end
-        within = (lowest, highest) if joined else (low, high)
         end = _sum_conductances(
-            fine, groups, begins, members, place, coarse, end, low, lowest, within
+            fine, groups, begins, members, place, coarse, end, low, lowest, within[b]
         )
         spans[b, 1] = end
 
@@ -334,7 +340,7 @@ def _sum_conductances(
     start: int,
     first: int,
     lowest: int,
-    within: tuple[int, int],
+    within: IntArray,
 ) -> int:
     """Fill the rows of groups from `first` on with entries from `start` on, and return their end.
 
@@ -369,29 +375,37 @@ def build_hierarchy(
     laplacian: csr_array,
     ground: FloatArray | None = None,
     *,
-    blocks: int | None = None,
+    nodes_per_block: int = NODES_PER_BLOCK,
     threads: int = 1,
-) -> Hierarchy:
+) -> tuple[Hierarchy, list[Blocks]]:
     """Group nodes, and groups of nodes, until few are left; see `LaplacianSolver`.
 
-    Level 0 is cut into a number of blocks; by default, it follows from that of the nodes.
+    The levels that are cut into blocks come first.
     """
-    count = blocks or min(max(int(laplacian.shape[0]) // _NODES_PER_BLOCK, 1), _MOST_BLOCKS)
-    if count > 1 and laplacian.shape[0] > _MAX_COARSEST_NODES:
+    n = int(laplacian.shape[0])
+    if n >= 2 * nodes_per_block:
         # Where nodes have few neighbours in their block, only all together can be grouped.
         with suppress(RuntimeError):
-            return _build_blocks(laplacian, ground, count, threads)
-    return _build_blocks(laplacian, ground, 1, threads)
+            return _build_levels(laplacian, ground, nodes_per_block, threads)
+    return _build_levels(laplacian, ground, n + 1, threads)
 
 
-def _build_blocks(
-    laplacian: csr_array, ground: FloatArray | None, count: int, threads: int
-) -> Hierarchy:
+def _join_blocks(bounds: IntArray, nodes_per_block: int) -> IntArray:
+    """Return the bounds of as many unions of blocks as pay for a level."""
+    blocks = len(bounds) - 1
+    count = min(max(int(bounds[-1] - bounds[0]) // nodes_per_block, 1), blocks)
+    return bounds[np.arange(count + 1) * blocks // count]
+
+
+def _build_levels(
+    laplacian: csr_array, ground: FloatArray | None, nodes_per_block: int, threads: int
+) -> tuple[Hierarchy, list[Blocks]]:
     n = int(laplacian.shape[0])
     # every level has at most three quarters of the nodes of the last, so 4 n are enough;
     # pages that are never touched take no memory
     network = _empty_network(4 * n + _MAX_COARSEST_NODES, 2 * int(laplacian.nnz))
     parents: Indices = np.empty(4 * n + _MAX_COARSEST_NODES, np.int32)
+    count = min(max(n // nodes_per_block, 1), _MOST_BLOCKS)
     block_bounds = np.arange(count + 1) * n // count
     spans = np.empty((count, 2), np.int64)
     entries = (
@@ -402,28 +416,27 @@ def _build_blocks(
     in_ranges(_read_blocks, count, threads, block_bounds, *entries, network, spans, smallest=1)
     _close_gaps(network, block_bounds, spans)
     _tie_to_ground(network, 0, ground)
-    bounds = [0, n]
-    group_bounds = block_bounds
+    bounds, blocks = [0, n], []
     while bounds[-1] - bounds[-2] > _MAX_COARSEST_NODES:
-        within = block_bounds if len(bounds) == 2 else np.array(bounds[-2:])
-        network, ends = _add_level(network, parents, within, threads)
-        group_bounds = ends if len(bounds) == 2 else group_bounds
-        last = int(ends[-1])
+        network, groups = _add_level(network, parents, block_bounds, nodes_per_block, threads)
+        if len(block_bounds) > 2:
+            cuts = _list_cuts(network, bounds[-2], bounds[-1])
+            blocks.append(Blocks(block_bounds, groups, cuts))
+        block_bounds = _join_blocks(groups, nodes_per_block)
+        last = int(groups[-1])
         if ground is not None:
-            groups = parents[bounds[-2] : bounds[-1]] - bounds[-1]
-            ground = np.bincount(groups, ground, last - bounds[-1]).astype(np.float64)
+            of_group = parents[bounds[-2] : bounds[-1]] - bounds[-1]
+            ground = np.bincount(of_group, ground, last - bounds[-1]).astype(np.float64)
             _tie_to_ground(network, bounds[-1], ground)
         bounds.append(last)
-    return Hierarchy(
+    hierarchy = Hierarchy(
         np.array(bounds, np.int64),
         _choose_second_steps(network, bounds),
         network,
         parents,
         _invert_coarsest(network, bounds[-2], bounds[-1], grounded=ground is not None),
-        block_bounds,
-        group_bounds,
-        _list_cuts(network, n if count > 1 else 0),
     )
+    return hierarchy, blocks
 
 
 def _tie_to_ground(network: Network, start: int, ground: FloatArray | None) -> None:
@@ -435,7 +448,7 @@ def _tie_to_ground(network: Network, start: int, ground: FloatArray | None) -> N
 
 
 def _add_level(
-    network: Network, parents: Indices, blocks: IntArray, threads: int
+    network: Network, parents: Indices, blocks: IntArray, nodes_per_block: int, threads: int
 ) -> tuple[Network, IntArray]:
     """Pair the nodes of each block of the last level, and pair the pairs.
 
@@ -454,12 +467,13 @@ def _add_level(
     else:
         raise RuntimeError("the fluxes between cells are not finite, or underflow")
     pairs = _empty_network(count, network.starts[stop] - network.starts[start])
-    _contract(network, blocks, parents, pairs, pair_blocks, threads)
+    _contract(network, blocks, parents, pairs, pair_blocks, pair_blocks, threads)
     groups = np.empty(count, np.int32)
     nodes = pairs, pair_blocks, _MIN_TIE, inverses
     ends = _pair_blocks(*nodes, groups, stop, np.empty(count), threads)
     network = _grow_network(network, network.starts[stop] + pairs.starts[count])
-    _contract(pairs, pair_blocks, groups, network, ends, threads, joined=True)
+    joined = _join_blocks(ends, nodes_per_block)
+    _contract(pairs, pair_blocks, groups, network, ends, joined, threads)
     parents[start:stop] = groups[parents[start:stop]]
     return network, ends
 

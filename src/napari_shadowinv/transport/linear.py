@@ -38,6 +38,9 @@ from napari_shadowinv.geometry.compiler import kernel, njit
 from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.transport._coarsening import (
+    NODES_PER_BLOCK,
+    Blocks,
+    Cuts,
     Hierarchy,
     Network,
     build_hierarchy,
@@ -217,10 +220,9 @@ def _dot(start: int, stop: int, a: FloatArray, b: FloatArray) -> float:
 
 
 @kernel
-def _first_step(start: int, stop: int, network: Network, vectors: _Vectors) -> tuple[float, float]:
+def _first_step(start: int, stop: int, vectors: _Vectors) -> tuple[float, float]:
     """Minimise along the level's first correction; return its energy and the step's length."""
     residual, x = vectors.residual, vectors.correction
-    _multiply(start, stop, network, x, vectors.direction_product)
     energy = _dot(start, stop, x, vectors.direction_product)
     if not energy > 0.0:
         energy = 1.0
@@ -232,12 +234,9 @@ def _first_step(start: int, stop: int, network: Network, vectors: _Vectors) -> t
 
 
 @kernel
-def _second_step(
-    start: int, stop: int, network: Network, vectors: _Vectors, energy: float, length: float
-) -> None:
+def _second_step(start: int, stop: int, vectors: _Vectors, energy: float, length: float) -> None:
     """Minimise over the plane of the level's first and second corrections."""
     x = vectors.correction
-    _multiply(start, stop, network, x, vectors.product)
     mixed = _dot(start, stop, x, vectors.direction_product) / energy
     second_energy = _dot(start, stop, x, vectors.product) - mixed * mixed * energy
     second = 0.0
@@ -253,7 +252,7 @@ def _cycle(hierarchy: Hierarchy, top: int, vectors: _Vectors) -> None:
     """Turn the residual of level `top` into its correction by one K-cycle."""
     # What the first step of each level has found waits in arrays, because a cached kernel
     # must not call itself.
-    bounds, twice, network, parents, inverse, _, _, _ = hierarchy
+    bounds, twice, network, parents, inverse = hierarchy
     deepest = bounds.shape[0] - 2
     energies, lengths = np.zeros(deepest + 1), np.zeros(deepest + 1)
     halfway = np.zeros(deepest + 1, np.bool_)
@@ -269,50 +268,61 @@ def _cycle(hierarchy: Hierarchy, top: int, vectors: _Vectors) -> None:
             level -= 1
             start, stop = bounds[level], bounds[level + 1]
             _ascend(start, stop, network, parents, vectors)
+            x = vectors.correction
             if twice[level] and halfway[level]:
-                _second_step(start, stop, network, vectors, energies[level], lengths[level])
+                _multiply(start, stop, network, x, vectors.product)
+                _second_step(start, stop, vectors, energies[level], lengths[level])
                 halfway[level] = False
             elif twice[level]:
-                energies[level], lengths[level] = _first_step(start, stop, network, vectors)
+                _multiply(start, stop, network, x, vectors.direction_product)
+                energies[level], lengths[level] = _first_step(start, stop, vectors)
                 halfway[level] = again = True
         if not again:
             return
 
 
 @njit(nogil=True, cache=True)
-def _descend_blocks(start: int, stop: int, hierarchy: Hierarchy, vectors: _Vectors) -> None:
-    """Sweep blocks `start` to `stop` of level 0 forward."""
-    blocks, groups = hierarchy.blocks, hierarchy.groups
-    network, parents = hierarchy.network, hierarchy.parents
+def _descend_blocks(
+    start: int, stop: int, blocks: Blocks, network: Network, parents: Indices, vectors: _Vectors
+) -> None:
+    """Sweep blocks `start` to `stop` of a level forward."""
+    bounds, groups = blocks.bounds, blocks.groups
     for b in range(start, stop):
-        nodes = blocks[b], blocks[b + 1], groups[b], groups[b + 1]
+        nodes = bounds[b], bounds[b + 1], groups[b], groups[b + 1]
         _descend(nodes[0], nodes[1], nodes[2], nodes[3], network, parents, vectors)
 
 
 @njit(nogil=True, cache=True)
-def _ascend_blocks(start: int, stop: int, hierarchy: Hierarchy, vectors: _Vectors) -> None:
-    """Sweep blocks `start` to `stop` of level 0 backward."""
-    blocks = hierarchy.blocks
+def _ascend_blocks(
+    start: int, stop: int, blocks: Blocks, network: Network, parents: Indices, vectors: _Vectors
+) -> None:
+    """Sweep blocks `start` to `stop` of a level backward."""
     for b in range(start, stop):
-        _ascend(blocks[b], blocks[b + 1], hierarchy.network, hierarchy.parents, vectors)
+        _ascend(blocks.bounds[b], blocks.bounds[b + 1], network, parents, vectors)
 
 
-@njit(nogil=True, cache=True)
-def _between_sweeps(hierarchy: Hierarchy, vectors: _Vectors) -> None:
-    """Complete the forward sweep where blocks meet, correct, and prepare the backward sweep."""
-    # The sweep of a block uses the values that the other blocks had before: zero, and then those
-    # that the coarser levels have corrected.
-    first, second, conductances, nodes, saved = hierarchy.cuts
-    residual, x, parents = vectors.residual, vectors.correction, hierarchy.parents
-    for k in range(first.size):
-        i, j, conductance = first[k], second[k], conductances[k]
+# The sweep of a block uses the values that the other blocks had before: zero, and then those that
+# the coarser levels have corrected.
+
+
+@kernel
+def _complete_descent(cuts: Cuts, parents: Indices, vectors: _Vectors) -> None:
+    """Complete the forward sweep where blocks meet."""
+    residual, x = vectors.residual, vectors.correction
+    for k in range(cuts.first.size):
+        i, j, conductance = cuts.first[k], cuts.second[k], cuts.conductances[k]
         residual[parents[i]] += conductance * x[j]
         residual[parents[j]] += conductance * x[i]
-    _cycle(hierarchy, 1, vectors)
-    for k in range(nodes.size):
-        saved[k] = residual[nodes[k]]
-    for k in range(first.size):
-        i, j, conductance = first[k], second[k], conductances[k]
+
+
+@kernel
+def _prepare_ascent(cuts: Cuts, parents: Indices, vectors: _Vectors) -> None:
+    """Save the residual where blocks meet, and prepare it for the backward sweep."""
+    residual, x = vectors.residual, vectors.correction
+    for k in range(cuts.nodes.size):
+        cuts.saved[k] = residual[cuts.nodes[k]]
+    for k in range(cuts.first.size):
+        i, j, conductance = cuts.first[k], cuts.second[k], cuts.conductances[k]
         residual[i] += conductance * (x[j] + x[parents[j]])
         residual[j] += conductance * (x[i] + x[parents[i]])
 
@@ -350,8 +360,8 @@ class LaplacianSolver:
     with nothing positive off the diagonal and rows that sum to zero; its columns may come in any
     order, but neighbours should be near in the numbering for speed. A ground at potential 0, if
     any, is tied to each node by a conductance, added to the diagonal. A graph that is not
-    connected raises a RuntimeError. Blocks of nodes, by default as many as pay, are swept side by
-    side; solutions do not depend on the number of threads.
+    connected raises a RuntimeError. Large levels are cut into blocks of about as many nodes as pay,
+    which are swept side by side; solutions do not depend on the number of threads.
     """
 
     def __init__(
@@ -359,14 +369,16 @@ class LaplacianSolver:
         laplacian: csr_array,
         ground: FloatArray | None = None,
         *,
-        blocks: int | None = None,
+        nodes_per_block: int = NODES_PER_BLOCK,
         threads: int | None = 1,
     ) -> None:
         self._threads = available_threads(threads)
         self._n = int(laplacian.shape[0])
         self._grounded = ground is not None
         self._rows = _rows(laplacian, ground)
-        self._hierarchy = build_hierarchy(laplacian, ground, blocks=blocks, threads=self._threads)
+        self._hierarchy, self._blocks = build_hierarchy(
+            laplacian, ground, nodes_per_block=nodes_per_block, threads=self._threads
+        )
         nodes = int(self._hierarchy.bounds[-1])
         self._vectors = _Vectors(*(np.zeros(nodes) for _ in _Vectors._fields))
 
@@ -418,7 +430,7 @@ class LaplacianSolver:
     def _iterate(self, solution: FloatArray, energy: float) -> float:
         """Do one step of flexible conjugate gradients; return its direction's energy."""
         n, vectors = self._n, self._vectors
-        self._precondition()
+        self._correct(0)
         share = _dot(0, n, vectors.correction, vectors.direction_product) / energy
         _turn(n, share, self._grounded, vectors)
         self._multiply(vectors.direction, vectors.direction_product)
@@ -428,17 +440,33 @@ class LaplacianSolver:
             _advance(n, length, solution, vectors)
         return energy
 
-    def _precondition(self) -> None:
-        """Turn the residual into a correction by one K-cycle."""
+    def _correct(self, level: int) -> None:
+        """Turn the residual of a level into its correction by one K-cycle."""
         hierarchy, vectors = self._hierarchy, self._vectors
-        count = len(hierarchy.blocks) - 1
-        if count == 1:
-            _cycle(hierarchy, 0, vectors)
+        if level == len(self._blocks):
+            _cycle(hierarchy, level, vectors)
             return
-        in_ranges(_descend_blocks, count, self._threads, hierarchy, vectors, smallest=1)
-        _between_sweeps(hierarchy, vectors)
-        in_ranges(_ascend_blocks, count, self._threads, hierarchy, vectors, smallest=1)
-        _restore(hierarchy.cuts.nodes, hierarchy.cuts.saved, vectors.residual)
+        start, stop = hierarchy.bounds[level : level + 2]
+        self._sweep(level)
+        if hierarchy.twice[level]:
+            _multiply(start, stop, hierarchy.network, vectors.correction, vectors.direction_product)
+            energy, length = _first_step(start, stop, vectors)
+            self._sweep(level)
+            _multiply(start, stop, hierarchy.network, vectors.correction, vectors.product)
+            _second_step(start, stop, vectors, energy, length)
+
+    def _sweep(self, level: int) -> None:
+        """Sweep the blocks of a level forward, correct by the next level, and sweep backward."""
+        blocks, vectors = self._blocks[level], self._vectors
+        cuts, parents = blocks.cuts, self._hierarchy.parents
+        sweep = blocks, self._hierarchy.network, parents, vectors
+        count = len(blocks.bounds) - 1
+        in_ranges(_descend_blocks, count, self._threads, *sweep, smallest=1)
+        _complete_descent(cuts, parents, vectors)
+        self._correct(level + 1)
+        _prepare_ascent(cuts, parents, vectors)
+        in_ranges(_ascend_blocks, count, self._threads, *sweep, smallest=1)
+        _restore(cuts.nodes, cuts.saved, vectors.residual)
 
     def _multiply(self, x: FloatArray, product: FloatArray) -> None:
         # Not with the hierarchy's rounded conductances.
