@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -45,7 +45,7 @@ from napari_shadowinv.options import MAX_DEFAULT_SITES, Instrument, InversionOpt
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.preprocessing.image_checks import CheckedImage, image_warnings
-from napari_shadowinv.transport.sites import Levels, Margin, SitePlan, edge_flux, plan_levels
+from napari_shadowinv.transport.sites import RATIO, Levels, Margin, SitePlan, edge_flux, plan_levels
 from napari_shadowinv.transport.solvers import LevelSolution, fit_flux_factor, solve
 
 __all__ = ["count_sites", "invert", "plan_sites"]
@@ -292,13 +292,22 @@ def invert(
             return ImageNoise(prepared.in_units(), options, instrument.noise_correlation)
 
         def check_image() -> tuple[Caution, ...]:
-            noise()  # before the checks, because the first levels wait for it
             recorded = prepared.image * prepared.flux_scale
             beam = _checked_source(plan) if plan.measured else None
             return image_warnings(recorded, beam, prepared.mask)
 
+        @cache
+        def begin_checks() -> Callable[[], tuple[Caution, ...]]:
+            return begin(check_image, options.threads)
+
+        def needed(solutions: Sequence[LevelSolution]) -> float:
+            factor = budget.needed(solutions)
+            finer = sum(count > len(solutions[-1].weights) for count in levels.counts)
+            if factor <= RATIO or finer == 1:
+                begin_checks()  # while the solver waits for the sites of the last level
+            return factor
+
         noise = begin(estimate_noise, options.threads)
-        signs = begin(check_image, options.threads)
         budget = Budget(plan, prepared, noise, options, instrument)
         if not options.is_adaptive and not levels.is_complete:
             levels = levels.up_to(_site_domain(plan.source, options, plan.mask).n_sites)
@@ -306,6 +315,8 @@ def invert(
             may_differ = options.is_adaptive and not levels.is_complete
             levels = _levels_from_start(start, levels, plan.margin_width, may_differ=may_differ)
     adaptive = options.is_adaptive and not levels.is_complete and start is None
+    if not adaptive:
+        begin_checks()
     solutions: list[LevelSolution] = []
     coarse = 0
     while True:
@@ -317,7 +328,7 @@ def invert(
                 report,
                 start=None if start is None else start.weights,
                 margin=plan.margin,
-                needed=budget.needed if adaptive else None,
+                needed=needed if adaptive else None,
                 solved=solutions,
                 target=budget.target,
             )
@@ -345,7 +356,7 @@ def invert(
         of_beam = filter(None, [errors.beam_caution()])
         quality = replace(quality, warnings=(*of_beam, *quality.warnings))
     with _measure_time("prepare", seconds):
-        quality = replace(quality, warnings=(*quality.warnings, *signs()))
+        quality = replace(quality, warnings=(*quality.warnings, *begin_checks()()))
     reprojection = fields.reprojection * prepared.unit
     return Inversion(
         image=prepared.image,
