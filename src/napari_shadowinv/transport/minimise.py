@@ -397,6 +397,7 @@ _MAX_BLUR_IN_PIXELS = 16.0  # wider blurs are computed on means of pixels
 _MIN_BLUR_IN_PIXELS = 1.5  # smallest blur, in pixels, that hides them
 _MAX_PARTS = 8  # of a pixel's side
 _MAX_PIXELS = 2**22  # after splitting
+_MIN_PIXELS_PER_WORKER = 2**17  # of a transform
 _SHARES_OF_PREDICTION = (1.0, 0.5, 0.25)
 _MIN_PREDICTED_SHARE = 1e-2  # of the smallest flux to reach
 
@@ -429,7 +430,7 @@ def blur_to_density(image: FloatArray, width: float, threads: int | None = 1) ->
 def _blur_means(image: FloatArray, width: float, parts: int, threads: int | None) -> FloatArray:
     """Blur the means of squares of pixels."""
     means = _means(image, parts)
-    workers = available_threads(threads)
+    workers = available_threads(threads) if means.size > _MIN_PIXELS_PER_WORKER else 1
     spectrum = dctn(means, workers=workers)
     for axis in (0, 1):
         waves = np.pi * np.arange(means.shape[axis]) / means.shape[axis]
