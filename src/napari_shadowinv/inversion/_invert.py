@@ -292,6 +292,7 @@ def invert(
             return ImageNoise(prepared.in_units(), options, instrument.noise_correlation)
 
         def check_image() -> tuple[Caution, ...]:
+            noise()  # before the checks, because the solver waits for it
             recorded = prepared.image * prepared.flux_scale
             beam = _checked_source(plan) if plan.measured else None
             return image_warnings(recorded, beam, prepared.mask)
