@@ -26,7 +26,7 @@ from napari_shadowinv import (
     synthetic_image,
     uncertainty,
 )
-from napari_shadowinv._system.arrays import coordinate_spacing, order_by_value
+from napari_shadowinv._system.arrays import block_sums, coordinate_spacing, order_by_value
 from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.fitting.measurements import collect_data
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -285,3 +285,15 @@ def test_order_by_value_keeps_equal_values_in_sequence() -> None:
 def test_coordinate_spacing_is_in_metres(unit: str, metres: float) -> None:
     spacing = coordinate_spacing(_placed(2.0, 2.0, unit), "image")
     assert spacing == pytest.approx(2 * metres)
+
+
+@pytest.mark.parametrize("side", [1, 2, 3, 7])
+def test_block_sums_are_numpys_to_the_last_bit(side):
+    plane = np.random.default_rng(0).random((22, 30))
+    height, width = 22 // side, 30 // side
+    blocks = plane[: height * side, : width * side].reshape(height, side, width, side)
+    np.testing.assert_array_equal(block_sums(plane, side), blocks.sum(axis=(1, 3)))
+    usable = plane > 0.1
+    counts = (blocks > 0.1).sum(axis=(1, 3))
+    np.testing.assert_array_equal(block_sums(usable, side), counts)
+    assert block_sums(plane.astype(np.float32), side).dtype == np.float32

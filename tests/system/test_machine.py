@@ -179,6 +179,7 @@ def test_memory_is_that_of_the_control_group(
 
 
 def test_a_paused_collector_works_again_afterwards_and_holds_nothing_back():
+    gc.enable()  # other tests may have ended a command before it was loaded
     gc.unfreeze()
     with paused_collector():
         assert not gc.isenabled()

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from scipy import fft, ndimage
 from scipy.optimize import isotonic_regression
 
-from napari_shadowinv._system.arrays import NORMAL_MAD, blocks_of
+from napari_shadowinv._system.arrays import NORMAL_MAD, block_sums
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -483,7 +483,7 @@ def _fit_poses(pairs: list[_Pair], edges: FloatArray) -> Poses:
 def _large(image: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Large structure in few pixels, and how much of each of them is known."""
     planes = (usable.astype(np.float64), np.where(usable, image, 0.0))
-    counts, sums = (blocks_of(plane, _BLOCK_PX).sum(axis=(1, 3)) for plane in planes)
+    counts, sums = (block_sums(plane, _BLOCK_PX) for plane in planes)
     return np.asarray(sums / np.maximum(counts, 1.0)), np.asarray(counts / _BLOCK_PX**2)
 
 

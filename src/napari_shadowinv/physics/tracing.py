@@ -23,7 +23,13 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import distance_transform_edt
 
 from napari_shadowinv import __version__
-from napari_shadowinv._system.arrays import PLANE, as_numbers, check_finite, plain_array
+from napari_shadowinv._system.arrays import (
+    PLANE,
+    as_numbers,
+    block_sums,
+    check_finite,
+    plain_array,
+)
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model
@@ -406,8 +412,7 @@ def _fluence(
     source = _beam(flight, profile, *image_range(flight.shape), 1)
     inside = _is_inside(rays.landing, flight.shape)
     tally = _Tally(lost.size, int(inside.sum()), int(lost.sum()), int(rays.steps.sum()))
-    blocks = image.reshape(size[0] // fine, fine, size[1] // fine, fine).sum(axis=(1, 3))
-    return blocks[cut], source, tally
+    return block_sums(image, fine)[cut], source, tally
 
 
 def _count(

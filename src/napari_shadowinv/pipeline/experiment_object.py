@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates, spline_filter
 
-from napari_shadowinv._system.arrays import as_numbers, plain_array
+from napari_shadowinv._system.arrays import as_numbers, complete_block_means, plain_array
 from napari_shadowinv._system.validation import suggestion, validate
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -70,9 +70,7 @@ class Grid(NamedTuple):
 
     def in_pixels(self, values: FloatArray) -> FloatArray:
         """Return means over the pixels, (H + 2 margin, W + 2 margin), of sampled values."""
-        height, width = (size // self.factor for size in self.sizes)
-        blocks = values.reshape(height, self.factor, width, self.factor)
-        return np.asarray(blocks.mean(axis=(1, 3)))
+        return complete_block_means(values, self.factor)
 
     def inner(self, pixels: FloatArray) -> FloatArray:
         """Return the pixels of the image, without the margin."""

@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, PlainSerializer
 from pydantic.fields import FieldInfo
 
-from napari_shadowinv._system.arrays import blocks_of
+from napari_shadowinv._system.arrays import block_sums
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
@@ -125,8 +125,8 @@ class Radiograph:
             return self
         binned = replace(
             self.map_planes(
-                lambda plane: blocks_of(plane, factor).sum(axis=(1, 3)),
-                lambda mask: np.asarray(blocks_of(mask, factor).all(axis=(1, 3))),
+                lambda plane: block_sums(plane, factor),
+                lambda mask: block_sums(mask, factor) == factor**2,
             ),
             setup=None if self.setup is None else bin_setup(self.setup, factor),
             metadata={**self.metadata, "bin": factor * int(self.metadata.get("bin", 1))},

@@ -40,6 +40,7 @@ from scipy.fft import dctn, idctn
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
+from napari_shadowinv._system.arrays import complete_block_means
 from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
@@ -444,8 +445,7 @@ def _means(image: FloatArray, parts: int) -> FloatArray:
     height, width = image.shape
     if height % parts or width % parts:
         image = np.pad(image, ((0, -height % parts), (0, -width % parts)), mode="edge")
-    rows = sum((image[k::parts] for k in range(parts)), start=np.zeros(()))
-    return sum((rows[:, k::parts] for k in range(parts)), start=np.zeros(())) / parts**2
+    return complete_block_means(image, parts)
 
 
 def sharpen(

@@ -21,7 +21,7 @@ from napari_shadowinv._napari.widgets._qt import (
     while_alive,
     with_button,
 )
-from napari_shadowinv._system.arrays import blocks_of, join_masks
+from napari_shadowinv._system.arrays import complete_block_means, join_masks
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
@@ -290,7 +290,7 @@ def _structure(layer: Any) -> float:
     data = layer.data
     if not isinstance(data, np.ndarray) or data.ndim != 2 or min(data.shape) < 4 * _BLOCK_PX:
         return 0.0
-    means = blocks_of(data, _BLOCK_PX).mean(axis=(1, 3), dtype=np.float64)
+    means = complete_block_means(data, _BLOCK_PX)
     mean = means.mean()
     if not np.isfinite(mean) or mean <= 0:
         return 0.0
