@@ -59,11 +59,18 @@ class CombinationError(ValueError):
 class CheckedModel(BaseModel, metaclass=_CheckedMeta):
     """Model that refuses a wrong value with an `InputError` of one sentence.
 
-    It cannot be changed and has no other fields. `model_validate` raises pydantic's own error,
-    which lists all mistakes; see `validate`.
+    It cannot be changed and has no other fields. A field that is described has its name as its
+    title, unless it has another. `model_validate` raises pydantic's own error, which lists all
+    mistakes; see `validate`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        for name, field in cls.model_fields.items():
+            if field.description and field.title is None:
+                field.title = name.replace("_", " ").capitalize()
 
     def __setattr__(self, name: str, value: Any) -> None:
         try:

@@ -100,7 +100,6 @@ class AxisymmetricProfile(Product):
     )
     direction: Literal["vertical", "horizontal"] = Field(
         default="vertical",
-        title="Direction",
         description="Rough direction of an axis that is to be found.",
     )
     find_tilt: bool = Field(

@@ -121,7 +121,6 @@ class Product(Choice):
         default="",
         max_length=60,
         pattern=r"^[\w .()+-]*$",
-        title="Label",
         description="Name in files and figures. Default: that of the product.",
     )
 

@@ -118,21 +118,18 @@ class TurbulenceSpectrum(Product):
     )
     slope: bool = Field(
         default=True,
-        title="Slope",
         description="Whether to fit a power law; refused where rays cross too often for one image.",
     )
     taper: float = Field(
         default=0.125,
         gt=0,
         le=0.5,
-        title="Taper",
         description="Share of the shorter side over which the window rises, at each end.",
     )
     phantoms: int = Field(
         default=2,
         ge=0,
         le=50,
-        title="Phantoms",
         description=(
             "Number of random fields on which the response of the inversion is measured. 0: no "
             "correction."
@@ -149,7 +146,6 @@ class TurbulenceSpectrum(Product):
     )
     response: tuple[float, ...] = Field(
         default=(),
-        title="Response",
         description="Retrieved over true power of each ring. Default: measured.",
         json_schema_extra={"hidden": True},
     )
@@ -161,7 +157,6 @@ class TurbulenceSpectrum(Product):
     )
     rings: tuple[int, int] | None = Field(
         default=None,
-        title="Rings",
         description="First and last ring of the trusted range. Default: measured.",
         json_schema_extra={"hidden": True},
     )

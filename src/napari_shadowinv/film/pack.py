@@ -274,9 +274,9 @@ Slabs = Annotated[tuple[Slab, ...], BeforeValidator(_split_slabs)]
 class FilmType(CheckedModel):
     """Type of film: its layers in the order in which protons cross them, and its calibration."""
 
-    before: Slabs = Field(default=(), title="Before", description="In front of the active layer.")
+    before: Slabs = Field(default=(), description="In front of the active layer.")
     active: Slab = Field(title="Active layer", description="Such as 12 um HD active.")
-    behind: Slabs = Field(default=(), title="Behind", description="Behind the active layer.")
+    behind: Slabs = Field(default=(), description="Behind the active layer.")
     calibration: Path | None = _file_field("Calibration", "Table (.csv) of doses and pixels.")
     unexposed: Path | None = _file_field("Unexposed film", "Scan of a film that saw nothing.")
     dose_range: tuple[float, float] = Field(
@@ -302,23 +302,17 @@ FILM_TYPES = {
 class PackLayer(CheckedModel):
     """Film of the pack, and the filters in front of it."""
 
-    film: str = Field(title="Film", description="Its type.")
-    filters: Slabs = Field(
-        default=(), title="Filters", description="In front of it, such as 13 um Al; 25 um Fe."
-    )
+    film: str = Field(description="Its type.")
+    filters: Slabs = Field(default=(), description="In front of it, such as 13 um Al; 25 um Fe.")
     file: Path | None = _file_field("Scan", "Its file; otherwise it is one of the pack's scan.")
     turned: Annotated[Literal[0, 180], BeforeValidator(_from_digits)] = Field(
         default=0, title="Turned (°)", description="180 if it was scanned upside down."
     )
-    mirrored: bool = Field(
-        default=False, title="Mirrored", description="Whether it was scanned with its back down."
-    )
+    mirrored: bool = Field(default=False, description="Whether it was scanned with its back down.")
     mask: Path | None = _file_field(
         "Mask", "Image of the upright film's shape, 0 at unusable pixels."
     )
-    exclude: bool = Field(
-        default=False, title="Exclude", description="Whether its scan is useless."
-    )
+    exclude: bool = Field(default=False, description="Whether its scan is useless.")
 
 
 class Pack(CheckedModel):
@@ -329,17 +323,16 @@ class Pack(CheckedModel):
     """
 
     layers: tuple[PackLayer, ...] = Field(
-        min_length=1, title="Layers", description="Films and the filters in front of each."
+        min_length=1, description="Films and the filters in front of each."
     )
     films: Mapping[str, FilmType] = Field(
-        default_factory=dict, title="Films", description="By type: layers, calibration."
+        default_factory=dict, description="By type: layers, calibration."
     )
     materials: Mapping[str, Material] = Field(
-        default_factory=dict, title="Materials", description="How filters and films stop protons."
+        default_factory=dict, description="How filters and films stop protons."
     )
     setup: Mapping[str, Any] | None = Field(
         default=None,
-        title="Setup",
         description="Distances, that of the image to the first film. The scans give the size of "
         "pixels, the pack the energies.",
     )
@@ -381,7 +374,6 @@ class Pack(CheckedModel):
     )
     align: Literal["images", "edges"] = Field(
         default="images",
-        title="Align",
         description="By shared structure, or by edges alone; not used where there are fiducials.",
     )
 

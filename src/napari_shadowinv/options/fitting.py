@@ -54,7 +54,6 @@ class FitOptions(CheckedModel):
     smoothness: float | None = Field(
         default=None,
         gt=0,
-        title="Smoothness",
         description=(
             "Weight of the squared fourth derivatives of each field's potential (px). Default: "
             "weights of fourth and sixth derivatives estimated from the data, for each field."
@@ -62,7 +61,6 @@ class FitOptions(CheckedModel):
     )
     boundary: Literal["fading", "free"] = Field(
         default="fading",
-        title="Boundary",
         description=(
             "'fading': the object lies within the image and its field fades towards the edge. "
             "'free': the object extends beyond the edge, where its potential decays."
@@ -109,7 +107,6 @@ class FitOptions(CheckedModel):
         default=8,
         ge=2,
         le=32,
-        title="Beam modes",
         description="Number of cosine modes per axis for the logarithm of an unknown beam.",
     )
     max_error: MaxError = 0.05
@@ -117,12 +114,10 @@ class FitOptions(CheckedModel):
         default=6,
         ge=0,
         le=1000,
-        title="Samples",
         description="Number of random fields for the error bars; 0 for no error bars.",
     )
     sampling: Literal["linear", "resolve"] = Field(
         default="linear",
-        title="Sampling",
         description=(
             "'linear': random fields respond to noise and instrument to first order. 'resolve': "
             "each is fitted to images with other noise and another instrument, which takes 2 to 5 "
@@ -131,7 +126,6 @@ class FitOptions(CheckedModel):
     )
     evidence: bool = Field(
         default=False,
-        title="Evidence",
         description=(
             "Compute the log evidence, to compare choices of fields; takes as long as a few "
             "samples."
@@ -212,7 +206,6 @@ class FitChoices(CheckedModel):
 
     fields: tuple[str, ...] | None = Field(
         default=None,
-        title="Fields",
         description=(
             f"Cause of the deflection: {_any_of(deflector_titles())}. Two of them, separated by a "
             "comma, need images at two energies. Default: B, or phase for light."
@@ -221,7 +214,6 @@ class FitChoices(CheckedModel):
     )
     beam: Literal["known", "unknown"] = Field(
         default="known",
-        title="Beam",
         description=(
             "'known': the source is the beam. 'unknown': fit a smooth beam, the same for all "
             "images apart from its brightness."
@@ -229,7 +221,6 @@ class FitChoices(CheckedModel):
     )
     brightness: Literal["known", "free"] = Field(
         default="known",
-        title="Brightness",
         description=(
             "'known': images are as bright as the source. 'free': fit the brightness of each image "
             "relative to the source."
@@ -237,7 +228,6 @@ class FitChoices(CheckedModel):
     )
     noise: Noise | None = Field(
         default=None,
-        title="Noise",
         description=(
             "'poisson' for images in counts; 'proportional' if the noise is a fraction of each "
             "pixel, as on film; or the standard deviation of a pixel after all steps. Default: "
@@ -266,9 +256,7 @@ class FitChoices(CheckedModel):
         title="Resolution (m)",
         description="Standard deviation of the detector's point spread in m, at the detector.",
     )
-    options: FitOptions = Field(
-        default=FitOptions(), title="Options", description="Options of the fit."
-    )
+    options: FitOptions = Field(default=FitOptions(), description="Options of the fit.")
 
     @field_validator("fields", mode="before")
     @classmethod

@@ -80,12 +80,10 @@ class Instrument(CheckedModel):
 
     detector: Detector | None = Field(
         default=None,
-        title="Detector",
         description="Kind of detector, for the numbers that are not stated.",
     )
     beam_source: BeamSource | None = Field(
         default=None,
-        title="Beam source",
         description="Origin of the beam, for its numbers that are not stated.",
     )
     beam_rms: float | None = Field(
@@ -103,7 +101,6 @@ class Instrument(CheckedModel):
         default=0.25,
         gt=0,
         le=1,
-        title="Beam length",
         description=(
             "Length over which the true beam differs from the source, as a share of the image's "
             "shorter side."
@@ -123,7 +120,6 @@ class Instrument(CheckedModel):
         default=0.0,
         ge=0,
         lt=1,
-        title="Energy",
         description=(
             "Relative error of the beam's energy, or of its wavelength. It scales the field in SI "
             "units, not the displacement."
@@ -133,7 +129,6 @@ class Instrument(CheckedModel):
         default=0.0,
         ge=0,
         lt=1,
-        title="Background",
         description=(
             "Stray light, fog or dark level left in image and source, as a share of the mean."
         ),
@@ -142,7 +137,6 @@ class Instrument(CheckedModel):
         default=0.0,
         ge=0,
         lt=1,
-        title="Gamma",
         description="Error of the exponent of the detector's response, which is 1 if linear.",
     )
     blur: float = Field(
@@ -156,7 +150,6 @@ class Instrument(CheckedModel):
         default=0.0,
         ge=0,
         lt=1,
-        title="Absorption",
         description="Relative r.m.s. variation of the transmission of the object.",
     )
     registration: float = Field(
@@ -173,7 +166,6 @@ class Instrument(CheckedModel):
         default=0.0,
         ge=0,
         le=10,
-        title="Other field",
         description=(
             "Displacement by a field that is not retrieved, such as E, as a share of the "
             "displacement by the retrieved one."

@@ -49,7 +49,6 @@ class InversionOptions(CheckedModel):
         default=0.01,
         gt=0,
         lt=1,
-        title="Accuracy",
         description=(
             "Target discretisation error of the displacement (relative r.m.s.). Sites are added "
             "until it is reached or falls below a fifth of the noise error; in a stack, the first "
@@ -62,7 +61,6 @@ class InversionOptions(CheckedModel):
         default=1e-3,
         gt=0,
         lt=1,
-        title="Floor",
         description=(
             "Minimum image intensity as a fraction of the mean: darker pixels are raised to it. "
             "This keeps the transport solvable; values below 1e-3 rarely converge."
@@ -73,21 +71,18 @@ class InversionOptions(CheckedModel):
         default=1e-3,
         gt=0,
         lt=1,
-        title="Tolerance",
         description="Convergence criterion: maximum relative flux error of any cell.",
     )
     lloyd_iterations: int = Field(
         default=5,
         ge=0,
         le=1000,
-        title="Lloyd iterations",
         description="Maximum Lloyd iterations, which space the sites evenly.",
         json_schema_extra=_MOVES_SITES,
     )
     lloyd_tolerance: float = Field(
         default=0.1,
         ge=0,
-        title="Lloyd tolerance",
         description=(
             "Lloyd relaxation stops once the r.m.s. movement of the sites falls below this "
             "fraction of their mean spacing."
@@ -105,7 +100,6 @@ class InversionOptions(CheckedModel):
     )
     integration: Literal["mean", "y", "x"] = Field(
         default="mean",
-        title="Integration",
         description=(
             "Centroid read-out only: integrate along 'y' first, along 'x' first, or take the "
             "'mean' of both."
@@ -113,7 +107,6 @@ class InversionOptions(CheckedModel):
     )
     solver: Literal["newton", "lbfgs", "quasi-newton"] = Field(
         default="newton",
-        title="Solver",
         description=(
             "'newton': damped Newton steps. 'lbfgs': limited-memory BFGS, as in the paper; "
             "slow, for comparison. 'quasi-newton': BFGS with a dense n × n matrix, for small "
@@ -122,7 +115,6 @@ class InversionOptions(CheckedModel):
     )
     stages: Literal["multi", "single"] = Field(
         default="multi",
-        title="Stages",
         description=(
             "'multi': solve with few sites first and interpolate the potential to successively "
             "more. 'single': all sites at once, starting from zero weights."
@@ -144,7 +136,6 @@ class InversionOptions(CheckedModel):
     )
     boundary: Literal["closed", "free"] = Field(
         default="closed",
-        title="Boundary",
         description=(
             "'closed': no flux crosses the image edge, as in the paper. 'free': flux may leave "
             "and enter, and the potential of the object decays beyond the edge."
@@ -175,7 +166,6 @@ class InversionOptions(CheckedModel):
     )
     flux: Literal["conserve", "known", "fit"] = Field(
         default="conserve",
-        title="Flux",
         description=(
             "Free boundary only. 'conserve': inflow equals outflow, so image and source may "
             "have different units. 'known': image and source have the same exposure and units. "
@@ -196,7 +186,6 @@ class InversionOptions(CheckedModel):
     noise_level: float | None = Field(
         default=None,
         gt=0,
-        title="Noise level",
         description=(
             "Standard deviation of the noise of one pixel of the inverted image, in its units, for "
             "the error budget. Default: measured from the differences between neighbouring pixels."
@@ -206,7 +195,6 @@ class InversionOptions(CheckedModel):
     units_per_quantum: float | None = Field(
         default=None,
         gt=0,
-        title="Units per quantum",
         description=(
             "Image units per detected quantum, for the error budget: the noise is then Poisson "
             "noise."
@@ -216,14 +204,12 @@ class InversionOptions(CheckedModel):
     seed: int = Field(
         default=0,
         ge=0,
-        title="Seed",
         description="Random seed for the site positions; the same seed gives the same result.",
         json_schema_extra=_MOVES_SITES,
     )
     threads: int | None = Field(
         default=None,
         ge=1,
-        title="Threads",
         description="Number of threads. Default: all cores. It does not affect the result.",
     )
 

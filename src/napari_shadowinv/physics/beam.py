@@ -188,7 +188,7 @@ class BeamSetup(CheckedModel):
     # Whether a small source magnifies the object onto a film or plate, as it does with particles.
     projects: ClassVar[bool] = False
 
-    kind: str = Field(title="Kind", description="Kind of probe.")
+    kind: str = Field(description="Kind of probe.")
     source_object_distance: float = Field(
         gt=0,
         title="Source to object (m)",

@@ -85,7 +85,6 @@ class FourToroidsRecipe(PhantomRecipe):
     probe = "proton"
     strength: float = Field(
         default=1.0,
-        title="Strength",
         description=(
             "Scale factor for the fields, whose highest peak is 135 MG µm at 1; caustics form at 1."
         ),

@@ -177,7 +177,7 @@ class ProtonSetup(BeamSetup):
     }
 
     kind: Literal["proton"] = Field(
-        default="proton", title="Kind", description="Kind of probe: a beam of charged particles."
+        default="proton", description="Kind of probe: a beam of charged particles."
     )
     energy: float = number_field(
         "Kinetic energy (MeV)",
@@ -187,7 +187,6 @@ class ProtonSetup(BeamSetup):
     )
     species: Species = Field(
         default="proton",
-        title="Species",
         description="Particle species; electrons are deflected the opposite way.",
     )
 
@@ -360,7 +359,7 @@ class OpticalSetup(BeamSetup):
     )
 
     kind: Literal["optical"] = Field(
-        default="optical", title="Kind", description="Kind of probe: a beam of light."
+        default="optical", description="Kind of probe: a beam of light."
     )
     source_object_distance: float = Field(
         default=math.inf,

@@ -24,7 +24,6 @@ class TraceOptions(CheckedModel):
 
     output: Literal["fluence", "counts"] = Field(
         default="fluence",
-        title="Output",
         description=(
             "fluence: the exact image of regular rays, without noise; counts: particles drawn at "
             "random, with their counting statistics."
@@ -34,7 +33,6 @@ class TraceOptions(CheckedModel):
         default=4,
         ge=1,
         le=256,
-        title="Rays per pixel",
         description=(
             "Rays traced per pixel for a fluence; the next square number is used. Between the rays "
             "the displacement is interpolated by cubic splines."
@@ -76,7 +74,6 @@ class TraceOptions(CheckedModel):
     )
     keep_particles: bool = Field(
         default=False,
-        title="Keep particles",
         description="Also return start, landing point and deflection of each particle; for counts.",
     )
 

@@ -35,12 +35,10 @@ class ExperimentOptions(CheckedModel):
         default=1000.0,
         gt=0,
         le=1e9,
-        title="Counts",
         description="Mean counts a pixel without the object, in each image.",
     )
     reference: Literal["none", "recorded"] = Field(
         default="none",
-        title="Reference",
         description=(
             "'recorded': an image of the beam without the object is the source. 'none': a uniform "
             "beam is assumed."
@@ -58,7 +56,6 @@ class ExperimentOptions(CheckedModel):
         default=0.0,
         ge=0,
         lt=0.5,
-        title="Beam structure",
         description=(
             "Relative r.m.s. structure of the beam that the reference records, over the beam's "
             "length. How far the beam differs from its reference is a number of the instrument."
@@ -94,12 +91,10 @@ class ExperimentOptions(CheckedModel):
         default=20,
         ge=2,
         le=1000,
-        title="Draws",
         description="Number of simulated shots, each with its own imperfections and noise.",
     )
     method: Literal["automatic", "inversion", "fit"] = Field(
         default="automatic",
-        title="Method",
         description=(
             "'inversion' for one image, 'fit' for several or one. Default: an inversion for one "
             "image."

@@ -21,7 +21,6 @@ class _StoreOptions(CheckedModel):
 
     variables: tuple[str, ...] | None = Field(
         default=None,
-        title="Variables",
         description="Variables to store; on the command line, separated by commas. Default: "
         "potential, displacement and caustic, at a million pixels 13 MB per shot before "
         "compression; of a fit, potential, displacement and its error bars.",
@@ -33,9 +32,7 @@ class _StoreOptions(CheckedModel):
         description="Type of stored images; sites, weights and scalars keep 64 bits.",
         json_schema_extra=_RARE,
     )
-    overwrite: bool = Field(
-        default=False, title="Overwrite", description="Discard the content of the store."
-    )
+    overwrite: bool = Field(default=False, description="Discard the content of the store.")
     redo_failed: bool = Field(
         default=False, title="Retry failed shots", description="Resume, and retry failed shots."
     )
@@ -65,21 +62,18 @@ class RunOptions(_StoreOptions):
     warm_start: int = Field(
         default=1,
         ge=1,
-        title="Warm start",
         description="Size of groups in which each shot is initialised from the previous one, for "
         "similar shots with a common source.",
         json_schema_extra={"metavar": "N"},
     )
     shard: str | None = Field(
         default=None,
-        title="Shard",
         description="Part of the shots to process, such as 3/40. All shards write into one store, "
         "also at the same time and from several machines; merge it when they have ended.",
         json_schema_extra={"metavar": "K/N"},
     )
     shot_table: Path | None = Field(
         default=None,
-        title="Shot table",
         description="Table with a row for each shot (CSV, or HDF5 as file.h5::/entry/shots) that "
         "is stored with the shots by the numbers in their names: energies, delays, remarks.",
         json_schema_extra={"metavar": "FILE"},
@@ -87,7 +81,6 @@ class RunOptions(_StoreOptions):
     workers: int | None = Field(
         default=None,
         ge=1,
-        title="Workers",
         description="Shots that are processed at once on this machine. Default: one per core.",
         json_schema_extra={**_RARE, "metavar": "N"},
     )
@@ -144,20 +137,17 @@ class WatchOptions(_StoreOptions):
     )
     warm_start: bool = Field(
         default=True,
-        title="Warm start",
         description="Initialise each shot from the last but one, because two are inverted "
         "simultaneously, unless that one failed or did not converge. Fits, and shots with "
         "estimated sources, always start from zero.",
     )
     latest: bool = Field(
         default=False,
-        title="Latest",
         description="Invert the newest file first and skip those that came while others were "
         "inverted. A watch without this choice inverts skipped shots later.",
     )
     status_file: Path | None = Field(
         default=None,
-        title="Status file",
         description="JSON file with the newest shot, its age and field, the numbers of shots, the "
         "rate and the last warning, replaced at least once a second, for another program to show.",
         json_schema_extra={"metavar": "FILE"},
@@ -178,7 +168,6 @@ class WatchOptions(_StoreOptions):
     )
     polling: bool = Field(
         default=False,
-        title="Polling",
         description="Poll the folder once a second instead of relying on file-system events.",
         json_schema_extra=_RARE,
     )

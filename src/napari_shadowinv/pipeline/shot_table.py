@@ -49,17 +49,15 @@ class ShotRow(CheckedModel):
     __pydantic_extra__: dict[str, _BeamValue]
     file: Path = Field(title="Image", description="Its file.")
     setup: Path | None = Field(
-        default=None, title="Setup", description="TOML file with the experimental geometry."
+        default=None, description="TOML file with the experimental geometry."
     )
     strength: Annotated[tuple[float, ...], BeforeValidator(_strength)] | None = Field(
         default=None,
-        title="Strength",
         description="Displacement relative to the first image; with two fields '1 0.6'.",
     )
     brightness: float | None = Field(
         default=None,
         gt=0,
-        title="Brightness",
         description="How many times brighter than the source the image is.",
     )
     psf: float | None = Field(
@@ -69,27 +67,22 @@ class ShotRow(CheckedModel):
         description="Standard deviation in px, after the step 'bin'.",
     )
     mask: Path | None = Field(
-        default=None, title="Mask", description="Image of the same size, 0 at unusable pixels."
+        default=None, description="Image of the same size, 0 at unusable pixels."
     )
     source: Literal["unknown"] | Path | None = Field(
         default=None,
-        title="Source",
         description="Image of the undisturbed beam, or unknown to fit a smooth one.",
     )
     noise: Noise | None = Field(
         default=None,
-        title="Noise",
         description="poisson for counts, proportional for a share of each pixel, or the standard "
         "deviation in a pixel, after the step 'bin'.",
     )
     shot: str | None = Field(
         default=None,
-        title="Shot",
         description="In a table of many shots that are fitted: which of them the image belongs to.",
     )
-    exclude: bool = Field(
-        default=False, title="Exclude", description="true, yes or 1 to leave the image out."
-    )
+    exclude: bool = Field(default=False, description="true, yes or 1 to leave the image out.")
 
     @model_validator(mode="before")
     @classmethod

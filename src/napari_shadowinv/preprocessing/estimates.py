@@ -312,7 +312,6 @@ class TotalVariationEstimate(Estimate):
     iterations: int = Field(
         default=1000,
         ge=1,
-        title="Iterations",
         description="Maximum iterations; an object of radius r px needs about r².",
     )
 

@@ -228,7 +228,6 @@ class ButterworthFilter(Filter):
         default=2,
         ge=1,
         le=20,
-        title="Order",
         description=(
             "Beyond the cutoff the amplitude falls as this power of the wavelength; high orders "
             "ring."
@@ -353,7 +352,6 @@ class HotPixelFilter(Filter):
     threshold: float = Field(
         default=6.0,
         gt=0,
-        title="Threshold",
         description=(
             "Replace pixels that differ from the median of their neighbours by more than this "
             "many standard deviations of the noise."

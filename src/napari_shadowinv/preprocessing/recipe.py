@@ -41,11 +41,9 @@ class MeasuredSource(Choice):
     title = "measured"
     key = "method"
     method: Literal["measured"] = "measured"
-    file: Path | None = Field(
-        default=None, title="File", description="Image of the undisturbed beam."
-    )
+    file: Path | None = Field(default=None, description="Image of the undisturbed beam.")
     variable: str | None = Field(
-        default=None, title="Variable", description="Name of the array in a file with several."
+        default=None, description="Name of the array in a file with several."
     )
 
 
@@ -86,37 +84,32 @@ class Recipe(CheckedModel):
     """
 
     steps: tuple[AnyStep, ...] = Field(
-        default=(), title="Steps", description="What is done to the image first, in this order."
+        default=(), description="What is done to the image first, in this order."
     )
     source: AnySource | None = Field(
         default=None,
-        title="Source",
         description="The undisturbed beam. Default: as measured if there is one, else uniform.",
     )
     source_mask: Path | None = Field(
         default=None,
-        title="Source mask",
         description="Image of the same size, 0 where the object covers the beam.",
     )
     mask: Path | None = Field(
-        default=None, title="Mask", description="Image of the same size, 0 at unusable pixels."
+        default=None, description="Image of the same size, 0 at unusable pixels."
     )
     setup: Setup | None = Field(
         default=None,
-        title="Setup",
         description="The experimental geometry, for results in SI units.",
     )
     instrument: Instrument = Field(
         default=Instrument(),
-        title="Instrument",
         description="How well beam, detector and alignment are known, for the errors.",
     )
     options: InversionOptions = Field(
-        default=InversionOptions(), title="Options", description="Options of the inversion."
+        default=InversionOptions(), description="Options of the inversion."
     )
     fit: FitChoices | None = Field(
         default=None,
-        title="Fit",
         description="Choices of a fit of the forward model, for those that fit and do not invert.",
     )
 

@@ -278,7 +278,6 @@ class Dark(Step):
     step: Literal["dark"] = "dark"
     level: Level = Field(
         default=0.0,
-        title="Level",
         description=(
             "Counts of the detector without light, or an image of them, which is subtracted from "
             "image and source."
@@ -478,7 +477,6 @@ class Bin(Step):
         default=2,
         ge=1,
         le=1000,
-        title="Factor",
         description="Sum blocks of N×N pixels; the setup's pixel size grows with them.",
         json_schema_extra={"metavar": "N"},
     )
