@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.polygons import clipped_to_rectangle, over_pixels, power_cell, power_diagram, shoelace
-from napari_shadowinv.geometry.density import Density, merge_pixels, split_pixels
+from napari_shadowinv._system.arrays import block_sums
+from napari_shadowinv.geometry.density import Density, split_pixels
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
@@ -182,4 +183,4 @@ def test_squares_of_pixels_equal_the_pixels_that_share_their_flux():
         actual, desired = getattr(diagram, quantity), getattr(expected, quantity)
         np.testing.assert_allclose(actual, desired, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(diagram.laplacian().toarray(), expected.laplacian().toarray())
-    np.testing.assert_allclose(merge_pixels(pixels.image, 4), few)
+    np.testing.assert_allclose(block_sums(pixels.image, 4), few)

@@ -11,7 +11,7 @@ pixel the integrands are polynomials of degree 3 at most, for which Simpson's ru
 exact. Beyond the image the density is zero, so polygons need no clipping.
 
 - make a density of an image: `Density`
-- the same density on smaller pixels: `split_pixels`; a coarser one: `merge_pixels`
+- the same density on smaller pixels: `split_pixels`
 - integrals along one edge: `walk_edge` (a numba kernel)
 """
 
@@ -103,15 +103,6 @@ def side_of_squares(shape: tuple[int, int], largest: float) -> int:
     while 2 * side <= largest and shape[0] % (2 * side) == shape[1] % (2 * side) == 0:
         side *= 2
     return side
-
-
-def merge_pixels(image: FloatArray, side: int) -> FloatArray:
-    """Return the flux of the squares that tile an image, shape (H / side, W / side)."""
-    if side == 1:
-        return image
-    height, width = image.shape
-    rows = image.reshape(height // side, side, width).sum(axis=1)
-    return np.asarray(rows.reshape(len(rows), width // side, side).sum(axis=2))
 
 
 def split_pixels(image: FloatArray, factor: int) -> FloatArray:

@@ -25,10 +25,11 @@ from typing import Literal
 import numpy as np
 from scipy.sparse import csr_array
 
+from napari_shadowinv._system.arrays import block_sums
 from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.geometry.compiler import njit
-from napari_shadowinv.geometry.density import Density, merge_pixels, side_of_squares
+from napari_shadowinv.geometry.density import Density, side_of_squares
 from napari_shadowinv.geometry.interpolation import (
     WIDTH,
     CloughTocher,
@@ -228,7 +229,7 @@ class LinearResponse:
         return (self.area if mask.all() else self._masses(used, self._triangulation)), of_source
 
     def _masses(self, image: FloatArray, triangulation: RegularTriangulation) -> FloatArray:
-        squares = merge_pixels(image, self._side)
+        squares = block_sums(image, self._side)
         density = Density.from_image(squares, side=self._side, threads=self._threads)
         return PowerDiagram(triangulation, density, threads=self._threads).masses
 
