@@ -471,13 +471,11 @@ def _inverted(
         should_stop=should_stop,
     )
     assessment, errors = inversion.assess_in(setup), inversion.errors_in(setup)
-    error, peak_error = _errors_made(inversion.displacement, simulator.truth)
     shot = PlannedShot(
         number,
         assessment.verdict,
         assessment.reason,
-        error,
-        peak_error,
+        *_errors_made(inversion.displacement, simulator.truth),
         total=np.nan if errors is None else errors.share,
         parts={} if errors is None else _parts_of(errors),
     )
@@ -517,14 +515,12 @@ def _fitted(
         should_stop=should_stop,
     )
     displacement = result.fields[0].displacement
-    error, peak_error = _errors_made(displacement, simulator.truth)
     parts, total, verdict = _fit_errors(result, inputs)
     shot = PlannedShot(
         number,
         verdict,
         result.explanation,
-        error,
-        peak_error,
+        *_errors_made(displacement, simulator.truth),
         total=total,
         parts=parts,
         scales=_scales_of(result, inputs),

@@ -68,6 +68,10 @@ class Grid(NamedTuple):
         )
         return rows, columns
 
+    def places(self) -> FloatArray:
+        """Return the places (y, x) of all samples, (2, h, w), px."""
+        return np.stack(np.meshgrid(*self.lines(), indexing="ij"))
+
     def in_pixels(self, values: FloatArray) -> FloatArray:
         """Return means over the pixels, (H + 2 margin, W + 2 margin), of sampled values."""
         return complete_block_means(values, self.factor)
@@ -130,16 +134,15 @@ class PlannedObject:
         InputError
             If the deflector does not act on the beam, or only one experiment is described.
         """
-        factor, ratio = 1.0, 1.0
+        factor = 1.0
         if setup is not None and self.setup is not None:
             factor = displacement_ratio(self.setup, setup, deflector=self.deflector)
-            ratio = setup.object_pixel_size / self.setup.object_pixel_size
         elif setup is not None:
             raise InputError(
                 f"the object is {self.title} in px without a setup, but the experiment has one: "
                 "give the setup of the displacement, or none at all"
             )
-        places = self._places(grid, ratio)
+        places = self._places(grid, setup)
         values = [
             map_coordinates(
                 spline_filter(part, mode="nearest"), places, mode="nearest", prefilter=False
@@ -152,13 +155,9 @@ class PlannedObject:
         """Return the share of the beam that passes at each sample; None for a transparent one."""
         if self.shadow is None:
             return None
-        ratio = 1.0
-        if setup is not None and self.setup is not None:
-            ratio = setup.object_pixel_size / self.setup.object_pixel_size
-        places = self._places(grid, ratio)
-        return 1 - np.asarray(
-            map_coordinates(self.shadow.astype(np.float64), places, order=0, mode="nearest")
-        )
+        shadow = self.shadow.astype(np.float64)
+        places = self._places(grid, setup)
+        return 1 - np.asarray(map_coordinates(shadow, places, order=0, mode="nearest"))
 
     def image(self, beam: FloatArray, displacement: FloatArray, grid: Grid) -> FloatArray:
         """Return the image of a beam that rays carry to where they are displaced.
@@ -179,9 +178,11 @@ class PlannedObject:
         fine = synthetic_image(grid.factor * displacement, beam, rays_per_pixel=_TILES, threads=1)
         return grid.in_pixels(fine)
 
-    def _places(self, grid: Grid, ratio: float) -> FloatArray:
-        """Indices into the samples, (2, h, w), of the places of a grid."""
-        lines = []
+    def _places(self, grid: Grid, setup: Setup | None) -> FloatArray:
+        """Indices into the samples, (2, h, w), of the places of a grid in px of a setup."""
+        ratio, lines = 1.0, []
+        if setup is not None and self.setup is not None:
+            ratio = setup.object_pixel_size / self.setup.object_pixel_size
         for line, side, size in zip(grid.lines(), grid.shape, self.samples.shape[1:], strict=True):
             from_middle = (line - (side - 1) / 2) * ratio * self.finer
             lines.append(from_middle + (size - 1) / 2)

@@ -34,6 +34,14 @@ _MIN_GAIN = 0.02  # of the error, worth a sentence
 _LISTED_GAINS = 3
 _LEAST_PART = 0.01  # of the largest one
 
+# Numbers of a shot in tables and datasets: attribute and title.
+_NUMBERS = {
+    "error": ("error", "Error made, r.m.s."),
+    "peak_error": ("peak_error", "Error made at the peak"),
+    "reported_error": ("total", "Error reported, r.m.s."),
+    "searched": ("is_searched", "Whether alternative solutions were looked for"),
+}
+
 
 @dataclass(frozen=True)
 class Spread:
@@ -255,11 +263,6 @@ class ExperimentPlan:
         better, before = (f"{digits * x:.2g} {unit}".rstrip() for x in (size / 2, size))
         return f"{self._title(name)} known to {better} instead of {before}", factor
 
-    @property
-    def _nouns(self) -> dict[str, str]:
-        noun = self.setups[0].beam_quantity().noun if self.setups else "energy"
-        return {"energy": noun, "beam_between": "beam between energies"}
-
     def _stated(self, name: str) -> float:
         """Standard deviation of a number of the instrument."""
         if name == "beam":
@@ -301,7 +304,8 @@ class ExperimentPlan:
         level = Level.SOUND if self.is_determined else Level.DOUBTFUL
         counts = ", ".join(f"{name} {n}" for name, n in self.verdicts.items())
         yield Fact("verdicts", "Verdicts", f"of {len(self.shots)} shots: {counts}", level)
-        if reason := self._usual_reason:
+        reasons = (shot.reason for shot in self.shots if not shot.is_determined)
+        if reason := next(reasons, ""):
             yield Fact("reason", "Usual reason", reason, Level.DOUBTFUL)
         if self.silent:
             text = (
@@ -327,11 +331,6 @@ class ExperimentPlan:
         yield from self._gain_facts()
         yield from self._caveat_facts()
         yield time_fact(self.seconds)
-
-    @property
-    def _usual_reason(self) -> str:
-        reasons = [shot.reason for shot in self.shots if not shot.is_determined]
-        return reasons[0] if reasons else ""
 
     def _gain_facts(self) -> Iterator[Fact]:
         before = math.sqrt(sum(share**2 for share in self.parts.values()))
@@ -359,20 +358,18 @@ class ExperimentPlan:
         yield Fact("assumed", "Assumed", text, is_detail=True)
 
     def _title(self, name: str) -> str:
-        return self._nouns.get(name, name.replace("_", " "))
+        if name == "energy" and self.setups:
+            return self.setups[0].beam_quantity().noun
+        return "beam between energies" if name == "beam_between" else name.replace("_", " ")
 
     def rows(self) -> list[dict[str, Any]]:
         """Return a row for each shot, for a table."""
-        names = list(self.parts)
         return [
             {
                 "draw": shot.number,
                 "verdict": str(shot.verdict),
-                "error": shot.error,
-                "peak_error": shot.peak_error,
-                "reported_error": shot.total,
-                "searched": shot.is_searched,
-                **{f"part_{name}": shot.parts.get(name, math.nan) for name in names},
+                **{name: getattr(shot, attribute) for name, (attribute, _) in _NUMBERS.items()},
+                **{f"part_{name}": shot.parts.get(name, math.nan) for name in self.parts},
             }
             for shot in self.shots
         ]
@@ -390,19 +387,10 @@ class ExperimentPlan:
 
         causes = list(self.parts)
         parts = [[shot.parts.get(name, math.nan) for name in causes] for shot in self.shots]
-        per_shot = {
-            "error": ("Error made, r.m.s.", [shot.error for shot in self.shots]),
-            "peak_error": ("Error made at the peak", [shot.peak_error for shot in self.shots]),
-            "reported_error": ("Error reported, r.m.s.", [shot.total for shot in self.shots]),
-            "searched": (
-                "Whether alternative solutions were looked for",
-                [shot.is_searched for shot in self.shots],
-            ),
-        }
-        variables: dict[str, Any] = {
-            name: ("draw", np.asarray(values), {"units": "1", "long_name": title})
-            for name, (title, values) in per_shot.items()
-        }
+        variables: dict[str, Any] = {}
+        for name, (attribute, title) in _NUMBERS.items():
+            numbers = np.asarray([getattr(shot, attribute) for shot in self.shots])
+            variables[name] = "draw", numbers, {"units": "1", "long_name": title}
         variables["verdict"] = "draw", [str(shot.verdict) for shot in self.shots]
         label = {"units": "1", "long_name": "Parts of the reported error, r.m.s."}
         variables["parts"] = ("draw", "cause"), np.reshape(parts, (len(self.shots), -1)), label

@@ -142,11 +142,6 @@ class ShotSimulator:
         self._nominal = [object.displacement(setup, self._grid) for setup in setups]
         self.truth = coarse[0]
 
-    @property
-    def is_shadowed(self) -> bool:
-        """Whether the object stops a part of the beam."""
-        return self._object.shadow is not None
-
     def draw(self, number: int) -> SimulatedShots:
         """Return the shots of a draw; the same number gives the same shots."""
         streams = {
@@ -162,6 +157,14 @@ class ShotSimulator:
         admixture = instrument.other_field * streams["other_field"].normal()
         width = instrument.blur * abs(streams["blur"].normal())
         exponent = max(1 + instrument.gamma * streams["gamma"].normal(), _LEAST_EXPONENT)
+
+        def counts(flux: FloatArray, image: int, mean: float, noise: str) -> FloatArray:
+            blur = math.hypot(self._detector.psf[image], width)
+            flux = gaussian_filter(flux, blur, mode="nearest")
+            level = instrument.background * streams["background"].normal()
+            recorded = np.maximum(grid.inner(flux), 0) ** exponent + level
+            return streams[noise].poisson(mean * np.maximum(recorded, 0)).astype(np.float64)
+
         images = []
         for image, setup in enumerate(self._setups):
             between = beam.prior.between if image else 0.0
@@ -173,25 +176,14 @@ class ShotSimulator:
             if image:
                 displacement = self._misaligned(displacement, streams["alignment"])
             flux = self._object.image(light, displacement, grid)
-            flux = gaussian_filter(
-                flux, math.hypot(self._detector.psf[image], width), mode="nearest"
-            )
-            level = instrument.background * streams["background"].normal()
-            recorded = np.maximum(grid.inner(flux), 0) ** exponent + level
-            expected = beam.counts * np.maximum(recorded, 0)
-            images.append(streams["counts"].poisson(expected).astype(np.float64))
+            images.append(counts(flux, image, beam.counts, "counts"))
         source, noise = None, 0.0
         if beam.is_recorded:
             reference = self._moved(structure * open_share, streams["registration"])
-            psf = self._detector.psf[0]
-            reference = gaussian_filter(reference, math.hypot(psf, width), mode="nearest")
-            level = instrument.background * streams["background"].normal()
-            recorded = np.maximum(grid.inner(reference), 0) ** exponent + level
-            expected = beam.reference_counts * np.maximum(recorded, 0)
-            counted = streams["reference"].poisson(expected).astype(np.float64)
+            counted = counts(reference, 0, beam.reference_counts, "reference")
             source, noise = counted / beam.reference_counts, 1 / beam.reference_counts
             source, noise = beam.counts * source, beam.counts * noise
-        elif self.is_shadowed:
+        elif self._object.shadow is not None:
             source = beam.counts * grid.inner(grid.in_pixels(open_share))
         return SimulatedShots(np.stack(images), source, noise)
 
@@ -272,29 +264,24 @@ class ShotSimulator:
 
     def _misaligned(self, displacement: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Displacement onto a detector that is shifted, turned and scaled by random numbers."""
-        size = self._detector.instrument.registration
-        numbers = size * rng.normal(size=4)
-        if not size:
+        if not self._detector.instrument.registration:
             return displacement
-        landed = displacement + np.stack(np.meshgrid(*self._grid.lines(), indexing="ij"))
-        return displacement + self._motion(landed, numbers)
+        return displacement + self._motion(displacement + self._grid.places(), rng)
 
     def _moved(self, reference: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Reference in pixels, out of register with the image."""
-        size = self._detector.instrument.registration
-        numbers = size * rng.normal(size=4)
-        if not size:
+        if not self._detector.instrument.registration:
             return self._grid.in_pixels(reference)
-        places = np.stack(np.meshgrid(*self._grid.lines(), indexing="ij"))
-        moved = places + self._motion(places, numbers)
+        places = self._grid.places()
+        moved = places + self._motion(places, rng)
         indices = (moved + 0.5 + self._grid.margin) * self._grid.factor - 0.5
         shifted = map_coordinates(reference, indices, order=3, mode="nearest")
         return self._grid.in_pixels(np.maximum(shifted, 0))
 
-    def _motion(self, places: FloatArray, numbers: FloatArray) -> FloatArray:
-        """Shift, rotation and change of scale, each in px, the latter two at the corners."""
+    def _motion(self, places: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Random shift, rotation and change of scale, in px, the latter two at the corners."""
         height, width = self._grid.shape
         corner = np.hypot(height, width) / 2
         y, x = (places[0] - (height - 1) / 2) / corner, (places[1] - (width - 1) / 2) / corner
-        down, right, turn, scale = numbers
+        down, right, turn, scale = self._detector.instrument.registration * rng.normal(size=4)
         return np.stack([down + turn * x + scale * y, right - turn * y + scale * x])
