@@ -6,9 +6,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,7 +19,7 @@ from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.tables import read_rows
 from napari_shadowinv._system.validation import CheckedModel
-from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film import (
@@ -120,13 +121,12 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
         _check_bits(layer.file or pack.scan, scan, bits)
         mask = None if layer.mask is None else read_radiograph(layer.mask).image > 0
         _check_on_scan(fiducials.get(number, []), scan, pack.fiducials)
-        is_mirrored = pack.is_mirrored(layer)
-        lay = scan, layer.turned, is_mirrored
+        turn = layer.turned, pack.is_mirrored(layer)
         marks = {
-            mark.name: _turn_places(np.array([mark.y, mark.x]), *lay)
+            mark.name: _turn_places(np.array([mark.y, mark.x]), scan, *turn)
             for mark in fiducials.get(number, [])
         }
-        scan, corners = to_scan_frame(scan, corners, layer.turned, is_mirrored)
+        scan, corners = to_scan_frame(scan, corners, *turn)
         return Film(number, scan, corners, calibration, background, mask, marks)
 
     films = in_parallel(film, used)
@@ -336,7 +336,8 @@ def run_film(
         report("dose", film.number - 1, len(pack.layers), film.name)
         return _film_doses(film, shape, scales[film.number - 1], pack.rim)
 
-    cut = {film.number: film.corners for film in films}
+    by_layer = partial(_by_layer, films, len(pack.layers))
+    corners = by_layer([_corners_on_scan(film, pack) for film in films])
     # Marks through the pack lie behind each other, the image content lies on rays.
     marked = any(film.fiducials for film in films)
     if not marked:
@@ -352,23 +353,30 @@ def run_film(
     pairs = zip(films, aligned, strict=True)
     moved = any((film.corners != shifted.corners).any() for film, shifted in pairs)
     doses = in_parallel(doses_of, aligned) if moved else edges
-    planes = _stack_planes(len(pack.layers), shape, aligned, doses)
+    dose = by_layer([film_doses.dose for film_doses in doses])
+    error = by_layer([film_doses.error for film_doses in doses])
+    usable = by_layer([film_doses.usable for film_doses in doses], False)
     # Per area of the first film: behind it the same protons cover more.
-    planes["dose"] *= scales[:, None, None] ** 2
+    dose *= scales[:, None, None] ** 2
     spectra = unfold(
-        planes["dose"],
-        np.where(planes["usable"], planes["dose_error"], np.inf),
+        dose,
+        np.where(usable, error, np.inf),
         response,
         on_progress=on_progress,
         should_stop=should_stop,
     )
-    planes["dose_error"] *= planes["dose"]
-    planes |= {"fluence": spectra.fluence, "fluence_error": spectra.error}
-    stored = {name: plane.astype(np.float32) for name, plane in planes.items() if name != "usable"}
+    error *= dose
     return FilmDoses(
-        **stored,
-        usable=planes["usable"],
-        **_film_values(pack, films, cut, poses),
+        dose=dose.astype(np.float32),
+        dose_error=error.astype(np.float32),
+        fluence=spectra.fluence.astype(np.float32),
+        fluence_error=spectra.error.astype(np.float32),
+        usable=usable,
+        shifts=by_layer(poses.shifts),
+        shift_errors=by_layer(poses.errors),
+        turns=by_layer(poses.turns),
+        by_images=by_layer(poses.by_images, False),
+        corners=corners,
         energies=spectra.energies,
         bands=np.array([(band.peak, band.low, band.high) for band in response.bands]),
         provenance=Provenance(kind="film pack", pack=pack, images=_scans(pack, films)),
@@ -376,6 +384,11 @@ def run_film(
         pixel_size=pixel,
         setups=pack.setups(spectra.energies, pixel),
     )
+
+
+def _corners_on_scan(film: Film, pack: Pack) -> FloatArray:
+    layer = pack.layers[film.number - 1]
+    return to_scan_frame(film.scan, film.corners, layer.turned, pack.is_mirrored(layer))[1]
 
 
 def _scans(pack: Pack, films: list[Film]) -> tuple[ImageOrigin, ...]:
@@ -493,44 +506,14 @@ def _align_films(
     return Poses.by_edges(len(films))
 
 
-def _stack_planes(
-    count: int, shape: tuple[int, int], films: list[Film], doses: list[_Doses]
-) -> dict[str, Any]:
-    """Stack doses and errors by layer, with NaN for excluded layers."""
-    planes: dict[str, Any] = {
-        name: np.full((count, *shape), np.nan) for name in ("dose", "dose_error")
-    }
-    planes["usable"] = np.zeros((count, *shape), dtype=bool)
-    for film, film_doses in zip(films, doses, strict=True):
-        planes["dose"][film.number - 1] = film_doses.dose
-        planes["dose_error"][film.number - 1] = film_doses.error
-        planes["usable"][film.number - 1] = film_doses.usable
-    return planes
-
-
-def _film_values(
-    pack: Pack, films: list[Film], corners: Mapping[int, FloatArray], poses: Poses
-) -> dict[str, Any]:
-    """Collect alignment and corners of each layer, NaN for excluded ones."""
-    count = len(pack.layers)
-    shifts, on_scans = np.full((count, 2), np.nan), np.full((count, 4, 2), np.nan)
-    turns, errors = np.full(count, np.nan), np.full(count, np.nan)
-    by_images = np.zeros(count, dtype=bool)
-    for k, film in enumerate(films):
-        at = film.number - 1
-        shifts[at], turns[at] = poses.shifts[k], poses.turns[k]
-        errors[at], by_images[at] = poses.errors[k], poses.by_images[k]
-        layer = pack.layers[at]
-        _, on_scans[at] = to_scan_frame(
-            film.scan, corners[film.number], layer.turned, pack.is_mirrored(layer)
-        )
-    return {
-        "shifts": shifts,
-        "shift_errors": errors,
-        "turns": turns,
-        "by_images": by_images,
-        "corners": on_scans,
-    }
+def _by_layer(
+    films: list[Film], count: int, values: Sequence[AnyArray] | AnyArray, excluded: Any = np.nan
+) -> AnyArray:
+    """Return values of the films by layer, with `excluded` for those without a film."""
+    layers: AnyArray = np.full((count, *np.shape(values[0])), excluded)
+    for film, value in zip(films, values, strict=True):
+        layers[film.number - 1] = value
+    return layers
 
 
 def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) -> list[Caution]:
