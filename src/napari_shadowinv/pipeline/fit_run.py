@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitShot, compare, fit, point_spread
 from napari_shadowinv.fitting.shots import common_values, value_of_first
@@ -38,7 +37,6 @@ from napari_shadowinv.pipeline.inversion_run import Inputs, Shot, collect_inputs
 from napari_shadowinv.pipeline.shot_table import ShotRow, fiducials_from
 from napari_shadowinv.preprocessing import (
     FIT_STEPS,
-    Estimate,
     Radiograph,
     Recipe,
     UniformEstimate,
@@ -60,6 +58,9 @@ __all__ = [
     "run_refinement",
     "usual_fields",
 ]
+
+# Numbers of an image, in rows of a table, shots and provenances.
+_NUMBERS = ("strength", "brightness", "psf", "noise")
 
 
 def run_refinement(
@@ -172,6 +173,11 @@ class FitInputs:
         assert self.provenance.recipe.fit is not None
         return self.provenance.recipe.fit
 
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Keys of the fields."""
+        return self.choices.fields or ("B",)
+
     @cached_property
     def setups(self) -> tuple[Setup, ...] | None:
         """The setups of all images after the steps; None if there are none."""
@@ -222,6 +228,16 @@ class FitInputs:
             "instrument": self.provenance.recipe.instrument,
             "options": self.choices.options,
         }
+
+    def run(self, on_progress: OnProgress | None, should_stop: ShouldStop | None) -> Fit:
+        """Fit the fields to the images."""
+        result = fit(
+            **self.keywords,
+            fields=self.fields,
+            on_progress=on_progress,
+            should_stop=should_stop,
+        )
+        return self.with_provenance(result)
 
     def with_provenance(self, result: Fit) -> Fit:
         """Return a fit with its setups and its provenance; the recipe names its fields."""
@@ -277,14 +293,7 @@ def run_fit(
     InversionCancelled
         If `should_stop` returned true.
     """
-    inputs = collect_fit_inputs(recipe, shots, should_stop=should_stop)
-    result = fit(
-        **inputs.keywords,
-        fields=inputs.choices.fields or ("B",),
-        on_progress=on_progress,
-        should_stop=should_stop,
-    )
-    return inputs.with_provenance(result)
+    return collect_fit_inputs(recipe, shots, should_stop=should_stop).run(on_progress, should_stop)
 
 
 def run_comparison(
@@ -404,26 +413,17 @@ def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) ->
     """Apply the steps to an image, and estimate its source if the recipe does so."""
     try:
         shot = inputs.prepare(should_stop)
-        doubts = image_warnings(shot.image, shot.source, shot.mask)
+        source, estimate = shot.source, inputs.recipe.estimate
+        doubts = [*image_warnings(shot.image, source, shot.mask)]
         if shot.setup is not None:
             doubts += setup_warnings(shot.setup, shot.shape)
-        shot = replace(shot, warnings=(*shot.warnings, *doubts))
-        estimate = inputs.recipe.estimate
-        if estimate is None or isinstance(estimate, UniformEstimate):
-            return shot
-        return _with_estimate(inputs, shot, estimate, should_stop)
+        if estimate is not None and not isinstance(estimate, UniformEstimate):
+            recorded = inputs.shot.shape
+            positioned = estimate.adapt_to(shot.setup, recorded, inputs.recipe.matrix(recorded))
+            source = estimate_source(positioned, shot, should_stop, doubts.append)
+        return replace(shot, source=source, warnings=(*shot.warnings, *doubts))
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
-
-
-def _with_estimate(
-    inputs: Inputs, shot: Radiograph, estimate: Estimate, should_stop: ShouldStop | None
-) -> Radiograph:
-    recorded = inputs.shot.shape
-    positioned = estimate.adapt_to(shot.setup, recorded, inputs.recipe.matrix(recorded))
-    doubts: list[Caution] = []
-    source = estimate_source(positioned, shot, should_stop, doubts.append)
-    return replace(shot, source=source, warnings=(*shot.warnings, *doubts))
 
 
 def compared_fields(setups: Sequence[Setup] | None) -> tuple[tuple[str, ...], ...]:
@@ -467,8 +467,7 @@ def _image_origins(
     origins, masks = [], []
     for row, inputs, shot in zip(recorded, collected, ready, strict=True):
         before = inputs.provenance
-        names = ("strength", "brightness", "psf", "noise", "measured")
-        entries: dict[str, Any] = {name: getattr(row, name) for name in names}
+        entries: dict[str, Any] = {name: getattr(row, name) for name in (*_NUMBERS, "measured")}
         entries["setup"] = inputs.shot.setup
         entries |= {"notes": shot.notes, "warnings": shot.warnings}
         origins.append(before.image.model_copy(update=entries))
@@ -495,24 +494,16 @@ def read_row_images(
     channel, variable : str, optional
         Part of each file to read; the channel also applies to sources.
     """
-    return tuple(_read_row_image(row, recipe, channel, variable) for row in rows)
-
-
-def _read_row_image(
-    row: ShotRow, recipe: Recipe, channel: str | None, variable: str | None
-) -> FitShot:
-    shot = read_part(row.file, channel, variable)
-    beam = None if row.source_file is None else read_part(row.source_file, channel)
-    return FitShot(
-        image=shot,
-        setup=row_setup(row, shot, recipe),
-        source="unknown" if row.source == "unknown" else beam,
-        mask=row.mask,
-        strength=row.strength,
-        brightness=row.brightness,
-        psf=row.psf,
-        noise=row.noise,
-    )
+    images = []
+    for row in rows:
+        shot = read_part(row.file, channel, variable)
+        source: Any = row.source
+        if isinstance(source, Path):
+            source = read_part(source, channel)
+        setup = row_setup(row, shot, recipe)
+        numbers = {name: getattr(row, name) for name in _NUMBERS}
+        images.append(FitShot(shot, setup=setup, source=source, mask=row.mask, **numbers))
+    return tuple(images)
 
 
 def row_setup(row: ShotRow, shot: Radiograph, recipe: Recipe) -> Setup | None:

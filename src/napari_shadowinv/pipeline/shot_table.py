@@ -102,8 +102,7 @@ class ShotRow(CheckedModel):
     @property
     def beam(self) -> dict[str, float]:
         """Energy or wavelength of the row, by name; empty without it."""
-        entries: dict[str, float | None] = self.model_extra or {}
-        return {name: value for name, value in entries.items() if value is not None}
+        return _drop_none(self.model_extra or {})
 
     @property
     def beam_text(self) -> str:
@@ -111,16 +110,10 @@ class ShotRow(CheckedModel):
         return ", ".join(beam_quantities()[name].text(value) for name, value in self.beam.items())
 
     @property
-    def source_file(self) -> Path | None:
-        """The file of its source, if there is one."""
-        return self.source if isinstance(self.source, Path) else None
-
-    @property
     def files(self) -> dict[str, Path]:
         """Files of the image, by the names of the columns."""
-        columns = {"file": self.file, "setup": self.setup, "mask": self.mask}
-        complete = {**columns, "source": self.source_file}
-        return {name: path for name, path in complete.items() if path is not None}
+        columns = {name: getattr(self, name) for name in ("file", "setup", "mask", "source")}
+        return {name: path for name, path in columns.items() if isinstance(path, Path)}
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -272,9 +265,5 @@ def is_table(path: Path) -> bool:
 
 def _read_shots(table: Path, shared: Mapping[str, Any] | None = None) -> dict[int, ShotRow]:
     """Return all rows of a table by their lines; file names are relative to its folder."""
-    return read_rows(
-        table,
-        ShotRow,
-        columns=ShotRow.columns(),
-        shared=_drop_none(shared or {}),
-    )
+    shared = _drop_none(shared or {})
+    return read_rows(table, ShotRow, columns=ShotRow.columns(), shared=shared)

@@ -15,7 +15,7 @@ import numpy as np
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, FitShot, FitWindows, LeaveOneOut, fit, leave_one_out
+from napari_shadowinv.fitting import Fit, FitShot, FitWindows, LeaveOneOut, leave_one_out
 from napari_shadowinv.fitting.measurements import strengths_of
 from napari_shadowinv.fitting.shots import common_values
 from napari_shadowinv.fitting.windows import check_count
@@ -102,7 +102,7 @@ def run_leave_one_out(
     order = _order_by_energy(inputs)
     left_out = leave_one_out(
         **inputs.only(order).keywords,
-        fields=inputs.choices.fields or ("B",),
+        fields=inputs.fields,
         on_progress=on_progress,
         should_stop=should_stop,
     )
@@ -156,14 +156,7 @@ def run_windows(
                 stage = f"window {number} of {len(groups)}"  # noqa: B023
                 on_progress(replace(progress, stage=stage))
 
-        part = inputs.only(group)
-        result = fit(
-            **part.keywords,
-            fields=part.choices.fields or ("B",),
-            on_progress=on_fit_progress,
-            should_stop=should_stop,
-        )
-        fits.append(part.with_provenance(result))
+        fits.append(inputs.only(group).run(on_fit_progress, should_stop))
     return FitWindows(tuple(map(tuple, groups)), tuple(fits), strengths)
 
 
@@ -189,7 +182,6 @@ def _strengths(inputs: FitInputs) -> FloatArray:
     values = [shot.strength for shot in inputs.recorded]
     strengths = common_values(inputs.names, values, "strength")
     if strengths is None:
-        fields = inputs.choices.fields or ("B",)
-        return strengths_of(inputs.setups, fields, len(inputs.shots), inputs.names)
+        return strengths_of(inputs.setups, inputs.fields, len(inputs.shots), inputs.names)
     matrix = np.array(strengths, dtype=np.float64)
     return np.asarray(matrix / matrix[0])
