@@ -360,9 +360,11 @@ class _Reader:
         self._check_recipe(provenance.recipe)
         self._check_recipe(origins.recipe)
         self.changes += _version_changes(provenance.version)
-        numbered = provenance.kind == "fit"
-        images = [self._image(origins, k, numbered=numbered) for k in range(count)]
-        shots = [self._shot(origins, k, images[k], numbered=numbered) for k in range(count)]
+        is_fit = provenance.kind == "fit"
+        names = [f"image {k + 1}" if is_fit else "the image" for k in range(count)]
+        images = list(map(self._read, origins.images, names, self.images or [None] * count))
+        sources = [f"the source of {name}" if is_fit else "the source" for name in names]
+        shots = [self._shot(origins, k, images[k], sources[k]) for k in range(count)]
         dark = origins.image.dark
         path = None if dark is None else self._find(dark, "the dark frame")
         shots[0] = replace(shots[0], fiducials=self._fiducials(provenance))
@@ -409,20 +411,13 @@ class _Reader:
         channel = None if origin.channel is None else str(origin.channel)
         return read_part(Path(argument), channel, origin.variable)
 
-    def _image(self, provenance: Provenance, k: int, *, numbered: bool) -> Radiograph:
-        name = f"image {k + 1}" if numbered else "the image"
-        return self._read(provenance.images[k], name, self.images[k] if self.images else None)
-
-    def _shot(
-        self, provenance: Provenance, k: int, image: Radiograph, *, numbered: bool
-    ) -> FitShot:
+    def _shot(self, provenance: Provenance, k: int, image: Radiograph, source_name: str) -> FitShot:
         """Return an image with its setup, source, masks and numbers."""
         origin, source = provenance.images[k], None
         if origin.source is not None and (
             (origin.source.file, origin.source.variable) != (origin.file, origin.variable)
         ):
-            name = f"the source of image {k + 1}" if numbered else "the source"
-            source = self._read(origin.source, name, self.source)
+            source = self._read(origin.source, source_name, self.source)
         return FitShot(
             # The provenance says which other contents of the file were used.
             image=replace(image, setup=None, mask=None, source_mask=None),
