@@ -116,7 +116,7 @@ def plan_experiment(
     2
     """
     inputs = _checked_inputs(object, setups, shape, instrument, options)
-    return _plan(inputs, Reporter(on_progress, should_stop), should_stop)
+    return _plan(inputs, Reporter(on_progress, should_stop))
 
 
 def sweep_experiment(
@@ -171,7 +171,7 @@ def sweep_experiment(
             None if on_progress is None else _shifted(on_progress, number, len(changed)),
             should_stop,
         )
-        plans.append(_plan(each, report, should_stop))
+        plans.append(_plan(each, report))
     swept = SWEPT[quantity]
     return ExperimentSweep(quantity, swept.title, swept.unit, tuple(numbers), tuple(plans))
 
@@ -186,12 +186,7 @@ class Swept(NamedTuple):
 
 def _swept() -> dict[str, Swept]:
     quantities = {}
-    owners: dict[str, tuple[type[BaseModel], Sequence[str]]] = {
-        "options": (ExperimentOptions, _OF_OPTIONS),
-        "setup": (BeamSetup, _OF_SETUP),
-        "instrument": (Instrument, _OF_INSTRUMENT),
-    }
-    for owner, (model, names) in owners.items():
+    for owner, (model, names) in _OWNERS.items():
         for name in names:
             title = model.model_fields[_FIELDS.get(name, name)].title or name
             title = f"{title} error" if name in _FIELDS else title
@@ -202,29 +197,30 @@ def _swept() -> dict[str, Swept]:
     return quantities
 
 
-_OF_OPTIONS = (
-    "counts",
-    "reference_counts",
-    "beam_structure",
-    "psf",
-    "source_size",
-    "resolution",
-)
 # Names of fields that two models have.
 _FIELDS = {"energy_error": "energy"}
-_OF_SETUP = ("source_object_distance", "object_image_distance")
-_OF_INSTRUMENT = (
-    "beam_rms",
-    "beam_length",
-    "beam_between",
-    "energy_error",
-    "background",
-    "gamma",
-    "blur",
-    "absorption",
-    "registration",
-    "other_field",
-)
+_OWNERS: dict[str, tuple[type[BaseModel], Sequence[str]]] = {
+    "options": (
+        ExperimentOptions,
+        ("counts", "reference_counts", "beam_structure", "psf", "source_size", "resolution"),
+    ),
+    "setup": (BeamSetup, ("source_object_distance", "object_image_distance")),
+    "instrument": (
+        Instrument,
+        (
+            "beam_rms",
+            "beam_length",
+            "beam_between",
+            "energy_error",
+            "background",
+            "gamma",
+            "blur",
+            "absorption",
+            "registration",
+            "other_field",
+        ),
+    ),
+}
 SWEPT: dict[str, Swept] = _swept()
 """Quantities that `sweep_experiment` can vary, by their keys."""
 
@@ -371,7 +367,7 @@ def _with_value(inputs: _Inputs, quantity: str, value: float) -> _Inputs:
     return changed
 
 
-def _plan(inputs: _Inputs, report: Reporter, should_stop: ShouldStop | None) -> ExperimentPlan:
+def _plan(inputs: _Inputs, report: Reporter) -> ExperimentPlan:
     start = time.perf_counter()
     options = inputs.options
     report("draws", 0, options.draws)
@@ -382,7 +378,7 @@ def _plan(inputs: _Inputs, report: Reporter, should_stop: ShouldStop | None) -> 
             "energy and the distances"
         )
     ensure = ensure_fit_compiled if inputs.is_fit else ensure_inversion_compiled
-    ensure(None, should_stop)
+    ensure(None, report.should_stop)
     prepared = time.perf_counter()
     retrieve = _fitted if inputs.is_fit else _inverted
     searched = min(options.searched, options.draws) if inputs.is_fit else options.draws
@@ -390,7 +386,7 @@ def _plan(inputs: _Inputs, report: Reporter, should_stop: ShouldStop | None) -> 
 
     def draw_all(numbers: range, near: Fit | None) -> Iterator[_Retrieved]:
         def compute(number: int) -> _Retrieved:
-            return retrieve(inputs, simulator, number, near, should_stop)
+            return retrieve(inputs, simulator, number, near, report.should_stop)
 
         with ThreadPoolExecutor(available_threads(options.threads)) as pool:
             tasks = [pool.submit(compute, number) for number in numbers]
