@@ -122,12 +122,8 @@ class Cache:
             if key == last_key and is_same:
                 source, doubts = last_source, last_doubts
         if source is None:
-            if most_pixels is None:
-                source = estimate.source(image, mask, should_stop, doubts.append)
-            else:
-                source = quick_source(
-                    estimate, image, mask, most_pixels, should_stop, doubts.append
-                )
+            pixels = image.size if most_pixels is None else most_pixels
+            source = quick_source(estimate, image, mask, pixels, should_stop, doubts.append)
             self._estimated = key, image, mask, source, doubts
         if on_caution is not None:
             for doubt in doubts:
@@ -319,7 +315,7 @@ def run_prepared(
     # Before an estimate is made, and before sites are spread: mistakes are reported at once.
     if shot.source is None:
         prepare(shot.image, None, options, shot.mask)
-    source = _source(inputs, shot, report, should_stop, cache, doubts, preview=preview)
+    source = _source(inputs, shot, report, cache, doubts, preview=preview)
     instrument, estimate = inputs.recipe.instrument, inputs.recipe.estimate
     if estimate is not None:
         instrument = with_prior_of(estimate, shot, instrument, should_stop)
@@ -363,7 +359,6 @@ def _source(
     inputs: Inputs,
     shot: Radiograph,
     report: Reporter,
-    should_stop: ShouldStop | None,
     cache: Cache,
     doubts: list[Caution],
     *,
@@ -383,7 +378,7 @@ def _source(
     estimate = estimate.adapt_to(shot.setup, recorded, matrix)
     report("source", 0, None, estimate.title)
     cached = partial(cache.source, estimate, most_pixels=PREVIEW_PIXELS if preview else None)
-    return estimate_source(estimate, shot, should_stop, doubts.append, by=cached)
+    return estimate_source(estimate, shot, report.should_stop, doubts.append, by=cached)
 
 
 def collect_inputs(
