@@ -198,25 +198,18 @@ def draft_pack(
     ]
     films: dict[str, dict[str, str]] = {}
     for kind in sorted({str(layer["film"]) for layer in layer_entries}):
-        parts = {"calibration": calibrations, "unexposed": unexposed}
-        films[kind] = {
-            part: path.name
-            for part, candidates in parts.items()
-            if (path := _file_for_type(kind, candidates, types)) is not None
-        }
+        for part, candidates in (("calibration", calibrations), ("unexposed", unexposed)):
+            if (path := _file_for_type(kind, candidates, types)) is not None:
+                films.setdefault(kind, {})[part] = path.name
     entries: dict[str, Any] = {}
     if facts.seen_from is not None:
         entries["seen_from"] = facts.seen_from
-    distances = {
-        name: getattr(facts, name) for name in ("source_object_distance", "object_image_distance")
-    }
+    distances = facts.model_dump(include={"source_object_distance", "object_image_distance"})
     if None not in distances.values():
         entries["setup"] = distances
     elif any(value is not None for value in distances.values()):
         raise InputError("only one of two distances is given: give both, or none")
-    return {**entries, "films": {kind: parts for kind, parts in films.items() if parts}} | {
-        "layers": [dict(layer) for layer in layer_entries]
-    }
+    return {**entries, "films": films, "layers": [dict(layer) for layer in layer_entries]}
 
 
 def missing_entries(entries: Mapping[str, Any]) -> list[str]:
