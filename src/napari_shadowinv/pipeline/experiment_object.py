@@ -11,7 +11,7 @@ An object supplies the displacement of rays in any setup.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -78,8 +78,7 @@ class Grid(NamedTuple):
 
     def inner(self, pixels: FloatArray) -> FloatArray:
         """Return the pixels of the image, without the margin."""
-        height, width = self.shape
-        inside = (slice(self.margin, self.margin + side) for side in (height, width))
+        inside = (slice(self.margin, self.margin + side) for side in self.shape)
         return pixels[tuple(inside)]
 
 
@@ -400,7 +399,5 @@ def object_of_result(result: Any, *, deflector: str | None = None) -> PlannedObj
     displacement = getattr(field, "displacement", None)
     if displacement is None:
         raise InputError(f"got a {content.kind.noun}, expected a result with a field")
-    return replace(
-        object_of_displacement(displacement, setup, title="an earlier result"),
-        deflector=deflector or deflector_titles().get(getattr(field, "name", "")),
-    )
+    cause = deflector or deflector_titles().get(getattr(field, "name", ""))
+    return object_of_displacement(displacement, setup, deflector=cause, title="an earlier result")

@@ -238,12 +238,10 @@ class ExperimentPlan:
         total = math.sqrt(sum(squares.values()))
         gains = []
         for name, square in squares.items():
-            change = self._change_of(name)
-            if change is None:
-                continue
-            text, factor = change
-            less = math.sqrt(max(total**2 - square * (1 - factor**2), 0.0))
-            gains.append(Gain(name, text, less))
+            if change := self._change_of(name):
+                text, factor = change
+                less = math.sqrt(max(total**2 - square * (1 - factor**2), 0.0))
+                gains.append(Gain(name, text, less))
         return tuple(sorted(gains, key=lambda gain: gain.total))
 
     def _change_of(self, name: str) -> tuple[str, float] | None:
