@@ -254,15 +254,16 @@ def collect_rerun(
     provenance = _checked_provenance(dataset, name)
     listed: Any = () if images is None else images
     shots = (listed,) if isinstance(listed, (str, Path, Radiograph)) else tuple(listed)
+    version = provenance.version
     reader = _Reader(name, folder or Path(), shots, source, other_folders)
+    if version != __version__:
+        reader.changes.append(f"made by version {version}, now {__version__}")
     if provenance.pack is not None:
         files = provenance.pack.files
         for file in files:
             reader.check(file, "the file")
-        changes = _version_changes(provenance.version)
-        return RerunInputs(
-            dataset, provenance, Recipe(), files=tuple(files), changes=tuple(changes)
-        )
+        changes = tuple(reader.changes)
+        return RerunInputs(dataset, provenance, Recipe(), files=tuple(files), changes=changes)
     return reader.inputs(dataset, provenance)
 
 
@@ -359,7 +360,6 @@ class _Reader:
         origins = provenance.start or provenance
         self._check_recipe(provenance.recipe)
         self._check_recipe(origins.recipe)
-        self.changes += _version_changes(provenance.version)
         is_fit = provenance.kind == "fit"
         names = [f"image {k + 1}" if is_fit else "the image" for k in range(count)]
         images = list(map(self._read, origins.images, names, self.images or [None] * count))
@@ -472,10 +472,6 @@ class _Reader:
 
 def _with_dark(recipe: Recipe, path: Path | None) -> Recipe:
     return recipe if path is None else recipe.with_dark_file(path)
-
-
-def _version_changes(version: str) -> list[str]:
-    return [] if version == __version__ else [f"made by version {version}, now {__version__}"]
 
 
 def _image_changes(before: Provenance, after: Provenance) -> list[str]:
