@@ -312,15 +312,12 @@ def _refuse_unsuitable(inputs: _Inputs) -> None:
                     f"received {name} in m without a setup: give the setup, or the point spread in "
                     "px"
                 )
-    first = setups[0]
-    for number, setup in enumerate(setups[1:], start=2):
-        assert first is not None
-        assert setup is not None
-        ratio = setup.object_pixel_size / first.object_pixel_size
-        if abs(ratio - 1) > _SAME_SIZE:
+    sizes = [setup.object_pixel_size for setup in setups if setup is not None]
+    for number, size in enumerate(sizes[1:], start=2):
+        if abs(size / sizes[0] - 1) > _SAME_SIZE:
             raise InputError(
-                f"image {number} has pixels of {setup.object_pixel_size * 1e6:.6g} µm at the "
-                f"object, the first of {first.object_pixel_size * 1e6:.6g} µm: expected the same"
+                f"image {number} has pixels of {size * 1e6:.6g} µm at the object, the first of "
+                f"{sizes[0] * 1e6:.6g} µm: expected the same"
             )
     if len(setups) > 1 and len(set(setups)) < len(setups):
         raise InputError("two setups are the same: give images of different energies")
