@@ -61,10 +61,9 @@ def trace_file(
         As `read_field_grid` and `napari_shadowinv.trace`; or if the setup is none of particles.
     """
     checked = check_particles(setup)
-    view = view or GridView()
     if source is not None:
         shape = getattr(source, "shape", shape)
-    grid = view.apply(read_field_grid(path, iteration=iteration))
+    grid = (view or GridView()).apply(read_field_grid(path, iteration=iteration))
     return trace(
         grid,
         checked,
