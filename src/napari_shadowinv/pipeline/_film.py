@@ -472,14 +472,11 @@ def _cut_groups(films: list[Film], kinds: Sequence[str]) -> list[tuple[object, .
     sizes = np.array([upright(film.corners)[2] for film in films])
     groups = np.zeros(sizes.shape, dtype=int)
     for kind in set(kinds):
-        of_kind = np.array([name == kind for name in kinds])
+        of_kind = np.flatnonzero([name == kind for name in kinds])
         for axis in (0, 1):
-            lengths = sizes[of_kind, axis]
-            order = np.argsort(lengths)
-            is_wider = np.diff(lengths[order], prepend=lengths[order[0]]) > _CUT_APART_PX
-            group = np.empty(len(lengths), dtype=int)
-            group[order] = np.cumsum(is_wider)
-            groups[of_kind, axis] = group
+            order = of_kind[np.argsort(sizes[of_kind, axis])]
+            lengths = sizes[order, axis]
+            groups[order, axis] = np.cumsum(np.diff(lengths, prepend=lengths[0]) > _CUT_APART_PX)
     return [(kind, *map(int, group)) for kind, group in zip(kinds, groups, strict=True)]
 
 
