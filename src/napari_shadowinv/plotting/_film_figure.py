@@ -43,8 +43,7 @@ def pack_figure(doses: FilmDoses, *, title: str | None = None) -> Figure:
         A figure with an Agg canvas; write it with `save_figure`.
     """
     planes, usable = doses.dose, doses.usable
-    count, *sides = planes.shape
-    shape = sides[0], sides[1]
+    count, *shape = planes.shape
     panels_shown = count + (count >= 3)
     columns = min(_COLUMNS, panels_shown)
     width, height = (_PANEL_SHARE * side for side in _panels.panel_size(shape))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -54,8 +55,7 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
     matplotlib.figure.Figure
         A figure with an Agg canvas; write it with `save_figure`.
     """
-    count, *sides = fit.images.shape
-    shape = sides[0], sides[1]
+    count, *shape = fit.images.shape
     kinds = _kinds(fit)
     upright = count > _MAX_ROWS
     columns = count if upright else len(kinds)
@@ -182,8 +182,7 @@ def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figur
     matplotlib.figure.Figure
         A figure with an Agg canvas; write it with `save_figure`.
     """
-    count, *sides = left_out.images.shape
-    shape = sides[0], sides[1]
+    count, *shape = left_out.images.shape
     side_by_side = -(-count // _MAX_LEFT_OUT_ROWS)
     columns, rows = _PANELS_PER_IMAGE * side_by_side, -(-count // side_by_side)
     first_fact, *of_images = left_out.facts
@@ -223,8 +222,7 @@ def windows_figure(windows: FitWindows, *, title: str | None = None) -> Figure:
         A figure with an Agg canvas; write it with `save_figure`.
     """
     displacement = windows.displacement
-    count, fields = displacement.shape[:2]
-    shape = displacement.shape[3], displacement.shape[4]
+    count, fields, _, *shape = displacement.shape
     columns = max(2, min(count + 1, math.ceil(math.sqrt(_PAGE_ASPECT * fields * (count + 1)))))
     rows = -(-(count + 1) // columns)
     verdicts = [
@@ -254,7 +252,7 @@ def windows_figure(windows: FitWindows, *, title: str | None = None) -> Figure:
 
 
 def _page(
-    shape: tuple[int, int],
+    shape: Sequence[int],
     rows: int,
     columns: int,
     sentences: list[tuple[str, str]],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -18,8 +18,6 @@ from napari_shadowinv.physics.significance import LEVEL
 from napari_shadowinv.physics.units import ShownField, prefix_for, shown_potential
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -31,12 +29,7 @@ if TYPE_CHECKING:
 _CUT_COLOURS = ("#1f9bff", "#18b368")
 _REFERENCE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 2.4, "alpha": 0.45}
 _CAUSTIC_DENSITY = 0.15  # level of the outline of a caustic
-_LINE_IN = 0.18  # of a header or footer
-
-
-def _strongest(field: ShownField) -> float:
-    """Upper end of a colour scale, which must not be empty even if the field is."""
-    return field.largest or 1.0
+LINE_IN = 0.18  # of a header or footer
 
 
 def _label(field: ShownField) -> str:
@@ -70,14 +63,14 @@ class Scale:
     pixel: float
     unit: str
 
-    def extent(self, shape: tuple[int, int]) -> tuple[float, float, float, float]:
+    def extent(self, shape: Sequence[int]) -> tuple[float, float, float, float]:
         """Left, right, bottom and top edge, for images whose first row is on top."""
         edges = (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
         x_min, x_max, y_max, y_min = (edge * self.pixel for edge in edges)
         return x_min, x_max, y_max, y_min
 
 
-def image_scale(shape: tuple[int, int], setup: Setup | None) -> Scale:
+def image_scale(shape: Sequence[int], setup: Setup | None) -> Scale:
     """Metres at the object with a setup, pixels without."""
     if setup is None:
         return Scale(1.0, "px")
@@ -132,7 +125,7 @@ class Grid:
 
 
 def choose_grid(
-    shape: tuple[int, int], panels: int, *, foot: float = 0.0, title: bool = True
+    shape: Sequence[int], panels: int, *, foot: float = 0.0, title: bool = True
 ) -> Grid:
     """Choose the columns for which the page is closest to a slide's 16:10."""
     width, height = panel_size(shape)
@@ -144,7 +137,7 @@ def choose_grid(
     return min(grids, key=lambda g: abs(np.log(g.figure_size[0] / g.figure_size[1] / 1.6)))
 
 
-def panel_size(shape: tuple[int, int]) -> tuple[float, float]:
+def panel_size(shape: Sequence[int]) -> tuple[float, float]:
     """Width and height in inches: panels of equal area, with room for ticks on the short side."""
     aspect = shape[0] / shape[1]
     width = float(np.clip(2.75 / np.sqrt(aspect), 1.2, 6.4))
@@ -174,18 +167,20 @@ def new_page(
 ) -> Iterator[tuple[Figure, list[Panel]]]:
     """Yield a figure with its empty panels, between lines of text, each with its colour."""
     top = grid.head - 0.08
-    head, foot = grid.head + _LINE_IN * len(header), grid.foot + _LINE_IN * len(footer)
+    head, foot = grid.head + LINE_IN * len(header), grid.foot + LINE_IN * len(footer)
     grid = replace(grid, head=head, foot=foot)
     width, height = grid.figure_size
     with styled_figure(grid.figure_size) as figure:
         if title:
             figure.text(0.2 / width, 1 - 0.26 / height, title, size=13, weight="bold", va="center")
         for number, (text, colour) in enumerate(header):
-            y = 1 - (top + _LINE_IN * number) / height
+            y = 1 - (top + LINE_IN * number) / height
             figure.text(0.2 / width, y, text, size=10, color=colour, va="top")
         boxes = [grid.box(index) for index in range(grid.rows * grid.columns)]
         yield figure, [Panel(figure.add_axes(box), scale, grid) for box in boxes]
-        write_footer(figure, footer, grid)
+        for number, (text, colour) in enumerate(reversed(footer)):
+            y = (0.1 + LINE_IN * number) / height
+            figure.text(0.2 / width, y, text, size=8.5, color=colour, va="bottom")
 
 
 def wrapped(sentences: Iterable[tuple[str, str]], letters: int) -> list[tuple[str, str]]:
@@ -218,14 +213,6 @@ def footer_lines(facts: Iterable[Fact], headline: str, letters: int) -> list[tup
     paragraphs.append((fact_line(fact for fact in quiet if not is_long[fact]), QUIET_COLOUR))
     paragraphs += [(fact_line([fact]), QUIET_COLOUR) for fact in quiet if is_long[fact]]
     return wrapped(paragraphs, letters)
-
-
-def write_footer(figure: Figure, lines: Sequence[tuple[str, str]], grid: Grid) -> None:
-    """Write lines, each with its colour, below the panels."""
-    width, height = grid.figure_size
-    for number, (text, colour) in enumerate(reversed(lines)):
-        y = (0.1 + _LINE_IN * number) / height
-        figure.text(0.2 / width, y, text, size=8.5, color=colour, va="bottom")
 
 
 @dataclass(frozen=True)
@@ -266,36 +253,10 @@ class Panel:
         if np.isnan(plane).any():
             self.axes.patch.set(facecolor="0.92", edgecolor="0.6", hatch="////")
 
-    def hatch(self, region: BoolArray, colour: str) -> None:
-        """Hatch a region of the picture with thin lines, through which it remains visible."""
-        from matplotlib.colors import to_rgba
-
-        place: Any = {"extent": self.scale.extent(region.shape), "origin": "upper"}
-        filled: Any = self.axes.contourf(
-            region.astype(np.float64), levels=[0.5, 1.5], colors="none", hatches=["///"], **place
-        )
-        filled.set(edgecolor=to_rgba(colour, 0.28), linewidth=0.0)
-
-    def note(self, text: str) -> None:
-        """Write a few words into the lower left corner of the picture."""
-        box = {"facecolor": "black", "alpha": 0.6, "linewidth": 0, "boxstyle": "square,pad=0.25"}
-        style: Any = {"transform": self.axes.transAxes, "fontsize": 7, "color": "white"}
-        self.axes.text(0.02, 0.02, text, bbox=box, va="bottom", zorder=5, **style)
-
     def contour(self, plane: AnyArray, levels: ArrayLike, colour: str, **style: Any) -> None:
         """Draw lines of equal value onto the picture."""
         place: Any = {"extent": self.scale.extent(plane.shape), "origin": "upper"}
         self.axes.contour(plane, levels=levels, colors=colour, **place, **style)
-
-    def plot(self, values: FloatArray, **style: Any) -> None:
-        """Plot a cut along an axis of the image."""
-        self.axes.plot(np.arange(values.size) * self.scale.pixel, values, **style)
-
-    def band(self, values: FloatArray, error: FloatArray, colour: str) -> None:
-        """Fill the band within a standard deviation of a cut."""
-        places = np.arange(values.size) * self.scale.pixel
-        edges = np.maximum(values - error, 0), values + error
-        self.axes.fill_between(places, *edges, color=colour, alpha=0.25, linewidth=0)
 
     def few_ticks(self) -> None:
         """Keep the tick labels apart on small panels."""
@@ -334,7 +295,7 @@ class Panel:
 
     def draw_field(self, field: ShownField, title: str = "") -> None:
         """Show a field, and the lines of `draw_cuts`."""
-        self.draw_vectors(field, title or field.name, _strongest(field))
+        self.draw_vectors(field, title or field.name, field.largest or 1.0)
         row, column = field.peak
         style: Any = {"linewidth": 1.0, "linestyle": (0, (5, 3))}
         self.axes.axhline(row * self.scale.pixel, color=_CUT_COLOURS[0], **style)
@@ -375,15 +336,23 @@ class Panel:
         )
 
     def hatch_insignificant(self, structures: Structures | None) -> None:
-        """Hatch the pixels outside structures, and say so in the corner."""
+        """Hatch the pixels outside structures thinly, and say so in the lower left corner."""
+        from matplotlib.colors import to_rgba
+
         if structures is None:
             return
         outside = structures.labels == 0
         text = f"all above {LEVEL:g} σ"
         if outside.any():
-            self.hatch(outside, "white")
+            place: Any = {"extent": self.scale.extent(outside.shape), "origin": "upper"}
+            filled: Any = self.axes.contourf(
+                outside.astype(np.float64), [0.5, 1.5], colors="none", hatches=["///"], **place
+            )
+            filled.set(edgecolor=to_rgba("white", 0.28), linewidth=0.0)
             text = f"hatched: no structure above {LEVEL:g} σ"
-        self.note(text)
+        box = {"facecolor": "black", "alpha": 0.6, "linewidth": 0, "boxstyle": "square,pad=0.25"}
+        style: Any = {"transform": self.axes.transAxes, "fontsize": 7, "color": "white"}
+        self.axes.text(0.02, 0.02, text, bbox=box, va="bottom", zorder=5, **style)
 
     def outline_caustics(self, caustic: BoolArray) -> None:
         """Draw a line around the caustics."""
@@ -403,9 +372,11 @@ class Panel:
         }
         for (name, line), colour in zip(lines.items(), _CUT_COLOURS, strict=True):
             values = field.magnitude[line]
-            self.plot(values, color=colour, linewidth=1.4, label=name)
+            places = np.arange(values.size) * self.scale.pixel
+            self.axes.plot(places, values, color=colour, linewidth=1.4, label=name)
             if error is not None:
-                self.band(values, error[line], colour)
+                edges = np.maximum(values - error[line], 0), values + error[line]
+                self.axes.fill_between(places, *edges, color=colour, alpha=0.25, linewidth=0)
         self.finish_cuts(field, "Cuts through the peak")
 
     def coordinate(self, index: int) -> str:
@@ -438,10 +409,12 @@ def draw_side_by_side(
     """
     *pictures, cuts = panels
     reference = next(iter(fields.values()))
-    largest = max(map(_strongest, fields.values() if common else [reference]))
+    # A colour scale must not be empty even if a field is.
+    largest = max(each.largest or 1.0 for each in (fields.values() if common else [reference]))
     row, _ = reference.peak
+    places = np.arange(reference.magnitude.shape[1]) * cuts.scale.pixel
     for panel, (name, field) in zip(pictures, fields.items(), strict=True):
         panel.draw_vectors(field, name, largest)
         style = _REFERENCE_STYLE if field is reference else {"linewidth": 1.3}
-        cuts.plot(field.magnitude[row], label=name, **style)
+        cuts.axes.plot(places, field.magnitude[row], label=name, **style)
     cuts.finish_cuts(reference, f"Cut at y = {cuts.coordinate(row)}")

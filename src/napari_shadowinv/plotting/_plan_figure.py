@@ -71,36 +71,34 @@ def sweep_figure(sweep: ExperimentSweep) -> Figure:
     matplotlib.figure.Figure
         A figure with an Agg canvas; write it with `save_figure`.
     """
-    with _panels.styled_figure((6.4, 4.8), layout="constrained") as figure:
-        _draw_sweep(figure, sweep)
-    return figure
-
-
-def _draw_sweep(figure: Figure, sweep: ExperimentSweep) -> None:
     order = np.argsort(sweep.values)
     values = np.array(sweep.values)[order]
     plans = [sweep.plans[k] for k in order]
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
-    spreads = [plan.error for plan in plans]
-    low, high = ([100 * getattr(each, end) for each in spreads] for end in ("low", "high"))
-    above.fill_between(values, low, high, color=GOOD_COLOUR, alpha=0.2, label="68 % of the draws")
-    medians = [100 * each.median for each in spreads]
-    above.plot(values, medians, "o-", color=GOOD_COLOUR, label="error made")
-    totals = [100 * plan.total.median for plan in plans]
-    above.plot(values, totals, "--", color=QUIET_COLOUR, label="error reported")
-    above.set_ylabel("error of the field (%, r.m.s.)")
-    above.set_ylim(bottom=0)
-    above.legend()
-    above.set_title(plans[0].title)
-    shares = [100 * plan.determined_share for plan in plans]
-    below.plot(values, shares, "s-", color=QUIET_COLOUR)
-    below.set_ylim(-5, 105)
-    below.set_ylabel("determined\n(% of draws)")
-    below.set_xlabel(f"{sweep.title} ({sweep.unit})" if sweep.unit else sweep.title)
-    if values[0] > 0 and values[-1] / values[0] > _LOG_RANGE:
-        below.set_xscale("log")
-        below.minorticks_off()
-    below.set_xticks(values, [f"{value:.3g}" for value in values])
+    with _panels.styled_figure((6.4, 4.8), layout="constrained") as figure:
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
+        spreads = [plan.error for plan in plans]
+        low, high = ([100 * getattr(each, end) for each in spreads] for end in ("low", "high"))
+        above.fill_between(
+            values, low, high, color=GOOD_COLOUR, alpha=0.2, label="68 % of the draws"
+        )
+        medians = [100 * each.median for each in spreads]
+        above.plot(values, medians, "o-", color=GOOD_COLOUR, label="error made")
+        totals = [100 * plan.total.median for plan in plans]
+        above.plot(values, totals, "--", color=QUIET_COLOUR, label="error reported")
+        above.set_ylabel("error of the field (%, r.m.s.)")
+        above.set_ylim(bottom=0)
+        above.legend()
+        above.set_title(plans[0].title)
+        shares = [100 * plan.determined_share for plan in plans]
+        below.plot(values, shares, "s-", color=QUIET_COLOUR)
+        below.set_ylim(-5, 105)
+        below.set_ylabel("determined\n(% of draws)")
+        below.set_xlabel(f"{sweep.title} ({sweep.unit})" if sweep.unit else sweep.title)
+        if values[0] > 0 and values[-1] / values[0] > _LOG_RANGE:
+            below.set_xscale("log")
+            below.minorticks_off()
+        below.set_xticks(values, [f"{value:.3g}" for value in values])
+    return figure
 
 
 def _draw_errors(axes: Axes, plan: ExperimentPlan) -> None:

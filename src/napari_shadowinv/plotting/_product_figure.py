@@ -68,14 +68,12 @@ def _footer(results: Sequence[ProductResult]) -> list[tuple[str, str]]:
         listed = "; ".join(f"{fact.title.lower()} {fact.text}" for fact in numbers)
         sentences.append((f"{each.title}: {listed}", QUIET_COLOUR))
         doubts += [fact for fact in each.facts if fact not in numbers]
-    sentences += [(f"{fact.title}: {fact.text}", _colour(fact.level)) for fact in doubts]
+    for fact in doubts:
+        colour = QUIET_COLOUR if fact.level is Level.SOUND else ALARM_COLOUR
+        sentences.append((f"{fact.title}: {fact.text}", colour))
     limits = dict.fromkeys(sentence for each in results for sentence in each.limits)
     sentences += [(text, QUIET_COLOUR) for text in limits]
     return _panels.wrapped(dict.fromkeys(sentences), _LETTERS)
-
-
-def _colour(level: Level) -> str:
-    return QUIET_COLOUR if level is Level.SOUND else ALARM_COLOUR
 
 
 def _panels_of(result: ProductResult) -> tuple[tuple[str, ...], ...]:

@@ -122,11 +122,12 @@ def comparison_figure(
     if len(shapes) != 1:
         raise InputError(f"fields have shapes {shapes}: expected one or more of the same shape")
     in_units = dict(zip(fields, shown_fields(arrays, setup), strict=True))
-    shape = shapes[0][1], shapes[0][2]
+    shape = shapes[0][1:]
     grid = _panels.choose_grid(shape, panels=len(in_units) + 1, foot=0.35, title=bool(title))
-    with _panels.new_page(grid, _panels.image_scale(shape, setup), title) as (figure, panels):
+    grid = replace(grid, foot=grid.foot - _panels.LINE_IN)
+    scale, footer = _panels.image_scale(shape, setup), [(caption, QUIET_COLOUR)]
+    with _panels.new_page(grid, scale, title, footer=footer) as (figure, panels):
         draw_side_by_side(panels, in_units)
-        _panels.write_footer(figure, [(caption, QUIET_COLOUR)], grid)
     return figure
 
 
