@@ -39,7 +39,9 @@ def local_client(count: int) -> Iterator[Any]:
     with ExitStack() as opened:
         environment = dask.config.get(_ENVIRONMENT)
         opened.enter_context(dask.config.set(_dask_settings(environment)))
-        opened.enter_context(_without_variable(_TRIMMING, environment.get(_TRIMMING)))
+        # An earlier cluster may have left it there.
+        if os.environ.get(_TRIMMING) == str(environment.get(_TRIMMING)):
+            opened.callback(os.environ.setdefault, _TRIMMING, os.environ.pop(_TRIMMING))
         # Data spilled to disk when memory is short could be exchanged for code.
         spill_folder = str(opened.enter_context(temporary_folder("shadowinv")))
         opened.enter_context(dask.config.set({"temporary-directory": spill_folder}))
@@ -79,15 +81,6 @@ def _dask_settings(environment: dict[str, Any]) -> dict[str, Any]:
         # has the same size: that takes an eighth of the time of a shot.
         _ENVIRONMENT: {name: value for name, value in environment.items() if name != _TRIMMING},
     }
-
-
-@contextmanager
-def _without_variable(name: str, value: Any) -> Iterator[None]:
-    """Remove a variable from the environment if an earlier cluster has left it there."""
-    with ExitStack() as opened:
-        if os.environ.get(name) == str(value):
-            opened.callback(os.environ.setdefault, name, os.environ.pop(name))
-        yield
 
 
 @contextmanager
