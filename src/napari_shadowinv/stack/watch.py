@@ -365,7 +365,9 @@ class Watch:
             return
         if attempt.failure:
             self._arrivals.check()
-        self._lanes[running.lane] = self._start_for_next(attempt)
+        chained = self._stack is not None and self._stack.chained
+        good = attempt.result is not None and attempt.result.report.converged
+        self._lanes[running.lane] = attempt.result if chained and good else None
         self._ended += 1
         try:
             if begin_next:
@@ -483,11 +485,6 @@ class Watch:
         self._overwrite = False
         self.store = GrowingStore(created, NUMBERED_AS_ARRIVED)
         return self.store
-
-    def _start_for_next(self, attempt: Attempt) -> Inversion | Fit | None:
-        chained = self._stack is not None and self._stack.chained
-        good = attempt.result is not None and attempt.result.report.converged
-        return attempt.result if chained and good else None
 
 
 def watch_stack(
