@@ -274,7 +274,7 @@ def run_stack(
                 # It may be that of another shard.
                 stack = resume(store, stack, stored)
             elif arrived:
-                store = append_shots(store, stack, stored)
+                store = append_shots(store, stack)
             _Run(stack, store, again, on_progress, should_stop).run_on(engine)
     return read_stack(path, numbers=numbers)
 
@@ -493,23 +493,21 @@ def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
 
 
 def _coordinates(stack: Stack) -> dict[str, Variable]:
-    return {name: _stored_coordinate(values) for name, values in coordinates_of(stack).items()}
-
-
-def _stored_coordinate(coordinate: Any) -> Variable:
     import xarray as xr
 
-    labelled = xr.as_variable(coordinate)
-    dims = tuple(map(str, labelled.dims))
-    values, attributes = labelled.values, dict(labelled.attrs)
-    if values.dtype.kind in "UO":
-        return Variable(dims, str, attributes, values.astype(object))
-    if values.dtype.kind in "mM":
-        # As numbers, because Zarr has no times; the units say which.
-        attributes = {**attributes, "units": "ns since 1970-01-01"}
-        numbers = values.astype("datetime64[ns]").astype("int64")
-        return Variable(dims, np.dtype("int64"), attributes, numbers)
-    return Variable(dims, values.dtype, attributes, values)
+    coordinates = {}
+    for name, coordinate in coordinates_of(stack).items():
+        labelled = xr.as_variable(coordinate)
+        values, attributes = labelled.values, dict(labelled.attrs)
+        if values.dtype.kind in "mM":
+            # As numbers, because Zarr has no times; the units say which.
+            attributes["units"] = "ns since 1970-01-01"
+            values = values.astype("datetime64[ns]").astype("int64")
+        is_text = values.dtype.kind in "UO"
+        values = values.astype(object) if is_text else values
+        dims, dtype = tuple(map(str, labelled.dims)), str if is_text else values.dtype
+        coordinates[name] = Variable(dims, dtype, attributes, values)
+    return coordinates
 
 
 def _variables(stack: Stack, dtype: np.dtype[Any]) -> dict[str, Variable]:
@@ -642,7 +640,7 @@ def _difference(before: str, now: str) -> str:
         return f"{shorten(before or 'none', 80)} there, {shorten(now or 'none', 80)} now"
 
 
-def append_shots(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> StackStore:
+def append_shots(store: StackStore, stack: Stack) -> StackStore:
     """Append shots that arrived since the last run, as pending, to the store."""
     coordinates = {
         name: np.asarray(coordinate.values)[len(store.names) :]
@@ -650,7 +648,6 @@ def append_shots(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack
         if coordinate.along_shots
     }
     begins = [*store.attributes.get(_APPENDED, []), len(store.names)]
-    source = _identity(stack, dtype)["source_image"]
-    attributes = {"source_image": source, _APPENDED: begins}
+    attributes = {"source_image": stack.source_text(None), _APPENDED: begins}
     grow_store(store.path, coordinates, attributes)
     return StackStore(store.path)
