@@ -119,7 +119,7 @@ def test_sites_are_made_once_for_shots_with_one_source(night, plans_made, schedu
 
 
 def test_threads_that_ask_at_once_get_the_same_plan(night, plans_made):
-    beam = _worker.Beam.of(night.source.shape, night.source, None)
+    beam = _worker.Beam(night.source.shape, night.source, None)
     plans: list[object] = []
     start = threading.Barrier(4)
 
@@ -140,9 +140,9 @@ def test_plans_depend_on_source_mask_and_options(night, plans_made):
     mask = np.ones(night.source.shape, bool)
     mask[0, 0] = False
     beams = [
-        _worker.Beam.of(night.source.shape, night.source, None),
-        _worker.Beam.of(night.source.shape, night.source + 1, None),
-        _worker.Beam.of(night.source.shape, night.source, mask),
+        _worker.Beam(night.source.shape, night.source, None),
+        _worker.Beam(night.source.shape, night.source + 1, None),
+        _worker.Beam(night.source.shape, night.source, mask),
     ]
     for beam in beams:
         for _ in range(2):

@@ -25,7 +25,7 @@ from napari_shadowinv._system.arrays import (
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import AnyArray
-from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import count_sites
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, check_source, number_of_sites
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
@@ -73,6 +73,7 @@ from napari_shadowinv.stack._worker import (
     InvertTask,
     shared_plan,
     threads_here,
+    try_shot,
 )
 
 CHAINED = "each shot from an earlier one, as they arrived"
@@ -133,7 +134,7 @@ class Stack:
         if isinstance(self.task, FitTask):
             return sizes
         # Sites of shots with their own beams are stored only if they do not depend on the beam.
-        beam = self.beam or Beam.of(self.task.shape, None, self.task.moved.mask)
+        beam = self.beam or Beam(self.task.shape, None, self.task.moved.mask)
         return {**sizes, "site": count_sites(beam.image, self.task.recipe.options, mask=beam.mask)}
 
     @property
@@ -223,14 +224,10 @@ def needed_shares(stack: Stack, should_stop: ShouldStop | None = None) -> list[f
     most = count_sites(stack.beam.image, stack.task.recipe.options, mask=stack.beam.mask)
     needed = []
     for shot in stack.shots.items[:MAX_TRIED_SHOTS]:
-        try:
-            images, _ = shot.images.load()
-            inversion = stack.task.run(images, stack.beam, workers=1, should_stop=should_stop)
-        except InversionCancelled:
-            raise
-        except Exception:  # the error is reported when it is its turn
+        result: Any = try_shot(stack.task, shot, stack.beam, None, 1, should_stop).result
+        if result is None:  # the error is reported when it is its turn
             continue
-        needed.append(inversion.report.n_sites / most)
+        needed.append(result.report.n_sites / most)
         if len(needed) == _DECIDING_SHOTS:
             break
     return needed
@@ -349,7 +346,7 @@ def _plan_fit(
         )
     # An estimate or a list of sources gives each shot its own beam.
     per_shot = sources is not None or inputs.recipe.estimate not in (None, UniformEstimate())
-    beam = None if per_shot else Beam.of(inputs.shot.shape, source, None)
+    beam = None if per_shot else Beam(inputs.shot.shape, source, None)
     labels = task.labels
     if task.choices.options.samples < 2:
         labels.pop("displacement_uncertainty")
@@ -474,13 +471,13 @@ def _shared_beam(inputs: Inputs, source: AnyArray | None) -> Beam | None:
     """Return the common source after all steps, and mask; None if each shot has its own source."""
     moved = inputs.recipe.move(inputs.shot)
     if isinstance(inputs.recipe.source, UniformEstimate):
-        return Beam.of(moved.shape, None, moved.mask)
+        return Beam(moved.shape, None, moved.mask)
     if source is None:
         return None
     ready = inputs.recipe.prepare(replace(inputs.shot, image=source, source=source))
     assert ready.source is not None
     check_source(ready.source, ready.mask)
-    return Beam.of(ready.shape, ready.source, ready.mask)
+    return Beam(ready.shape, ready.source, ready.mask)
 
 
 def _checked_variables(

@@ -57,18 +57,17 @@ class Beam:
     shape: tuple[int, int]
     source: AnyArray | None = field(default=None, repr=False)
     mask: BoolArray | None = field(default=None, repr=False)
-    key: str = ""  # checksum of the other fields
 
     @property
     def image(self) -> AnyArray:
         """The source; ones for a uniform beam."""
         return np.ones(self.shape) if self.source is None else self.source
 
-    @classmethod
-    def of(cls, shape: tuple[int, int], source: AnyArray | None, mask: BoolArray | None) -> Beam:
-        parts = ["" if array is None else checksum(array) for array in (source, mask)]
-        text = f"{shape}{parts[0]}|{parts[1]}"
-        return cls(shape, source, mask, hashlib.sha256(text.encode()).hexdigest())
+    @cached_property
+    def key(self) -> str:
+        """Checksum of the fields."""
+        parts = ["" if array is None else checksum(array) for array in (self.source, self.mask)]
+        return hashlib.sha256(f"{self.shape}{parts[0]}|{parts[1]}".encode()).hexdigest()
 
 
 @dataclass
@@ -121,7 +120,7 @@ class _SharedSites(Cache):
         *,
         measured: bool = True,
     ) -> SitePlan:
-        beam = self.beam or Beam.of(source.shape, source, mask)
+        beam = self.beam or Beam(source.shape, source, mask)
         return shared_plan(beam, options, measured=measured, should_stop=should_stop)
 
 
@@ -240,7 +239,7 @@ class InvertTask(Task):
         recipe = inputs.recipe
         ready = recipe.prepare(inputs.shot, should_stop)
         if beam is None and isinstance(recipe.source, UniformEstimate):
-            beam = Beam.of(ready.shape, None, ready.mask)
+            beam = Beam(ready.shape, None, ready.mask)
         if beam is not None:
             ready = replace(ready, source=beam.image)
             if beam.source is None:
@@ -258,7 +257,14 @@ class InvertTask(Task):
     ) -> Inputs:
         """Return the image of a row over its brightness, with its own source, mask and setup."""
         common = self.inputs
-        self._check_setup(row.setup)
+        setups = (row.setup, self.recipe.setup)
+        kinds = [None if setup is None else setup.kind for setup in setups]
+        if kinds[0] != kinds[1]:
+            texts = [f"a setup of kind '{kind}'" if kind else "no setup" for kind in kinds]
+            raise InputError(
+                f"it has {texts[0]}, and the first row of its table {texts[1]}: a store has the "
+                "units of one kind of setup; give all rows such a setup, or use two tables"
+            )
         bare = Radiograph(
             image.image / (row.brightness or 1.0), path=image.path, metadata=image.metadata
         )
@@ -283,16 +289,6 @@ class InvertTask(Task):
         if row.source is None:
             entries["source"] = common.provenance.image.source
         return replace(inputs, provenance=inputs.provenance.with_image(**entries))
-
-    def _check_setup(self, setup: Setup | None) -> None:
-        first = self.recipe.setup
-        kinds = [None if setup is None else setup.kind, None if first is None else first.kind]
-        if kinds[0] != kinds[1]:
-            texts = [f"a setup of kind '{kind}'" if kind else "no setup" for kind in kinds]
-            raise InputError(
-                f"it has {texts[0]}, and the first row of its table {texts[1]}: a store has the "
-                "units of one kind of setup; give all rows such a setup, or use two tables"
-            )
 
     def _planes(self, result: Inversion) -> tuple[dict[str, AnyArray], Any]:
         names = variable_labels().keys() & set(self.variables)
