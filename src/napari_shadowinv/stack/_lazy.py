@@ -282,19 +282,23 @@ class _Graph:
 
     def dataset(self) -> xarray.Dataset:
         import xarray as xr
+        from dask.delayed import delayed
 
+        da: Any = import_module("dask.array")
         stack = self._stack
+        shared = delayed(values_of_beam, pure=True)(self._beam, stack.task.recipe.options)
         variables: dict[str, Any] = {}
         for name, (dims, labels) in stack.task.labels.items():
             if name not in stack.task.variables:
                 continue
             if stack.is_shared(name):
-                variables[name] = (dims, self._shared_array(name, dims), labels)
+                shape = tuple(stack.sizes[dim] for dim in dims)
+                values = da.from_delayed(shared[name], shape, dtype=dtype_of(name))
+                variables[name] = (dims, values, labels)
             else:
                 variables[name] = (("shot", *dims), self._per_shot_array(name, dims), labels)
         setups = stack.setups
         if setups is not None:
-            da: Any = import_module("dask.array")
             variables["setup"] = (("shot",), da.from_array(np.array(setups, "O"), 1), SETUPS_LABEL)
         for column in columns_of(INVERSIONS):
             if column.value is not None:
@@ -311,11 +315,3 @@ class _Graph:
             new_axis=list(range(1, 1 + len(dims))),
             meta=np.empty((0,) * (1 + len(dims)), dtype or dtype_of(name)),
         )
-
-    def _shared_array(self, name: str, dims: tuple[str, ...]) -> Any:
-        from dask.delayed import delayed
-
-        values = delayed(values_of_beam, pure=True)(self._beam, self._stack.task.recipe.options)
-        da: Any = import_module("dask.array")
-        shape = tuple(self._stack.sizes[dim] for dim in dims)
-        return da.from_delayed(values[name], shape, dtype=dtype_of(name))
