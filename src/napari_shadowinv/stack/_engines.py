@@ -277,18 +277,12 @@ def engine_for(
     elif isinstance(scheduler, import_module("distributed").Client):
         yield _Cluster(scheduler)
     else:
-        with _quiet_dask(), _connected(scheduler, should_stop) as client:
-            yield _Cluster(client)
-
-
-@contextmanager
-def _quiet_dask() -> Iterator[None]:
-    """Keep dask's tracebacks of a lost connection from the terminal: `EngineError` reports it."""
-    with ExitStack() as opened:
-        for logger in map(logging.getLogger, ("distributed", "distributed.client")):
-            opened.callback(logger.setLevel, logger.level)
-            logger.setLevel(logging.CRITICAL)
-        yield
+        with ExitStack() as opened:
+            # No tracebacks of a lost connection in the terminal: `EngineError` reports it.
+            for logger in map(logging.getLogger, ("distributed", "distributed.client")):
+                opened.callback(logger.setLevel, logger.level)
+                logger.setLevel(logging.CRITICAL)
+            yield _Cluster(opened.enter_context(_connected(scheduler, should_stop)))
 
 
 def is_local(scheduler: Any) -> bool:
@@ -300,9 +294,8 @@ def is_local(scheduler: Any) -> bool:
 def _resolve_scheduler(scheduler: Any) -> Any:
     """Return the scheduler; by default dask's current client, else threads."""
     if scheduler is None and "distributed" in sys.modules:
-        distributed: Any = sys.modules["distributed"]
         with suppress(ValueError):
-            return distributed.default_client()
+            return import_module("distributed").default_client()
     return "threads" if scheduler is None else scheduler
 
 
