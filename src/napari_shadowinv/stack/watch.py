@@ -251,9 +251,7 @@ class Watch:
             self.report()
 
     def _is_over(self, idle: float | None) -> bool:
-        if self._most is not None and self._ended >= self._most:
-            return True
-        if self._should_stop is not None and self._should_stop():
+        if (self._most is not None and self._ended >= self._most) or self._is_stopped():
             return True
         quiet = time.monotonic() - max(self._arrivals.last_event, self._last)
         is_quiet = self._arrivals.is_quiet and not self._running
@@ -292,11 +290,9 @@ class Watch:
         if not waiting or waiting[0] in at_work:
             return
         arrived = self._arrivals.next_name(0.0)
-        if arrived is None:
-            return
         if arrived in at_work:
             self._arrivals.put_back(arrived)
-        else:
+        elif arrived is not None:
             self._begin(arrived, quietly=True)
 
     def _skip(self, names: Iterable[str]) -> None:
