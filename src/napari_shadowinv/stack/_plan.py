@@ -276,12 +276,11 @@ def describe_stack(
         )
     image = None if sources is None or shot_sources is not None else np.asarray(sources, np.float64)
     task: AnyTask
-    common = None
     if resolved.fit is not None:
         task, beam = _plan_fit(inputs, shot_sources, image, resolved, variables, warm_start)
     else:
         task, beam = _plan_inversion(stack_shots, inputs, image, resolved, variables, warm_start)
-        common = image if task.by_row else None
+    common = image if task.by_row else None
     own_sources = None if shot_sources is None else shot_sources.items
     if common is not None and beam is None:
         own_sources = [Shot("", ArrayReference(common))] * len(stack_shots)
@@ -526,13 +525,11 @@ def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:
         options = options.model_copy(update={"threads": threads_here()})
     plan = shared_plan(beam, options)
     level = plan.levels[-1]
-    mask = np.ones(beam.shape, bool) if beam.mask is None else beam.mask
-    source = None if beam.source is None else check_source(beam.source, beam.mask)
     return {
         "sites": level.sites - plan.margin_width,
         "site_mass": level.mass * plan.unit,
-        "mask": mask,
-        "source": source,
+        "mask": np.ones(beam.shape, bool) if beam.mask is None else beam.mask,
+        "source": None if beam.source is None else check_source(beam.source, beam.mask),
     }
 
 
