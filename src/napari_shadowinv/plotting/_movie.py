@@ -77,9 +77,8 @@ def stack_frames(
     if not high > low:
         raise InputError(f"limits are {low:g} and {high:g}: the second must be larger")
     unit = str(field.attrs.get("units", ""))
-    factor, prefix = 1.0, ""
-    if takes_prefix(unit):
-        factor, prefix = prefix_for(max(abs(low), abs(high)))
+    largest = max(abs(low), abs(high))
+    factor, prefix = prefix_for(largest) if takes_prefix(unit) else (1.0, "")
     label = f"{field.attrs.get('long_name', variable)} ({prefix}{display_unit(unit)})"
     shape = field.sizes["y"], field.sizes["x"]
     draw = _Frame(shape, _common_setup(stack), label, (factor * low, factor * high))
