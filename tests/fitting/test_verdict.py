@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -11,7 +11,9 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting.pattern import Pattern
 from napari_shadowinv.fitting.posterior import BeamError
+from napari_shadowinv.fitting.result import FitReport
 from napari_shadowinv.fitting.verdict import assess_verdict
+from napari_shadowinv.options import FitOptions
 
 
 def blob(middle: tuple[int, int]) -> FloatArray:
@@ -36,10 +38,24 @@ GOOD: dict[str, Any] = {
     "displacement": blob((24, 24)),
     "used": np.ones((48, 48), bool),
     "hidden": 0.0,
-    "edge_is_free": False,
     "parts": {},
-    "max_error": 0.05,
+    "options": FitOptions(max_error=0.05),
 }
+
+
+def assess(
+    *,
+    uncertainty: float,
+    ended: bool,
+    beam: BeamError | None,
+    parts: dict[str, float],
+    **facts: Any,
+) -> tuple[Verdict, str]:
+    """Return the verdict on a fit with these errors and other facts."""
+    report = FitReport(0.0, 1, ended, {}, uncertainty, beam=beam, parts=parts)
+    return assess_verdict(report, **facts)
+
+
 ALONE = {
     "chi2": np.array([1.0]),
     "names": ["image 1"],
@@ -59,14 +75,14 @@ def test_errors_that_are_underestimated_need_a_margin(part: str, side: int, safe
         used = np.ones((side, 96), bool)
         changes = {"displacement": displacement, "used": used}
         changes |= {"uncertainty": share, "parts": {part: share}}
-        verdict, why = assess_verdict(**GOOD | changes)
+        verdict, why = assess(**GOOD | changes)
         assert verdict is expected
         if expected is Verdict.UNCERTAIN and safety > 1:
             assert f"{safety} times as large" in why
 
 
 def test_images_that_are_explained_in_one_way_determine_the_field() -> None:
-    verdict, why = assess_verdict(**GOOD)
+    verdict, why = assess(**GOOD)
     assert verdict is Verdict.DETERMINED
     assert "2 images" in why
     assert "0.97 to 1.04" in why
@@ -76,7 +92,7 @@ def test_images_that_are_explained_in_one_way_determine_the_field() -> None:
     ("chi2", "expected"), [(0.6, Verdict.DETERMINED), (0.3, Verdict.MISFIT), (1.4, Verdict.MISFIT)]
 )
 def test_noise_that_is_not_as_given_hides_what_does_not_fit(chi2: float, expected: Verdict) -> None:
-    verdict, why = assess_verdict(**GOOD | {"chi2": np.array([chi2, 1.0])})
+    verdict, why = assess(**GOOD | {"chi2": np.array([chi2, 1.0])})
     assert verdict is expected
     assert ("noise is given too large: image 1: χ² 0.3" in why) == (chi2 < 0.4)
 
@@ -86,14 +102,14 @@ def test_noise_that_is_not_as_given_hides_what_does_not_fit(chi2: float, expecte
 )
 def test_counts_with_too_little_noise_have_a_dark_level(share: float, expected: Verdict) -> None:
     pattern = Pattern(np.array([-1.0, 1.0]), missing_counts=share, counts_deviation=0.005)
-    verdict, why = assess_verdict(**GOOD | {"pattern": pattern})
+    verdict, why = assess(**GOOD | {"pattern": pattern})
     assert verdict is expected
     assert ("a dark level of about 10%" in why) == (share > 0.05)
 
 
 def test_images_that_are_explained_better_with_more_blur_do_not_fit() -> None:
-    assert assess_verdict(**GOOD | {"gain_by_blur": 5.0})[0] is Verdict.DETERMINED
-    verdict, why = assess_verdict(**GOOD | {"gain_by_blur": 30.0})
+    assert assess(**GOOD | {"gain_by_blur": 5.0})[0] is Verdict.DETERMINED
+    verdict, why = assess(**GOOD | {"gain_by_blur": 30.0})
     assert verdict is Verdict.MISFIT
     assert "give the point spread" in why
 
@@ -113,7 +129,7 @@ def test_verdict_names_a_residual_that_is_no_noise(
     strength: float, cause: str, expected: Verdict
 ) -> None:
     pattern = Pattern(np.array([0.5, strength]), cause=cause)
-    verdict, why = assess_verdict(**GOOD | {"pattern": pattern})
+    verdict, why = assess(**GOOD | {"pattern": pattern})
     assert verdict is expected
     if expected is Verdict.MISFIT:
         assert f"image 2: {strength:.0f} " in why
@@ -123,7 +139,7 @@ def test_verdict_names_a_residual_that_is_no_noise(
 
 def test_verdict_takes_a_pattern_of_a_cut_object_for_the_edge() -> None:
     cut = {"displacement": blob((24, 46)), "pattern": Pattern(np.array([0.0, 40.0]))}
-    verdict, why = assess_verdict(**GOOD | cut)
+    verdict, why = assess(**GOOD | cut)
     assert verdict is Verdict.EDGE
     assert "larger field of view" in why
     assert "no noise" in why
@@ -134,18 +150,18 @@ def test_verdict_finds_a_field_that_is_turned_back_on_all_sides() -> None:
     y, x = (np.indices((48, 48)) - 23.5) / 20
     outward = 0.1 * np.stack([y, x]) * np.exp(-((y**2 + x**2) ** 4) / 8)
     displacement = blob((24, 24)) + outward
-    verdict, why = assess_verdict(**GOOD | {"displacement": displacement})
+    verdict, why = assess(**GOOD | {"displacement": displacement})
     assert verdict is Verdict.EDGE
     assert "on all sides" in why
     masked = np.ones((48, 48), bool)
     masked[:, :8] = False
     at_mask = {"displacement": displacement, "used": masked}
-    assert assess_verdict(**GOOD | at_mask)[0] is Verdict.DETERMINED
+    assert assess(**GOOD | at_mask)[0] is Verdict.DETERMINED
 
 
 @pytest.mark.parametrize(("hidden", "expected"), [(0.3, "determined"), (0.8, "too uncertain")])
 def test_verdict_names_a_mask_over_the_strongest_structure(hidden: float, expected: str) -> None:
-    verdict, why = assess_verdict(**GOOD | {"hidden": hidden})
+    verdict, why = assess(**GOOD | {"hidden": hidden})
     assert verdict == expected
     assert ("mask hides" in why) == (hidden > 0.5)
 
@@ -153,7 +169,7 @@ def test_verdict_names_a_mask_over_the_strongest_structure(hidden: float, expect
 @pytest.mark.parametrize(("share", "expected"), [(0.03, "determined"), (0.2, "too uncertain")])
 def test_verdict_asks_for_the_beam_where_it_was_assumed(share: float, expected: str) -> None:
     beam = BeamError(sensitivity=0.1, variation=0.05, share=share, scale=0.25, assumed=True)
-    verdict, why = assess_verdict(**GOOD | {"beam": beam})
+    verdict, why = assess(**GOOD | {"beam": beam})
     assert verdict == expected
     if share > 0.05:
         # √(0.05² - 0.02²) / 0.1
@@ -172,85 +188,84 @@ def test_verdict_says_that_bars_beyond_deep_folds_are_small(
     jacobian = np.ones((48, 48))
     for place in of_object[: round(share * len(of_object))]:
         jacobian[tuple(place)] = -0.5
-    verdict, why = assess_verdict(**GOOD | {"jacobian": jacobian, "beam_unknown": beam_unknown})
+    verdict, why = assess(**GOOD | {"jacobian": jacobian, "beam_unknown": beam_unknown})
     assert verdict is Verdict.DETERMINED
     assert words in why
     assert ("deep folds" in why) == bool(words)
 
 
 def test_verdict_says_how_correlated_noise_widens_the_bars() -> None:
-    verdict, why = assess_verdict(
-        **GOOD | {"pattern": Pattern(np.array([0.0, 0.0]), correlation=1.0)}
-    )
+    verdict, why = assess(**GOOD | {"pattern": Pattern(np.array([0.0, 0.0]), correlation=1.0)})
     assert verdict is Verdict.DETERMINED
     assert "correlated over 1.0 px" in why
     assert "3.5 times" in why
 
 
 def test_unknown_error_bars_do_not_speak_against_a_field() -> None:
-    verdict, why = assess_verdict(**GOOD | {"uncertainty": float("nan")})
+    verdict, why = assess(**GOOD | {"uncertainty": float("nan")})
     assert verdict is Verdict.DETERMINED
     assert "error bars were not" in why
 
 
 @pytest.mark.parametrize(
-    ("column", "uniform", "free", "expected"),
+    ("column", "uniform", "boundary", "expected"),
     [
-        (24, 0.0, False, Verdict.DETERMINED),
-        (24, 0.2, False, Verdict.DETERMINED),
-        (24, 0.5, False, Verdict.EDGE),  # by what lies beyond
-        (24, 0.5, True, Verdict.DETERMINED),
-        (24, 5.0, True, Verdict.EDGE),
-        (9, 0.0, True, Verdict.EDGE),
+        (24, 0.0, "fading", Verdict.DETERMINED),
+        (24, 0.2, "fading", Verdict.DETERMINED),
+        (24, 0.5, "fading", Verdict.EDGE),  # by what lies beyond
+        (24, 0.5, "free", Verdict.DETERMINED),
+        (24, 5.0, "free", Verdict.EDGE),
+        (9, 0.0, "free", Verdict.EDGE),
     ],
 )
 def test_a_field_that_the_edge_cuts_is_told(
-    column: int, uniform: float, free: bool, expected: Verdict
+    column: int, uniform: float, boundary: Literal["fading", "free"], expected: Verdict
 ) -> None:
     displacement = blob((24, column)) + np.array([0, uniform])[:, None, None]
-    verdict, why = assess_verdict(**GOOD | {"displacement": displacement, "edge_is_free": free})
+    options = FitOptions(boundary=boundary)
+    verdict, why = assess(**GOOD | {"displacement": displacement, "options": options})
     assert verdict is expected
-    assert ("free boundary" in why) == (expected is Verdict.EDGE and not free)
+    assert ("free boundary" in why) == (expected is Verdict.EDGE and boundary == "fading")
 
 
 def test_an_object_that_the_edge_cuts_is_told_where_its_field_comes_out_too_weak() -> None:
     """By its divergence, which the image shows."""
     displacement = blob((24, 24)) + 0.27 * blob((24, 2))
-    assert assess_verdict(**GOOD | {"displacement": displacement})[0] is Verdict.EDGE
-    free = {"displacement": displacement, "edge_is_free": True}
-    assert assess_verdict(**GOOD | free)[0] is Verdict.DETERMINED
+    assert assess(**GOOD | {"displacement": displacement})[0] is Verdict.EDGE
+    free = {"displacement": displacement, "options": FitOptions(boundary="free")}
+    assert assess(**GOOD | free)[0] is Verdict.DETERMINED
 
 
 def test_a_search_that_was_cut_short_determines_nothing() -> None:
-    verdict, why = assess_verdict(**GOOD | {"ended": False})
+    verdict, why = assess(**GOOD | {"ended": False})
     assert verdict is Verdict.UNCERTAIN
     assert "allow more" in why
 
 
 def test_rays_that_one_image_has_lost_leave_it_open() -> None:
     away = {"displacement": 12 * blob((24, 40))}
-    verdict, why = assess_verdict(**GOOD | ALONE | away)
+    verdict, why = assess(**GOOD | ALONE | away)
     assert verdict is Verdict.AMBIGUOUS
     assert "past the image" in why
-    assert assess_verdict(**GOOD | away)[0] is Verdict.EDGE
+    assert assess(**GOOD | away)[0] is Verdict.EDGE
 
 
 def test_an_unknown_beam_is_determined_by_several_images() -> None:
-    assert assess_verdict(**GOOD | {"beam_unknown": True})[0] is Verdict.DETERMINED
+    assert assess(**GOOD | {"beam_unknown": True})[0] is Verdict.DETERMINED
 
 
 def test_an_image_that_is_not_explained_is_named() -> None:
-    verdict, why = assess_verdict(**GOOD | {"chi2": np.array([1.1, 4.23])})
+    verdict, why = assess(**GOOD | {"chi2": np.array([1.1, 4.23])})
     assert verdict is Verdict.MISFIT
     assert "image 2: χ² 4.2" in why
     assert "image 1" not in why
     assert "between images" in why
-    _, alone = assess_verdict(**GOOD | ALONE | {"chi2": np.array([1.8])})
+    _, alone = assess(**GOOD | ALONE | {"chi2": np.array([1.8])})
     assert "between images" not in alone
 
 
 def test_one_image_does_not_tell_an_unknown_beam() -> None:
-    verdict, why = assess_verdict(**GOOD | ALONE | {"beam_unknown": True})
+    verdict, why = assess(**GOOD | ALONE | {"beam_unknown": True})
     assert verdict is Verdict.AMBIGUOUS
     assert "beam" in why
 
@@ -269,15 +284,15 @@ def test_one_image_does_not_tell_where_rays_meet_or_cross(
         jacobian[tuple(place)] = value
     used = np.ones(displacement.shape[1:], bool)
     changes = {"jacobian": jacobian, "displacement": displacement, "used": used}
-    verdict, why = assess_verdict(**GOOD | ALONE | changes)
+    verdict, why = assess(**GOOD | ALONE | changes)
     assert verdict.startswith(expected)
     assert ("5% of the object" in why) == (share > 0.02)
-    assert assess_verdict(**GOOD | changes)[0] is Verdict.DETERMINED  # several images tell
+    assert assess(**GOOD | changes)[0] is Verdict.DETERMINED  # several images tell
 
 
 def test_several_fields_that_explain_as_well_are_told() -> None:
     solutions = [(0.01, 0.2), (0.02, 0.31), (0.005, 0.01), (0.5, 0.9)]
-    verdict, why = assess_verdict(**GOOD | {"others": solutions})
+    verdict, why = assess(**GOOD | {"others": solutions})
     assert verdict is Verdict.SEVERAL
     assert why.startswith("3 different fields")  # one is the same, one explains worse
     assert "31%" in why
@@ -287,11 +302,11 @@ def test_several_fields_that_explain_as_well_are_told() -> None:
 def test_other_fields_do_not_matter_if_they_are_worse_or_the_same(
     other: tuple[float, float],
 ) -> None:
-    assert assess_verdict(**GOOD | {"others": [other]})[0] is Verdict.DETERMINED
+    assert assess(**GOOD | {"others": [other]})[0] is Verdict.DETERMINED
 
 
 def test_noise_that_leaves_much_open_is_told() -> None:
-    verdict, why = assess_verdict(**GOOD | {"uncertainty": 0.12})
+    verdict, why = assess(**GOOD | {"uncertainty": 0.12})
     assert verdict is Verdict.UNCERTAIN
     assert "12%" in why
 
@@ -299,10 +314,7 @@ def test_noise_that_leaves_much_open_is_told() -> None:
 def test_the_gravest_doubt_comes_first() -> None:
     """Images that are not explained, then one image, then other fields, then noise."""
     all_of_them = GOOD | ALONE | {"beam_unknown": True, "others": [(0.0, 0.5)], "uncertainty": 0.5}
-    assert assess_verdict(**all_of_them | {"chi2": np.array([9.0])})[0] is Verdict.MISFIT
-    assert assess_verdict(**all_of_them)[0] is Verdict.AMBIGUOUS
-    assert assess_verdict(**all_of_them | {"beam_unknown": False})[0] is Verdict.SEVERAL
-    assert (
-        assess_verdict(**all_of_them | {"beam_unknown": False, "others": []})[0]
-        is Verdict.UNCERTAIN
-    )
+    assert assess(**all_of_them | {"chi2": np.array([9.0])})[0] is Verdict.MISFIT
+    assert assess(**all_of_them)[0] is Verdict.AMBIGUOUS
+    assert assess(**all_of_them | {"beam_unknown": False})[0] is Verdict.SEVERAL
+    assert assess(**all_of_them | {"beam_unknown": False, "others": []})[0] is Verdict.UNCERTAIN

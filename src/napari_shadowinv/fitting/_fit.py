@@ -630,23 +630,19 @@ def _result(
     folded = float((jacobian < 0).mean())
     rivals = [(basin.objective / basins[0].objective - 1, basin.distance) for basin in basins[1:]]
     verdict, explanation = assess_verdict(
+        report,
+        options,
         chi2=chi2,
         names=_names(data.setups, len(images)),
         others=rivals,
         single=data.single,
         beam_unknown=scene.beam_modes > 0,
         jacobian=jacobian,
-        uncertainty=uncertainty,
-        ended=report.converged,
         gain_by_blur=blur_gain,
         pattern=pattern,
-        beam=beam,
         displacement=displacements.sum(axis=0),
         used=np.asarray(used.any(axis=0)),
         hidden=hidden_contrast(model / np.maximum(beams, _DARKEST * units) - 1, used),
-        edge_is_free=options.boundary == "free",
-        parts=parts,
-        max_error=options.max_error,
         searched=data.near is None,
     )
     return Fit(

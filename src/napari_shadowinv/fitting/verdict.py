@@ -7,7 +7,7 @@ as well. `hidden_contrast` finds masks that hide the structure that determines a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import ndimage
@@ -17,13 +17,14 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting.instrument import TITLES
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
-from napari_shadowinv.fitting.posterior import BeamError
+from napari_shadowinv.fitting.result import FitReport
 from napari_shadowinv.fitting.search import SMALL_PX
 from napari_shadowinv.inversion.solution_checks import (
     TURNED_BACK,
     inner_sides,
     turning_displacement,
 )
+from napari_shadowinv.options import FitOptions
 
 __all__ = ["assess_verdict", "hidden_contrast"]
 
@@ -104,6 +105,8 @@ _SMOOTHED, _FROM_EDGE = 2.0, 2  # px
 
 
 def assess_verdict(
+    report: FitReport,
+    options: FitOptions,
     *,
     chi2: FloatArray,
     names: Sequence[str],
@@ -111,23 +114,21 @@ def assess_verdict(
     single: bool,
     beam_unknown: bool,
     jacobian: FloatArray,
-    uncertainty: float,
-    ended: bool,
     gain_by_blur: float,
     pattern: Pattern,
-    beam: BeamError | None,
     displacement: FloatArray,
     used: BoolArray,
     hidden: float,
-    edge_is_free: bool,
-    parts: Mapping[str, float],
-    max_error: float,
     searched: bool = True,
 ) -> tuple[Verdict, str]:
     """Return the verdict on a fit, and a sentence that says why.
 
     Parameters
     ----------
+    report : FitReport
+        Errors of the displacement, response to the beam, and convergence.
+    options : FitOptions
+        Boundary and largest total error of a determined fit.
     chi2 : ndarray, shape (L,)
         Of each image.
     names : sequence of str
@@ -140,31 +141,21 @@ def assess_verdict(
         Whether the beam is fitted, too.
     jacobian : ndarray, shape (H, W)
         Determinant of the map to the image where it is folded most.
-    uncertainty : float
-        R.m.s. standard deviation of the displacement as a share of it; NaN if it is not known.
-    ended : bool
-        Whether the search for the best field ended before its last step.
     gain_by_blur : float
         By how much a wider point spread lowers the objective.
     pattern : Pattern
         Structure in the residuals.
-    beam : BeamError or None
-        Response of the displacement to a beam that differs from its source, if known.
     displacement : ndarray, shape (2, H, W)
         Sum over all fields in the first image, px.
     used : ndarray of bool, shape (H, W)
         The pixels that were fitted in any image.
     hidden : float
         Contrast around the mask's holes as a share of the strongest; see `hidden_contrast`.
-    edge_is_free : bool
-        Whether the field was let go on beyond the edge.
-    parts : mapping of str to float
-        What the uncertainty is made of, the largest first; empty without an instrument.
-    max_error : float
-        Largest total error of a determined fit, as a share of the displacement.
     searched : bool, default True
         Whether the fit has started from several fields.
     """
+    uncertainty, parts, beam = report.uncertainty, report.parts, report.beam
+    max_error = options.max_error
     if worst := _those(names, chi2, chi2 > _MISFIT):
         causes = "noise, source (uniform, measured or unknown) or point spread may be wrong"
         if len(chi2) > 1:
@@ -202,7 +193,7 @@ def assess_verdict(
             "which came from where: the same bright lines come from fields with other folds; take "
             "another energy"
         )
-    at_edge = _edge_text(displacement, used, edge_is_free)
+    at_edge = _edge_text(displacement, used, options.boundary == "free")
     if pattern.is_certain:
         # An object that the edge cuts leaves a pattern, too.
         verdict = Verdict.EDGE if at_edge else Verdict.MISFIT
@@ -249,7 +240,7 @@ def assess_verdict(
             f"measure the beam to {allowed:.1g} % and give it as the source, state its variation, "
             "or fit it with several energies, as a source that is unknown"
         )
-    if not ended:
+    if not report.converged:
         return Verdict.UNCERTAIN, (
             "the search reached its maximum number of iterations before it ended: allow more"
         )
