@@ -21,7 +21,6 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
-from napari_shadowinv.fitting.descent import coarser
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import (
     EXACT,
@@ -54,7 +53,6 @@ from napari_shadowinv.fitting.posterior import (
 )
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.search import (
-    MIDDLE_SPACING,
     SMALL_PX,
     Minimum,
     Start,
@@ -387,7 +385,7 @@ def _find_openness(
     """Draw samples around the best unknowns."""
 
     def posterior_with(scene: Scene, start: Minimum, modes: SoftModes | None = None) -> Posterior:
-        middle = replace(coarser(scene, best.bin), spacing=_SPACING_OF_SAMPLES)
+        middle = best.coarsen(scene, _SPACING_OF_SAMPLES)
         ends = _with_numbers(scene, start).unknowns
         return Posterior(middle, ends, rng, lambda: on_step("samples", best.value), modes)
 
@@ -536,7 +534,6 @@ def _basins(
     Smoother fields have decided which is best: the present λ favours what follows the
     noise.
     """
-    middle = replace(coarser(scene, best.bin), spacing=MIDDLE_SPACING)
     ends = [best]
     for minimum in others[:2]:
         rival = minimum if minimum.bin == best.bin else in_recorded_pixels(scene, minimum)
@@ -545,6 +542,7 @@ def _basins(
         )
         rival = replace(rival, unknowns=unknowns)
         ends.append(settle_minimum(scene, rival, on_step, "other starts"))
+    middle = best.coarsen(scene)
     chi2 = [float(middle.chi2(end.unknowns).mean()) for end in ends]
     return tuple(
         Basin(end.start, end.value, each, best.distance(end), end.displacement)

@@ -21,7 +21,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting._fit import collect_starts, report_steps, reweight_counts
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
-from napari_shadowinv.fitting.descent import coarser, finer, settle
+from napari_shadowinv.fitting.descent import finer, settle
 from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.measurements import FitData, collect_data
 from napari_shadowinv.fitting.posterior import Posterior
@@ -29,8 +29,6 @@ from napari_shadowinv.fitting.rays import at_rest
 from napari_shadowinv.fitting.search import (
     COARSE_GAIN,
     FIRST_SMOOTHNESS,
-    MIDDLE,
-    MIDDLE_SPACING,
     SMOOTHNESS_RATIO,
     Minimum,
     estimate_smoothness,
@@ -324,8 +322,7 @@ class _Work:
             start, sampled = finer(coarse.unknowns), (fine, unknowns)
             large = fine.images.size > _MAX_SAMPLED_PIXELS
             if large:
-                middle = replace(coarser(scene.only(members), MIDDLE), spacing=MIDDLE_SPACING)
-                sampled = middle, coarse.unknowns.only(members)
+                sampled = coarse.coarsen(scene.only(members)), coarse.unknowns.only(members)
         rng = np.random.default_rng(self._options.seed)
         posterior = Posterior(
             *sampled, rng, lambda: self._on_step(_name(members), value), linear=linear
@@ -400,8 +397,7 @@ class _Work:
 
     @staticmethod
     def _chi2_in_middle(scene: Scene, minimum: Minimum, members: list[int]) -> FloatArray:
-        middle = replace(coarser(scene.only(members), MIDDLE), spacing=MIDDLE_SPACING)
-        return middle.chi2(minimum.unknowns.only(members))
+        return minimum.coarsen(scene.only(members)).chi2(minimum.unknowns.only(members))
 
 
 def _linear_of(k: int, scene: Scene, unknowns: Unknowns, joint: _JointFit | None) -> Linear:

@@ -22,17 +22,10 @@ from napari_shadowinv.inversion.machine_code import compilation_frequency
 
 __all__ = ["ensure_compiled", "is_compiled"]
 
-_KERNELS: tuple[Any, ...] = (
-    _ray_kernels.deposit,
-    _ray_kernels.add_corners,
-    _ray_kernels.gather,
-    _ray_kernels.boxes,
-    _ray_kernels.collect,
-    _ray_kernels.merge,
-    _ray_kernels.normal_times,
-    _ray_kernels.rows_times,
-    _ray_kernels.transpose_times,
-    _ray_kernels.add_ties,
+_KERNELS: tuple[Any, ...] = tuple(
+    kernel
+    for name, kernel in vars(_ray_kernels).items()
+    if hasattr(kernel, "py_func") and not name.startswith("_")
 )
 _SIZE = (8, 8)
 

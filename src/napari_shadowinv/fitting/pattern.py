@@ -24,14 +24,12 @@ from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnStep, run_in_parallel
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes
-from napari_shadowinv.fitting.descent import coarser
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import strengths_of
-from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.search import (
-    MIDDLE_SPACING,
     SMOOTHNESS_RATIO,
     Minimum,
+    posterior_of,
     settle_minimum,
 )
 from napari_shadowinv.fitting.unknowns import Unknowns
@@ -333,7 +331,7 @@ def name_cause(
     on_step : callable
         Receives the stage and the objective.
     """
-    pixels = replace(coarser(scene, best.bin), spacing=MIDDLE_SPACING)
+    pixels = best.coarsen(scene)
     misfit = pixels.chi2(best.unknowns) - 1
     excess = float((misfit * (pixels.weights > 0).sum(axis=(1, 2))).sum())
     rivals = list(_rivals(scene, best, names, setups))
@@ -389,11 +387,8 @@ def log_evidence(
     if options.smoothness is None:
         scene = replace(scene, smoothness=scene.smoothness / SMOOTHNESS_RATIO)
     ended = settle_minimum(scene, best, on_step, "evidence", least_gain=0.1)
-    middle = replace(coarser(scene, best.bin), spacing=MIDDLE_SPACING)
     chances = [np.random.default_rng([options.seed, crc32(name.encode())]) for name in names]
-    report = partial(on_step, "evidence", ended.value)
-    posterior = Posterior(middle, ended.unknowns, chances[0], report)
-    return posterior.log_evidence(chances)
+    return posterior_of(scene, ended, chances[0], on_step, "evidence").log_evidence(chances)
 
 
 def _rivals(

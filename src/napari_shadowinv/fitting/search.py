@@ -32,27 +32,25 @@ from napari_shadowinv.physics.poisson import border_mean
 __all__ = [
     "COARSE_GAIN",
     "FIRST_SMOOTHNESS",
-    "MIDDLE",
-    "MIDDLE_SPACING",
     "SMALL_PX",
     "SMOOTHNESS_RATIO",
     "Minimum",
     "Start",
     "estimate_smoothness",
     "in_recorded_pixels",
+    "posterior_of",
     "refine_minimum",
     "search",
     "settle_minimum",
 ]
 
-MIDDLE = 2  # pixels in which starts are compared and λ is found
 FIRST_SMOOTHNESS = np.array([50.0, 2000.0])  # λ and κ
 _COARSE_SMOOTHNESS = 3.0  # times that, before the data have told
 _COARSE_STEPS, COARSE_GAIN, _FINE_GAIN = 60, 3.0, 2.0
 _LAST_GAIN = 0.5  # in pixels of two, where it costs little
 _HELD_BEAM = 0.01  # spread of an unknown beam's cosines before the field has been found
 _HOPELESS, _CONTINUED = 3.0, 3  # times the best objective; at most so many go on
-_COARSE_SPACING, MIDDLE_SPACING = 1 / 3, 0.25
+_COARSE_SPACING, _MIDDLE_SPACING = 1 / 3, 0.25
 _BLURRED, _SPACING_OF_BLURRED = 2.0, 0.5  # px: so wide a blur hides how far apart rays are
 _SPACINGS, _EXPLAINED = (0.2, 0.14), 1.05  # px, and the χ² for which the first is dense enough
 # With an instrument's numbers, an error of the model far below the noise changes the field.
@@ -103,6 +101,10 @@ class Minimum:
         for _ in range(int(np.log2(self.bin // bin))):
             unknowns = finer(unknowns)
         return unknowns
+
+    def coarsen(self, scene: Scene, spacing: float = _MIDDLE_SPACING) -> Scene:
+        """Return a scene in the pixels of this minimum."""
+        return replace(coarser(scene, self.bin), spacing=spacing)
 
     def distance(self, other: Minimum) -> float:
         """Return how far another displacement is from this one, relative to it (r.m.s.)."""
@@ -270,7 +272,7 @@ def _settle_smoothness(
 ) -> tuple[FloatArray, Scene, Minimum]:
     """Find the likeliest λ and κ; also returns the scene and the minimum of the last before."""
     for _ in range(_ROUNDS):
-        likely, change = _posterior(scene, end, rng, on_step).likely_smoothness()
+        likely, change = posterior_of(scene, end, rng, on_step).likely_smoothness()
         smoothness = likely / smoothness_in_pixels(end.bin)
         if change < _SETTLED:
             break
@@ -301,7 +303,7 @@ def _settle_response(
     """Find the numbers that change the response to fields, and how uncertain they are."""
     turns, before = 1, None
     for _ in range(rounds):
-        response = _posterior(scene, end, rng, on_step).response(_PAIRS)
+        response = posterior_of(scene, end, rng, on_step).response(_PAIRS)
         mean, precision = _mean_of_numbers(response)
         remaining = np.maximum(mean, scene.least_numbers()) - response.numbers
         # Steps that turn back hover about their end: their mean is nearer to it.
@@ -332,10 +334,16 @@ def _mean_of_numbers(response: Response) -> tuple[FloatArray, FloatArray]:
     return np.linalg.solve(precision, weights @ pull), precision
 
 
-def _posterior(scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep) -> Posterior:
-    middle = replace(coarser(scene, end.bin), spacing=MIDDLE_SPACING)
-    report = partial(on_step, "smoothness", end.value)
-    return Posterior(middle, end.unknowns, rng, report, end.modes)
+def posterior_of(
+    scene: Scene,
+    end: Minimum,
+    rng: np.random.Generator,
+    on_step: OnStep,
+    stage: str = "smoothness",
+) -> Posterior:
+    """Return the Gaussian around a minimum of a scene, in its pixels."""
+    report = partial(on_step, stage, end.value)
+    return Posterior(end.coarsen(scene), end.unknowns, rng, report, end.modes)
 
 
 def settle_minimum(
@@ -349,7 +357,7 @@ def settle_minimum(
     is_rough: bool = False,
 ) -> Minimum:
     """Return where a descent ends with other λ and κ, in the minimum's pixels, without blur."""
-    middle = replace(coarser(scene, minimum.bin), spacing=MIDDLE_SPACING)
+    middle = minimum.coarsen(scene)
     unknowns, value, _, _ = settle(
         middle,
         minimum.unknowns,
