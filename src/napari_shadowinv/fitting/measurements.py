@@ -25,7 +25,7 @@ from napari_shadowinv._system.arrays import (
 )
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
-from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import Around, imperfect_instrument
@@ -369,12 +369,7 @@ def _checked_mask(
         used = as_numbers("mask", mask) != 0
         if valid is not None:
             used &= valid
-        if used.shape not in (data.shape, data.shape[1:]):
-            raise InputError(
-                f"mask has shape {used.shape}: expected {data.shape[1:]} or {data.shape}, like the "
-                "images"
-            )
-        used = np.broadcast_to(used, data.shape)
+        used = _like_images("mask", used, data)
     if exposed is not None:
         used = used & exposed
     for name, image, plane in zip(names, data, used, strict=True):
@@ -389,6 +384,16 @@ def _checked_mask(
         if not image[plane].mean() > 0:
             raise InputError(f"{name} has no flux: expected a beam; check its background")
     return used
+
+
+def _like_images(name: str, values: AnyArray, data: FloatArray) -> AnyArray:
+    """Return values for each image, from as many or from a plane for all of them."""
+    if values.shape not in (data.shape, data.shape[1:]):
+        raise InputError(
+            f"{name} has shape {values.shape}: expected {data.shape[1:]} or {data.shape}, like the "
+            "images"
+        )
+    return np.broadcast_to(values, data.shape)
 
 
 def _checked_strengths(strengths: ArrayLike, count: int) -> FloatArray:
@@ -521,17 +526,12 @@ def _checked_source(source: Any, data: FloatArray, used: BoolArray) -> FloatArra
             raise InputError(f"source is {source!r}: expected an array, None or 'unknown'")
         levels = [image[use].mean() for image, use in zip(data, used, strict=True)]
         return np.asarray(np.ones(data.shape) * np.array(levels)[:, None, None])
-    beams = as_numbers("source", source)
-    if beams.shape not in (data.shape, data.shape[1:]):
-        raise InputError(
-            f"source has shape {beams.shape}: expected {data.shape[1:]} or {data.shape}, like the "
-            "images"
-        )
+    beams = _like_images("source", as_numbers("source", source), data)
     if not np.isfinite(beams).all() or beams.min() < 0 or not beams.any():
         raise InputError(
             "source has pixels that are negative or not finite, or no flux: expected a beam"
         )
-    return np.array(np.broadcast_to(beams, data.shape))
+    return np.array(beams)
 
 
 def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
