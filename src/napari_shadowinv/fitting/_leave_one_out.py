@@ -194,7 +194,8 @@ class _Work:
             usual = SMOOTHNESS_RATIO * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1))
             scene = replace(scene, smoothness=usual)
         alone = self._run_for_each(
-            self._all, partial(_Work._settle_alone, scene=scene, begun=begun)
+            self._all,
+            lambda work, k: work._settle_members(scene, begun, [k], f"image {k + 1} alone"),
         )
         most: list[int] = []
         remaining = self._all
@@ -203,9 +204,6 @@ class _Work:
             most = max(most, group, key=len)
             remaining = [k for k in remaining if k not in group]
         return most
-
-    def _settle_alone(self, k: int, scene: Scene, begun: Minimum) -> Minimum:
-        return self._settle_members(scene, begun, [k], f"image {k + 1} alone")
 
     def _settle_without(self, k: int, scene: Scene, minimum: Minimum, group: list[int]) -> Minimum:
         """Fit a group but for one image; unknowns of all are kept, so that each can come back."""
@@ -252,8 +250,9 @@ class _Work:
         Larger pixels may set aside too many: images that the others predict are added again.
         """
         joint = self._fit_jointly(scene, common, agreeing)
-        alone = partial(_Work._fit_alone, scene=scene, common=common, joint=joint)
-        own_fits = self._run_for_each(self._all, alone)
+        own_fits = self._run_for_each(
+            self._all, lambda work, k: work._fit_alone(k, scene, common, joint)
+        )
         predictions: dict[int, _Prediction] = {}
         while outside := [k for k in self._all if k not in agreeing]:
             fit = self._sample_fit(scene, common, agreeing, joint)
