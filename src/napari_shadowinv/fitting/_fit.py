@@ -612,7 +612,7 @@ def _result(
     if by_beam is not None:
         beam = BeamError(
             sensitivity=largest_share(by_beam.by_percent, displacements),
-            variation=by_beam.variation,
+            variation=data.beam.rms,
             share=largest_share(by_beam.errors, displacements),
             scale=data.beam.length,
             assumed=data.assumed,

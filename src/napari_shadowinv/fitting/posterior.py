@@ -635,11 +635,10 @@ def _spread(
 class BeamShifts:
     """Standard deviations of each field's displacement by its beam in px, (M, 2, H, W).
 
-    `by_percent` is for beams that vary by 1 %. `errors` is for beams that vary by `variation`, as
-    far as the images do not exclude them, of which `changes` are random examples.
+    `by_percent` is for beams that vary by 1 %. `errors` is for beams that vary as far as is stated
+    or assumed, and the images do not exclude, of which `changes` are random examples.
     """
 
-    variation: float
     by_percent: FloatArray
     errors: FloatArray
     changes: tuple[Unknowns, ...] = ()
@@ -674,15 +673,15 @@ def shifts_by_beam(
     changes = posterior.moved_by_beams([0.01 * each for each in variations])
     by_percent = _spread(scene, changes, data.size, length / 3)
     if not variation:
-        return BeamShifts(variation, by_percent, 0 * by_percent)
+        return BeamShifts(by_percent, 0 * by_percent)
     if not data.common:
         scale = 100 * variation
         scaled = tuple(change.like(scale * change.flat()) for change in changes)
-        return BeamShifts(variation, by_percent, scale * by_percent, scaled)
+        return BeamShifts(by_percent, scale * by_percent, scaled)
     # Several images exclude most of the beams that would move the field far.
     changes = posterior.open_beams(variation, samples[: max(_OPEN_BEAM_SAMPLES, enough)], rng)
     errors = _spread(scene, changes, data.size, length / 3)
-    return BeamShifts(variation, by_percent, errors, tuple(changes))
+    return BeamShifts(by_percent, errors, tuple(changes))
 
 
 def sampled_potentials(
