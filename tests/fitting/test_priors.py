@@ -122,7 +122,7 @@ def test_smoothness_holds_the_squared_derivatives_of_a_cosine(which: int, power:
     """½ λ ∫ |k⁴ a cos(kx)|², half of that on average, for λ; k⁶ for κ."""
     smoothness = np.zeros((1, 2))
     smoothness[0, which] = 7.0
-    prior = Prior(RayModel(SIZE, PAD), np.ones(1), smoothness, 0.0, np.inf, 0, 0.3, None, 1)
+    prior = Prior(rays=RayModel(SIZE, PAD), strengths=np.ones(1), smoothness=smoothness, tie=0.0)
     rows, columns = prior.rays.shape
     like = nothing(prior)
     wave = np.pi * 5 / (columns * KNOT)
@@ -133,7 +133,13 @@ def test_smoothness_holds_the_squared_derivatives_of_a_cosine(which: int, power:
 
 
 def test_the_strip_ties_the_potential_and_the_image_does_not() -> None:
-    prior = Prior(RayModel(SIZE, PAD), np.ones(1), np.zeros((1, 2)), 2.0, 15.0, 0, 0.3, None, 1)
+    prior = Prior(
+        rays=RayModel(SIZE, PAD),
+        strengths=np.ones(1),
+        smoothness=np.zeros((1, 2)),
+        tie=2.0,
+        decay=15.0,
+    )
     y, x = places(prior)
     inside, outside = nothing(prior), nothing(prior)
     inside.potentials[0] = np.maximum(0, 1 - ((y - 12) ** 2 + (x - 16) ** 2) / 60)

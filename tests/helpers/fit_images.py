@@ -10,12 +10,15 @@ from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting import FitShot
+from napari_shadowinv.fitting.forward import Linear
+from napari_shadowinv.fitting.unknowns import Unknowns
 
 __all__ = [
     "Displacement",
     "bump",
     "counted",
     "distance",
+    "hessian_times",
     "noisy",
     "of_each",
     "on_pixels",
@@ -111,3 +114,10 @@ def distance(found: FloatArray, truth: FloatArray) -> float:
 def of_each(shots: Sequence[FitShot], attribute: str) -> list[Any]:
     """What is known of each image."""
     return [getattr(shot, attribute) for shot in shots]
+
+
+def hessian_times(linear: Linear, change: Unknowns) -> Unknowns:
+    """Return the Gauss-Newton Hessian of a scene times a change of the unknowns."""
+    only_free = linear.scene._only_free
+    free = only_free(change)
+    return only_free(linear.scene.prior.times(free)).plus(linear.normal_times(free))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from typing import NamedTuple, TypeVar
 
@@ -21,7 +21,7 @@ from napari_shadowinv._system.machine import available_threads, results_of
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.fitting.instrument import DARKEST, EXACT, Imperfect, Part, widen, widening
 from napari_shadowinv.fitting.rays import Pulls, RayModel, at_rest
-from napari_shadowinv.fitting.unknowns import AdditiveBlock, Fiducials, Prior, Unknowns
+from napari_shadowinv.fitting.unknowns import Prior, PriorTerms, Unknowns
 
 __all__ = ["Linear", "Scene", "blurred"]
 
@@ -32,9 +32,9 @@ _MOST_PIXELS_SIDE_BY_SIDE = 1 << 16  # more than one larger image at a time take
 _IMAGES_PER_THREAD = 2  # of fewer, the last one would leave threads without work
 
 
-@dataclass(frozen=True)
-class Scene:
-    """Images with all that is known about how they were made, in pixels of one size.
+@dataclass(frozen=True, kw_only=True)
+class Scene(PriorTerms):
+    """Images, all that is known about how they were made, and the prior, in pixels of one size.
 
     Attributes
     ----------
@@ -46,8 +46,6 @@ class Scene:
         Known flux of the beams, as `RayModel.around` returns it.
     psf : sequence of float or ndarray
         Standard deviation in px of each image's point spread, or its kernel.
-    smoothness, tie, decay, beam_modes, beam_spread, shift_spread, fiducials, added
-        See `Prior`; smoothness has the shape (M, 2).
     pad, spacing, threads
         See `RayModel`.
     free_brightness : bool
@@ -56,8 +54,6 @@ class Scene:
         Which numbers of a frame are unknown, but for the first image.
     blur : float
         Standard deviation in px by which residuals are blurred.
-    bin : int
-        Side of a pixel in recorded pixels.
     imperfect : Imperfect
         Standard deviations of an instrument that is not exact.
     held : frozenset of str
@@ -74,21 +70,12 @@ class Scene:
     strengths: FloatArray
     beams: FloatArray
     psf: Sequence[float | FloatArray]
-    smoothness: FloatArray
-    tie: float = 30.0
-    decay: float = np.inf
     pad: int = 16
-    beam_modes: int = 0
-    beam_spread: float = 0.3
     free_brightness: bool = False
     free_frames: BoolArray = field(default_factory=lambda: np.zeros(6, bool))
-    shift_spread: float = 5.0
-    fiducials: Fiducials | None = None
     blur: float = 0.0
     spacing: float = 0.25
-    bin: int = 1
     threads: int | None = None
-    added: tuple[AdditiveBlock, ...] = ()
     imperfect: Imperfect = EXACT
     held: frozenset[str] = frozenset()
     spread: FloatArray | None = None
@@ -117,19 +104,8 @@ class Scene:
     @cached_property
     def prior(self) -> Prior:
         """The prior of the unknowns."""
-        return Prior(
-            rays=self.rays,
-            strengths=self.strengths[0],
-            smoothness=self.smoothness,
-            tie=self.tie,
-            decay=self.decay,
-            beam_modes=self.beam_modes,
-            beam_spread=self.beam_spread,
-            fiducials=self.fiducials,
-            bin=self.bin,
-            shift_spread=self.shift_spread,
-            added=self.added,
-        )
+        terms = {each.name: getattr(self, each.name) for each in fields(PriorTerms)}
+        return Prior(rays=self.rays, strengths=self.strengths[0], **terms)
 
     def nothing(self) -> Unknowns:
         """Return the unknowns of no object in a beam as known."""
@@ -214,12 +190,12 @@ class Scene:
         value, slope = self._priors(unknowns)
         of_shape, strengths = np.zeros(self.beams.shape[1:]), self.strengths_with(unknowns)
         shots = list(self._shots(unknowns, counts))
-        for k, each in enumerate(self._of_each(partial(self._pulls, unknowns), shots)):
-            value += each.value
-            slope.brightness[k] += each.of_brightness
-            self._add_light_pulls(slope, k, each.scaled)
-            each.seen.add_pulls(slope, k, each.scaled)
-            pulls = each.of_rays
+        differentiated = self._of_each(partial(self._pulls, unknowns), shots)
+        for k, (of_image, of_brightness, seen, scaled, pulls) in enumerate(differentiated):
+            value += of_image
+            slope.brightness[k] += of_brightness
+            self._add_light_pulls(slope, k, scaled)
+            seen.add_pulls(slope, k, scaled)
             self._add_potential_pulls(slope, unknowns, strengths[k], k, pulls.potential)
             entering = self._entering(unknowns, k)
             of_shape += self._add_beam_pulls(slope, k, pulls.beam, entering)
@@ -227,8 +203,10 @@ class Scene:
         slope.beam[:] += self._of_modes(of_shape * self._beam_shape(unknowns))
         return value, self._only_free(slope)
 
-    def _pulls(self, unknowns: Unknowns, shot: _Shot) -> _ShotPulls:
-        """Differentiate an image's part of the objective."""
+    def _pulls(
+        self, unknowns: Unknowns, shot: _Shot
+    ) -> tuple[float, float, _Seen, FloatArray, Pulls]:
+        """Differentiate an image's part of the objective: by log brightness, image and rays."""
         k = shot.number
         seen, model, residual = self._misfit(unknowns, shot)
         pull = np.sqrt(self.weights[k]) * blurred(residual, self.blur)
@@ -243,7 +221,7 @@ class Scene:
             of_frame=k > 0 and bool(self.free_frames.any()),
         )
         value = float(np.einsum("yx,yx", residual, residual)) / 2
-        return _ShotPulls(value, seen, scaled, np.einsum("yx,yx", pull, model), of_rays)
+        return value, np.einsum("yx,yx", pull, model), seen, scaled, of_rays
 
     def _of_each(self, function: Callable[[_Shot], _T], shots: Sequence[_Shot]) -> list[_T]:
         """Call a function for each image, side by side if these are small and many."""
@@ -261,10 +239,6 @@ class Scene:
         means = np.where(is_wavy[:, None] & is_wavy, 0.25, 0.5)
         total = np.sqrt((means[weights > 0] / weights[weights > 0]).sum())
         return replace(self, beam_modes=modes, beam_spread=float(variation / total))
-
-    def beam_changes(self, change: Unknowns) -> FloatArray:
-        """Return the change of each image's beam as a share of it, for beams at their sources."""
-        return np.broadcast_to(self._modes(change.beam), self.beams.shape)
 
     def changed_by_beams(
         self, unknowns: Unknowns, counts: list[IntArray], variations: FloatArray
@@ -542,16 +516,6 @@ class _Seen:
             derivatives += np.einsum("yx,yx", pull, values)
 
 
-class _ShotPulls(NamedTuple):
-    """An image's part of the objective, and its derivatives by all that it depends on."""
-
-    value: float
-    seen: _Seen
-    scaled: FloatArray  # by the image without its brightness
-    of_brightness: float
-    of_rays: Pulls
-
-
 @dataclass(frozen=True)
 class Linear:
     """A scene to first order in changes of unknowns.
@@ -579,11 +543,6 @@ class Linear:
             return None
         jacobians, seen = ([each[k] for k in numbers] for each in (self.jacobians, self.seen))
         return Linear(scene, self.unknowns.only(numbers), jacobians, seen)
-
-    def hessian_times(self, change: Unknowns) -> Unknowns:
-        """Return the Gauss-Newton Hessian times a change of the unknowns."""
-        free = self.scene._only_free(change)
-        return self.scene._only_free(self.scene.prior.times(free)).plus(self.normal_times(free))
 
     def normal_times(self, change: Unknowns) -> Unknowns:
         """Return `pull` of `push` of a change of what is free."""

@@ -36,6 +36,7 @@ __all__ = [
     "AdditiveBlock",
     "Fiducials",
     "Prior",
+    "PriorTerms",
     "Unknowns",
     "additive_blocks",
 ]
@@ -180,16 +181,12 @@ _NORMAL = np.array(1.0)  # 1 / s² of the numbers of an instrument
 _STRETCH_SPREAD = 0.05  # of turns, magnifications and shears
 
 
-@dataclass(frozen=True)
-class Prior:
-    """Gaussian prior of the unknowns, in pixels of one size.
+@dataclass(frozen=True, kw_only=True)
+class PriorTerms:
+    """How far unknowns are held, in pixels of one size.
 
     Attributes
     ----------
-    rays : RayModel
-        The rays of all images.
-    strengths : ndarray, shape (M,)
-        Displacement in the first image by each field's displacement.
     smoothness : ndarray, shape (M, 2)
         λ and κ of each field.
     tie, decay : float
@@ -208,17 +205,31 @@ class Prior:
         Unknown light that adds to each image.
     """
 
-    rays: RayModel
-    strengths: FloatArray
     smoothness: FloatArray
-    tie: float
-    decay: float
-    beam_modes: int
-    beam_spread: float
-    fiducials: Fiducials | None
-    bin: int
+    tie: float = 30.0
+    decay: float = np.inf
+    beam_modes: int = 0
+    beam_spread: float = 0.3
+    fiducials: Fiducials | None = None
+    bin: int = 1
     shift_spread: float = 5.0
     added: tuple[AdditiveBlock, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prior(PriorTerms):
+    """Gaussian prior of the unknowns.
+
+    Attributes
+    ----------
+    rays : RayModel
+        The rays of all images.
+    strengths : ndarray, shape (M,)
+        Displacement in the first image by each field's displacement.
+    """
+
+    rays: RayModel
+    strengths: FloatArray
 
     def value_and_slope(self, unknowns: Unknowns) -> tuple[float, Unknowns]:
         """Return the sum of all terms, and its derivatives."""
