@@ -9,8 +9,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.descent import binned, coarser, descend, finer, settle
+from napari_shadowinv.fitting.descent import coarser, descend, finer, settle
 from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.instrument import binned
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
 

@@ -22,12 +22,12 @@ from scipy.fft import dctn, idctn
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
 from napari_shadowinv.fitting.forward import Linear, Scene
+from napari_shadowinv.fitting.instrument import binned
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import POWERS, Fiducials, Unknowns
 
 __all__ = [
     "Preconditioner",
-    "binned",
     "coarser",
     "descend",
     "finer",
@@ -422,13 +422,6 @@ def settle(
         )
         taken += more
     return now, value, taken, taken < steps
-
-
-def binned(planes: FloatArray, factor: int) -> FloatArray:
-    """Return the sums of square blocks of pixels of each plane."""
-    count, height, width = planes.shape
-    blocks = planes.reshape(count, height // factor, factor, width // factor, factor)
-    return np.asarray(blocks.sum(axis=(2, 4)))
 
 
 def coarser(scene: Scene, factor: int) -> Scene:

@@ -28,7 +28,7 @@ from napari_shadowinv.options import BeamPrior, Instrument
 if TYPE_CHECKING:
     from napari_shadowinv.fitting.unknowns import Unknowns
 
-__all__ = ["DARKEST", "EXACT", "Imperfect", "Part", "Shapes", "widen", "widening"]
+__all__ = ["DARKEST", "EXACT", "Imperfect", "Part", "Shapes", "binned", "widen", "widening"]
 
 DARKEST = 1e-4  # of a beam, for a logarithm
 _LEAST_EXPONENT = 0.2
@@ -109,7 +109,8 @@ class ProductShapes:
         along_y, along_x = (
             functions.reshape(len(functions), -1, factor).mean(axis=2) for functions in self.modes
         )
-        outer = None if self.envelope is None else _block_means(self.envelope[None], factor)[0]
+        envelope = self.envelope
+        outer = None if envelope is None else binned(envelope[None], factor)[0] / factor**2
         return ProductShapes((along_y, along_x), self.places, self.means, outer)
 
     def _along(self, image: FloatArray, modes: tuple[FloatArray, FloatArray]) -> FloatArray:
@@ -168,7 +169,7 @@ class Shapes:
     def coarsen(self, factor: int) -> Shapes:
         """Return the same in larger pixels."""
         products = None if self.products is None else self.products.coarsen(factor)
-        return replace(self, planes=_block_means(self.planes, factor), products=products)
+        return replace(self, planes=binned(self.planes, factor) / factor**2, products=products)
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,10 +370,11 @@ def _with_error(row: Sequence[float], sign: str = "") -> str:
     return f"{value:{sign}.{digits}f} ± {error:.{digits}f}"
 
 
-def _block_means(planes: FloatArray, factor: int) -> FloatArray:
+def binned(planes: FloatArray, factor: int) -> FloatArray:
+    """Return the sums of square blocks of pixels of each plane."""
     count, height, width = planes.shape
     blocks = planes.reshape(count, height // factor, factor, width // factor, factor)
-    return np.asarray(blocks.mean(axis=(2, 4)))
+    return np.asarray(blocks.sum(axis=(2, 4)))
 
 
 def widen(image: FloatArray, variance: float) -> FloatArray:
