@@ -156,20 +156,12 @@ class _JointFit:
         return self.linear.only([self.members.index(k) for k in members])
 
 
-@dataclass(frozen=True)
-class _OwnFit:
-    """χ² of an image with a field of its own, and of the noise in it."""
-
-    chi2: float
-    noise_chi2: float
-
-
 class _Work:
     """Context of all steps: images, options, and the callback for progress."""
 
     def __init__(self, data: FitData, options: FitOptions, on_step: OnStep) -> None:
         self._data, self._options, self._on_step = data, options, on_step
-        self._count = len(data.units)
+        self._all = list(range(len(data.units)))
 
     def _run_for_each(self, numbers: list[int], work: Callable[[_Work, int], _T]) -> dict[int, _T]:
         """Call `work(context, number)` for images, in threads."""
@@ -227,10 +219,6 @@ class _Work:
             together = tried[out]
         return left
 
-    @property
-    def _all(self) -> list[int]:
-        return list(range(self._count))
-
     def estimate_smoothness(self, members: list[int], begun: Minimum) -> tuple[Scene, Minimum]:
         """All images with the λ and κ of some, and weights of counts; the field of those."""
         scene = self._data.scene_with(self._options.smoothness)
@@ -250,14 +238,14 @@ class _Work:
         Larger pixels may set aside too many: images that the others predict are added again.
         """
         joint = self._fit_jointly(scene, common, agreeing)
-        own_fits = self._run_for_each(
+        alone = self._run_for_each(
             self._all, lambda work, k: work._fit_alone(k, scene, common, joint)
         )
         predictions: dict[int, _Prediction] = {}
         while outside := [k for k in self._all if k not in agreeing]:
             fit = self._sample_fit(scene, common, agreeing, joint)
             for k in outside:
-                predictions[k] = self._predict(k, agreeing, scene, fit, own_fits[k], None)
+                predictions[k] = self._predict(k, agreeing, scene, fit, alone[k], None)
             back = [k for k in outside if predictions[k].chi2 <= predictions[k].limit]
             if not back:
                 break
@@ -267,7 +255,7 @@ class _Work:
         def predict(work: _Work, k: int) -> _Prediction:
             others = [image for image in agreeing if image != k]
             fit = work._sample_fit(scene, common, others, joint)
-            return work._predict(k, others, scene, fit, own_fits[k], joint)
+            return work._predict(k, others, scene, fit, alone[k], joint)
 
         predictions |= self._run_for_each(agreeing, predict)
         return [predictions[k] for k in self._all]
@@ -338,7 +326,7 @@ class _Work:
         others: list[int],
         scene: Scene,
         fit: _SampledFit,
-        own_fit: _OwnFit,
+        alone: tuple[float, float],
         joint: _JointFit | None,
     ) -> _Prediction:
         """One image, as others predict it."""
@@ -356,18 +344,22 @@ class _Work:
         variance = fit.variance_in(_linear_of(k, scene, unknowns, joint))
         variance += _RAY_VARIANCE_RATIO * _chi2(brightness * image, brightness * rough, weights)
         limit = _MAX_NOISE_RATIO + _MAX_VARIANCE_RATIO * variance
+        own_chi2, noise_chi2 = alone
         return _Prediction(
-            brightness * image, weights, brightness, chi2, own_fit.chi2, limit * own_fit.noise_chi2
+            brightness * image, weights, brightness, chi2, own_chi2, limit * noise_chi2
         )
 
-    def _fit_alone(self, k: int, scene: Scene, common: Minimum, joint: _JointFit | None) -> _OwnFit:
+    def _fit_alone(
+        self, k: int, scene: Scene, common: Minimum, joint: _JointFit | None
+    ) -> tuple[float, float]:
+        """χ² of an image with a field of its own, and of the noise in it."""
         fit = self._sample_fit(scene, common, [k], joint)
         unknowns = fit.unknowns.only([k])
         chi2 = float(fit.scene.chi2(unknowns)[0])
         # A field of an image's own follows the noise by as much as it is left open.
         variance = fit.variance_in(_linear_of(k, fit.scene, unknowns, joint))
         share = min(variance, _MAX_FITTED_SHARE)
-        return _OwnFit(chi2, chi2 / (1 - share))
+        return chi2, chi2 / (1 - share)
 
     def _match_brightness(self, k: int, made: FloatArray, one: Scene) -> tuple[float, FloatArray]:
         """Brightness with which a prediction is nearest to an image, and the pixels' weights."""
