@@ -32,7 +32,6 @@ GOOD: dict[str, Any] = {
     "jacobian": np.ones((48, 48)),
     "uncertainty": 0.02,
     "ended": True,
-    "gain_by_blur": -500.0,
     "pattern": Pattern(np.array([-1.0, 1.0])),
     "beam": None,
     "displacement": blob((24, 24)),
@@ -108,8 +107,9 @@ def test_counts_with_too_little_noise_have_a_dark_level(share: float, expected: 
 
 
 def test_images_that_are_explained_better_with_more_blur_do_not_fit() -> None:
-    assert assess(**GOOD | {"gain_by_blur": 5.0})[0] is Verdict.DETERMINED
-    verdict, why = assess(**GOOD | {"gain_by_blur": 30.0})
+    small, large = (Pattern(np.array([-1.0, 1.0]), blur_gain=gain) for gain in (5.0, 30.0))
+    assert assess(**GOOD | {"pattern": small})[0] is Verdict.DETERMINED
+    verdict, why = assess(**GOOD | {"pattern": large})
     assert verdict is Verdict.MISFIT
     assert "give the point spread" in why
 

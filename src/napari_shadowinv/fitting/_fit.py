@@ -239,8 +239,8 @@ def fit(
             share = pattern.missing_counts - absorbed / np.count_nonzero(scene.weights)
             pattern = replace(pattern, missing_counts=share)
         # With several images the fit is repeated only if the residual asks for it.
-        suspected = data.single or pattern.blur_score > _MIN_BLUR_SCORE
-        blur_gain = gain_by_blur(scene, best, on_step) if suspected else 0.0
+        if data.single or pattern.blur_score > _MIN_BLUR_SCORE:
+            pattern = replace(pattern, blur_gain=gain_by_blur(scene, best, on_step))
         if pattern.is_certain and pattern.chi2 < _MAX_RIVAL_CHI2:
             cause = name_cause(scene, best, fields, data.setups, on_step)
             pattern = replace(pattern, cause=cause)
@@ -291,7 +291,6 @@ def fit(
         openness,
         potentials,
         found_by,
-        blur_gain,
         pattern,
     )
 
@@ -580,7 +579,6 @@ def _result(
     openness: _Openness,
     samples: FloatArray | None,
     report: FitReport,
-    blur_gain: float,
     pattern: Pattern,
 ) -> Fit:
     height, width = data.size
@@ -636,7 +634,6 @@ def _result(
         single=data.single,
         beam_unknown=scene.beam_modes > 0,
         jacobian=jacobian,
-        gain_by_blur=blur_gain,
         pattern=pattern,
         displacement=displacements.sum(axis=0),
         used=np.asarray(used.any(axis=0)),

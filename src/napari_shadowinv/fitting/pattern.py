@@ -212,6 +212,8 @@ class Pattern:
         The largest of all images.
     blur_score : float
         See `blur_score`.
+    blur_gain : float
+        How much a wider point spread lowers the objective; see `gain_by_blur`.
     missing_counts : float
         Share by which the noise is smaller than counts imply, as a dark level of that share
         makes it.
@@ -225,6 +227,7 @@ class Pattern:
     correlation: float = 0.0
     chi2: float = 1.0
     blur_score: float = 0.0
+    blur_gain: float = 0.0
     missing_counts: float = 0.0
     counts_deviation: float = np.inf
     cause: str = ""

@@ -114,7 +114,6 @@ def assess_verdict(
     single: bool,
     beam_unknown: bool,
     jacobian: FloatArray,
-    gain_by_blur: float,
     pattern: Pattern,
     displacement: FloatArray,
     used: BoolArray,
@@ -141,8 +140,6 @@ def assess_verdict(
         Whether the beam is fitted, too.
     jacobian : ndarray, shape (H, W)
         Determinant of the map to the image where it is folded most.
-    gain_by_blur : float
-        By how much a wider point spread lowers the objective.
     pattern : Pattern
         Structure in the residuals.
     displacement : ndarray, shape (2, H, W)
@@ -176,7 +173,7 @@ def assess_verdict(
             "one image cannot tell the beam from the object: many pairs of them explain it; take "
             "another energy, or an image of the beam"
         )
-    if gain_by_blur > _BLURRED:
+    if pattern.blur_gain > _BLURRED:
         return Verdict.MISFIT, (
             "a wider point spread explains the image better: it is blurred by more than the "
             "given one, by source or detector; give the point spread, or source size and "
