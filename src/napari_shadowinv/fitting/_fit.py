@@ -282,16 +282,7 @@ def fit(
         spread_ratio=float("nan") if pairs is None else pairs.spread_ratio,
     )
     return _result(
-        data,
-        fine,
-        unknowns,
-        fields,
-        options,
-        basins,
-        openness,
-        potentials,
-        found_by,
-        pattern,
+        data, fine, unknowns, fields, options, basins, openness, potentials, found_by, pattern
     )
 
 

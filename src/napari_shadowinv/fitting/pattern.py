@@ -26,12 +26,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import strengths_of
-from napari_shadowinv.fitting.search import (
-    SMOOTHNESS_RATIO,
-    Minimum,
-    posterior_of,
-    settle_minimum,
-)
+from napari_shadowinv.fitting.search import SMOOTHNESS_RATIO, Minimum, posterior_of, settle_minimum
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.setup import Setup

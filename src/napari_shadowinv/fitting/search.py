@@ -335,11 +335,7 @@ def _mean_of_numbers(response: Response) -> tuple[FloatArray, FloatArray]:
 
 
 def posterior_of(
-    scene: Scene,
-    end: Minimum,
-    rng: np.random.Generator,
-    on_step: OnStep,
-    stage: str = "smoothness",
+    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep, stage: str = "smoothness"
 ) -> Posterior:
     """Return the Gaussian around a minimum of a scene, in its pixels."""
     report = partial(on_step, stage, end.value)

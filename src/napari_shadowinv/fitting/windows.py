@@ -376,8 +376,7 @@ class FitWindows:
     @property
     def setup(self) -> Setup | None:
         """The experiment of the image to which all displacements belong; None if not known."""
-        first = self.fits[0]
-        return first.setups[0] if first.setups else None
+        return self.fits[0].setup
 
     @property
     def displacement(self) -> FloatArray:
