@@ -168,7 +168,6 @@ def solve(
     *,
     tolerance: float,
     iterations: int,
-    after_step: Callable[[int], None] | None = None,
     modes: SoftModes | None = None,
 ) -> FloatArray:
     """Solve a positive definite system by conjugate gradients, from zero.
@@ -183,8 +182,6 @@ def solve(
         Length of the residual relative to the right side.
     iterations : int
         Most steps.
-    after_step : callable, optional
-        Receives the number of steps.
     modes : SoftModes, optional
         Of nearly the same matrix; modes of this solution are added.
     """
@@ -206,7 +203,5 @@ def solve(
         direction = turned + ratio * direction
         history.add(*before, share, ratio)
         steps += 1
-        if after_step is not None:
-            after_step(steps)
     modes.learn(history)
     return solution
