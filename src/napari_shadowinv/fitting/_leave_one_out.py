@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -111,8 +111,7 @@ def leave_one_out(
     return _result(data, predictions)
 
 
-@dataclass(frozen=True)
-class _Prediction:
+class _Prediction(NamedTuple):
     """The prediction of an image by others, in units of its beam, and the limit of its χ²."""
 
     image: FloatArray
@@ -449,20 +448,17 @@ def _result(data: FitData, predictions: Sequence[_Prediction]) -> LeaveOneOut:
     units = data.units[:, None, None]
     used = data.scene.weights[:, :height, :width] > 0
     images = data.scene.images[:, :height, :width] * units
-    models = np.stack([each.image for each in predictions])[:, :height, :width] * units
+    made, weights, brightness, chi2, alone, limit = map(np.array, zip(*predictions, strict=True))
+    models = made[:, :height, :width] * units
     residual = np.where(used, images - models, 0.0)
     level = np.where(used, images, 0.0).sum(axis=(1, 2)) / used.sum(axis=(1, 2))
     squares = (residual**2).sum(axis=(1, 2)) / used.sum(axis=(1, 2))
-    chi2, alone, limit = (
-        np.array([getattr(each, name) for each in predictions])
-        for name in ("chi2", "alone", "limit")
-    )
     return LeaveOneOut(
         images=images,
         mask=used,
         predicted=models,
         residual=residual,
-        brightness=np.array([each.brightness for each in predictions]) * data.brightness,
+        brightness=brightness * data.brightness,
         chi2=chi2,
         alone=alone,
         limit=limit,
@@ -470,5 +466,5 @@ def _result(data: FitData, predictions: Sequence[_Prediction]) -> LeaveOneOut:
         explanation=explanation_of(chi2, limit, data.setups, data.names),
         setups=data.setups or (),
         names=data.names or (),
-        noise=data.noise_of(np.stack([each.weights for each in predictions])),
+        noise=data.noise_of(weights),
     )
