@@ -366,38 +366,34 @@ class Fit:
         key = max(parts, key=lambda part: parts[part])
         return f"{TITLES[key]} {100 * parts[key]:.2g} %"
 
-    @property
-    def _error_rows(self) -> list[tuple[str, str]]:
-        """The errors of the displacement in words: names and texts."""
+    def _error_facts(self) -> Iterator[Fact]:
+        """The errors of the displacement, and its sensitivity to what is not stated."""
         report = self.report
         if np.isnan(report.uncertainty):
-            return []
+            return
         if report.parts:
-            return [
-                ("errors", f"{report.total:.2%} of the displacement (r.m.s.): {report.ranking}"),
-                ("instrument", "; ".join(number_text(*each) for each in report.numbers.items())),
-                *self._sensitivity_rows,
-            ]
-        text = f"{report.uncertainty:.2%} of the displacement by noise (r.m.s.)"
-        if report.noise_correlation > 0:
-            text += f", which is correlated over {report.noise_correlation:.1f} px"
-        if report.beam is None:
-            return [("error bars", text), *self._sensitivity_rows]
-        if report.beam.variation:
-            text = f"{report.total:.2%} of the displacement in total (r.m.s.); {text}"
-        return [("error bars", text), ("beam", report.beam.text), *self._sensitivity_rows]
-
-    @property
-    def _sensitivity_rows(self) -> list[tuple[str, str]]:
-        """Sensitivities to what is not stated of the instrument, in words."""
+            text = f"{report.total:.2%} of the displacement (r.m.s.): {report.ranking}"
+            yield error_fact("errors", text)
+            numbers = "; ".join(number_text(*each) for each in report.numbers.items())
+            yield error_fact("instrument", numbers)
+        else:
+            text = f"{report.uncertainty:.2%} of the displacement by noise (r.m.s.)"
+            if report.noise_correlation > 0:
+                text += f", which is correlated over {report.noise_correlation:.1f} px"
+            if report.beam is not None and report.beam.variation:
+                text = f"{report.total:.2%} of the displacement in total (r.m.s.); {text}"
+            yield error_fact("error bars", text)
+            if report.beam is not None:
+                yield error_fact("beam", report.beam.text)
         names = {each.key: each.name(each.tested) for each in IMPERFECTIONS}
         effects = ", ".join(
             f"{share:.2g} ({names[key]})" if share > 1 else f"{share:.2%} ({names[key]})"
-            for key, share in self.report.sensitivities.items()
-            if key not in self.report.parts
+            for key, share in report.sensitivities.items()
+            if key not in report.parts
         )
-        text = f"the displacement would move by (r.m.s.): {effects}"
-        return [("sensitivity", text)] if effects else []
+        if effects:
+            text = f"the displacement would move by (r.m.s.): {effects}"
+            yield error_fact("sensitivity", text)
 
     @property
     def warnings(self) -> tuple[Caution, ...]:
@@ -467,7 +463,7 @@ class Fit:
             *self._image_facts(names),
             *(self._field_fact(field) for field in self.fields),
             *self._significance_facts(),
-            *(error_fact(name, text) for name, text in self._error_rows),
+            *self._error_facts(),
             *self._solution_facts(),
             time_fact(self.report.seconds),
         )
