@@ -152,18 +152,8 @@ class RayModel:
         model = potential, counts, beam, frame
         self._in_ranges(kernels.deposit, _BANDS, model, size, corners, reached)
         image = np.zeros(self.seen)
-        threads = available_threads(self.threads)
-        in_ranges(
-            kernels.add_corners,
-            len(image),
-            threads,
-            corners,
-            reached,
-            size[1],
-            _GUARD,
-            image,
-            smallest=_WORTH_A_THREAD_ROWS,
-        )
+        threads, sums = available_threads(self.threads), (corners, reached, size[1], _GUARD, image)
+        in_ranges(kernels.add_corners, len(image), threads, *sums, smallest=_WORTH_A_THREAD_ROWS)
         return image
 
     def gradient(
@@ -233,19 +223,8 @@ class RayModel:
         used, pixels = np.zeros_like(ends), np.empty(most, np.int32)
         of_splines, of_instrument = np.empty((most, 16)), np.empty((most, instrument_columns))
         begins, lines = ends - areas, (used, pixels, of_splines, of_instrument)
-        free = of_beam, of_frame
-        self._in_ranges(
-            kernels.collect,
-            len(reached),
-            model,
-            size,
-            reached,
-            begins,
-            _GUARD,
-            self._middle,
-            free,
-            *lines,
-        )
+        places = begins, _GUARD, self._middle, (of_beam, of_frame)
+        self._in_ranges(kernels.collect, len(reached), model, size, reached, *places, *lines)
         rows = np.empty(math.prod(self.seen) + 1, np.int32)
         entries = (16 + instrument_columns) * int(used.sum())
         columns, values = np.empty(entries, np.int32), np.empty(entries, np.float32)
