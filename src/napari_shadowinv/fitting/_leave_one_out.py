@@ -161,6 +161,7 @@ class _Work:
     def __init__(self, data: FitData, options: FitOptions, on_step: OnStep) -> None:
         self._data, self._options, self._on_step = data, options, on_step
         self._all = list(range(len(data.units)))
+        self._scene = data.scene_with(options.smoothness)
 
     def _run_for_each(self, numbers: list[int], work: Callable[[_Work, int], _T]) -> dict[int, _T]:
         """Call `work(context, number)` for images, in threads."""
@@ -174,13 +175,12 @@ class _Work:
 
     def search_all(self, should_stop: ShouldStop | None) -> Minimum:
         """Where a search in all images ends, in pixels of two."""
-        scene = self._data.scene_with(self._options.smoothness)
         begun = collect_starts(self._data, self._on_step, should_stop)
-        return search(scene, begun, self._on_step)[0]
+        return search(self._scene, begun, self._on_step)[0]
 
     def find_agreeing(self, begun: Minimum) -> list[int]:
         """The most images that one field explains, found in pixels of two."""
-        scene = self._data.scene_with(self._options.smoothness)
+        scene = self._scene
         if self._options.smoothness is None:
             usual = SMOOTHNESS_RATIO * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1))
             scene = replace(scene, smoothness=usual)
@@ -220,11 +220,10 @@ class _Work:
 
     def estimate_smoothness(self, members: list[int], begun: Minimum) -> tuple[Scene, Minimum]:
         """All images with the λ and κ of some, and weights of counts; the field of those."""
-        scene = self._data.scene_with(self._options.smoothness)
         rng = np.random.default_rng(self._options.seed)
         first = replace(begun, unknowns=begun.unknowns.only(members))
-        part, best = estimate_smoothness(scene.only(members), first, rng, self._on_step)
-        scene = replace(scene, smoothness=part.smoothness)
+        part, best = estimate_smoothness(self._scene.only(members), first, rng, self._on_step)
+        scene = replace(self._scene, smoothness=part.smoothness)
         common = replace(best, unknowns=begun.unknowns.with_images(members, best.unknowns))
         if self._data.counted:
             scene = reweight_counts(self._data, scene, common)
