@@ -248,23 +248,22 @@ class Imperfect:
         shapes = tuple(each.coarsen(factor) for each in self.shapes)
         return replace(self, blur=self.blur / factor**2, shapes=shapes)
 
-    def number(self, key: str, numbers: FloatArray) -> float:
-        """Return the one number of an imperfection among the numbers of its kind."""
-        return float(numbers[self.place(key)][0])
+    def _change(self, key: str, numbers: FloatArray) -> float:
+        """The change by the one number of an imperfection, among the numbers of its kind."""
+        size: float = getattr(self, key)
+        return size * float(numbers[self.place(key)][0]) if size else 0.0
 
     def exponent(self, common: FloatArray) -> float:
         """Return the exponent of the response."""
-        if not self.gamma:
-            return 1.0
-        return max(1 + self.gamma * self.number("gamma", common), _LEAST_EXPONENT)
+        return max(1 + self._change("gamma", common), _LEAST_EXPONENT)
 
     def variance(self, common: FloatArray) -> float:
         """Return what adds to the variance of the point spread, px²."""
-        return self.blur * self.number("blur", common) if self.blur else 0.0
+        return self._change("blur", common)
 
     def offset(self, separate: FloatArray) -> float:
         """Return the constant of an image, in units of its beam's mean."""
-        return self.background * self.number("background", separate) if self.background else 0.0
+        return self._change("background", separate)
 
     def entering(self, beam: FloatArray, common: FloatArray, separate: FloatArray) -> FloatArray:
         """Return the light of a beam as recorded, without what the detector did to it."""
