@@ -19,12 +19,7 @@ from napari_shadowinv.preprocessing import (
     image_checks,
     image_warnings,
 )
-from napari_shadowinv.preprocessing.image_checks import (
-    CheckedImage,
-    dark_level,
-    saturated_share,
-    stray_pixels,
-)
+from napari_shadowinv.preprocessing.image_checks import CheckedImage, dark_level
 
 SHAPE = (160, 160)
 COUNTS = 300
@@ -62,13 +57,18 @@ def named(image, source, mask=None) -> list[str]:
     return [caution.code for caution in image_warnings(image, source, mask)]
 
 
+def offset_share(*planes: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """The dark level of an image, or of image and source."""
+    return dark_level([CheckedImage.of(plane, mask) for plane in planes])
+
+
 def test_a_source_that_shots_share_is_checked_once(shot, faint, monkeypatch):
     checked: list[np.ndarray] = []
     find = image_checks.stray_pixels
 
-    def note(image: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    def note(image: np.ndarray, usable: np.ndarray) -> np.ndarray:
         checked.append(image)
-        return find(image, mask)
+        return find(image, usable)
 
     monkeypatch.setattr(image_checks, "stray_pixels", note)
     source = shot[1].copy()
@@ -106,8 +106,8 @@ def test_image_warnings_are_silent_on_a_right_shot(shot):
 def test_dark_level_is_the_offset_in_units_of_the_mean(shot, share):
     image = shot[0]
     offset = share * image.mean()
-    assert dark_level(image) == 0
-    assert dark_level(image + offset) == pytest.approx(share / (1 + share), rel=0.15)
+    assert offset_share(image) == 0
+    assert offset_share(image + offset) == pytest.approx(share / (1 + share), rel=0.15)
     assert named(image + offset, shot[1] + offset) == ["dark-level"]
 
 
@@ -115,7 +115,7 @@ def test_dark_level_is_the_offset_in_units_of_the_mean(shot, share):
 def test_dark_level_needs_no_kind_of_noise_to_be_silent(power):
     image = synthetic_image(toroid(SHAPE, paper_setup(), 97.0, 30e-6).displacement)
     rng = np.random.default_rng(2)
-    assert dark_level(image + 0.05 * image**power * rng.normal(size=SHAPE)) == 0
+    assert offset_share(image + 0.05 * image**power * rng.normal(size=SHAPE)) == 0
 
 
 def test_dark_level_of_image_and_source_needs_no_deep_shadows():
@@ -126,10 +126,10 @@ def test_dark_level_of_image_and_source_needs_no_deep_shadows():
         rng = np.random.default_rng(seed)
         image, source = (rng.poisson(COUNTS * plane).astype(float) for plane in (clean, beam()))
         offset = 0.2 * image.mean()
-        level = dark_level(image + offset, None, source + offset)
+        level = offset_share(image + offset, source + offset)
         assert level == pytest.approx(0.2 / 1.2, rel=0.3)
-        assert dark_level(image, None, source) == 0
-        alone.append(dark_level(image + offset))
+        assert offset_share(image, source) == 0
+        alone.append(offset_share(image + offset))
     assert np.count_nonzero(alone) < 4
 
 
@@ -141,8 +141,8 @@ def test_most_dark_levels_of_a_tenth_show_in_shallow_shadows():
         rng = np.random.default_rng(seed)
         image, source = (rng.poisson(COUNTS * plane).astype(float) for plane in (clean, beam()))
         offset = 0.1 * image.mean()
-        levels.append(dark_level(image + offset, None, source + offset))
-        assert dark_level(image, None, source) == 0
+        levels.append(offset_share(image + offset, source + offset))
+        assert offset_share(image, source) == 0
     assert np.count_nonzero(levels) >= 8
     assert np.median(levels) == pytest.approx(0.1 / 1.1, rel=0.15)
 
@@ -158,7 +158,7 @@ def test_noise_in_proportion_to_the_signal_is_no_dark_level(uneven, speckle):
         return rng.poisson(1000 * clean * pixels * flickering).astype(float)
 
     image, source = recorded(synthetic_image(truth, beam())), recorded(beam())
-    assert dark_level(image, None, source) == 0
+    assert offset_share(image, source) == 0
 
 
 def test_dark_level_ignores_masked_pixels(shot):
@@ -166,28 +166,34 @@ def test_dark_level_ignores_masked_pixels(shot):
     mask = np.ones(SHAPE, bool)
     mask[:, :40] = False
     garbled = np.where(mask, image, np.random.default_rng(0).normal(5000, 900, SHAPE))
-    assert dark_level(garbled, mask) == dark_level(np.where(mask, image, 0.0), mask) > 0.1
+    assert (
+        offset_share(garbled, mask=mask)
+        == offset_share(np.where(mask, image, 0.0), mask=mask)
+        > 0.1
+    )
 
 
 def test_saturation_is_the_share_of_clipped_pixels(shot):
     image, source = shot
     limit = 1.5 * image.mean()
     clipped = np.minimum(image, limit)
-    assert saturated_share(clipped) == np.mean(image >= limit)
-    assert saturated_share(image) == 0
+    assert CheckedImage.of(clipped).saturated == np.mean(image >= limit)
+    assert CheckedImage.of(image).saturated == 0
     assert named(clipped, source) == ["saturation"]
 
 
 def test_saturation_leaves_uniform_images_alone():
-    assert saturated_share(np.ones(SHAPE)) == 0
+    assert CheckedImage.of(np.ones(SHAPE)).saturated == 0
 
 
 def test_saturation_leaves_a_beam_with_a_flat_top_alone():
     y, x = np.mgrid[-1:1:200j, -1:1:200j]
     beam = np.round(100 + 1000 * np.exp(-((x**2 + y**2) ** 2) / 0.03))
     assert (beam == beam.max()).mean() > 2e-3  # whole numbers repeat the maximum
-    assert saturated_share(beam) == 0
-    assert saturated_share(np.minimum(beam, 1000.0)) == pytest.approx((beam >= 1000).mean())
+    assert CheckedImage.of(beam).saturated == 0
+    assert CheckedImage.of(np.minimum(beam, 1000.0)).saturated == pytest.approx(
+        (beam >= 1000).mean()
+    )
 
 
 def test_saturated_pixels_under_a_mask_do_not_count(shot):
@@ -195,8 +201,8 @@ def test_saturated_pixels_under_a_mask_do_not_count(shot):
     image[:20] = 10 * image.max()
     mask = np.ones(SHAPE, bool)
     mask[:20] = False
-    assert saturated_share(image) == 20 / SHAPE[0]
-    assert saturated_share(image, mask) == 0
+    assert CheckedImage.of(image).saturated == 20 / SHAPE[0]
+    assert CheckedImage.of(image, mask).saturated == 0
 
 
 def test_stray_pixels_are_those_put_in(shot):
@@ -205,15 +211,17 @@ def test_stray_pixels_are_those_put_in(shot):
     image[rows, columns] = 20 * COUNTS
     image[30, 20] = 0
     expected = {*zip(rows.tolist(), columns.tolist(), strict=True), (30, 20)}
-    assert {tuple(place) for place in np.argwhere(stray_pixels(image)).tolist()} == expected
-    assert not stray_pixels(shot[0]).any()
+    assert {
+        tuple(place) for place in np.argwhere(CheckedImage.of(image).stray).tolist()
+    } == expected
+    assert not CheckedImage.of(shot[0]).stray.any()
     assert named(image, shot[1]) == ["hot-pixels"]
 
 
 def test_stray_pixels_leave_a_focus_alone():
     y, x = np.indices(SHAPE) - 80.0
     focus = 1 + 100 / (1 + 8 * (y**2 + x**2))
-    assert not stray_pixels(focus).any()
+    assert not CheckedImage.of(focus).stray.any()
 
 
 @pytest.mark.parametrize("shift", [(6, 0), (-6, 4), (0, 20)])

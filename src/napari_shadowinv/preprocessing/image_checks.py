@@ -1,7 +1,7 @@
 """Checks of an image and its reference for violated assumptions of an inversion.
 
 - all of them, as cautions: `image_warnings`
-- of one image: `saturated_share`, `stray_pixels`
+- of one image: `CheckedImage`, `stray_pixels`
 - of an image and its reference: `dark_level`, `ReferencePair`
 
 An image must be linear in the fluence, without offset, and on the same pixels as its reference.
@@ -97,8 +97,18 @@ class CheckedImage:
 
     @cached_property
     def saturated(self) -> float:
-        """The `saturated_share` of the other pixels."""
-        return saturated_share(self.image, self.usable & ~self.stray)
+        """Share of the other pixels on a plateau at the maximum; 0 if there is none."""
+        used = self.usable & ~self.stray
+        values = self.image.ravel() if used.all() else self.image[used]
+        top = float(values.max())
+        at_top = int((values == top).sum())
+        if at_top < max(_MIN_PLATEAU_PIXELS, _MIN_PLATEAU_SHARE * values.size):
+            return 0.0
+        median = float(np.median(values))
+        if not top > _PLATEAU_RISE * median:
+            return 0.0
+        just_below = int((values > top - _BELOW_PLATEAU * (top - median)).sum()) - at_top
+        return at_top / values.size if at_top > _PLATEAU_EXCESS * just_below else 0.0
 
     @cached_property
     def _local(self) -> tuple[FloatArray, FloatArray]:
@@ -177,7 +187,7 @@ def image_warnings(
 
 def _warnings(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caution]:
     planes = {"image": image} if source is None else {"image": image, "source": source}
-    if dark := _dark_level(list(planes.values())):
+    if dark := dark_level(list(planes.values())):
         yield Caution(
             "dark-level",
             f"dark level: the noise of the image vanishes at {dark:.0%} of its mean instead of at "
@@ -226,41 +236,15 @@ def _warnings(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caut
         )
 
 
-def saturated_share(image: FloatArray, mask: BoolArray | None = None) -> float:
-    """Return the share of pixels on a plateau at the maximum; 0 if there is none.
-
-    Parameters
-    ----------
-    image : ndarray, shape (H, W)
-    mask : ndarray of bool, shape (H, W), optional
-        True at usable pixels.
-    """
-    values = image.ravel() if mask is None or mask.all() else image[mask]
-    top = float(values.max())
-    at_top = int((values == top).sum())
-    if at_top < max(_MIN_PLATEAU_PIXELS, _MIN_PLATEAU_SHARE * values.size):
-        return 0.0
-    median = float(np.median(values))
-    if not top > _PLATEAU_RISE * median:
-        return 0.0
-    just_below = int((values > top - _BELOW_PLATEAU * (top - median)).sum()) - at_top
-    return at_top / values.size if at_top > _PLATEAU_EXCESS * just_below else 0.0
-
-
-def stray_pixels(image: FloatArray, mask: BoolArray | None = None) -> BoolArray:
+def stray_pixels(image: FloatArray, usable: BoolArray) -> BoolArray:
     """Return the pixels that are far brighter, or darker, than each of their neighbours.
 
-    A quick look for broken pixels; `remove_hot_pixels` searches more thoroughly.
-
-    Parameters
-    ----------
-    image : ndarray, shape (H, W)
-    mask : ndarray of bool, shape (H, W), optional
-        True at usable pixels; pixels with a neighbour that is not are left out.
+    A quick look for broken pixels; `remove_hot_pixels` searches more thoroughly. Pixels with a
+    neighbour that is not usable are left out.
     """
     stray = np.zeros(image.shape, bool)
     part = image[:: max(1, image.size // _NOISE_SAMPLES)]
-    mean = float(image.mean() if mask is None or mask.all() else image[mask].mean())
+    mean = float(image.mean() if usable.all() else image[usable].mean())
     if not mean > 0:
         return stray
     bends = part[:, 3:] - 3 * part[:, 2:-1] + 3 * part[:, 1:-2] - part[:, :-3]
@@ -288,8 +272,8 @@ def stray_pixels(image: FloatArray, mask: BoolArray | None = None) -> BoolArray:
     difference = np.abs(neighbours - level).max(axis=0)
     alone = difference < limit / 3 + _MAX_NEIGHBOUR_DIFFERENCE * np.abs(level)
     stray[rows, columns] = (is_hot | is_dead) & alone
-    if mask is not None and not mask.all():
-        stray &= ndimage.binary_erosion(mask, np.ones((3, 3)))
+    if not usable.all():
+        stray &= ndimage.binary_erosion(usable, np.ones((3, 3)))
     return stray
 
 
@@ -503,19 +487,14 @@ _MAX_CHI2 = 5.0  # per degree of freedom
 _PATTERN_DEVIATIONS = 2.0
 
 
-def dark_level(
-    image: FloatArray, mask: BoolArray | None = None, source: FloatArray | None = None
-) -> float:
+def dark_level(planes: Sequence[CheckedImage]) -> float:
     """Estimate an offset that was left in an image, as a share of its mean, from its noise.
 
     Parameters
     ----------
-    image : ndarray, shape (H, W)
-        In any unit.
-    mask : ndarray of bool, shape (H, W), optional
-        True at usable pixels.
-    source : ndarray, shape (H, W), optional
-        The recorded beam, in the same unit. It has an offset of its own, or shares the image's.
+    planes : sequence of CheckedImage
+        The image, and the recorded beam, if any, in the same unit. It has an offset of its own, or
+        shares the image's.
 
     Returns
     -------
@@ -523,11 +502,6 @@ def dark_level(
         0 unless the noise cannot be explained without an offset, by any sum of a constant
         variance, one in proportion to the signal, and one to its square.
     """
-    planes = (image, source)
-    return _dark_level([CheckedImage.of(plane, mask) for plane in planes if plane is not None])
-
-
-def _dark_level(planes: Sequence[CheckedImage]) -> float:
     if min(planes[0].image.shape) < _WINDOW_PX:
         return 0.0
     if any(plane.brightness.size < _MIN_PIXELS for plane in planes):
