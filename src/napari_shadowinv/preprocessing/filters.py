@@ -105,12 +105,9 @@ class LowPassFilter(Filter):
     function = staticmethod(low_pass)
     primary = "width"
     place = 80
+    smooths: ClassVar[bool] = True
     step: Literal["low-pass"] = "low-pass"
     width: float = width_field(1.0, "Standard deviation of the Gaussian blur in px.", 0.1, 20.0)
-
-    @property
-    def smooths(self) -> bool:
-        return True
 
 
 def high_pass(image: ArrayLike, width: float, *, keep_mean: bool = True) -> FloatArray:
@@ -145,14 +142,11 @@ class HighPassFilter(Filter):
     function = staticmethod(high_pass)
     primary = "width"
     place = 60
+    flattens: ClassVar[bool] = True
     step: Literal["high-pass"] = "high-pass"
     width: float = width_field(
         50.0, "Structures much larger than this standard deviation, in px, are removed.", 1.0, 200.0
     )
-
-    @property
-    def flattens(self) -> bool:
-        return True
 
 
 def butterworth(
@@ -306,6 +300,7 @@ class BackgroundFilter(Filter):
 
     title = "flatten (polynomial)"
     place = 50
+    flattens: ClassVar[bool] = True
     step: Literal["background"] = "background"
     degree: int = degree_field(" that is divided out or subtracted.")
     kind: Literal["divide", "subtract"] = Field(
@@ -313,10 +308,6 @@ class BackgroundFilter(Filter):
         title="How",
         description="'divide' by the polynomial (uneven beam) or 'subtract' it (stray light).",
     )
-
-    @property
-    def flattens(self) -> bool:
-        return True
 
     def _filter(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
