@@ -90,15 +90,6 @@ class Estimate(Choice):
                 f"got the estimate '{self.title}' without a mask: it fills in the masked pixels; "
                 "choose a mask that covers the object"
             )
-        return self._source(image, mask, should_stop, on_caution)
-
-    def _source(
-        self,
-        image: FloatArray,
-        mask: BoolArray | None,
-        should_stop: ShouldStop | None,
-        on_caution: OnCaution | None,
-    ) -> FloatArray:
         values = self.values()
         if self.is_checked:
             values["on_caution"] = on_caution
@@ -145,7 +136,7 @@ class UniformEstimate(Estimate):
     place = 10
     method: Literal["uniform"] = "uniform"
 
-    def _source(self, image: FloatArray, mask: BoolArray | None, *_: Any) -> FloatArray:
+    def source(self, image: FloatArray, mask: BoolArray | None, *_: Any, **__: Any) -> FloatArray:
         return uniform_source(image, mask=mask)
 
 
@@ -577,7 +568,7 @@ class IsotropicEstimate(Estimate):
         y, x = ((c + 0.5) / factor - 0.5 for c in (self.centre_y, self.centre_x))
         return self._at(y, x, bin_setup(self._setup, factor))
 
-    def _source(self, image: FloatArray, mask: BoolArray | None, *_: Any) -> FloatArray:
+    def source(self, image: FloatArray, mask: BoolArray | None, *_: Any, **__: Any) -> FloatArray:
         if self._setup is None:
             raise _without_setup()
         return isotropic_source(image, self._setup, mask=mask, **self.values())
