@@ -341,13 +341,12 @@ class ReferencePair:
         near = mismatch[np.ix_(*(np.arange(-side, side + 1) for side in reach))]
         best = np.unravel_index(int(near.argmin()), near.shape)
         shift = np.array([int(place) - side for place, side in zip(best, reach, strict=True)])
-        if (np.abs(shift) == reach).any():
+        if (np.abs(shift) == reach).any() or not shift.any():
             return None
-        if not shift.any() or not _fits_after(
-            shot, beam, ring, noise, (shift[0], shift[1]), _MAX_MATCH[blur]
-        ):
+        down, right = shift
+        if not _fits_after(shot, beam, ring, noise, (down, right), _MAX_MATCH[blur]):
             return None
-        return float(shift[0] * step), float(shift[1] * step)
+        return float(down * step), float(right * step)
 
     @cached_property
     def _blocks(self) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -369,7 +368,10 @@ class ReferencePair:
         """Whether the source has structure at its borders by which to compare the image."""
         if self._ring.sum() < _MIN_BLOCKS:
             return False
-        return _contrast(self._blocks[1], self._ring) >= _MIN_CONTRAST
+        beam = self._blocks[1]
+        # Structure that neighbouring blocks share is free of noise.
+        variance = _neighbour_covariance(beam, beam, self._ring)
+        return math.sqrt(max(variance, 0.0)) >= _MIN_CONTRAST
 
 
 def border_ring(shape: tuple[int, ...]) -> BoolArray:
@@ -382,11 +384,6 @@ def border_ring(shape: tuple[int, ...]) -> BoolArray:
 
 def _coarse_step(shape: tuple[int, ...]) -> int:
     return max(1, -(-max(shape) // _COARSE_SIDE_PX))
-
-
-def _contrast(values: FloatArray, usable: BoolArray) -> float:
-    """Return the r.m.s. of the structure that neighbouring blocks share, free of noise."""
-    return float(np.sqrt(max(_neighbour_covariance(values, values, usable), 0.0)))
 
 
 def _neighbour_covariance(first: FloatArray, second: FloatArray, usable: BoolArray) -> float:
