@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from itertools import pairwise
@@ -204,19 +204,16 @@ class Errors:
     @property
     def largest_part(self) -> str:
         """Largest part with its share, such as "beam 23 % (5 % rms over a quarter, assumed)"."""
-        name, error = next(iter(self.parts.items()))
-        return self._part_text(name, _percent(error.rms, self.rms))
+        return self._part_text(next(iter(self.parts)))
 
     @property
     def ranking(self) -> str:
         """The parts as shares of the displacement (r.m.s.), the largest first."""
-        return ", ".join(
-            self._part_text(name, _percent(error.rms, self.rms))
-            for name, error in self.parts.items()
-        )
+        return ", ".join(map(self._part_text, self.parts))
 
-    def _part_text(self, name: str, share: str) -> str:
+    def _part_text(self, name: str) -> str:
         """Describe a part by its title, its share, and the deviation that it stands for."""
+        share = _percent(self.parts[name].rms, self.rms)
         if name == self._beam_name:
             size = f"{100 * self.beam_variation:.2g} % rms over {self._beam_length}"
             return f"beam {share} ({size}, {_BASES[self.beam_basis]})"
@@ -510,13 +507,16 @@ class Budget:
                 sizes[imperfection.name(stated)] = stated
         # All at once, because the solver needs as long for one as for several.
         moves = response.to(np.concatenate([pattern for *_, pattern in tests]))
-        first = 0
-        for errors, name, pattern in tests:
-            errors[name] = estimate(moves[:, first : first + len(pattern)])
-            first += len(pattern)
+        ends = np.cumsum([len(pattern) for *_, pattern in tests])
+        for (errors, name, _), part in zip(tests, np.split(moves, ends[:-1], axis=1), strict=True):
+            errors[name] = estimate(part)
         if share := self.instrument.other_field:
             name = f"other field, {100 * share:.2g} %"
             effects[name], sizes[name] = _scale_error(lengths, share), share
+        for cause, flux_errors in FLUX_ERRORS.items():
+            samples = flux_errors(response, solved[-1], self.options)
+            if samples is not None:
+                effects[cause] = estimate(response.to(samples))
         by_percent = estimate(
             _TESTED_VARIATION * response.to(_unit_beams(response.level, *self._beam_waves))
         )
@@ -529,11 +529,7 @@ class Budget:
             rms=lengths.rms,
             discretisation=discretisation,
             noise=estimate(*self._noisy_moves(response, solved[-1].level.spacing)),
-            effects=effects
-            | {
-                cause: estimate(response.to(samples))
-                for cause, samples in self._flux_errors(response, solved[-1])
-            },
+            effects=effects,
             beam=beam,
             beam_sensitivity=by_percent,
             sensitivities=sensitivities,
@@ -640,14 +636,6 @@ class Budget:
             self._by_noise[response] = response.to(noise), variance
         moves, variance = self._by_noise[response]
         return moves, response.finer(variance, spacing, self._noise.grain)
-
-    def _flux_errors(
-        self, response: LinearResponse, solution: LevelSolution
-    ) -> Iterator[tuple[str, FloatArray]]:
-        for cause, flux_errors in FLUX_ERRORS.items():
-            samples = flux_errors(response, solution, self.options)
-            if samples is not None:
-                yield cause, samples
 
     @property
     def _beam_waves(self) -> tuple[float, int]:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import add
 from typing import NamedTuple
 
 import numpy as np
@@ -266,12 +267,7 @@ class Scatter:
         return cls(1, change, change**2, quantities)
 
     def __add__(self, other: Scatter) -> Scatter:
-        return Scatter(
-            self.count + other.count,
-            self.sums + other.sums,
-            self.squares + other.squares,
-            self.quantities + other.quantities,
-        )
+        return Scatter(*map(add, vars(self).values(), vars(other).values()))
 
     @property
     def mean(self) -> FloatArray:
@@ -306,12 +302,7 @@ class Pairs:
         return cls(1, linear, solved, np.stack([linear**2, solved**2, linear * solved]))
 
     def __add__(self, other: Pairs) -> Pairs:
-        return Pairs(
-            self.count + other.count,
-            self.linear + other.linear,
-            self.solved + other.solved,
-            self.products + other.products,
-        )
+        return Pairs(*map(add, vars(self).values(), vars(other).values()))
 
     @property
     def shift(self) -> FloatArray:
