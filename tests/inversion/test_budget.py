@@ -388,7 +388,7 @@ def test_sites_needed_follow_from_the_fall_of_the_error(monkeypatch, image, powe
     move = np.full((2, 9), np.sqrt(0.5))  # 1 px
     monkeypatch.setattr(budget, "_move", lambda solution: move)
     monkeypatch.setattr(budget, "_change", lambda solved: (np.full(9, 0.04**2), power))
-    monkeypatch.setattr(budget._noise, "displacements", lambda level: (0.0, 0.0))
+    monkeypatch.setattr(noise, "displacements", lambda level: (0.0, 0.0))
     levels = [SimpleNamespace(weights=np.zeros(n), residual=0.0) for n in (100, 400)]
     assert budget.needed(levels) == pytest.approx(1.3 * 4 ** (1 / power))
 

@@ -20,7 +20,7 @@ from napari_shadowinv.inversion.budget import discretisation_share
 from napari_shadowinv.inversion.error_bars import Uncertainty, uncertainty
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import prepare
-from napari_shadowinv.options import Instrument
+from napari_shadowinv.options import Instrument, InversionOptions
 from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.poisson import potential_from_displacement
 from napari_shadowinv.physics.setup import Setup
@@ -106,13 +106,13 @@ class ResampledInversion(SampledField):
 
     def evaluate(self, choose: Choose, samples: int, callbacks: Callbacks) -> Evaluation:
         inversion = self.inversion
-        options, noise = recorded_shot(inversion)
         mask = None if inversion.mask.all() else inversion.mask
+        options, noise = recorded_shot(inversion, mask)
         plan = plan_sites(
             inversion.source, options, mask=mask, measured=has_measured_source(inversion),
             **callbacks,
         )  # fmt: skip
-        coarse = self._coarse_inversion(callbacks)
+        coarse = self._coarse_inversion(options, mask, callbacks)
         measures: list[Measure] = []
 
         def quantities(changes: FloatArray) -> dict[str, Measure]:
@@ -154,17 +154,18 @@ class ResampledInversion(SampledField):
             return
         yield from (each for each in scatter.warnings if each.code == "samples")
 
-    def _coarse_inversion(self, callbacks: Callbacks) -> Inversion | None:
+    def _coarse_inversion(
+        self, options: InversionOptions, mask: BoolArray | None, callbacks: Callbacks
+    ) -> Inversion | None:
         """Invert the image with a quarter of the sites; None if these are too few."""
         inversion = self.inversion
-        options, _ = recorded_shot(inversion)
         count = (options.n_sites or 0) // _COARSER
         if count < _MIN_COARSE_SITES:
             return None
         coarse = invert(
             inversion.image,
             source=inversion.source,
-            mask=None if inversion.mask.all() else inversion.mask,
+            mask=mask,
             options=options.model_copy(update={"n_sites": count}),
             instrument=inversion.instrument,
             **callbacks,
@@ -182,7 +183,7 @@ class ResampledInversion(SampledField):
             )
 
 
-def recorded_shot(inversion: Inversion) -> tuple[Any, Any]:
+def recorded_shot(inversion: Inversion, mask: BoolArray | None) -> tuple[InversionOptions, Any]:
     """Return options that repeat an inversion of its own image, and its noise for `uncertainty`.
 
     The image of a result is scaled to the flux of its source, and so are the noise level and the
@@ -198,7 +199,6 @@ def recorded_shot(inversion: Inversion) -> tuple[Any, Any]:
     options = options.model_copy(update=changes)
     if options.units_per_quantum is not None:
         return options, "poisson"
-    mask = None if inversion.mask.all() else inversion.mask
     prepared = prepare(inversion.image, inversion.source, options, mask)
     noise = ImageNoise(prepared.in_units(), options, inversion.instrument.noise_correlation)
     mean = inversion.source[inversion.mask].mean()

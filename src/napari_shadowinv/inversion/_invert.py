@@ -113,7 +113,7 @@ def _plan(
     """Plan sites without computing any level."""
     domain = _site_domain(source, options, mask)
     plan = plan_levels(
-        domain.beam if domain.margin is None else domain.margin.beam,
+        domain.beam,
         domain.n_sites,
         lloyd_iterations=options.lloyd_iterations,
         lloyd_tolerance=options.lloyd_tolerance,
@@ -141,7 +141,7 @@ def count_sites(
 
 
 class _SiteDomain(NamedTuple):
-    """Beam that sites are spread over, also in units of a power of two, and their number."""
+    """Source, beam in units of a power of two that sites are spread over, and their number."""
 
     source: FloatArray
     beam: FloatArray
@@ -166,7 +166,7 @@ def _site_domain(
         return _SiteDomain(checked, beam, unit, usable, None, n_sites)
     margin = Margin.around(beam, margin_around(beam.shape, options), usable)
     n_sites = round(n_sites * margin.beam.sum() / beam.sum())
-    return _SiteDomain(checked, beam, unit, usable, margin, n_sites)
+    return _SiteDomain(checked, margin.beam, unit, usable, margin, n_sites)
 
 
 @contextmanager
@@ -444,14 +444,6 @@ def _check_boundary(plan: SitePlan, options: InversionOptions) -> None:
         )
 
 
-class _Reprojection(NamedTuple):
-    """The image that the field makes, and the flux that crossed its edges."""
-
-    image: FloatArray
-    flux_left: dict[str, float]
-    flux_entered: dict[str, float]
-
-
 @dataclass(frozen=True)
 class _Fields:
     """Fields read from the weights, at the image's pixels."""
@@ -490,7 +482,9 @@ def _read_fields(
         )
     tiles = int(np.clip(math.ceil(_TILES_PER_SPACING / solution.level.spacing), 2, _MOST_TILES))
 
-    def reproject() -> _Reprojection:
+    def reproject() -> tuple[FloatArray, dict[str, float], dict[str, float]]:
+        """Return the image that the field makes, and the flux that left and entered it."""
+
         def image_of(source: FloatArray, first: int, last: int) -> FloatArray:
             def on_progress(news: Progress) -> None:
                 report_share(report, news.step / (news.total or 1), first, last)
@@ -505,13 +499,13 @@ def _read_fields(
 
         source = prepared.source / prepared.unit
         if plan.margin is None:
-            return _Reprojection(image_of(source, _READ_STEPS, _STEPS), {}, {})
+            return image_of(source, _READ_STEPS, _STEPS), {}, {}
         halfway = (_READ_STEPS + _STEPS) // 2
         of_image, of_margin = plan.margin.parts(source)
         from_image = image_of(of_image, _READ_STEPS, halfway)
         from_margin = image_of(of_margin, halfway, _STEPS)
         edges = edge_flux(from_image, from_margin, plan.margin)
-        return _Reprojection(plan.within(from_image + from_margin), *edges)
+        return plan.within(from_image + from_margin), *edges
 
     inner = plan.within(potential)
     moves = np.ascontiguousarray(plan.within(displacement))
@@ -521,13 +515,13 @@ def _read_fields(
 
     errors_at_end = begin(estimate, options.threads)
     with _measure_time("read-out", seconds):
-        reprojection = reproject()
+        image, left, entered = reproject()
     fields = _Fields(
         np.ascontiguousarray(inner - border_mean(inner)),
         moves,
-        np.ascontiguousarray(reprojection.image),
-        reprojection.flux_left,
-        reprojection.flux_entered,
+        np.ascontiguousarray(image),
+        left,
+        entered,
         options.threads,
     )
     return fields, errors_at_end
@@ -567,14 +561,13 @@ def _make_report(
     )
     cautions: tuple[Caution, ...] = (Caution("not-converged", text),)
     if finest.converged:
-        moves, n_sites = fields.displacement, len(finest.weights)
         cautions = find_cautions(
             prepared,
             noise,
-            moves,
+            fields.displacement,
             fields.reprojection,
             fields.jacobian,
-            n_sites,
+            len(finest.weights),
             options,
             beam_difference=budget.beam_difference,
         )

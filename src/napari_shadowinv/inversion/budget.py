@@ -405,7 +405,7 @@ class Budget:
         instrument: Instrument,
     ) -> None:
         self._plan, self._prepared = plan, prepared
-        self._wait_for_noise, self.options = noise, options
+        self._noise, self.options = noise, options
         self.instrument = instrument if plan.measured else instrument.without_reference()
         if self._beam.components is not None:
             self._beam.components.check_shape(prepared.mask.shape)
@@ -415,10 +415,6 @@ class Budget:
         self._by_noise: dict[LinearResponse, tuple[FloatArray, FloatArray]] = {}
         self._look_ahead: Callable[[], None] = lambda: None
         self.reason = ""
-
-    @property
-    def _noise(self) -> ImageNoise:
-        return self._wait_for_noise()
 
     @cached_property
     def target(self) -> Target:
@@ -452,7 +448,8 @@ class Budget:
             self.reason = f"{text}, below the accuracy of {100 * self.options.accuracy:.2g} %"
             return 0.0
         # An estimate for a uniform beam; the exact value is needed only where this is large.
-        noise, _ = self._noise.displacements(self._noise.typical)
+        image_noise = self._noise()
+        noise, _ = image_noise.displacements(image_noise.typical)
         if error < _MAX_SHARE_OF_NOISE * noise:
             response = self._response(solved)
             moves, finer = self._noisy_moves(response, solved[-1].level.spacing)
@@ -537,7 +534,7 @@ class Budget:
             beam_variation=variation,
             beam_scale=self._beam.length,
             beam_basis=basis,
-            noise_correlation=self._noise.correlation_length,
+            noise_correlation=self._noise().correlation_length,
         )
 
     @cached_property
@@ -550,7 +547,7 @@ class Budget:
         if self.instrument.registration:
             source = np.where(prepared.mask, prepared.source, prepared.source[prepared.mask].mean())
             patterns = self.instrument.registration * motions(source)
-        return beam_difference(prepared, self._noise, patterns)
+        return beam_difference(prepared, self._noise(), patterns)
 
     @cached_property
     def _beam_variation(self) -> tuple[float, str]:
@@ -630,12 +627,12 @@ class Budget:
             rng = np.random.default_rng(self.options.seed)
             mean = self._prepared.source[self._prepared.mask].mean() / self._prepared.unit
             brightness = response.flux / (response.area * mean)
-            variance = self._noise.variance(brightness) * mean**2 * response.area
-            variance *= self._noise.clumping
+            variance = self._noise().variance(brightness) * mean**2 * response.area
+            variance *= self._noise().clumping
             noise = np.sqrt(variance) * rng.normal(size=(_NOISE_SAMPLES, len(variance)))
             self._by_noise[response] = response.to(noise), variance
         moves, variance = self._by_noise[response]
-        return moves, response.finer(variance, spacing, self._noise.grain)
+        return moves, response.finer(variance, spacing, self._noise().grain)
 
     @property
     def _beam_waves(self) -> tuple[float, int]:
