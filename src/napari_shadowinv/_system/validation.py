@@ -221,7 +221,7 @@ def _error_clause(
     if not path:
         return message
     name, field = name_of(*path), model.model_fields.get(path[-1])
-    title = _lower(field.title) if field is not None and field.title and not names else "it"
+    title = lower_first(field.title) if field is not None and field.title and not names else "it"
     if kind == "missing":
         return f"{name} is missing" + ("" if names else f", give the {title}")
     received = f"{name} is {_shorten(detail['input'])}"
@@ -230,10 +230,10 @@ def _error_clause(
         return f"{received}: {title} must be {words} {context[key]:g}"
     if message.startswith(opening := "Input should be "):
         return f"{received}: {title} must be {message.removeprefix(opening)}"
-    return f"{received}: {_lower(message)}"
+    return f"{received}: {lower_first(message)}"
 
 
-def _lower(text: str) -> str:
+def lower_first(text: str) -> str:
     """Make the first word fit inside a sentence, unless it is an abbreviation."""
     return text if text[1:2].isupper() else text[:1].lower() + text[1:]
 

@@ -16,6 +16,7 @@ import textwrap
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
@@ -23,7 +24,7 @@ from pydantic.fields import FieldInfo
 from typer import Argument, Option
 from typer.core import TyperCommand, TyperGroup
 
-from napari_shadowinv._system.validation import Model, suggestion, validate
+from napari_shadowinv._system.validation import Model, lower_first, suggestion, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import IMAGE_TITLES
 from napari_shadowinv.options import FitChoices, FitOptions, Instrument, InversionOptions
@@ -315,6 +316,9 @@ Quiet = Annotated[bool, Option("--quiet", "-q", help="Print errors only.")]
 QuietInversion = Annotated[bool, Option("--quiet", "-q", help="Print errors and warnings only.")]
 
 
+Flags = dict[str, inspect.Parameter]
+
+
 def _type_of(field: FieldInfo) -> tuple[Any, str | None]:
     """Return the type of a flag, and the placeholder for its value in the help."""
     annotation: Any = field.annotation
@@ -330,13 +334,17 @@ def _type_of(field: FieldInfo) -> tuple[Any, str | None]:
     return str, "FIRST:LAST" if kinds[0] is not str else None
 
 
+def _extra(field: FieldInfo, key: str, default: str | None) -> Any:
+    """Return an entry that a field has for its flag."""
+    extra = field.json_schema_extra
+    return extra.get(key, default) if isinstance(extra, dict) else default
+
+
 def _flag(
     flag: str, field: FieldInfo, panel: str | None, text: str
 ) -> tuple[str, inspect.Parameter]:
     kind, metavar = _type_of(field)
-    extra = field.json_schema_extra
-    if isinstance(extra, dict):
-        metavar = str(extra.get("metavar", metavar or "")) or None
+    metavar = _extra(field, "metavar", metavar) or None
     name = f"--{flag}/--no-{flag}" if kind is bool and field.default else f"--{flag}"
     option = Option(name, help=text, metavar=metavar, rich_help_panel=panel)
     name = flag.replace("-", "_")
@@ -367,60 +375,35 @@ def flag_names(model: type[BaseModel]) -> dict[str, str]:
     return {name: f"--{flag(name)}" for name in model.model_fields}
 
 
-Flags = list[tuple[str, inspect.Parameter]]
-
-
 def _step_flags(steps: Iterable[type[Step]], panel: str) -> Flags:
-    return [
+    return dict(
         _flag(_step_flag(step, name), field, panel, _step_help(step, name, field))
         for step in steps
         for name, field in step.parameters().items()
-    ]
+    )
 
 
 def _option_flags(
     model: type[BaseModel], default_panel: str | None, without: Collection[str] = ()
 ) -> Flags:
     """Return the flags of a model's fields; a field may name its own panel."""
-    flags = []
-    for name, field in model.model_fields.items():
-        if name in without:
-            continue
-        extra = field.json_schema_extra
-        panel = extra.get("panel", default_panel) if isinstance(extra, dict) else default_panel
-        flags.append(
-            _flag(
-                _option_flag(name),
-                field,
-                None if panel is None else str(panel),
-                _field_help(field),
-            )
-        )
-    return flags
+    return dict(
+        _flag(_option_flag(name), field, _extra(field, "panel", default_panel), _field_help(field))
+        for name, field in model.model_fields.items()
+        if name not in without
+    )
 
 
-def _recipe_flags() -> Flags:
-    flags = _step_flags(STEPS.values(), _STEPS)
+def _estimate_flags() -> Flags:
     method = FieldInfo(annotation=str | None, title="Source")
     text = f"How to estimate the undisturbed beam: {', '.join(ESTIMATES)}."
-    flags.append(_flag("source-from", method, _ESTIMATES, text))
+    flags = [_flag("source-from", method, _ESTIMATES, text)]
     for name in dict.fromkeys(n for method in ESTIMATES.values() for n in method.parameters()):
         fields = {key: method.parameters()[name] for key, method in _estimates_with(name).items()}
-        text = " ".join(f"For {key}: {_lower_first(_field_help(f))}" for key, f in fields.items())
+        text = " ".join(f"For {key}: {lower_first(_field_help(f))}" for key, f in fields.items())
         field = next(iter(fields.values()))
         flags.append(_flag(_estimate_flag(name), field, _ESTIMATES, text))
-    flags += _option_flags(Instrument, _INSTRUMENT)
-    return flags + _option_flags(InversionOptions, _OPTIONS)
-
-
-def _fit_flags() -> Flags:
-    return [
-        *_step_flags(FIT_STEPS.values(), _FIT_STEPS),
-        # The command has its own --source and --brightness.
-        *_option_flags(FitChoices, _FIT_CHOICES, without=("beam", "brightness", "options")),
-        *_option_flags(Instrument, _INSTRUMENT),
-        *_option_flags(FitOptions, _FIT_OPTIONS),
-    ]
+    return dict(flags)
 
 
 def _field_help(field: FieldInfo) -> str:
@@ -436,7 +419,7 @@ def _estimates_with(parameter: str) -> dict[str, Any]:
 
 def _step_help(step: type[Step], name: str, field: FieldInfo) -> str:
     title = f"{step.title[:1].upper()}{step.title[1:]}"
-    text = _lower_first(str(field.description))
+    text = lower_first(str(field.description))
     if not step.primary or name == step.primary:
         return f"{title}: {text}"
     return f"For --{step.name()}: {text} Default: {_default_text(field)}."
@@ -446,15 +429,6 @@ def _default_text(field: FieldInfo) -> str:
     return f"{field.default:g}" if isinstance(field.default, float) else str(field.default)
 
 
-def _lower_first(text: str) -> str:
-    return text if text[1:2].isupper() else text[:1].lower() + text[1:]
-
-
-def takes_recipe(command: Callable[..., None]) -> Callable[..., None]:
-    """Add a flag for each parameter of a recipe to a command with the argument `flags`."""
-    return _with_flags(command, dict(_recipe_flags()))
-
-
 def takes_run(
     model: type[BaseModel], inputs: Callable[..., dict[str, Any]]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -462,65 +436,27 @@ def takes_run(
 
     The command receives the choices of the run as `run`, a `model`, and what `inputs` returns.
     """
-    of_run = dict(_option_flags(model, None))
     shared = _command_parameters(inputs)
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
         def with_inputs(*, flags: dict[str, Any], **arguments: Any) -> None:
-            chosen = {name: flags.pop(name) for name in of_run if name in flags}
-            run = validate(model, chosen, "", flag_names(model))
+            run = choices_of(model, flags)
+            flags = {name: x for name, x in flags.items() if name not in model.model_fields}
             files = {parameter.name: arguments.pop(parameter.name) for parameter in shared}
             command(**arguments, run=run, **inputs(**files, run=run, flags=flags))
 
         with_inputs.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
             [*_command_parameters(command), *shared]
         )
-        return _with_flags(with_inputs, {**of_run, **dict(_recipe_flags())})
+        return _with_flags(with_inputs, _option_flags(model, None) | _RECIPE_FLAGS)
 
     return decorate
 
 
-def takes_fit(command: Callable[..., None]) -> Callable[..., None]:
-    """Add a flag for each step and option of a fit to a command with the argument `flags`."""
-    return _with_flags(command, dict(_fit_flags()))
+def _with_flags(command: Callable[..., None], additions: Flags) -> Callable[..., None]:
+    """Add flags to a command with the argument `flags`."""
 
-
-def takes_trace(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the flags of a traced 3-D field to a command with the argument `flags`."""
-    flags = _option_flags(SizedView, _TRACE)
-    return _with_flags(command, dict(flags + _option_flags(TraceOptions, _TRACE, _PARTICLES)))
-
-
-def trace_choices(flags: Mapping[str, Any]) -> tuple[SizedView, TraceOptions]:
-    """Return the choices for a traced 3-D field by the flags."""
-    views = {name: value for name, value in flags.items() if name in SizedView.model_fields}
-    options = {name: value for name, value in flags.items() if name not in views}
-    return (
-        validate(SizedView, views, "", flag_names(SizedView)),
-        validate(TraceOptions, options, "", flag_names(TraceOptions)),
-    )
-
-
-def takes_plan(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the flags of a plan, an instrument and a 3-D field to a command with `flags`."""
-    of_plan = _option_flags(ExperimentOptions, None) + _option_flags(GridView, _TRACE)
-    return _with_flags(command, dict([*of_plan, *_option_flags(Instrument, _INSTRUMENT)]))
-
-
-def plan_choices(flags: Mapping[str, Any]) -> tuple[ExperimentOptions, Instrument]:
-    """Return the options and the instrument that flags of a plan state."""
-    models: list[Any] = []
-    for model in (ExperimentOptions, Instrument):
-        chosen = {name: flags[name] for name in model.model_fields if name in flags}
-        models.append(validate(model, chosen, "", flag_names(model)))
-    options, instrument = models
-    return options, instrument
-
-
-def _with_flags(
-    command: Callable[..., None], additions: Mapping[str, inspect.Parameter]
-) -> Callable[..., None]:
     @functools.wraps(command)
     def with_flags(**arguments: Any) -> None:
         flags = {name: arguments.pop(name) for name in additions}
@@ -542,19 +478,42 @@ def _command_parameters(command: Callable[..., Any]) -> list[inspect.Parameter]:
     ]
 
 
+_INSTRUMENT_FLAGS = _option_flags(Instrument, _INSTRUMENT)
+_RECIPE_FLAGS = (
+    _step_flags(STEPS.values(), _STEPS)
+    | _estimate_flags()
+    | _INSTRUMENT_FLAGS
+    | _option_flags(InversionOptions, _OPTIONS)
+)
+_FIT_FLAGS = (
+    _step_flags(FIT_STEPS.values(), _FIT_STEPS)
+    # The command has its own --source and --brightness.
+    | _option_flags(FitChoices, _FIT_CHOICES, without=("beam", "brightness", "options"))
+    | _INSTRUMENT_FLAGS
+    | _option_flags(FitOptions, _FIT_OPTIONS)
+)
+_TRACE_FLAGS = _option_flags(SizedView, _TRACE) | _option_flags(TraceOptions, _TRACE, _PARTICLES)
+_PLAN_FLAGS = (
+    _option_flags(ExperimentOptions, None) | _option_flags(GridView, _TRACE) | _INSTRUMENT_FLAGS
+)
+takes_recipe = partial(_with_flags, additions=_RECIPE_FLAGS)
+takes_fit = partial(_with_flags, additions=_FIT_FLAGS)
+takes_trace = partial(_with_flags, additions=_TRACE_FLAGS)
+takes_plan = partial(_with_flags, additions=_PLAN_FLAGS)
+
+
 def recipe_of(
     flags: Mapping[str, Any], base: Recipe, options: Mapping[str, Any], where: str = "options"
 ) -> Recipe:
     """Override a recipe with an options file, named `where`, and with flags."""
     before = base.options.model_dump(exclude_unset=True)
-    inversion_options = _options(InversionOptions, flags, before, options, where)
+    inversion_options = choices_of(InversionOptions, flags, before, options, where)
     if "margin" in flags and inversion_options.boundary != "free":
         raise InputError("received --margin: it needs --boundary free")
-    steps, source = _steps(flags, base.steps), _estimate(flags, base)
     changes = {
-        "steps": steps,
-        "source": source,
-        "instrument": _instrument(flags, base),
+        "steps": _steps(flags, base.steps),
+        "source": _estimate(flags, base),
+        "instrument": choices_of(Instrument, flags, base.instrument.stated),
         "options": inversion_options,
     }
     return base.model_copy(update=changes)
@@ -566,7 +525,7 @@ def fit_recipe_of(
     """Override a recipe with an options file, named `where`, and with flags of a fit."""
     before = base.fit or FitChoices()
     stated = before.options.model_dump(exclude_unset=True)
-    fit_options = _options(FitOptions, flags, stated, options, where)
+    fit_options = choices_of(FitOptions, flags, stated, options, where)
     changes = {name: flags[name] for name in FitChoices.model_fields if name in flags}
     values = before.model_dump(exclude_none=True, exclude={"options"})
     in_metres = ("source_size", "resolution")
@@ -580,31 +539,24 @@ def fit_recipe_of(
     )
     changes = {
         "steps": _steps(flags, base.steps),
-        "instrument": _instrument(flags, base),
+        "instrument": choices_of(Instrument, flags, base.instrument.stated),
         "fit": choices,
     }
     return base.model_copy(update=changes)
 
 
-def _options(
+def choices_of(
     model: type[Model],
     flags: Mapping[str, Any],
-    before: Mapping[str, Any],
-    content: Mapping[str, Any],
-    where: str,
+    before: Mapping[str, Any] = MappingProxyType({}),
+    content: Mapping[str, Any] = MappingProxyType({}),
+    where: str = "",
 ) -> Model:
-    """Override options with the content of a file, and with flags."""
+    """Override the values of a model with the content of the file `where`, and with flags."""
     chosen = {name: flags[name] for name in model.model_fields if name in flags}
     of_file = content.keys() - chosen.keys()
     names = flag_names(model) | {name: f"'{name}' in {where}" for name in of_file}
     return validate(model, {**before, **content, **chosen}, "", names)
-
-
-def _instrument(flags: Mapping[str, Any], base: Recipe) -> Instrument:
-    """Return the recipe's instrument with the numbers that flags state."""
-    changes = {name: flags[name] for name in Instrument.model_fields if name in flags}
-    names = flag_names(Instrument)
-    return validate(Instrument, {**base.instrument.stated, **changes}, "", names)
 
 
 def _steps(flags: Mapping[str, Any], steps: tuple[Step, ...]) -> tuple[Step, ...]:

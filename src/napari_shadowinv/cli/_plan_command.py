@@ -17,7 +17,9 @@ from napari_shadowinv.cli._terminal import (
     warn_of_setups,
 )
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.trace_options import GridView
+from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
@@ -109,7 +111,8 @@ def plan(
     _inputs.check_outputs({out: SITES.suffixes, page: FIGURE_SUFFIXES}, overwrite)
     _inputs.protect([out, page], [setup, recorded_with, _file_of(object)])
     view = {name: flags.pop(name) for name in GridView.model_fields if name in flags}
-    options, instrument = _flags.plan_choices(flags)
+    options = _flags.choices_of(ExperimentOptions, flags)
+    instrument = _flags.choices_of(Instrument, flags)
     first = None if setup is None else setup_from(setup)
     setups = _setups(first, energies)
     shape = None if size is None else shape_of_text(size, "--size")

@@ -452,9 +452,11 @@ def trace_field(
     quiet: bool,
 ) -> TracedImage:
     """Trace particles through the 3-D field in a file."""
+    from napari_shadowinv.physics.trace_options import SizedView, TraceOptions
     from napari_shadowinv.pipeline.traced_file import trace_file
 
-    view, options = _flags.trace_choices(flags)
+    view = _flags.choices_of(SizedView, flags)
+    options = _flags.choices_of(TraceOptions, flags)
     if source is not None and {"height", "width"} & flags.keys():
         raise InputError("received --height or --width, but --source sets the size: leave it out")
     with nullcontext() if quiet else progress_bars() as show:
