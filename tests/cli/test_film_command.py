@@ -10,7 +10,7 @@ import pytest
 
 from helpers.command_line import content, flat, shadowinv
 from napari_shadowinv import read
-from napari_shadowinv.cli import _film_command
+from napari_shadowinv.cli import _terminal
 from napari_shadowinv.film import read_corners
 from simulated_pack import Truth, simulate
 
@@ -118,7 +118,7 @@ def test_mistakes_in_a_pack_leave_nothing(
 
 
 def test_a_cancelled_run_leaves_nothing(truth: Truth, here: Path, monkeypatch) -> None:
-    monkeypatch.setattr(_film_command, "is_interrupted", lambda: True)
+    monkeypatch.setattr(_terminal, "is_interrupted", lambda: True)
     ended = shadowinv("film", truth.pack)
     assert ended.exit_code == 130
     assert content(here) == {}

@@ -153,13 +153,13 @@ def test_ctrl_c_leaves_nothing(folder: Path) -> None:
     before = content(folder)
     say_when = """
         import contextlib
-        from napari_shadowinv.cli import _fit_result
+        from napari_shadowinv.cli import _terminal
 
         @contextlib.contextmanager
         def bars():
             yield lambda progress: print("now" if progress.stage == "fit" else "")
 
-        _fit_result.progress_bars = bars
+        _terminal.progress_bars = bars
     """
     code, errors = interrupted(folder, say_when, list(map(str, PAIR)))
     assert (code, errors.strip()) == (130, "Cancelled")

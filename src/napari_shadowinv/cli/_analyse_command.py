@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,7 +12,7 @@ import typer
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._flags import HelpfulCommand
 from napari_shadowinv.cli._summary import Rows, fact_rows, two_columns, written_rows
-from napari_shadowinv.cli._terminal import is_interrupted, notify_errors, progress_bars, say
+from napari_shadowinv.cli._terminal import notify_errors, say, work_callbacks
 from napari_shadowinv.errors import InputError
 
 if TYPE_CHECKING:
@@ -103,13 +103,12 @@ def analyse(
         raise InputError(f"{result} is one result: --shots and --times belong to a store of shots")
     else:
         dataset = read_dataset(result)
-    with nullcontext() if quiet else progress_bars() as show:
+    with work_callbacks(quiet) as callbacks:
         common: dict[str, Any] = {
             "unit": unit,
             "deflector": deflector,
             "setup": None if setup is None else setup_from(setup),
-            "on_progress": show,
-            "should_stop": is_interrupted,
+            **callbacks,
         }
         if "shot" in dataset.dims:
             seconds = _times(times, dataset["index"].values.tolist())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -10,14 +9,13 @@ import typer
 
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._summary import fact_rows, two_columns, written_rows
-from napari_shadowinv.cli._terminal import is_interrupted, notify_errors, progress_bars, say
+from napari_shadowinv.cli._terminal import notify_errors, say, work_callbacks
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import ResultKind
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from napari_shadowinv.film import Pack
     from napari_shadowinv.film_doses import FilmDoses
 
 LayersFormat = Literal["tiff", "pradformat"]
@@ -82,7 +80,7 @@ def film(
     from napari_shadowinv.film import write_corners
     from napari_shadowinv.io import replacing
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, SITES, suffixes_for
-    from napari_shadowinv.pipeline import read_pack, write_layers
+    from napari_shadowinv.pipeline import read_pack, run_film, write_layers
     from napari_shadowinv.pipeline.film_files import LAYERS_TABLE
 
     if new is not None:
@@ -104,7 +102,8 @@ def film(
     _inputs.check_outputs(outputs, overwrite)
     content = read_pack(pack)
     _inputs.protect(list(outputs), [pack, *content.files])
-    doses = _run_pack(content, quiet)
+    with work_callbacks(quiet) as callbacks:
+        doses = run_film(content, **callbacks)
     written = [result, figure]
     _inputs.write_result(doses, [str(pack)], result, figure, overwrite)
     if layers is not None:
@@ -137,13 +136,6 @@ def _write_new(folder: Path, pack: Path | None, overwrite: bool) -> None:
     rows += [("to complete", text) for text in missing_entries(entries)]
     path = write_new_pack(folder, entries, overwrite=overwrite)
     say(two_columns("New pack", [*rows, ("written", str(path))]))
-
-
-def _run_pack(pack: Pack, quiet: bool) -> FilmDoses:
-    from napari_shadowinv.pipeline import run_film
-
-    with nullcontext() if quiet else progress_bars() as show:
-        return run_film(pack, on_progress=show, should_stop=is_interrupted)
 
 
 def film_table(doses: FilmDoses) -> Table:

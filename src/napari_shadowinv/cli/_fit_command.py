@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,13 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from napari_shadowinv.cli import _flags, _inputs
-from napari_shadowinv.cli._terminal import (
-    is_interrupted,
-    notify_errors,
-    progress_bars,
-    say,
-    warn_of_setups,
-)
+from napari_shadowinv.cli._summary import two_columns, written_rows
+from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups, work_callbacks
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.io.formats import IMAGE_TITLES
 
@@ -154,8 +148,7 @@ def fit(
         result_fit = _fit_result.compare_fields(chosen, shots, quiet, written=flags.get("fields"))
     else:
         result_fit = _fit_result.fit_images(chosen, shots, quiet)
-    with nullcontext() if quiet else progress_bars() as show:
-        callbacks: dict[str, Any] = {"on_progress": show, "should_stop": is_interrupted}
+    with work_callbacks(quiet) as callbacks:
         named = [replace(shot, name=name) for shot, name in zip(shots, short, strict=True)]
         static = run_checks(chosen, named, result_fit, **checks, **callbacks)
     _inputs.write_result(result_fit, names, result, figure, overwrite, static)
@@ -166,6 +159,6 @@ def fit(
     if not quiet:
         for table in _fit_result.check_tables(static):
             say(table)
-        say(_fit_result.fit_table(result_fit, names, list(outputs)))
+        say(two_columns("Fit", [*_fit_result.fit_rows(result_fit, names), *written_rows(outputs)]))
     _fit_result.exit_unless_static(static, result)
     _fit_result.exit_unless_determined(result_fit, result)

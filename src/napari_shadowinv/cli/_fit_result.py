@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -16,14 +15,12 @@ from napari_shadowinv.cli._summary import (
     setup_text,
     size_text,
     two_columns,
-    written_rows,
 )
 from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
-    is_interrupted,
-    progress_bars,
     say,
     say_on_stderr,
+    work_callbacks,
 )
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import RESULT
@@ -43,8 +40,8 @@ def fit_images(recipe: Recipe, shots: Sequence[FitShot], quiet: bool) -> Fit:
     """Fit fields to images, with a bar for each stage."""
     from napari_shadowinv.pipeline import run_fit
 
-    with nullcontext() if quiet else progress_bars() as show:
-        return run_fit(recipe, shots, on_progress=show, should_stop=is_interrupted)
+    with work_callbacks(quiet) as callbacks:
+        return run_fit(recipe, shots, **callbacks)
 
 
 def compare_fields(
@@ -67,8 +64,8 @@ def compare_fields(
             f"received --fields {written} and --compare, which compares {choices}: write one of "
             "these, or leave out --fields to write the likeliest"
         )
-    with nullcontext() if quiet else progress_bars() as show:
-        fits = run_comparison(recipe, shots, on_progress=show, should_stop=is_interrupted)
+    with work_callbacks(quiet) as callbacks:
+        fits = run_comparison(recipe, shots, **callbacks)
     if not quiet:
         say(comparison_table(fits))
     if written is None:
@@ -92,11 +89,6 @@ def comparison_table(fits: Sequence[Fit]) -> Table:
         evidence = "likeliest" if fit is fits[0] else f"{difference:+.1f}"
         table.add_row(names, chi2, evidence, fit.verdict)
     return table
-
-
-def fit_table(fit: Fit, names: Sequence[str], written: Sequence[Path]) -> Table:
-    """Build the table of a fit: its verdict, images, fields and files."""
-    return two_columns("Fit", [*fit_rows(fit, names), *written_rows(written)])
 
 
 def exit_unless_determined(fit: Fit, out: Path) -> None:
@@ -203,12 +195,12 @@ def check_figures(checks: StaticChecks, report: Path, title: str) -> dict[Path, 
 
 def check_tables(checks: StaticChecks) -> list[Table]:
     """Return a table for each check."""
-    tables = []
-    if checks.left_out is not None:
-        tables.append(two_columns("Left out", fact_rows(checks.left_out.facts)))
-    if checks.windows is not None:
-        tables.append(two_columns("Windows", fact_rows(checks.windows.facts)))
-    return tables
+    results: dict[str, Any] = {"Left out": checks.left_out, "Windows": checks.windows}
+    return [
+        two_columns(title, fact_rows(result.facts))
+        for title, result in results.items()
+        if result is not None
+    ]
 
 
 def exit_unless_static(checks: StaticChecks, out: Path) -> None:

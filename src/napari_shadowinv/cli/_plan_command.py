@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,11 +9,11 @@ import typer
 
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._terminal import (
-    is_interrupted,
+    EXIT_NOT_CONVERGED,
     notify_errors,
-    progress_bars,
     say,
     warn_of_setups,
+    work_callbacks,
 )
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import Instrument
@@ -42,7 +41,6 @@ HELP = {
     "figure": "Figure file: .png, .pdf or .svg. Default: a PNG next to the table.",
 }
 _OF_FILE = "Object of a file"
-_EXIT_NOT_DETERMINED = 3
 EPILOG = r"""
 [bold]Examples[/bold]
 shadowinv plan toroid --setup setup.toml --detector film --beam-source TNSA
@@ -120,8 +118,8 @@ def plan(
     choices: dict[str, Any] = {"shape": shape, "instrument": instrument, "options": options}
     warn_of_setups((each, shape) for each in setups or ())
     result: Any
-    with nullcontext() if quiet else progress_bars() as show:
-        choices |= {"on_progress": show, "should_stop": is_interrupted}
+    with work_callbacks(quiet) as callbacks:
+        choices |= callbacks
         if sweep is None:
             result = plan_experiment(target, setups, **choices)
         else:
@@ -136,7 +134,7 @@ def plan(
         rows = [headline_row(result.headline), *fact_rows(result.facts), *written_rows([out, page])]
         say(two_columns("Sweep" if is_sweep else "Plan", rows))
     if not result.is_determined:
-        raise typer.Exit(_EXIT_NOT_DETERMINED)
+        raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
 def _file_of(text: str) -> Path | None:

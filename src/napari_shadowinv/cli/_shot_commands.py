@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,11 +23,10 @@ from napari_shadowinv.cli._summary import (
 from napari_shadowinv.cli._terminal import (
     exit_unless_converged,
     invert_shot,
-    is_interrupted,
     notify_errors,
-    progress_bars,
     say,
     warn_of_setups,
+    work_callbacks,
 )
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
@@ -207,8 +205,8 @@ def rerun(
     inputs = collect_rerun(result, image, source=source, other_folders=other_folders)
     check_rerun(inputs, result, again_out, figure, overwrite)
     warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in inputs.shots)
-    with nullcontext() if quiet else progress_bars() as show:
-        again = inputs.run(show, is_interrupted)
+    with work_callbacks(quiet) as callbacks:
+        again = inputs.run(**callbacks)
     names = [str(file) for file in inputs.files[: len(inputs.shots)]] or [str(result)]
     _inputs.write_result(again.content, names, again_out, figure, overwrite, again.checks)
     if not quiet:
@@ -459,7 +457,7 @@ def trace_field(
     options = _flags.choices_of(TraceOptions, flags)
     if source is not None and {"height", "width"} & flags.keys():
         raise InputError("received --height or --width, but --source sets the size: leave it out")
-    with nullcontext() if quiet else progress_bars() as show:
+    with work_callbacks(quiet) as callbacks:
         return trace_file(
             path,
             setup,
@@ -469,8 +467,7 @@ def trace_field(
             source=source,
             iteration=iteration,
             seed=seed,
-            on_progress=show,
-            should_stop=is_interrupted,
+            **callbacks,
         )
 
 

@@ -86,17 +86,14 @@ def invert_shot(
     shot: Radiograph,
     source: Radiograph | None = None,
     quiet: bool = False,
-    **masks: Any,
 ) -> Inversion:
     """Apply a recipe to a shot; errors name the file."""
     from napari_shadowinv.pipeline import run
 
     warn_of_setups([(recipe.setup or shot.setup, shot.shape)])
-    with nullcontext() if quiet else progress_bars() as show:
+    with work_callbacks(quiet) as callbacks:
         try:
-            return run(
-                recipe, shot, source=source, **masks, on_progress=show, should_stop=is_interrupted
-            )
+            return run(recipe, shot, source=source, **callbacks)
         except InputError as error:
             if shot.path is None:
                 raise
@@ -117,6 +114,13 @@ def warn_of_setups(experiments: Iterable[tuple[Setup | None, tuple[int, int] | N
     ]
     for text in dict.fromkeys(texts):
         Console(stderr=True).print(plain(text, "yellow"), soft_wrap=True, highlight=False)
+
+
+@contextmanager
+def work_callbacks(quiet: bool) -> Iterator[dict[str, Any]]:
+    """Provide the callbacks of long work as keywords: bars of its progress, and Ctrl-C."""
+    with nullcontext() if quiet else progress_bars() as show:
+        yield {"on_progress": show, "should_stop": is_interrupted}
 
 
 @contextmanager
