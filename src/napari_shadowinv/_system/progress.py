@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from queue import SimpleQueue
 from threading import Event
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from napari_shadowinv._system.machine import Crew
 from napari_shadowinv.errors import InversionCancelled
@@ -37,20 +37,6 @@ OnProgress = Callable[[Progress], None]
 OnStep = Callable[[str, float], None]
 """Receives the stage and the objective after each step of a fit; an exception ends the fit."""
 ShouldStop = Callable[[], bool]
-
-
-class OnReport(Protocol):
-    """Receives the parts of a `Progress`; ends the work by an exception."""
-
-    def __call__(
-        self,
-        stage: str,
-        step: int,
-        total: int | None = None,
-        message: str = "",
-        objective: float | None = None,
-    ) -> None:
-        """Report a step."""
 
 
 _P = ParamSpec("_P")

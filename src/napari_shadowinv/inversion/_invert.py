@@ -18,7 +18,6 @@ from napari_shadowinv._system.arrays import check_mask, unpack_array, unpack_sho
 from napari_shadowinv._system.machine import begin
 from napari_shadowinv._system.progress import (
     OnProgress,
-    OnReport,
     Progress,
     Reporter,
     ShouldStop,
@@ -472,7 +471,7 @@ def _read_fields(
     """Read the last solution, and begin to estimate its errors; return a function that waits."""
     solution, options = solutions[-1], budget.options
 
-    def report_share(report: OnReport, share: float, first: int, last: int) -> None:
+    def report_share(report: Reporter, share: float, first: int, last: int) -> None:
         report("read-out", round(first + share * (last - first)), _STEPS)
 
     report_share(report, 0, 0, _READ_STEPS)
