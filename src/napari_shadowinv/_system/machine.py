@@ -51,15 +51,10 @@ def _group_limits() -> Iterator[int]:
         if controllers:
             root, file = _CGROUPS / "memory", "memory.limit_in_bytes"
         # In a container, its own group is the root of what it sees.
-        for folder in (root, *(root / part for part in _nested(name))):
+        group = Path(name.lstrip("/"))
+        for folder in (root, *(root / part for part in (group, *group.parents))):
             with suppress(OSError, ValueError):
                 yield int((folder / file).read_text())  # "max" for none
-
-
-def _nested(name: str) -> list[Path]:
-    """Return a group's path below the root, and the paths of the groups around it."""
-    path = Path(name.lstrip("/"))
-    return [path, *path.parents]
 
 
 @contextmanager

@@ -87,7 +87,7 @@ class BeamPrior(CheckedModel):
         If a value is out of range.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(allow_inf_nan=False)
 
     rms: float = Field(default=0.0, ge=0, lt=1)
     length: float = Field(default=0.25, gt=0, le=1)

@@ -27,9 +27,6 @@ from napari_shadowinv.options.beam_prior import ASSUMED_BEAM, BeamComponents, Be
 
 __all__ = ["BEAM_SOURCES", "DETECTORS", "Instrument"]
 
-_CONFIG = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
 Detector = Literal["film", "image plate", "CR-39", "scintillator", "camera"]
 BeamSource = Literal["TNSA", "implosion", "X-ray tube", "laser"]
 
@@ -73,7 +70,7 @@ class Instrument(CheckedModel):
     (0.1, 0.03, 0.1)
     """
 
-    model_config = _CONFIG
+    model_config = ConfigDict(allow_inf_nan=False)
 
     # Arrays are no text: a recipe names the files of the references.
     _components: BeamComponents | None = PrivateAttr(default=None)
