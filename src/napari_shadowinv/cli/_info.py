@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from napari_shadowinv import __version__
-from napari_shadowinv._system.machine import physical_memory
+from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cli import _summary
 from napari_shadowinv.facts import ResultKind
@@ -56,21 +56,15 @@ def _rows(path: Path, variable: str | None) -> _summary.Rows:
     form = format_of(path)
     if form.name == "mat":
         return _matlab_rows(path, variable)
-    if form.name == "cpsa":
-        return _radiograph_rows(read(path, variable=variable))
-    if variable is not None and form.named_reader:
+    if variable is not None and form.named_reader and form.name != "cpsa":
         array = read_hdf5(path, variable)
         return [("kind", f"array {variable!r} of an HDF5 file"), *_array_rows(array)]
-    if form.name == "npy" and variable is None:
+    if variable is None and form.name == "npy":
         return [("kind", "NPY array"), *_array_rows(read_npy(path))]
-    if form.name == "text" or variable is not None:
-        return _radiograph_rows(read(path, variable=variable))
-    if "result" not in form.holds:
+    if variable is None and form.name not in ("cpsa", "text") and "result" not in form.holds:
         return _picture_rows(path, form)
-    content = read(path)
-    if isinstance(content, Radiograph):
-        return _radiograph_rows(content)
-    return _result_rows(content)
+    content = read(path, variable=variable)
+    return _radiograph_rows(content) if isinstance(content, Radiograph) else _result_rows(content)
 
 
 def _frame_rows(frames: Radiograph | xarray.Dataset) -> _summary.Rows:
@@ -112,10 +106,7 @@ def _picture_rows(path: Path, form: Format) -> _summary.Rows:
     return [*rows, *_array_rows(array), *[("warning", caution.text) for caution in warnings]]
 
 
-def _radiograph_rows(shot: Radiograph | xarray.Dataset) -> _summary.Rows:
-    from napari_shadowinv.io import Radiograph
-
-    assert isinstance(shot, Radiograph)
+def _radiograph_rows(shot: Radiograph) -> _summary.Rows:
     names = {
         "text": "numbers as text",
         "pradformat": "pradformat radiograph",
@@ -247,7 +238,7 @@ def system_report() -> str:
         *[(name, _version(name) or "not installed") for name in PACKAGES.split()],
         ("Qt", ", ".join(_qt_bindings()) or "not installed"),
         ("platform", f"{platform.platform()}, {platform.machine()}"),
-        ("cores", _cores()),
+        ("cores", f"{os.cpu_count() or 'unknown'}, {available_threads(None)} usable"),
         ("memory", "unknown" if memory is None else f"{memory / 2**30:.1f} GiB"),
         ("compiled code", _compiled_code()),
     ]
@@ -265,15 +256,6 @@ def _version(package: str) -> str | None:
 def _qt_bindings() -> list[str]:
     versions = ((name, _version(name)) for name in QT_BINDINGS)
     return [f"{name} {number}" for name, number in versions if number]
-
-
-def _cores() -> str:
-    count = os.cpu_count()
-    try:
-        usable = len(os.sched_getaffinity(0))
-    except AttributeError:  # not on macOS or Windows
-        usable = count or 1
-    return f"{count or 'unknown'}, {usable} usable"
 
 
 def _compiled_code() -> str:
