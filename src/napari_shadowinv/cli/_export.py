@@ -148,14 +148,11 @@ def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[_Job]:
 def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[_Job]:
     check_pradformat_setup(setup_from_dataset(dataset))
     for index in range(dataset.sizes["shot"]):
-        shot = _with_origin(dataset.isel(shot=index))
+        shot = dataset.isel(shot=index)
+        # A shot may have its own provenance.
+        if (provenance := provenance_of(shot)) is not None:
+            shot = shot.assign_attrs(provenance=provenance.to_json())
         yield f"{_stem(shot)}{PRADFORMAT.suffix}", shot.compute, setup_from_dataset(shot)
-
-
-def _with_origin(shot: xarray.Dataset) -> xarray.Dataset:
-    """Return a shot with its own provenance, or else the provenance of its store."""
-    provenance = provenance_of(shot)
-    return shot if provenance is None else shot.assign_attrs(provenance=provenance.to_json())
 
 
 def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> Path:
@@ -179,20 +176,18 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
         rows.writerow(["shot", "name", "status", *listed, "reason", *headings])
         keys = [*(column.entry or column.key for column in content.columns), "reason"]
         for index in indices:
-            report = (_escape_entry(reports[index].get(key, "")) for key in keys)
+            report = (_escape_cell(reports[index].get(key, "")) for key in keys)
             peak = (f"{columns[name][index]:.9g}" for name in names)
             status = STATUS_NAMES[statuses[index]]
             rows.writerow([index, _escape_cell(content.names[index]), status, *report, *peak])
     return out
 
 
-def _escape_entry(value: Any) -> Any:
-    return _escape_cell(value) if isinstance(value, str) else value
-
-
-def _escape_cell(text: str) -> str:
+def _escape_cell(value: Any) -> Any:
     """Escape text that a terminal or a spreadsheet would interpret as a command."""
-    cell = escape_invisible(text)
+    if not isinstance(value, str):
+        return value
+    cell = escape_invisible(value)
     return f"'{cell}" if cell.startswith(_FORMULA_SIGNS) else cell
 
 
