@@ -34,6 +34,7 @@ from napari_shadowinv.cli._terminal import (
     say_on_stderr,
 )
 from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.facts import Level
 from napari_shadowinv.io.shot_columns import joined_columns
 from napari_shadowinv.io.store import (
     DAMAGED,
@@ -301,18 +302,6 @@ def _beam_rows(store: StackStore) -> Rows:
     return rows
 
 
-def _joined_rows(attributes: Mapping[str, Any]) -> Rows:
-    """Return the columns of a shot table."""
-    titles = [column.title for column in joined_columns(attributes)]
-    return [("shot table", ", ".join(titles))] if titles else []
-
-
-def _fit_rows(attributes: Mapping[str, Any]) -> Rows:
-    """Return the choices of the fit."""
-    choices = {**json.loads(attributes["fit"]), "fields": json.loads(attributes["fields"])}
-    return [("fit", options_text(choices))]
-
-
 def _site_rows(store: StackStore) -> Rows:
     """Return the number of sites with its reason, and the typical errors."""
     reports = [report for report in store.reports() if "n_sites" in report]
@@ -339,8 +328,7 @@ def _trouble_rows(store: StackStore) -> Rows:
     statuses = store.statuses()
     rows = []
     for status in (FAILED, DAMAGED):
-        label = STATUS_NAMES[status]
-        indices = [int(index) for index in np.flatnonzero(statuses == status)]
+        label, indices = STATUS_NAMES[status], np.flatnonzero(statuses == status).tolist()
         rows += [
             (label, f"{store.names[i]}: {store.report(i).get('reason', 'its report is missing')}")
             for i in indices[:_MAX_LISTED]
@@ -349,11 +337,8 @@ def _trouble_rows(store: StackStore) -> Rows:
             hidden = len(indices) - _MAX_LISTED
             rows.append((label, f"and {hidden} more: shadowinv status {store.path} --all"))
     skipped = [store.names[index] for index in np.flatnonzero(statuses == SKIPPED)]
-    rows += (
-        [("skipped", f"{_list_text(skipped)}; a watch without --latest inverts them")]
-        if skipped
-        else []
-    )
+    if skipped:
+        rows.append(("skipped", f"{_list_text(skipped)}; a watch without --latest inverts them"))
     rows += [(STATUS_NAMES[DAMAGED], problem) for problem in store.damage.files[:_MAX_LISTED]]
     if store.damage.shots or store.damage.files:
         rows.append(("warning", "repeat the run with --resume to repair the damage"))
@@ -462,6 +447,10 @@ def store_rows(store: StackStore, *, trouble: bool = True) -> Rows:
     """Describe a store."""
     attributes = store.attributes
     seconds = [report["seconds"] for report in store.reports() if "stages" in report]
+    titles = [column.title for column in joined_columns(attributes)]
+    fit = {}
+    if store.field is not None:
+        fit = {**json.loads(attributes["fit"]), "fields": json.loads(attributes["fields"])}
     rows = [
         ("kind", f"stack of {len(store.names)} shots, shadowinv {attributes['package_version']}"),
         ("created", str(attributes["created"])),
@@ -471,8 +460,8 @@ def store_rows(store: StackStore, *, trouble: bool = True) -> Rows:
         *_recipe_rows(store),
         *_beam_rows(store),
         ("stored", str(attributes["stored"])),
-        *_joined_rows(attributes),
-        *([] if store.field is None else _fit_rows(attributes)),
+        *([("shot table", ", ".join(titles))] if titles else []),
+        *([("fit", options_text(fit))] if fit else []),
         ("options", options_text(json.loads(attributes["options"]))),
         *_site_rows(store),
     ]
@@ -523,8 +512,6 @@ class _WatchPrinter:
         if outcome.reason:
             self._print(self.err, f"failed: {name}: {outcome.reason}", "red")
             return
-        from napari_shadowinv.facts import Level
-
         assert status.result is not None
         summary, doubts = _shot_summary(status.result)
         summary = f"  {summary}  {outcome.seconds:.2f} s{waiting}{doubts}"
@@ -563,7 +550,7 @@ def run_watch(
     quiet: bool,
 ) -> None:
     """Watch a folder; print a line for each shot and a summary."""
-    from napari_shadowinv.stack import watch_stack
+    from napari_shadowinv.stack import RunStatus, watch_stack
 
     printer = _WatchPrinter(folder, watch.pattern, quiet, Console(), Console(stderr=True))
     with suppress(KeyboardInterrupt, InversionCancelled):
@@ -576,15 +563,12 @@ def run_watch(
             on_progress=printer.update,
             should_stop=is_interrupted,
         )
-    _print_summary(printer.status, out, quiet)
+    _print_summary(printer.status or RunStatus(), out, quiet)
 
 
-def _print_summary(status: RunStatus | None, out: Path, quiet: bool) -> None:
-    done, failed, skipped, waiting = 0, 0, 0, 0
-    if status is not None:
-        done, failed, waiting = status.done, status.failed, status.waiting
-        skipped = status.skipped
-    remaining = f", {skipped} skipped" if skipped else ""
+def _print_summary(status: RunStatus, out: Path, quiet: bool) -> None:
+    done, failed, waiting = status.done, status.failed, status.waiting
+    remaining = f", {status.skipped} skipped" if status.skipped else ""
     remaining += f", {waiting} not yet inverted" if waiting else ""
     if not done:
         text = f"Stopped: {failed} failed, nothing written" if failed else "Stopped: no shots"
