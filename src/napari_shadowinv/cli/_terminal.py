@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import signal
 import sys
-import threading
 import time
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator
@@ -42,8 +41,7 @@ _REPEAT_S = 2.0  # repeated presses of Ctrl-C within this time count once
 
 P = ParamSpec("P")
 
-_ctrl_c = threading.Event()
-_ending_signal: int = signal.SIGINT
+_ending_signal: int | None = None  # that has come since the command began
 
 
 def plain(text: object, style: str = "") -> Text:
@@ -73,11 +71,11 @@ def say(content: str | Table) -> None:
         Console().print(content, highlight=False)
 
 
-def say_on_stderr(text: str) -> None:
-    """Print an error in one line."""
+def say_on_stderr(text: str, style: str = "bold red") -> None:
+    """Print an error, or a warning in another style, in one line."""
     from rich.console import Console
 
-    line = plain(" ".join(text.split()), "bold red")
+    line = plain(" ".join(text.split()), style)
     Console(stderr=True).print(line, soft_wrap=True, highlight=False)
 
 
@@ -102,18 +100,16 @@ def invert_shot(
 
 def warn_of_setups(experiments: Iterable[tuple[Setup | None, tuple[int, int] | None]]) -> None:
     """Print the doubts about setups and the shapes of their images, before the work begins."""
-    from rich.console import Console
-
     from napari_shadowinv.physics.setup import setup_warnings
 
     texts = [
-        text
+        caution.text
         for setup, shape in experiments
         if setup is not None
-        for text in setup_warnings(setup, shape)
+        for caution in setup_warnings(setup, shape)
     ]
     for text in dict.fromkeys(texts):
-        Console(stderr=True).print(plain(text, "yellow"), soft_wrap=True, highlight=False)
+        say_on_stderr(text, "yellow")
 
 
 @contextmanager
@@ -201,12 +197,12 @@ def exit_unless_converged(report: Report, out: Path) -> None:
 
 def is_interrupted() -> bool:
     """Whether Ctrl-C was pressed since the command began, as `should_stop`."""
-    return _ctrl_c.is_set()
+    return _ending_signal is not None
 
 
 def cancel_exit_code() -> int:
     """Return the exit code of a command that a signal has ended: 128 and its number."""
-    return 128 + _ending_signal
+    return 128 + (_ending_signal or signal.SIGINT)
 
 
 @contextmanager
@@ -215,15 +211,13 @@ def _handle_interrupts() -> Iterator[None]:
 
     SIGTERM and SIGHUP count as Ctrl-C, so that no half-written file remains.
     """
-    _ctrl_c.clear()
-    pressed = float("-inf")
     global _ending_signal
-    _ending_signal = signal.SIGINT
+    _ending_signal = None
+    pressed = float("-inf")
 
     def stop(number: int, frame: object) -> None:
         global _ending_signal
         nonlocal pressed
-        _ctrl_c.set()
         _ending_signal = number
         if time.monotonic() < pressed + _REPEAT_S:
             return  # it would interrupt the clean-up after the first
