@@ -93,11 +93,14 @@ def analyse(
 
     chosen = _products(product or [], products)
     suffixes = {csv: SITES.suffixes, figure: FIGURE_SUFFIXES, out: RESULT.suffixes}
-    outputs = {path: endings for path, endings in suffixes.items() if path is not None}
-    _inputs.check_outputs(outputs, overwrite)
-    _inputs.protect(list(outputs), [result, setup, products])
+    outputs = _inputs.check_outputs(suffixes, overwrite)
+    _inputs.protect(outputs, [result, setup, products])
     if is_stack(result):
-        _check_series(out)
+        if out is not None:
+            raise InputError(
+                f"received --out {out}, which copies one result with its products, but a store has "
+                "many results: use --csv"
+            )
         dataset = open_shots(result, shots)
     elif shots is not None or times is not None:
         raise InputError(f"{result} is one result: --shots and --times belong to a store of shots")
@@ -122,15 +125,6 @@ def analyse(
             say(table)
         if outputs:
             say(two_columns("Files", written_rows(outputs)))
-
-
-def _check_series(out: Path | None) -> None:
-    """Refuse a copy of a store."""
-    if out is not None:
-        raise InputError(
-            f"received --out {out}, which copies one result with its products, but a store has "
-            "many results: use --csv"
-        )
 
 
 def _times(text: str | None, shots: Sequence[int]) -> list[float] | None:

@@ -91,17 +91,16 @@ def film(
             "received no pack file: name one, or write one for a folder of scans with --new"
         )
     result, figure = _inputs.result_and_figure(pack, out, figure)
-    outputs: dict[Path, tuple[str, ...]] = {
+    suffixes: dict[Path | None, tuple[str, ...]] = {
         result: suffixes_for(ResultKind.FILM_DOSES),
         figure: FIGURE_SUFFIXES,
+        corners: SITES.suffixes,
     }
-    if corners is not None:
-        outputs[corners] = SITES.suffixes
     if layers is not None and (table := layers / LAYERS_TABLE).exists():
-        outputs[table] = SITES.suffixes
-    _inputs.check_outputs(outputs, overwrite)
+        suffixes[table] = SITES.suffixes
+    outputs = _inputs.check_outputs(suffixes, overwrite)
     content = read_pack(pack)
-    _inputs.protect(list(outputs), [pack, *content.files])
+    _inputs.protect(outputs, [pack, *content.files])
     with work_callbacks(quiet) as callbacks:
         doses = run_film(content, **callbacks)
     written = [result, figure]

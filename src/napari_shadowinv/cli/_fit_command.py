@@ -127,16 +127,18 @@ def fit(
     checks: dict[str, Any] = {"left_out": leave_one_out, "window": energy_window}
     _fit_result.check_requests(len(rows), **checks, fiducials=fiducials, result=result)
     figures = [figure, *_fit_result.static_figures(figure, **checks)]
-    outputs = {result: suffixes_for(ResultKind.FIT), **dict.fromkeys(figures, FIGURE_SUFFIXES)}
-    if save_recipe is not None:
-        outputs[save_recipe] = (".toml",)
-    _inputs.check_outputs(outputs, overwrite)
+    suffixes: dict[Path | None, tuple[str, ...]] = {
+        result: suffixes_for(ResultKind.FIT),
+        **dict.fromkeys(figures, FIGURE_SUFFIXES),
+        save_recipe: (".toml",),
+    }
+    outputs = _inputs.check_outputs(suffixes, overwrite)
     row_files = [file for row in rows for file in row.files.values()]
-    _inputs.protect(list(outputs), [*images, fiducials, options, recipe, *row_files])
+    _inputs.protect(outputs, [*images, fiducials, options, recipe, *row_files])
     chosen = _inputs.fit_recipe_from(
         flags, recipe, options, source=source, brightness=brightness, mask=mask
     )
-    _inputs.protect_files_of(chosen, list(outputs))
+    _inputs.protect_files_of(chosen, outputs)
     shots = read_row_images(rows, chosen, channel=channel, variable=variable)
     shots = (replace(shots[0], fiducials=fiducials), *shots[1:])
     _inputs.check_setup(result, shots[0].setup, chosen.fit.fields if chosen.fit else None)

@@ -42,12 +42,14 @@ def figure_beside(result: Path) -> Path:
     return result.with_suffix(PNG.suffix)
 
 
-def check_outputs(outputs: Mapping[Path, tuple[str, ...]], overwrite: bool) -> None:
-    """Refuse, before any work, files with a wrong ending or folder, or that exist."""
+def check_outputs(outputs: Mapping[Path | None, tuple[str, ...]], overwrite: bool) -> list[Path]:
+    """Return the files to be written; refuse, before any work, one that cannot be."""
     from napari_shadowinv.io import check_output
 
-    for path, suffixes in outputs.items():
-        check_output(path, overwrite, suffixes=suffixes)
+    paths = [path for path in outputs if path is not None]
+    for path in paths:
+        check_output(path, overwrite, suffixes=outputs[path])
+    return paths
 
 
 def protect(outputs: list[Path], inputs: list[Path | None]) -> None:

@@ -135,11 +135,13 @@ def invert(
     from napari_shadowinv.pipeline.files import read_part
 
     result, figure = _inputs.result_and_figure(image, out, figure)
-    outputs = {result: suffixes_for(ResultKind.INVERSION), figure: FIGURE_SUFFIXES}
-    if save_recipe is not None:
-        outputs[save_recipe] = (".toml",)
-    _inputs.check_outputs(outputs, overwrite)
-    _inputs.protect(list(outputs), [image, recipe, setup, options])
+    suffixes = {
+        result: suffixes_for(ResultKind.INVERSION),
+        figure: FIGURE_SUFFIXES,
+        save_recipe: (".toml",),
+    }
+    outputs = _inputs.check_outputs(suffixes, overwrite)
+    _inputs.protect(outputs, [image, recipe, setup, options])
     chosen = _inputs.recipe_from(
         flags,
         recipe,
@@ -150,7 +152,7 @@ def invert(
         mask=mask,
         source_mask=source_mask,
     )
-    _inputs.protect_files_of(chosen, list(outputs))
+    _inputs.protect_files_of(chosen, outputs)
     shot = read_part(image, channel, variable)
     chosen = chosen.model_copy(update={"setup": _inputs.setup_for(setup, shot, chosen)})
     _inputs.check_setup(result, chosen.setup)
@@ -159,7 +161,7 @@ def invert(
     if save_recipe is not None:
         write_recipe(save_recipe, chosen, overwrite=overwrite)
     if not quiet:
-        say(summary(inversion, shot, list(outputs)))
+        say(summary(inversion, shot, outputs))
     exit_unless_converged(inversion.report, result)
 
 
@@ -270,9 +272,8 @@ def forward(
     from napari_shadowinv.pipeline.files import setup_from
 
     path = Path(f"{field.stem}_image{TIFF.suffix}") if out is None else out
-    outputs = {path: tuple(IMAGE_WRITERS)} | ({} if truth is None else {truth: (".nc",)})
-    _inputs.check_outputs(outputs, overwrite)
-    _inputs.protect(list(outputs), [field, source, setup, recorded_with])
+    outputs = _inputs.check_outputs({path: tuple(IMAGE_WRITERS), truth: (".nc",)}, overwrite)
+    _inputs.protect(outputs, [field, source, setup, recorded_with])
     if source_variable is not None and source is None:
         raise InputError("received --source-variable: it needs --source, the file that contains it")
     target = None if setup is None else setup_from(setup)
@@ -289,7 +290,12 @@ def forward(
         traced = trace_field(field, target, beam, variable, flags, seed, quiet)
         write_traced(traced, path, truth, overwrite)
         if not quiet:
-            say(traced_table(traced, list(outputs)))
+            rows = [
+                ("setup", setup_text(traced.setup, shape=traced.image.shape)),
+                *fact_rows(traced.facts),
+                *written_rows(outputs),
+            ]
+            say(two_columns("Traced field", rows))
         return
     if flags or truth is not None or seed:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in flags) or "--truth or --seed"
@@ -479,16 +485,6 @@ def write_traced(traced: TracedImage, path: Path, truth: Path | None, overwrite:
     if truth is not None:
         with replacing(truth, overwrite) as temporary:
             traced.to_dataset().to_netcdf(temporary, engine="h5netcdf")
-
-
-def traced_table(traced: TracedImage, written: list[Path]) -> Table:
-    """Build the table of a traced image."""
-    rows = [
-        ("setup", setup_text(traced.setup, shape=traced.image.shape)),
-        *fact_rows(traced.facts),
-        *written_rows(written),
-    ]
-    return two_columns("Traced field", rows)
 
 
 @dataclass(frozen=True)
