@@ -35,10 +35,12 @@ from napari_shadowinv.io.shot_columns import joined_columns
 from napari_shadowinv.io.store_checksums import (
     FIXED,
     SEAL,
+    CheckedStore,
     Damage,
     Layout,
     Status,
     check_seal,
+    describes_arrays,
     find_damage,
     is_along_shots,
 )
@@ -244,8 +246,6 @@ def check_files(store: StackStore) -> None:
 def _open_readable(path: Path) -> dict[str, Any]:
     import zarr
 
-    from napari_shadowinv.io.store_checksums import CheckedStore
-
     arrays: dict[str, Any] = dict(zarr.open_group(CheckedStore(path), mode="r").arrays())
     names = arrays["name"]
     shots = names.shape[0]
@@ -272,8 +272,6 @@ def _parse_reports(path: Path, texts: Sequence[str]) -> list[dict[str, Any]]:
 def open_dataset(path: Path) -> xarray.Dataset:
     """Open the arrays of a Zarr folder lazily; each file is checked before it is read."""
     import xarray as xr
-
-    from napari_shadowinv.io.store_checksums import CheckedStore, describes_arrays
 
     # No variable is a time, whatever its unit. While a store grows, only the folder's consolidated
     # metadata give all arrays the same length.

@@ -104,17 +104,14 @@ class ShotWriter:
         attributes = store.attributes
         return cls(store.path, attributes["store_id"], len(store.names), attributes.get(SHARDS))
 
-    def write(self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
-        """Write a shot and its report; it is done when this returns, pending if this fails."""
-        self._commit(index, arrays, report, DONE)
-
     def fail(self, index: int, report: Mapping[str, Any]) -> None:
         """Write why a shot failed."""
-        self._commit(index, {}, report, FAILED)
+        self.write(index, {}, report, FAILED)
 
-    def _commit(
-        self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any], status: int
+    def write(
+        self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any], status: int = DONE
     ) -> None:
+        """Write a shot and its report; it has its status when this returns, pending if it fails."""
         attributes = read_attributes(self.path)
         if [attributes.get("store_id"), attributes.get(SHARDS)] != [self.store_id, self.shards]:
             raise StoreError(
@@ -547,18 +544,15 @@ class GrowingStore:
         self._writer.reopen(index)
         self._statuses[index] = PENDING
 
-    def write(self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
-        """As `ShotWriter.write`; the shot's numbers are there as soon as it is done."""
-        self._gather(index, report)
-        self._writer.write(index, arrays, report)
-        self._statuses[index] = DONE
-
     def fail(self, index: int, report: Mapping[str, Any]) -> None:
         """As `ShotWriter.fail`."""
-        self._gather(index, report)
-        self._writer.fail(index, report)
-        self._statuses[index] = FAILED
+        self.write(index, {}, report, FAILED)
 
-    def _gather(self, index: int, report: Mapping[str, Any]) -> None:
+    def write(
+        self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any], status: int = DONE
+    ) -> None:
+        """As `ShotWriter.write`; the shot's numbers are there as soon as it has its status."""
         shot = slice(index, index + 1)
         _write_columns(self.path, self._writer.arrays(), self._columns, [report], shot)
+        self._writer.write(index, arrays, report, status)
+        self._statuses[index] = status
