@@ -104,7 +104,10 @@ def mat_variables(path: Path) -> list[Variable]:
         if b"\x89HDF" not in (head[:4], head[_HDF5_OFFSET:]) and head[:10] != b"MATLAB 7.3":
             file.seek(0)
             return list(_variables_5(path, file))
-    return _variables_73(path)
+    with open_hdf5(path) as content:
+        # Names that begin with # are MATLAB's own.
+        names = [name for name in content if not name.startswith("#")]
+        return [_describe_variable(path, name, member(path, content, name)) for name in names]
 
 
 def _choose_image(path: Path, variables: list[Variable], name: str | None) -> Variable:
@@ -126,13 +129,6 @@ def _choose_image(path: Path, variables: list[Variable], name: str | None) -> Va
             f"{', '.join(map(str, images))}"
         )
     return images[0]
-
-
-def _variables_73(path: Path) -> list[Variable]:
-    with open_hdf5(path) as file:
-        # Names that begin with # are MATLAB's own.
-        names = [name for name in file if not name.startswith("#")]
-        return [_describe_variable(path, name, member(path, file, name)) for name in names]
 
 
 def _describe_variable(path: Path, name: str, item: Any) -> Variable:
@@ -228,11 +224,7 @@ def _load_5(path: Path, start: int, count: int, shape: tuple[int, ...]) -> AnyAr
         check_size(path, count)
         body = unpacker.decompress(unpacker.unconsumed_tail, max(count, 1))
         check_promise(path, "MATLAB", count, len(body))
-    return _read_values(body, order)
-
-
-def _read_values(body: bytes, order: str) -> AnyArray:
-    """Read a plane of numbers, which MATLAB keeps column after column."""
+    # A plane of numbers, which MATLAB keeps column after column.
     view = memoryview(body)
     _, shape, type_name, start = _read_preamble(view, order)
     kind, content, _ = _read_field(view, start, order)
