@@ -173,6 +173,7 @@ def _open_tiff(path: Path) -> Iterator[Any]:
     """Open a TIFF with the decoder's log silenced, because the error says it once."""
     import tifffile
 
+    check_regular(path, "a TIFF")
     logger = logging.getLogger("tifffile")
     before = logger.disabled
     logger.disabled = True
@@ -211,7 +212,6 @@ def _read_page(path: Path, page: Any) -> tuple[AnyArray, dict[str, Any]]:
 @as_file_errors
 def tiff_pages(path: Path) -> int:
     """Return how many pages a TIFF has."""
-    check_regular(path, "a TIFF")
     with _open_tiff(path) as tiff:
         return len(tiff.pages)
 
@@ -221,7 +221,6 @@ def read_tiff_page(
     path: Path, number: int, *, channel: str | int | None = None
 ) -> tuple[FloatArray, tuple[Caution, ...]]:
     """Read page `number`, from 0, of a TIFF that holds many, with warnings as of a `Radiograph`."""
-    check_regular(path, "a TIFF")
     with _open_tiff(path) as tiff:
         array, _ = _read_page(path, tiff.pages[number].aspage())
     where = f"page {number} of {path}"
