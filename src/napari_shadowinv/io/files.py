@@ -165,27 +165,24 @@ def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
     sweep(path.parent)
     temporary = hidden_name(path, path.suffix)
     with clear_up_when_terminated():
-        yield from _write_then_replace(path, temporary, overwrite)
-
-
-def _write_then_replace(path: Path, temporary: Path, overwrite: bool) -> Iterator[Path]:
-    try:
-        yield temporary
-        # Someone else may have written the file during the work.
-        check_output(path, overwrite)
-        with defer_interrupts():
-            # Only when the disk has the file is it known that there was room for it.
-            with temporary.open("rb+") as file:
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-    except OSError as error:
-        if error.errno not in _NO_ROOM and not _CUT_SHORT.fullmatch(str(error)):
-            raise
-        reason = error.strerror or "No space left on device"
-        raise FileFormatError(
-            f"{path} cannot be written ({reason}): free some disk space, or choose another folder"
-        ) from error
-    finally:
-        # A second Ctrl-C must not leave the half of it behind.
-        with defer_interrupts():
-            temporary.unlink(missing_ok=True)
+        try:
+            yield temporary
+            # Someone else may have written the file during the work.
+            check_output(path, overwrite)
+            with defer_interrupts():
+                # Only when the disk has the file is it known that there was room for it.
+                with temporary.open("rb+") as file:
+                    os.fsync(file.fileno())
+                os.replace(temporary, path)
+        except OSError as error:
+            if error.errno not in _NO_ROOM and not _CUT_SHORT.fullmatch(str(error)):
+                raise
+            reason = error.strerror or "No space left on device"
+            raise FileFormatError(
+                f"{path} cannot be written ({reason}): free some disk space, or choose another "
+                "folder"
+            ) from error
+        finally:
+            # A second Ctrl-C must not leave the half of it behind.
+            with defer_interrupts():
+                temporary.unlink(missing_ok=True)
