@@ -175,7 +175,7 @@ def test_store_without_checksums_gets_none():
     codec = SimpleNamespace(to_dict=lambda: {"name": "bytes"})
     metadata = SimpleNamespace(dimension_names=("shot",), codecs=[codec])
     array = SimpleNamespace(metadata=metadata, chunks=(1,))
-    assert note_shot(Path(), "id", {"potential": array}, 0, {"name": "a"}) == {}
+    assert note_shot(Path(), "id", {"potential": array}, 0, []) == {}
 
 
 def test_swapped_chunks_damage_both_shots(store):

@@ -310,25 +310,24 @@ def fields_of(arrays: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def note_shot(
-    root: Path, store_id: str, arrays: Mapping[str, Any], index: int, labels: Mapping[str, Any]
+    root: Path, store_id: str, arrays: Mapping[str, Any], index: int, copied: Collection[str]
 ) -> dict[str, Any]:
-    """Return a shot's place, labels and the checksums of its written chunks, for its report."""
+    """Return a shot's place, labels and the checksums of its written chunks, for its report.
+
+    Arrays that are `copied` from reports are no labels.
+    """
+    labels = {
+        name: np.asarray(array[index]).tolist()
+        for name, array in arrays.items()
+        if is_along_shots(array) and array.chunks[0] > 1 and name not in copied
+    }
     fields = {name: arrays[name] for name in fields_of(arrays)}
     if not all(map(_has_checksums, fields.values())):
         return {}
     chunks = {
         name: stored_checksum(chunk_file(root, array, index)) for name, array in fields.items()
     }
-    return {CHUNKS: chunks, LABELS: dict(labels), PLACE: [store_id, index]}
-
-
-def read_labels(arrays: Mapping[str, Any], numbers: Collection[str], index: int) -> dict[str, Any]:
-    """Return the labels of a shot; the `numbers` are arrays that are copied from reports."""
-    return {
-        name: np.asarray(array[index]).tolist()
-        for name, array in arrays.items()
-        if is_along_shots(array) and array.chunks[0] > 1 and name not in numbers
-    }
+    return {CHUNKS: chunks, LABELS: labels, PLACE: [store_id, index]}
 
 
 def stored_checksum(file: Path) -> str | None:
@@ -451,11 +450,8 @@ def _shot_problem(
         expected = report[CHUNKS].get(name)
         try:
             if stored_checksum(file) != expected:
-                return (
-                    f"its {name} is missing"
-                    if not file.exists()
-                    else (f"its {name} is not the one that was written")
-                )
+                state = "not the one that was written" if file.exists() else "missing"
+                return f"its {name} is {state}"
             if every_byte:
                 _read_chunk(file)
         except OSError as error:

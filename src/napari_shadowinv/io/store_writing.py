@@ -54,7 +54,6 @@ from napari_shadowinv.io.store_checksums import (
     fixed_keys,
     is_along_shots,
     note_shot,
-    read_labels,
     reseal,
     seal,
     stored_checksum,
@@ -126,8 +125,8 @@ class ShotWriter:
                     group[name][index : index + 1] = np.asarray(arrays[name])[np.newaxis]
                 else:
                     self._erase(group[name], index)
-            labels = read_labels(group, [c.key for c in columns_of_store(attributes)], index)
-            note = note_shot(self.path, self.store_id, group, index, labels)
+            copied = [column.key for column in columns_of_store(attributes)]
+            note = note_shot(self.path, self.store_id, group, index, copied)
             text = json.dumps({**report, **note})
             group["report"][index : index + 1] = np.array([text], dtype=object)
             group["status"][index : index + 1] = np.int8(status)
