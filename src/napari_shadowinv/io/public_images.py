@@ -28,10 +28,7 @@ class PublicFile:
 def _read_list() -> dict[str, PublicFile]:
     text = files(__package__).joinpath("public_files.csv").read_text(encoding="utf-8")
     rows = list(csv.reader(text.splitlines()))[1:]
-    return {
-        name: PublicFile(name, int(size), sha256, licence, address)
-        for name, size, sha256, licence, address in rows
-    }
+    return {name: PublicFile(name, int(size), *texts) for name, size, *texts in rows}
 
 
 PUBLIC_FILES = _read_list()
