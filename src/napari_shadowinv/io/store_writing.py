@@ -306,18 +306,16 @@ def create_store(
             # Zarr writes in a thread of its own, which would go on behind our back.
             with defer_interrupts():
                 _write_template(new, contents)
+            old = hidden_name(path)
             if path.exists() and not shared:
-                old = hidden_name(path)
                 os.replace(path, old)
+            try:
                 os.replace(new, path)
-                shutil.rmtree(old, ignore_errors=True)
-            else:
-                try:
-                    os.replace(new, path)
-                except OSError:
-                    # A folder that has content is not replaced: another process was faster.
-                    if not (shared and is_stack(path)):
-                        raise
+            except OSError:
+                # A folder that has content is not replaced: another process was faster.
+                if not (shared and is_stack(path)):
+                    raise
+            shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(new, ignore_errors=True)
     return StackStore(path)
