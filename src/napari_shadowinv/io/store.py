@@ -53,6 +53,7 @@ if TYPE_CHECKING:
 FORMAT = "shadowinv stack"
 STORE_SUFFIX = STORE.suffix
 UNREAD = -1  # status of a shot that was not looked at; never stored
+DONE: int  # mypy does not infer it for the default of a parameter
 PENDING, DONE, FAILED, DAMAGED, SKIPPED = map(int, Status)
 STATUS_NAMES = tuple(status.name.lower() for status in Status)
 # Attribute of a store whose shots are rows of a table, each with its own setup in its report.
