@@ -446,7 +446,7 @@ class SaveButton(QPushButton):
 class MoreLayersButton(QPushButton):
     """Adds the hidden layers of a result."""
 
-    def __init__(self, tool: ToolPanel, results: Callable[[], ResultLayers | None]) -> None:
+    def __init__(self, tool: ToolPanel, results: Callable[[], ResultLayers]) -> None:
         super().__init__("More layers")
         self._tool, self._results = tool, results
         self._others = ResultLayers(tool.viewer, self)
@@ -460,16 +460,29 @@ class MoreLayersButton(QPushButton):
     def add(self) -> None:
         """Add the layers, hidden, to this result and to later results of the same shot."""
         results = self._results()
-        tool_layers = [] if results is None else results.layers
-        layer = shown_result(self._tool.viewer, tool_layers)
+        layer = shown_result(self._tool.viewer, results.layers)
         missing = missing_layers(self._tool.viewer, layer)
         if not missing:
             show_info("All layers of the result are in the layer list")
-        elif results is not None and layer in tool_layers:
+        elif layer in results.layers:
             results.extend(missing)
         else:
             self._others = ResultLayers(self._tool.viewer, self)
             self._others.show(missing, select=False)
+
+
+def result_buttons(
+    tool: ToolPanel,
+    results: Callable[[], ResultLayers],
+    tip: str,
+    collect: Callable[[Any, Any], Savable] = result_to_save,
+) -> tuple[SaveButton, MoreLayersButton]:
+    """Create the buttons for the shown result, which of several is the last of the tool."""
+
+    def savable() -> Savable:
+        return collect(tool.viewer, shown_result(tool.viewer, field_of(results().layers)))
+
+    return SaveButton(tool, savable, tip), MoreLayersButton(tool, results)
 
 
 def field_of(layers: Iterable[Any]) -> list[Any]:

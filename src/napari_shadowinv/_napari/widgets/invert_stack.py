@@ -15,13 +15,7 @@ from qtpy.QtWidgets import QCheckBox, QFileDialog, QHeaderView, QLabel, QLineEdi
 
 from napari_shadowinv._napari.layer_metadata import main_layers, may_be_shot, role_of
 from napari_shadowinv._napari.stores import follow_shots, shot_rows
-from napari_shadowinv._napari.widgets._files import (
-    MoreLayersButton,
-    SaveButton,
-    field_of,
-    shot_to_save,
-    shown_result,
-)
+from napari_shadowinv._napari.widgets._files import result_buttons, shot_to_save
 from napari_shadowinv._napari.widgets._forms import PathEdit, RowPicker, labelled
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
@@ -266,14 +260,12 @@ class InvertStack(InversionInputs, ToolPanel):
         self.redo_failed.setToolTip("<qt>Retry the shots that failed in an earlier run.</qt>")
         self.engine = EnginePicker()
         self.report = ReportTable()
-        self.save_result = SaveButton(
+        self.save_result, self.more_layers = result_buttons(
             self,
-            lambda: shot_to_save(
-                self.viewer, shown_result(self.viewer, field_of(self.results.layers))
-            ),
+            lambda: self.results,
             "Save the displayed shot to a separate file. The store already contains all shots.",
+            shot_to_save,
         )
-        self.more_layers = MoreLayersButton(self, lambda: self.results)
         self.failures_title = QLabel("Failed shots")
         self.failures_title.setVisible(False)
         self.failures = FailureTable()
