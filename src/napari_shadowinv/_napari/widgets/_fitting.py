@@ -9,7 +9,7 @@ from typing import Any
 
 from napari.utils.notifications import show_warning
 from qtpy.QtCore import QSignalBlocker, Qt
-from qtpy.QtWidgets import QDoubleSpinBox, QPushButton, QWidget
+from qtpy.QtWidgets import QDoubleSpinBox, QWidget
 
 from napari_shadowinv._napari.fit_layers import alternative_layers, start_name
 from napari_shadowinv._napari.jobs import Finished, FitJob
@@ -22,7 +22,7 @@ from napari_shadowinv._napari.widgets._forms import (
     section,
 )
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, fact_rows
-from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, timer
+from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, push_button, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
 from napari_shadowinv.facts import Fact, Verdict
 from napari_shadowinv.fitting import Fit
@@ -46,13 +46,13 @@ class RefineSection(QWidget):
             "<qt>Standard deviation of the image's blur from source size and detector, in pixels "
             "of the object plane.</qt>"
         )
-        self.button = QPushButton("Refine")
-        self.button.setToolTip(
-            "<qt>Fit the forward model to the image, starting from its last inversion. The fit "
+        self.button = push_button(
+            "Refine",
+            "Fit the forward model to the image, starting from its last inversion. The fit "
             "includes blur, gives error bars, and works beyond the first caustic. The verdict "
-            "says whether the image determines the field.</qt>"
+            "says whether the image determines the field.",
+            lambda: refine(self.psf.value()),
         )
-        self.button.clicked.connect(lambda: refine(self.psf.value()))
         self.folded = section("Refine the result", labelled("Blur σ", self.psf), self.button)
         column(self, self.folded)
 
@@ -123,11 +123,10 @@ class FitView(QWidget):
     ) -> None:
         is_determined = fit.verdict is Verdict.DETERMINED
         sentence = f"{fit.explanation[:1].upper()}{fit.explanation[1:]}."
-        self.verdict.setText(
-            f"<b>Verdict: {html.escape(fit.verdict.value)}</b><br>{html.escape(sentence)}"
+        self.verdict.show_text(
+            f"<b>Verdict: {html.escape(fit.verdict.value)}</b><br>{html.escape(sentence)}",
+            "" if is_determined else PROBLEM_STYLE,
         )
-        self.verdict.setStyleSheet("" if is_determined else PROBLEM_STYLE)
-        self.verdict.setVisible(True)
         warnings = [("Warning", caution.text) for caution in fit.warnings]
         rows = [row for row in warnings if row not in inputs]
         self.report.show_rows([*rows, *inputs, *fact_rows(facts, details=None)])

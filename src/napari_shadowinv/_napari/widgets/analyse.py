@@ -207,8 +207,7 @@ class Analyse(qt.Docked):
             if peak is not None:
                 name = f"{profile.name}: " if len(self.profiles) > 1 else ""
                 lines.append(f"{name}{peak.text(profile.unit, self._unit)}")
-        self.measures.setText("\n".join(lines))
-        self.measures.setVisible(bool(lines))
+        self.measures.show_text("\n".join(lines))
 
     def show_problem(self, text: str) -> None:
         """Show a problem until the next profile."""

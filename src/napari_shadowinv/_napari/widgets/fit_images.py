@@ -12,14 +12,7 @@ from napari_shadowinv._napari.jobs import PACE, Finished, FitJob, estimate_fit_t
 from napari_shadowinv._napari.shots import radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
-from napari_shadowinv._napari.widgets._files import (
-    FitRecipeButton,
-    MoreLayersButton,
-    SaveButton,
-    field_of,
-    result_to_save,
-    shown_result,
-)
+from napari_shadowinv._napari.widgets._files import FitRecipeButton, result_buttons
 from napari_shadowinv._napari.widgets._fitting import FitView
 from napari_shadowinv._napari.widgets._forms import StepsSection
 from napari_shadowinv._napari.widgets._inputs import (
@@ -119,15 +112,12 @@ class FitImages(ToolPanel):
         self.recipes = FitRecipeButton(self)
         self.cost = forms.WrappingLabel()
         self.view = FitView(self.viewer, self.panel)
-        self.save_result = SaveButton(
+        self.save_result, self.more_layers = result_buttons(
             self,
-            lambda: result_to_save(
-                self.viewer, shown_result(self.viewer, field_of(self.view.results.layers))
-            ),
+            lambda: self.view.results,
             "Save the selected or last fit: complete with its layers (.shadowinv), or its field "
             "for other programs (.h5).",
         )
-        self.more_layers = MoreLayersButton(self, lambda: self.view.results)
         self.add(
             self.images,
             forms.labelled("Fields", self.fields),
@@ -319,8 +309,7 @@ class FitImages(ToolPanel):
         source = UNKNOWN if self.source.kind == UNKNOWN else None
         fields = len(self.fields.state().split(BOTH))
         estimate = estimate_fit_time(shape, len(rows), fields, source, options)  # type: ignore[arg-type]
-        self.cost.setText(estimate.text(PACE))
-        self.cost.setVisible(True)
+        self.cost.show_text(estimate.text(PACE))
 
     def _rows(self) -> list[ImageRow]:
         rows = self.images.used

@@ -381,21 +381,17 @@ class ForwardModel(ObjectPanel):
         try:
             field = input_field(layer, self.viewer.dims.point, self.setup.setup())
         except InputError as error:
-            self.interpretation.setText(error_text(error))
             # Nothing to choose from yet is no mistake.
-            self.interpretation.setStyleSheet("" if layer is None else forms.PROBLEM_STYLE)
+            style = "" if layer is None else forms.PROBLEM_STYLE
+            self.interpretation.show_text(error_text(error), style)
             return
-        self.interpretation.setText(field.text)
-        is_unlabelled = not is_field(layer)
-        self.interpretation.setStyleSheet(forms.PROBLEM_STYLE if is_unlabelled else "")
+        self.interpretation.show_text(field.text, "" if is_field(layer) else forms.PROBLEM_STYLE)
 
     def show_result(self, finished: Finished, job: ForwardJob) -> None:
         self.results = self._last.layers_for_next(job.subject)
         self.results.show(finished.layer_data)
         self.viewer.reset_view()
-        warning = finished.content.warning
-        self.warning.setText(warning)
-        self.warning.setVisible(bool(warning))
+        self.warning.show_text(finished.content.warning)
 
 
 def _side(name: str) -> QSpinBox:

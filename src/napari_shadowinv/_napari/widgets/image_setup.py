@@ -68,20 +68,15 @@ class ImageSetup(qt.Docked):
         setup = self.setup.setup()
         about.store_setup(layer, setup, self.setup.origin)
         if setup is None:
-            self._say(f"'{layer.name}' has no setup now")
+            self.status.show_text(f"'{layer.name}' has no setup now", "")
             return
         place_together(self.viewer, layer, setup, ())
-        self._say(f"'{layer.name}' has this setup now")
+        self.status.show_text(f"'{layer.name}' has this setup now", "")
 
     def show_problem(self, text: str) -> None:
         """Show a problem until another image is chosen."""
-        self._say(text, forms.PROBLEM_STYLE)
-
-    def _say(self, text: str, style: str = "") -> None:
-        self.status.setText(text)
-        self.status.setStyleSheet(style)
-        self.status.setVisible(bool(text))
+        self.status.show_text(text, forms.PROBLEM_STYLE)
 
     def _follow(self) -> None:
-        self._say("")
+        self.status.show_text("", "")
         self.setup.follow(self.image.layer, store=False)

@@ -28,13 +28,7 @@ from napari_shadowinv._napari.layer_metadata import (
 from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.shots import load_radiograph, radiograph_of
 from napari_shadowinv._napari.viewer_sync import show_caution
-from napari_shadowinv._napari.widgets._files import (
-    MoreLayersButton,
-    SaveButton,
-    field_of,
-    result_to_save,
-    shown_result,
-)
+from napari_shadowinv._napari.widgets._files import field_of, result_buttons
 from napari_shadowinv._napari.widgets._fitting import FitView, RefineSection
 from napari_shadowinv._napari.widgets._forms import (
     PROBLEM_STYLE,
@@ -170,15 +164,12 @@ class InvertShot(InversionInputs, LivePanel):
         self.results = ResultLayers(self.viewer, self)
         self.verdict, self.report = VerdictLine(), FoldedReport()
         self._reported: Result[Any] | None = None
-        self.save_result = SaveButton(
+        self.save_result, self.more_layers = result_buttons(
             self,
-            lambda: result_to_save(
-                self.viewer, shown_result(self.viewer, field_of(self._last_results().layers))
-            ),
+            self._last_results,
             "Save the selected or last result: complete with its layers (.shadowinv), for other "
             "programs (.h5), or its sites (.csv).",
         )
-        self.more_layers = MoreLayersButton(self, self._last_results)
         crop = with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
         self.add(labelled("Image", self.image), *self.beam, labelled("Crop", crop))
         self.add(*self.settings, self.live, self.keep_earlier, self.cost, self.panel)
@@ -337,9 +328,7 @@ class InvertShot(InversionInputs, LivePanel):
         except InputError:
             self.cost.setVisible(False)  # Run reports the problem
             return
-        self.cost.setText(cost.text)
-        self.cost.setStyleSheet(PROBLEM_STYLE if cost.exceeds_memory else "")
-        self.cost.setVisible(bool(cost.text))
+        self.cost.show_text(cost.text, PROBLEM_STYLE if cost.exceeds_memory else "")
 
     def _learn_pace(self, inversion: Inversion) -> None:
         seconds = inversion.report.seconds
