@@ -71,6 +71,7 @@ def shot_layer(
     role: str | None = SHOT,
     *,
     frame: Frame | None = None,
+    unit: str = "intensity",
     **more: Any,
 ) -> FullLayerData:
     """Describe an image or a stack of images; omit metadata that are None."""
@@ -80,7 +81,7 @@ def shot_layer(
         "name": name,
         "colormap": colour_map("image"),
         "contrast_limits": limits,  # otherwise napari would read two shots of a stack
-        "metadata": metadata_for(role, "intensity", setup, **metadata),
+        "metadata": metadata_for(role, unit, setup, **metadata),
         **frame.keywords(stacked=data.ndim > 2),
     }
     return data, keywords, "image"

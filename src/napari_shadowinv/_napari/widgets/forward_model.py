@@ -14,7 +14,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
 from napari_shadowinv._napari.layer_metadata import Frame, frame_for, frame_of
 from napari_shadowinv._napari.layers import FullLayerData
-from napari_shadowinv._napari.preferences import colour_map
+from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
@@ -112,22 +112,22 @@ class ForwardJob(Job):
 
     def layers(self, content: Prediction) -> list[FullLayerData]:
         """Describe the predicted image."""
-        # An inversion of the image uses this source.
-        inputs: dict[str, Any] = {} if content.source is None else {"source": content.source}
-        if self.setup_origin:
-            inputs["setup_origin"] = f"{about.CAME_WITH} the forward model, {self.setup_origin}"
+        origin = f"{about.CAME_WITH} the forward model, {self.setup_origin}"
         # In another experiment the object may have other pixels.
         frame = self.frame
         if self.field_setup is not None and self.field_setup != self.setup:
             frame = frame_for(content.image.shape, self.setup)
-        keywords = {
-            "name": self.name,
-            "metadata": about.metadata_for(about.SHOT, self.unit, self.setup, **inputs),
-            "colormap": colour_map("image"),
-            "contrast_limits": intensity_limits(content.image),
-            **frame.keywords(),
-        }
-        return [(content.image, keywords, "image")]
+        layer = shot_layer(
+            content.image,
+            self.name,
+            self.setup,
+            intensity_limits(content.image),
+            frame=frame,
+            unit=self.unit,
+            source=content.source,  # for an inversion of the image
+            setup_origin=origin if self.setup_origin else None,
+        )
+        return [layer]
 
     def _source(self, shape: tuple[int, ...]) -> tuple[FloatArray | None, BoolArray | None]:
         """Return the beam that passes the object, and where the object stops it."""

@@ -12,9 +12,8 @@ from qtpy.QtWidgets import QLineEdit
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
-from napari_shadowinv._napari.layer_metadata import frame_for
 from napari_shadowinv._napari.layers import FullLayerData
-from napari_shadowinv._napari.preferences import colour_map
+from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets._editors import parse_number
@@ -82,14 +81,8 @@ class PlanJob(Job):
         """Describe the image of the first draw."""
         plan = content.plans[content.best] if isinstance(content, ExperimentSweep) else content
         setup = plan.setups[0] if plan.setups else None
-        keywords = {
-            "name": f"{plan.title}, planned",
-            "metadata": about.metadata_for(about.SHOT, "counts", setup),
-            "colormap": colour_map("image"),
-            "contrast_limits": intensity_limits(plan.images[0]),
-            **frame_for(plan.shape, setup).keywords(),
-        }
-        return [(plan.images[0], keywords, "image")]
+        image, name = plan.images[0], f"{plan.title}, planned"
+        return [shot_layer(image, name, setup, intensity_limits(image), unit="counts")]
 
 
 class PlanPlot(Plot):
