@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import types
+from collections.abc import Mapping
 from contextlib import suppress
 from decimal import Decimal
 from pathlib import Path
@@ -83,10 +84,13 @@ def _ignore_wheel(widget: QWidget) -> None:
 
 
 class SteadyComboBox(QComboBox):
-    """A narrow combo box that ignores the mouse wheel."""
+    """A narrow combo box that ignores the mouse wheel; `choices` are titles by key."""
 
-    def __init__(self) -> None:
+    def __init__(self, choices: Mapping[Any, str] | None = None, tip: str = "") -> None:
         super().__init__()
+        for key, title in (choices or {}).items():
+            self.addItem(title, key)
+        self.setToolTip(f"<qt>{tip}</qt>" if tip else "")
         self.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon)
         self.setMinimumContentsLength(6)
         self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
@@ -146,44 +150,39 @@ class _Choice(Editor):
             self.inner.setCurrentIndex(self._choices.index(value))
 
 
-class _Integer(Editor):
-    def __init__(self, low: int | None, high: int | None) -> None:
-        super().__init__(QLargeIntSpinBox())
-        self.inner.setMinimum(-_MAX_INTEGER if low is None else low)
-        self.inner.setMaximum(_MAX_INTEGER if high is None else high)
-        # Typing a long number is one change.
-        self.inner.setKeyboardTracking(False)
-        self.inner.setMinimumWidth(80)
-        self.inner.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
-        _ignore_wheel(self.inner)
-        self.inner.valueChanged.connect(lambda _: self.changed.emit())
+class _Number(Editor):
+    """A spin box or a slider."""
 
-    def value(self) -> int:
-        return int(self.inner.value())
-
-    def set_value(self, value: Any) -> None:
-        self.inner.setValue(int(value))
-
-
-class _Slider(Editor):
-    """A number with both bounds, to be adjusted by eye."""
-
-    def __init__(self, low: float, high: float, is_integer: bool) -> None:
-        slider = QLabeledSlider if is_integer else QLabeledDoubleSlider
-        super().__init__(slider(Qt.Orientation.Horizontal))
-        self._is_integer = is_integer
-        if not is_integer:
-            self.inner.setDecimals(2)
-        self.inner.setRange(low, high)
-        _ignore_wheel(self.inner)
-        self.inner.valueChanged.connect(lambda _: self.changed.emit())
+    def __init__(self, inner: Any, number: type[int] | type[float]) -> None:
+        super().__init__(inner)
+        self._number = number
+        _ignore_wheel(inner)
+        inner.valueChanged.connect(lambda _: self.changed.emit())
 
     def value(self) -> float:
-        value = self.inner.value()
-        return int(value) if self._is_integer else float(value)
+        return self._number(self.inner.value())
 
     def set_value(self, value: Any) -> None:
-        self.inner.setValue(int(value) if self._is_integer else float(value))
+        self.inner.setValue(self._number(value))
+
+
+def _spin_box(low: int | None, high: int | None) -> _Number:
+    box = QLargeIntSpinBox()
+    box.setMinimum(-_MAX_INTEGER if low is None else low)
+    box.setMaximum(_MAX_INTEGER if high is None else high)
+    box.setKeyboardTracking(False)  # typing a long number is one change
+    box.setMinimumWidth(80)
+    box.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+    return _Number(box, int)
+
+
+def _slider(low: float, high: float, number: type[int] | type[float]) -> _Number:
+    """Create a number with both bounds, to be adjusted by eye."""
+    slider = (QLabeledSlider if number is int else QLabeledDoubleSlider)(Qt.Orientation.Horizontal)
+    if number is float:
+        slider.setDecimals(2)
+    slider.setRange(low, high)
+    return _Number(slider, number)
 
 
 class _Quantity(Editor):
@@ -323,9 +322,9 @@ def _plain_editor(kind: Any, field: FieldInfo) -> Editor:
     extra = field.json_schema_extra
     slider = extra.get("slider") if isinstance(extra, dict) else None
     if isinstance(slider, (tuple, list)):
-        return _Slider(slider[0], slider[1], is_integer=kind is int)  # type: ignore[arg-type]
+        return _slider(slider[0], slider[1], kind)  # type: ignore[arg-type]
     if kind is int:
-        return _Integer(*_integer_bounds(field))
+        return _spin_box(*_integer_bounds(field))
     if kind is float:
         return _Quantity(unit_in_title(field.title))
     if get_origin(kind) is tuple:

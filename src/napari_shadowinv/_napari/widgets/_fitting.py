@@ -69,10 +69,9 @@ class FitView(QWidget):
         self.results = ResultLayers(viewer, self)
         self.curve = ObjectiveCurve()
         self.verdict = WrappingLabel()
-        self.solutions = SteadyComboBox()
-        self.solutions.setToolTip(
-            "<qt>Alternative solutions from other starting points. Select one to show it next to "
-            "the best.</qt>"
+        self.solutions = SteadyComboBox(
+            tip="Alternative solutions from other starting points. Select one to show it next to "
+            "the best."
         )
         self._solutions_row = labelled("Solution", self.solutions)
         self.report = ReportTable()

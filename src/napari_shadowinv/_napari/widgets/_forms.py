@@ -230,9 +230,7 @@ class ModelPicker(QtWidgets.QWidget):
         super().__init__()
         self._kinds = dict(kinds)
         self._forms: dict[str, ModelForm] = {}
-        self.choice = SteadyComboBox()
-        for key, (title, _) in self._kinds.items():
-            self.choice.addItem(title, key)
+        self.choice = SteadyComboBox({key: title for key, (title, _) in kinds.items()})
         column(self, labelled(label, self.choice))
         self.choice.currentIndexChanged.connect(self._on_choice)
         self._on_choice()
@@ -409,12 +407,9 @@ class StepsSection(QWidget):
         super().__init__()
         self._kinds = kinds
         self.forms: list[StepForm] = []
-        self.choice = SteadyComboBox()
-        self.choice.addItem("add a step…")
-        for name, kind in kinds.items():
-            self.choice.addItem(kind.title, name)
-        self.choice.setToolTip(
-            "<qt>Processing of image, source and masks before the inversion or fit.</qt>"
+        self.choice = SteadyComboBox(
+            {None: "add a step…", **{name: kind.title for name, kind in kinds.items()}},
+            "Processing of image, source and masks before the inversion or fit.",
         )
         self._list = QWidget()
         column(self._list)

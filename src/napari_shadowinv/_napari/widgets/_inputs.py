@@ -620,10 +620,8 @@ class ChoiceBox(SteadyComboBox):
     """A choice that is saved between sessions."""
 
     def __init__(self, choices: dict[str, str], tip: str) -> None:
-        super().__init__()
+        super().__init__(choices, tip)
         self._selected: Any = None
-        self.setToolTip(f"<qt>{tip}</qt>")
-        self.offer(choices)
         self.activated.connect(self._on_choice)
 
     def offer(self, choices: dict[str, str]) -> None:

@@ -185,13 +185,12 @@ class ProductForm(QtWidgets.QWidget):
         self.result = LayerPicker(
             viewer, ("image",), tip, suits=lambda layer: bool(result_of(layer) or _store_of(layer))
         )
-        self.product = SteadyComboBox()
-        for name, kind in PRODUCTS.items():
-            self.product.addItem(f"{kind.title[:1].upper()}{kind.title[1:]}", name)
+        self.product = SteadyComboBox(
+            {name: f"{kind.title[:1].upper()}{kind.title[1:]}" for name, kind in PRODUCTS.items()}
+        )
         tip = "<qt>Shapes layer with the line or outline. Of several, the selected is used.</qt>"
         self.shapes = LayerPicker(viewer, ("shapes",), tip, "none yet")
-        self.unit = SteadyComboBox()
-        self.unit.setToolTip("<qt>Unit of the field, which chooses the field, too.</qt>")
+        self.unit = SteadyComboBox(tip="Unit of the field, which chooses the field, too.")
         self.width_edit = QtWidgets.QDoubleSpinBox()
         self.width_edit.setRange(0.0, 1e4)
         self.width_edit.setToolTip("<qt>Width of the strip across a profile's line, in px.</qt>")

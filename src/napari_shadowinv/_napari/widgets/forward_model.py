@@ -242,13 +242,10 @@ class ForwardModel(ObjectPanel):
             suits=may_be_field,
         )
         self.interpretation = forms.WrappingLabel()
-        self.deflector = SteadyComboBox()
-        self.deflector.addItem("default for the beam", None)
-        for name in deflector_titles().values():
-            self.deflector.addItem(name, name)
-        self.deflector.setToolTip(
-            "<qt>Field that deflects the beam. Used only to predict the object's image in another "
-            "experiment, when the setup differs from the result's setup.</qt>"
+        self.deflector = SteadyComboBox(
+            {None: "default for the beam", **{name: name for name in deflector_titles().values()}},
+            "Field that deflects the beam. Used only to predict the object's image in another "
+            "experiment, when the setup differs from the result's setup.",
         )
         self.height_px, self.width_px = _side("Height"), _side("Width")
         tip = "Image layer of the undisturbed beam."
