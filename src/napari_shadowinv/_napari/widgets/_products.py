@@ -228,7 +228,8 @@ class ProductForm(QtWidgets.QWidget):
         self.clear = qt.push_button("Clear", "Forget all measured products.", self._clear)
         shapes = qt.with_button(self.shapes, "✎", "Draw a new shape for the product.", self._draw)
         numbers = qt.side_by_side((self.width_edit, 1), (self.samples, 1))
-        rows = (
+        _, layout = qt.scrolling_column(
+            self,
             forms.labelled("Result", self.result),
             *self._store_rows,
             forms.labelled("Product", self.product),
@@ -236,12 +237,11 @@ class ProductForm(QtWidgets.QWidget):
             forms.labelled("Unit", self.unit),
             forms.labelled("Width, samples", numbers),
             self.panel,
+            self.plot,
+            self.report,
+            qt.side_by_side((self.export, 1), (self.picture, 1)),
+            qt.side_by_side((self.save, 1), (self.clear, 0)),
         )
-        files = qt.side_by_side((self.export, 1), (self.picture, 1))
-        buttons = qt.side_by_side((self.save, 1), (self.clear, 0))
-        _, layout = qt.scrolling_column(self)
-        for row in (*rows, self.plot, self.report, files, buttons):
-            layout.addWidget(row)
         layout.addStretch(1)
         self.result.picked.connect(self._on_result)
         self.product.currentIndexChanged.connect(lambda _: self._enable())

@@ -49,10 +49,10 @@ def column(holder: QWidget, *widgets: QWidget, margin: int = 0) -> QVBoxLayout:
     return layout
 
 
-def scrolling_column(holder: QWidget) -> tuple[QScrollArea, QVBoxLayout]:
+def scrolling_column(holder: QWidget, *widgets: QWidget) -> tuple[QScrollArea, QVBoxLayout]:
     """Fill a widget with a column that scrolls vertically; return its area and its layout."""
     content, area = QWidget(), QScrollArea()
-    layout = column(content, margin=6)
+    layout = column(content, *widgets, margin=6)
     layout.setAlignment(Qt.AlignmentFlag.AlignTop)
     area.setWidgetResizable(True)
     area.setFrameShape(QFrame.Shape.NoFrame)

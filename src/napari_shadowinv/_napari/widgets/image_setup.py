@@ -34,14 +34,8 @@ class ImageSetup(qt.Docked):
             "Apply", "Store the setup with the image, and show the image at its scale.", self.apply
         )
         self._keeper = qt.StateKeeper(self, "image-setup", self.setup.state)
-        self.area, rows = qt.scrolling_column(self)
-        for row in (
-            forms.labelled("Image", self.image),
-            self.setup,
-            self.apply_button,
-            self.status,
-        ):
-            rows.addWidget(row)
+        image = forms.labelled("Image", self.image)
+        self.area, _ = qt.scrolling_column(self, image, self.setup, self.apply_button, self.status)
         self.setup.restore(self._keeper.load())
         self.image.picked.connect(self._follow)
         self.setup.changed.connect(self._keeper.changed)
