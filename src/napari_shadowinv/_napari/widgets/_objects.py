@@ -9,7 +9,6 @@ from typing import Any
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
-from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
 from napari_shadowinv.physics.trace_options import GridView
@@ -72,8 +71,6 @@ class ObjectPanel(ToolPanel):
         self.file_row = forms.labelled("File", self.file)
         self.file.changed.connect(self.keep)
         self.setup = SetupPicker()
-        self.results = ResultLayers(viewer, self)
-        self._last = LastResults(viewer, self)
 
     def parts(self) -> dict[str, Any]:
         return {"setup": self.setup, "object": self.object, "file": self.file}

@@ -464,6 +464,9 @@ class ToolPanel(qt.Docked):
         self.viewer, self.panel = viewer, panel
         self._ready = False
         self._running_preview = False
+        self.results = ResultLayers(viewer, self)
+        self._last = LastResults(viewer, self)
+        self.keep_earlier = self._last.keep_earlier
         self.area, self.column = qt.scrolling_column(self)
         self._keeper = qt.StateKeeper(self, name, self.state)
         self._revealed: QtWidgets.QWidget | None = None
@@ -557,8 +560,6 @@ class LivePanel(ToolPanel):
         super().__init__(viewer, name, panel)
         self.live = QtWidgets.QCheckBox("Live preview")
         self.previewed = ResultLayers(viewer, self)
-        self._last = LastResults(viewer, self)
-        self.keep_earlier = self._last.keep_earlier
         self._preview_timer = qt.timer(self, _SETTLE_MS, self._preview, once=True)
         self.live.toggled.connect(self.on_change)
 

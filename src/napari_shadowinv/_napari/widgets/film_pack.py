@@ -38,7 +38,7 @@ from napari_shadowinv._napari.widgets._panels import (
     warning_rows,
 )
 from napari_shadowinv._napari.widgets._qt import COLOURS, Plot, push_button
-from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
+from napari_shadowinv._napari.widgets._results import ResultLayers
 from napari_shadowinv._system.hidden_files import temporary_folder
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -340,8 +340,6 @@ class FilmPack(ToolPanel):
         self._scratch = resources.enter_context(temporary_folder("film-pack"))
         qt.when_destroyed(self, resources.close)
         self._folders = count(1)
-        self._last = LastResults(viewer, self)
-        self.results = ResultLayers(viewer, self)
         self.fit_images = ResultLayers(viewer, self)
         self._build()
         self._connect()
@@ -415,7 +413,7 @@ class FilmPack(ToolPanel):
         tip = "Create a pack file from a folder of scans."
         self.new = push_button("New pack…", tip, self._new_pack)
         pack_row = qt.side_by_side((self.path, 1), (self.new, 0))
-        self.add(labelled("Pack", pack_row), self._last.keep_earlier, self.panel, self.actions)
+        self.add(labelled("Pack", pack_row), self.keep_earlier, self.panel, self.actions)
         self.corners = CornerEditor(self.viewer, self)
 
     def _connect(self) -> None:

@@ -30,7 +30,7 @@ from napari_shadowinv._napari.widgets._inputs import (
 )
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._qt import side_by_side, while_alive
-from napari_shadowinv._napari.widgets._results import LastResults, Origins, result_frame
+from napari_shadowinv._napari.widgets._results import Origins, result_frame
 from napari_shadowinv._napari.widgets._tables import ImageRow, ImageTable, beam_column
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
@@ -68,7 +68,6 @@ class FitImages(ToolPanel):
         super().__init__(
             viewer, "fit-images", RunPanel("Fit several images", "Run", tip, patience=0.4)
         )
-        self._last = LastResults(viewer, self)
         self._build()
         self._connect()
         self.restore_last()
@@ -129,7 +128,7 @@ class FitImages(ToolPanel):
             self.steps,
             forms.section("Instrument", self.instrument),
             forms.section("Options", self.options),
-            side_by_side((self._last.keep_earlier, 1), (self.recipes, 0)),
+            side_by_side((self.keep_earlier, 1), (self.recipes, 0)),
             self.cost,
             self.panel,
             self.view,

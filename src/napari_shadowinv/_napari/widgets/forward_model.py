@@ -264,7 +264,7 @@ class ForwardModel(ObjectPanel):
         size = side_by_side((self.width_px, 1), (QLabel("×"), 0), (self.height_px, 1))
         self._size_row = forms.labelled("Size (px)", size)
         self.add(self.object, self.file_row, *self._potential_rows, self._size_row, self.setup)
-        self.add(forms.labelled("Source", self.source), self._last.keep_earlier)
+        self.add(forms.labelled("Source", self.source), self.keep_earlier)
         self.add(self.panel, self.warning, self.save_result)
         self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
         self.object.changed.connect(self._on_change)

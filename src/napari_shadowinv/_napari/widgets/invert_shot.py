@@ -161,7 +161,6 @@ class InvertShot(InversionInputs, LivePanel):
         self.cost, self._pace = WrappingLabel(), 1.0
         self.refine_section = RefineSection(self.refine)
         self.fit_view = FitView(self.viewer, self.panel)
-        self.results = ResultLayers(self.viewer, self)
         self.verdict, self.report = VerdictLine(), FoldedReport()
         self._reported: Result[Any] | None = None
         self.save_result, self.more_layers = result_buttons(

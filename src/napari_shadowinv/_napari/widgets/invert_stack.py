@@ -228,7 +228,6 @@ class InvertStack(InversionInputs, ToolPanel):
         # A cancelled run may take as long as it needs to finish writing to the store.
         panel = RunPanel("Invert stack", "Run", tip, patience=math.inf)
         super().__init__(viewer, "invert-stack", panel)
-        self.results = ResultLayers(viewer, self)
         self._shown: StackJob | None = None
         self._ended, self._resets_view = 0, False
         self._arrows: Any = None

@@ -174,7 +174,7 @@ class PlanExperiment(ObjectPanel):
             forms.section("Simulated shots", self.options),
             forms.labelled("Vary", self.quantity),
             self._values_row,
-            self._last.keep_earlier,
+            self.keep_earlier,
             self.panel,
             self.verdict,
             self.plot,
