@@ -86,6 +86,21 @@ class WrappingLabel(QtWidgets.QLabel):
         self.setVisible(bool(text))
 
 
+class LineEdit(QtWidgets.QLineEdit):
+    """An entry that can be saved between sessions."""
+
+    def __init__(self, example: str, tip: str) -> None:
+        super().__init__()
+        self.setPlaceholderText(example)
+        self.setToolTip(f"<qt>{tip}</qt>")
+
+    def state(self) -> str:
+        return str(self.text())
+
+    def restore(self, text: Any) -> None:
+        self.setText(str(text))
+
+
 class PathEdit(QtWidgets.QWidget):
     changed = Signal()
 

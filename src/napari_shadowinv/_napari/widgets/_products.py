@@ -198,17 +198,15 @@ class ProductForm(QtWidgets.QWidget):
         self.samples.setRange(_MIN_SAMPLES, _MAX_SAMPLES)
         self.samples.setValue(_SAMPLES)
         self.samples.setToolTip("<qt>Number of samples of the field for the bands.</qt>")
-        self.times = QtWidgets.QLineEdit()
-        self.times.setPlaceholderText("shots are numbered")
-        self.times.setToolTip(
-            "<qt>Time between two shots of the store, such as 1 ns, or the times of all shots "
+        self.times = forms.LineEdit(
+            "shots are numbered",
+            "Time between two shots of the store, such as 1 ns, or the times of all shots "
             "used, such as 0, 1 ns, 3 ns; a number without a unit is in s. Empty: shots are "
-            "numbered, and rates are per shot.</qt>"
+            "numbered, and rates are per shot.",
         )
-        self.shots = QtWidgets.QLineEdit()
-        self.shots.setPlaceholderText("all finished ones")
-        self.shots.setToolTip(
-            "<qt>Shots of the store, such as 3:20 or 0,2,5. Empty: all finished ones.</qt>"
+        self.shots = forms.LineEdit(
+            "all finished ones",
+            "Shots of the store, such as 3:20 or 0,2,5. Empty: all finished ones.",
         )
         self._store_rows = (
             forms.labelled(_SHOTS, self.shots),
@@ -362,7 +360,6 @@ class ProductForm(QtWidgets.QWidget):
         rows = [(fact.title, fact.text) for fact in measured.facts]
         rows += [("Note", sentence) for sentence in measured.limits]
         self.report.show_rows(rows)
-        self.report.setVisible(True)
         self.plot.setVisible(self.plot.show_curves(measured))
         for widget in (self.export, self.picture, self.clear):
             widget.setEnabled(True)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from qtpy.QtWidgets import QLineEdit
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
@@ -145,19 +144,21 @@ class PlanExperiment(ObjectPanel):
             viewer, ("image",), "A layer of a result, whose field is the object.", suits=_has_field
         )
         self._field_row = forms.labelled("Result", self.field)
-        self.energies = _LineEdit(
+        self.energies = forms.LineEdit(
             "14.7, 30",
             "Energies of several images of a shot in MeV (of light: wavelengths in m), separated "
             "by commas. Empty: one image with the setup's.",
         )
-        self.side = _LineEdit("200 x 200", "Height and width of an image in px, such as 200 x 200.")
+        self.side = forms.LineEdit(
+            "200 x 200", "Height and width of an image in px, such as 200 x 200."
+        )
         self.instrument = InstrumentForm()
         self.options = forms.ModelForm(ExperimentOptions)
         self.quantity = ChoiceBox(
             {_NOTHING: "nothing", **{key: swept.title for key, swept in SWEPT.items()}},
             "Quantity of the experiment that is varied.",
         )
-        self.values = _LineEdit(
+        self.values = forms.LineEdit(
             "100, 300, 1000", "Values of the quantity, separated by commas, in its unit."
         )
         self._values_row = forms.labelled("Values", self.values)
@@ -277,21 +278,6 @@ class PlanExperiment(ObjectPanel):
 
 def _has_field(layer: Any) -> bool:
     return about.displacement_of(layer) is not None
-
-
-class _LineEdit(QLineEdit):
-    """An entry that is saved between sessions."""
-
-    def __init__(self, example: str, tip: str) -> None:
-        super().__init__()
-        self.setPlaceholderText(example)
-        self.setToolTip(f"<qt>{tip}</qt>")
-
-    def state(self) -> str:
-        return str(self.text())
-
-    def restore(self, text: Any) -> None:
-        self.setText(str(text))
 
 
 def _numbers(name: str, text: str, unit: str = "") -> Sequence[float]:
