@@ -48,12 +48,6 @@ class GridFileEdit(forms.PathEdit):
     def restore(self, path: Any) -> None:
         self.edit.setText(str(path))
 
-    def grid_file(self, view: Any) -> GridFile:
-        """Return the chosen file with a `GridView`, or raise an `InputError` without a file."""
-        if not self.path:
-            raise InputError("there is no file with a 3-D field: choose one")
-        return GridFile(self.path, view)
-
 
 class ObjectPanel(ToolPanel):
     """A panel for an object that deflects the beam: a phantom, a 3-D field, or a layer's field."""
@@ -82,7 +76,11 @@ class ObjectPanel(ToolPanel):
     def simulated_object(self) -> PhantomRecipe | GridFile:
         """Return the phantom or the file, or raise an `InputError`."""
         recipe: Any = self.object.model()
-        return self.file.grid_file(recipe) if self.object.kind == GRID else recipe
+        if self.object.kind != GRID:
+            return recipe
+        if not self.file.path:
+            raise InputError("there is no file with a 3-D field: choose one")
+        return GridFile(self.file.path, recipe)
 
     def choose_setup(self) -> None:
         """Select the kind of setup that the object requires, keeping its entries."""
