@@ -108,6 +108,13 @@ class SetupPicker(QWidget):
     def setup(self) -> Setup | None:
         return self.picker.model()  # type: ignore[return-value]
 
+    def complete_setup(self) -> Setup | None:
+        """Return the setup; None without one, or while it is incomplete."""
+        try:
+            return self.setup()
+        except InputError:
+            return None  # the form names the field
+
     @property
     def origin(self) -> str:
         """Where the setup comes from, such as ``"typed for 'shot'"``; empty without a setup."""
@@ -233,10 +240,7 @@ class SetupPicker(QWidget):
 
     def _show_geometry(self) -> None:
         """Show field of view, magnification and warnings below the form."""
-        try:
-            setup = self.setup()
-        except InputError:
-            setup = None  # the form names the field
+        setup = self.complete_setup()
         shape = None
         if self._layer is not None and not getattr(self._layer, "rgb", False):
             height, width = self._layer.data.shape[-2:]

@@ -203,7 +203,7 @@ class FitImages(ToolPanel):
         fields = choices.fields
         available = fields_of(self.setup.picker.kind if setup is None else setup.kind)
         in_metres = choices.source_size is not None or choices.resolution is not None
-        if in_metres and setup is None and self._shown_setup() is None:
+        if in_metres and setup is None and self.setup.complete_setup() is None:
             raise InputError(
                 f"{path} gives source size or resolution in m, which require a setup: select the "
                 "setup first, or give the point spread in px"
@@ -231,7 +231,7 @@ class FitImages(ToolPanel):
 
     def _spread(self, choices: FitChoices, row: ImageRow) -> float | None:
         """Return the point spread of an image in px after the steps, by a recipe."""
-        setup = self._shown_setup()
+        setup = self.setup.complete_setup()
         if setup is None or (choices.source_size is None and choices.resolution is None):
             return choices.psf
         shot = Radiograph(np.zeros(row.data.shape), setup=self._base_setup(row, setup))
@@ -352,7 +352,7 @@ class FitImages(ToolPanel):
         super().showEvent(event)
         # Another widget may have changed the setup of the reference.
         row = self.images.reference
-        setup = self._shown_setup()
+        setup = self.setup.complete_setup()
         if self._ready and row is not None and row.setup not in (None, setup):
             self.setup.suggest(row.setup, about.setup_origin_of(row.layer))
 
@@ -362,7 +362,7 @@ class FitImages(ToolPanel):
     def _on_reference(self) -> None:
         """Show the setup of a new reference; without a setup it gets the last one."""
         row = self.images.reference
-        old_setup = self._shown_setup()
+        old_setup = self.setup.complete_setup()
         self.setup.follow(None if row is None else row.layer)
         if row is not None:
             self.masks.follow(row.layer)
@@ -372,7 +372,7 @@ class FitImages(ToolPanel):
         self.view.empty()
         self._on_setup()
         # A complete setup is folded to show the controls below.
-        if self._shown_setup() is None:
+        if self.setup.complete_setup() is None:
             self.setup_section.expand(animate=False)
         else:
             self.setup_section.collapse(animate=False)
@@ -382,15 +382,9 @@ class FitImages(ToolPanel):
         entry = row.entries().get(beam)
         if isinstance(entry, float) and (row.plane is not None or row.setup is None):
             values[beam] = entry
-        setup = self._shown_setup()
+        setup = self.setup.complete_setup()
         if setup is None or values != setup.model_dump():
             self.setup.show_setup(values)
-
-    def _shown_setup(self) -> Setup | None:
-        try:
-            return self.setup.setup()
-        except InputError:
-            return None
 
     def _set_beam(self, value: float) -> None:
         """Set the energy or wavelength of the shown setup from the reference's row."""
@@ -400,7 +394,7 @@ class FitImages(ToolPanel):
 
     def _on_setup(self) -> None:
         self.fields.offer(fields_of(self.setup.picker.kind))
-        setup = self._shown_setup()
+        setup = self.setup.complete_setup()
         summary = "none" if setup is None else f"{setup.probe}, {self.setup.origin}"
         self.setup_section.setText(f"Setup: {summary}")
         self.setup_section.setToolTip(f"Setup: {summary}")
