@@ -549,7 +549,6 @@ class InversionInputs:
         options = forms.section("Options", self.options)
         instrument = forms.section("Instrument", self.instrument)
         self.settings = (self.setup, self.steps, instrument, options, self.recipes)
-        self.inputs = (*self.beam, self.setup, self.steps, self.instrument, self.options)
         self.source.changed.connect(self._show_source_mask)
         self._show_source_mask()
 

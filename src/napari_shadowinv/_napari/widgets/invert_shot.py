@@ -185,7 +185,7 @@ class InvertShot(InversionInputs, LivePanel):
         self.panel.button.clicked.connect(self._empty_report)
         self.panel.runner.started.connect(self._on_start)
         while_alive(self, self.viewer.layers.selection, "active", self._follow_result)
-        changes = [control.changed for control in self.inputs]
+        changes = [control.changed for control in self.parts().values()]
         for signal in (*changes, self.crop.picked, edits.edited):
             signal.connect(self.on_change)
 

@@ -276,7 +276,7 @@ class InvertStack(InversionInputs, ToolPanel):
     def _connect(self) -> None:
         self.shots.changed.connect(self._on_layer)
         self.setup.changed.connect(self._show_beams)
-        for part in (*self.inputs, self.engine):
+        for part in self.parts().values():
             part.changed.connect(self.keep)
         self.panel.runner.progressed.connect(self._on_progress)
         while_alive(self, self.viewer.dims, "current_step", self._on_step)
