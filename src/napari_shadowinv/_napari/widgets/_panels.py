@@ -291,11 +291,6 @@ class RunPanel(QtWidgets.QWidget):
     def say(self, text: str, problem: bool = False) -> None:
         self.status.show_text(text, PROBLEM_STYLE if problem else "")
 
-    def refuse(self, error: BaseException) -> None:
-        """Report an error of the user; the text stays when the notification is gone."""
-        show_user_error(error)
-        self.say(error_text(error), problem=True)
-
     def _on_start(self) -> None:
         if self._quiet:
             return
@@ -535,17 +530,13 @@ class ToolPanel(qt.Docked):
         self._running_preview = preview
         self.panel.run(job.work, job, quiet=preview)
 
+    @qt.notify_errors
     def _run_or_cancel(self) -> None:
         if self.panel.runner.running and not self._running_preview:
             self.panel.cancel()
             return
         self.forget()
-        try:
-            job = self.request()
-        except USER_ERRORS as error:
-            self.panel.refuse(error)
-            return
-        self.start(job)
+        self.start(self.request())
 
     @qt.notify_errors
     def _on_end(self, outcome: Outcome) -> None:
