@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -120,12 +119,8 @@ class FitView(QWidget):
     def _show_report(
         self, fit: Fit, facts: Iterable[Fact], inputs: Sequence[tuple[str, str]] = ()
     ) -> None:
-        is_determined = fit.verdict is Verdict.DETERMINED
-        sentence = f"{fit.explanation[:1].upper()}{fit.explanation[1:]}."
-        self.verdict.show_text(
-            f"<b>Verdict: {html.escape(fit.verdict.value)}</b><br>{html.escape(sentence)}",
-            "" if is_determined else PROBLEM_STYLE,
-        )
+        style = "" if fit.verdict is Verdict.DETERMINED else PROBLEM_STYLE
+        self.verdict.show_titled(f"Verdict: {fit.verdict.value}", f"{fit.explanation}.", style)
         warnings = [("Warning", caution.text) for caution in fit.warnings]
         rows = [row for row in warnings if row not in inputs]
         self.report.show_rows([*rows, *inputs, *fact_rows(facts, details=None)])

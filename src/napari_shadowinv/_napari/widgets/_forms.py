@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -84,6 +85,11 @@ class WrappingLabel(QtWidgets.QLabel):
         if style not in (None, self.styleSheet()):
             self.setStyleSheet(style)
         self.setVisible(bool(text))
+
+    def show_titled(self, title: str, text: str, style: str) -> None:
+        """Show a sentence below a bold title."""
+        sentence = html.escape(f"{text[:1].upper()}{text[1:]}")
+        self.show_text(f"<b>{html.escape(title)}</b><br>{sentence}", style)
 
 
 class LineEdit(QtWidgets.QLineEdit):

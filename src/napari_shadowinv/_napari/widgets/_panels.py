@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 import sys
 import threading
@@ -440,12 +439,8 @@ class VerdictLine(WrappingLabel):
 
     def show_headline(self, headline: Headline, prefix: str = "") -> None:
         """Show a headline after a prefix, such as ``"Preview: "``."""
-        level = headline.level.value.capitalize()
-        text = html.escape(headline.text)
-        self.show_text(
-            f"<b>{html.escape(prefix)}{level}</b><br>{text[:1].upper()}{text[1:]}",
-            _LEVEL_STYLES[headline.level],
-        )
+        title = f"{prefix}{headline.level.value.capitalize()}"
+        self.show_titled(title, headline.text, _LEVEL_STYLES[headline.level])
 
     def empty(self) -> None:
         self.show_text("")
