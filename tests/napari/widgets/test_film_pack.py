@@ -345,9 +345,11 @@ def test_new_pack_is_described_in_the_window(
         assert [dialog.table.item(row, 0).text() for row in range(dialog.table.rowCount())] == [
             path.name for path in film_pack.files
         ]
+        assert dialog._problem.isHidden()
         dialog.table.item(0, 2).setText("13 Al")
         dialog.accept()
         assert "expected thickness, unit" in dialog._problem.text()
+        assert not dialog._problem.isHidden()
         dialog.table.item(0, 2).setText("13 um Al; 25 um Fe")
         dialog.form.set_values({"seen_from": "source"})
         dialog.accept()

@@ -28,7 +28,13 @@ from napari_shadowinv._napari.packs import PackJob
 from napari_shadowinv._napari.result_files import dataset_of_layers
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._forms import ModelForm, PathEdit, WrappingLabel, labelled
+from napari_shadowinv._napari.widgets._forms import (
+    PROBLEM_STYLE,
+    ModelForm,
+    PathEdit,
+    WrappingLabel,
+    labelled,
+)
 from napari_shadowinv._napari.widgets._layers import LayerPicker, LayerWatch, mask_of, new_shapes
 from napari_shadowinv._napari.widgets._panels import (
     ReportTable,
@@ -81,7 +87,7 @@ class NewPackDialog(QtWidgets.QDialog):
             "<qt>Films in the order in which the beam passes them. Filters as thickness, unit and "
             "material, such as 13 um Al; 25 um Fe.</qt>"
         )
-        self._problem = WrappingLabel()
+        self._problem = WrappingLabel(style=PROBLEM_STYLE)
         choices = QtWidgets.QDialogButtonBox.StandardButton
         self.buttons = QtWidgets.QDialogButtonBox(choices.Save | choices.Cancel)
         self.buttons.accepted.connect(self.accept)
@@ -123,7 +129,7 @@ class NewPackDialog(QtWidgets.QDialog):
                 self._folder, self.entries(), overwrite=path.exists() and self._may_replace(path)
             )
         except (InputError, OSError, ValueError) as error:
-            self._problem.setText(str(error))
+            self._problem.show_text(str(error))
             return
         super().accept()
 
