@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from napari_shadowinv._system.arrays import block_sums
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.descent import coarser, descend, finer, settle
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.instrument import binned
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
 
@@ -84,7 +84,7 @@ def test_finer_pixels_make_the_same_image(scene: Scene) -> None:
     unknowns = bump(coarse, 2.0)
     model = coarse.model(unknowns, coarse.ray_counts(unknowns))
     twice = finer(unknowns)
-    binned_image = binned(fine.model(twice, fine.ray_counts(twice)), 2) / 4
+    binned_image = block_sums(fine.model(twice, fine.ray_counts(twice)), 2) / 4
     assert model.max() > 2
     np.testing.assert_allclose(model, binned_image, atol=0.03)
 
@@ -98,10 +98,10 @@ def test_finer_pixels_double_the_displacement(scene: Scene) -> None:
     np.testing.assert_allclose(middles, 2 * once, atol=0.03)
 
 
-def test_binned_adds_blocks() -> None:
+def test_blocks_of_each_plane_are_added() -> None:
     planes = np.arange(32.0).reshape(1, 4, 8)
-    np.testing.assert_array_equal(binned(planes, 2)[0], [[18, 26, 34, 42], [82, 90, 98, 106]])
-    assert binned(planes, 4).sum() == planes.sum()
+    np.testing.assert_array_equal(block_sums(planes, 2)[0], [[18, 26, 34, 42], [82, 90, 98, 106]])
+    assert block_sums(planes, 4).sum() == planes.sum()
 
 
 @pytest.mark.parametrize("factor", [2, 4])

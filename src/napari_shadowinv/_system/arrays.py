@@ -250,29 +250,26 @@ def _spacing(array: Any, dim: str, name: str) -> float | None:
     return None if metres is None else abs(mean) * metres
 
 
-def _blocks_of(plane: AnyArray, side: int) -> AnyArray:
-    """Return a plane as blocks, shape (rows, side, columns, side), cut where none is complete."""
-    rows, columns = (length // side for length in plane.shape)
-    return plane[: rows * side, : columns * side].reshape(rows, side, columns, side)
-
-
-def block_sums(plane: FloatArray | BoolArray, side: int) -> FloatArray:
-    """Return sums over square blocks, without incomplete ones."""
+def block_sums(planes: FloatArray | BoolArray, side: int) -> FloatArray:
+    """Return sums over square blocks of a plane, or of each of several, without incomplete ones."""
+    *count, height, width = planes.shape
+    rows, columns = height // side, width // side
+    whole = planes[..., : rows * side, : columns * side]
+    blocks = whole.reshape(*count, rows, side, columns, side)
     # Line by line, because numpy takes many times as long for sums over short axes.
-    blocks = _blocks_of(plane, side)
-    kind = plane.dtype if plane.dtype.kind == "f" else np.float64
-    columns: FloatArray = blocks[..., 0].astype(kind)
+    kind = planes.dtype if planes.dtype.kind == "f" else np.float64
+    lines: FloatArray = blocks[..., 0].astype(kind)
     for k in range(1, side):
-        columns += blocks[..., k]
-    sums: FloatArray = columns[:, 0].copy()
+        lines += blocks[..., k]
+    sums: FloatArray = lines[..., 0, :].copy()
     for k in range(1, side):
-        sums += columns[:, k]
+        sums += lines[..., k, :]
     return sums
 
 
-def complete_block_means(plane: FloatArray | BoolArray, side: int) -> FloatArray:
-    """Return means over square blocks, without incomplete ones."""
-    return block_sums(plane, side) / side**2
+def complete_block_means(planes: FloatArray | BoolArray, side: int) -> FloatArray:
+    """Return means over square blocks, as `block_sums` returns sums."""
+    return block_sums(planes, side) / side**2
 
 
 def block_means(values: FloatArray, block: int) -> FloatArray:

@@ -19,10 +19,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.fft import dctn, idctn
 
+from napari_shadowinv._system.arrays import block_sums, complete_block_means
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
 from napari_shadowinv.fitting.forward import Linear, Scene
-from napari_shadowinv.fitting.instrument import binned
 from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import POWERS, Fiducials, Unknowns
 
@@ -429,10 +429,10 @@ def coarser(scene: Scene, factor: int) -> Scene:
     if factor == 1:
         return scene
     used = scene.weights > 0
-    count = binned(used.astype(np.float64), factor)
-    images = binned(np.where(used, scene.images, 0), factor) / np.maximum(count, 1)
+    count = block_sums(used.astype(np.float64), factor)
+    images = block_sums(np.where(used, scene.images, 0), factor) / np.maximum(count, 1)
     variances = np.divide(1, scene.weights, out=np.zeros_like(scene.weights), where=used)
-    variance = binned(variances, factor) / np.maximum(count, 1) ** 2
+    variance = block_sums(variances, factor) / np.maximum(count, 1) ** 2
     weights = np.divide(
         1, variance, out=np.zeros_like(variance), where=(count >= factor**2 / 2) & (variance > 0)
     )
@@ -441,7 +441,7 @@ def coarser(scene: Scene, factor: int) -> Scene:
         scene,
         images=images,
         weights=weights,
-        beams=binned(scene.beams, factor) / factor**2,
+        beams=complete_block_means(scene.beams, factor),
         psf=[_narrower(width, factor) for width in scene.psf],
         # What is held against a potential is the same in all pixels.
         smoothness=scene.smoothness * smoothness_in_pixels(factor),

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.fft import dctn, idctn
 
+from napari_shadowinv._system.arrays import complete_block_means
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.inversion.imperfections import (
     IMPERFECTIONS,
@@ -28,7 +29,7 @@ from napari_shadowinv.options import BeamPrior, Instrument
 if TYPE_CHECKING:
     from napari_shadowinv.fitting.unknowns import Unknowns
 
-__all__ = ["DARKEST", "EXACT", "Imperfect", "Part", "Shapes", "binned", "widen", "widening"]
+__all__ = ["DARKEST", "EXACT", "Imperfect", "Part", "Shapes", "widen", "widening"]
 
 DARKEST = 1e-4  # of a beam, for a logarithm
 _LEAST_EXPONENT = 0.2
@@ -110,7 +111,7 @@ class ProductShapes:
             functions.reshape(len(functions), -1, factor).mean(axis=2) for functions in self.modes
         )
         envelope = self.envelope
-        outer = None if envelope is None else binned(envelope[None], factor)[0] / factor**2
+        outer = None if envelope is None else complete_block_means(envelope, factor)
         return ProductShapes((along_y, along_x), self.places, self.means, outer)
 
     def _along(self, image: FloatArray, modes: tuple[FloatArray, FloatArray]) -> FloatArray:
@@ -169,7 +170,7 @@ class Shapes:
     def coarsen(self, factor: int) -> Shapes:
         """Return the same in larger pixels."""
         products = None if self.products is None else self.products.coarsen(factor)
-        return replace(self, planes=binned(self.planes, factor) / factor**2, products=products)
+        return replace(self, planes=complete_block_means(self.planes, factor), products=products)
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,13 +368,6 @@ def _with_error(row: Sequence[float], sign: str = "") -> str:
         return f"{value:{sign}.3g}"
     digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 6))
     return f"{value:{sign}.{digits}f} ± {error:.{digits}f}"
-
-
-def binned(planes: FloatArray, factor: int) -> FloatArray:
-    """Return the sums of square blocks of pixels of each plane."""
-    count, height, width = planes.shape
-    blocks = planes.reshape(count, height // factor, factor, width // factor, factor)
-    return np.asarray(blocks.sum(axis=(2, 4)))
 
 
 def widen(image: FloatArray, variance: float) -> FloatArray:
