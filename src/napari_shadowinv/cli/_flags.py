@@ -442,7 +442,7 @@ def takes_run(
         @functools.wraps(command)
         def with_inputs(*, flags: dict[str, Any], **arguments: Any) -> None:
             run = choices_of(model, flags)
-            flags = {name: x for name, x in flags.items() if name not in model.model_fields}
+            flags = {key: value for key, value in flags.items() if key not in model.model_fields}
             files = {parameter.name: arguments.pop(parameter.name) for parameter in shared}
             command(**arguments, run=run, **inputs(**files, run=run, flags=flags))
 

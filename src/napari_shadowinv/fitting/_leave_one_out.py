@@ -447,8 +447,9 @@ def _result(data: FitData, predictions: Sequence[_Prediction]) -> LeaveOneOut:
     units = data.units[:, None, None]
     used = data.scene.weights[:, :height, :width] > 0
     images = data.scene.images[:, :height, :width] * units
-    made, weights, brightness, chi2, alone, limit = map(np.array, zip(*predictions, strict=True))
-    models = made[:, :height, :width] * units
+    arrays = map(np.array, zip(*predictions, strict=True))
+    predicted, weights, brightness, chi2, alone, limit = arrays
+    models = predicted[:, :height, :width] * units
     residual = np.where(used, images - models, 0.0)
     level = np.where(used, images, 0.0).sum(axis=(1, 2)) / used.sum(axis=(1, 2))
     squares = (residual**2).sum(axis=(1, 2)) / used.sum(axis=(1, 2))

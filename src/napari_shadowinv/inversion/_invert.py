@@ -514,13 +514,13 @@ def _read_fields(
 
     errors_at_end = begin(estimate, options.threads)
     with _measure_time("read-out", seconds):
-        image, left, entered = reproject()
+        image, outflow, inflow = reproject()
     fields = _Fields(
         np.ascontiguousarray(inner - border_mean(inner)),
         moves,
         np.ascontiguousarray(image),
-        left,
-        entered,
+        outflow,
+        inflow,
         options.threads,
     )
     return fields, errors_at_end
