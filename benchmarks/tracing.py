@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from napari_shadowinv import FieldGrid, ProtonSetup, TraceOptions, trace
 from napari_shadowinv._system.machine import available_threads
-from napari_shadowinv.physics.tracing import trace_particles
+from napari_shadowinv.physics.particle_flight import trace_particles
 
 Array = NDArray[np.float64]
 

@@ -25,7 +25,8 @@ from scipy.ndimage import gaussian_filter
 from napari_shadowinv import read, synthetic_image
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics import phantoms
-from napari_shadowinv.physics.setup import SETUPS, setup_from_dict, setup_warnings
+from napari_shadowinv.physics.beam import setup_warnings
+from napari_shadowinv.physics.setup import SETUPS, setup_from_dict
 from napari_shadowinv.preprocessing import image_warnings
 from reference import DATA, donut_case, toroid_case
 

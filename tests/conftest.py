@@ -20,14 +20,15 @@ from hypothesis import settings
 from helpers.public_data import public_file, public_names
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.fitting import Basin, Fit, FitOptions, FitReport, FittedField
+from napari_shadowinv.fitting import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.inversion import Inversion, Report
 from napari_shadowinv.inversion.budget import ErrorEstimate, Errors
 from napari_shadowinv.inversion.solution_checks import image_residual
-from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.options import FitOptions, InversionOptions
+from napari_shadowinv.physics.beam import BeamSetup
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.physics.setup import SETUPS, BeamSetup, OpticalSetup, ProtonSetup
+from napari_shadowinv.physics.setup import SETUPS, OpticalSetup, ProtonSetup
 
 # The same examples in each run: a failure is due to a change, not to chance.
 settings.register_profile("same each time", derandomize=True)

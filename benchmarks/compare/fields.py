@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 import tracing
 from napari_shadowinv.physics import phantoms
+from napari_shadowinv.physics.field_grid import FieldGrid
 from napari_shadowinv.physics.phantoms import Phantom
 from napari_shadowinv.physics.setup import ProtonSetup
-from napari_shadowinv.physics.tracing import FieldGrid, traced_displacement
+from napari_shadowinv.physics.tracing import traced_displacement
 
 Array = NDArray[np.float64]
 Field = Callable[[int], Array]

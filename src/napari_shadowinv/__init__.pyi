@@ -3,21 +3,22 @@ from ._system.progress import Progress
 from .analysis import analyse
 from .cautions import Caution
 from .errors import FileFormatError, InputError, InversionCancelled
-from .fitting import Fit, FitOptions, FitShot, fit
+from .fitting import Fit, FitShot, fit
 from .inversion import Inversion, Report, invert, plan_sites
 from .inversion.error_bars import Maximum, Uncertainty, uncertainty
-from .io import Radiograph, read, write
-from .options import BeamPrior, Instrument, InversionOptions
+from .io import read, write
+from .options import BeamPrior, FitOptions, Instrument, InversionOptions
 from .physics.field_grid import FieldGrid
 from .physics.forward import synthetic_image
 from .physics.poisson import poisson_invert
 from .physics.projection import project, project_potential
 from .physics.setup import OpticalSetup, ProtonSetup
-from .physics.tracing import TracedImage, TraceOptions, trace
+from .physics.trace_options import TraceOptions
+from .physics.tracing import TracedImage, trace
 from .pipeline import run
 from .pipeline.rerun import Rerun, rerun
 from .pipeline.run_options import RunOptions, WatchOptions
-from .preprocessing import Recipe
+from .preprocessing import Radiograph, Recipe
 from .stack import invert_stack, merge_stack, run_stack, stack_statistics, watch_stack
 
 __version__: str

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     AnyResult: TypeAlias = Inversion | Fit | FilmDoses | RetrievedField
 
-__all__ = ["AnyResult", "result_from_dataset", "unpack_result"]
-
 
 def result_from_dataset(dataset: xarray.Dataset) -> AnyResult:
     """Return the result in a dataset; its attributes decide on the kind.

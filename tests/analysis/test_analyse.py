@@ -25,10 +25,11 @@ from napari_shadowinv.analysis._field_samples import sampled_fields
 from napari_shadowinv.analysis.product import quantity_text
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
-from napari_shadowinv.fitting import Fit, FitOptions, fit
+from napari_shadowinv.fitting import Fit, fit
 from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.inversion.error_bars import Quantity, uncertainty
 from napari_shadowinv.inversion.result import RetrievedField
+from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import Phantom
 

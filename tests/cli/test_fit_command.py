@@ -19,11 +19,11 @@ from helpers.fit_images import of_each
 from napari_shadowinv.cli._flags import fit_recipe_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.fitting import Fit, FitOptions, LeaveOneOut, point_spread
+from napari_shadowinv.fitting import Fit, LeaveOneOut, point_spread
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read, write
 from napari_shadowinv.io.files import sha256
-from napari_shadowinv.options import FitChoices
+from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import ProtonSetup

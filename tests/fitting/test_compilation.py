@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from napari_shadowinv import InversionCancelled
-from napari_shadowinv.fitting import FitOptions, _ray_kernels, compilation, fit
+from napari_shadowinv.fitting import _ray_kernels, compilation, fit
 from napari_shadowinv.fitting.compilation import ensure_compiled, is_compiled
+from napari_shadowinv.options import FitOptions
 
 
 def printed(script: str, **environment: str) -> str:
@@ -79,7 +80,8 @@ import sys
 from pathlib import Path
 from typing import Any
 import numpy as np
-from napari_shadowinv.fitting import FitOptions, compilation, fit
+from napari_shadowinv.fitting import compilation, fit
+from napari_shadowinv.options import FitOptions
 from napari_shadowinv.inversion import compilation as of_transport
 
 compilation.is_compiled = of_transport.is_compiled = lambda: False

@@ -10,9 +10,9 @@ from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._system.arrays import block_sums
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.descent import coarser, descend, finer, settle
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
 
 SIZE, PAD = (48, 64), 16

@@ -12,8 +12,9 @@ from helpers.fit_images import Displacement, bump, counted, distance, noisy, on_
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.fitting import Fit, FitOptions, FitShot, compare, fit
+from napari_shadowinv.fitting import Fit, FitShot, compare, fit
 from napari_shadowinv.fitting.measurements import strengths_of
+from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.plotting import fit_figure

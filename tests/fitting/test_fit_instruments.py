@@ -12,7 +12,8 @@ from napari_shadowinv._system.progress import Progress
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.fitting import Fit, FitOptions, FitShot, fit
+from napari_shadowinv.fitting import Fit, FitShot, fit
+from napari_shadowinv.options import FitOptions
 
 SIZE = (48, 56)
 STRENGTHS = [1, 0.6]

@@ -9,9 +9,10 @@ import pytest
 
 from helpers.fit_images import hessian_times
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.forward import Scene, blurred
 from napari_shadowinv.fitting.instrument import EXACT, Imperfect, Shapes
-from napari_shadowinv.fitting.rays import KNOT, at_rest
+from napari_shadowinv.fitting.rays import at_rest
 from napari_shadowinv.fitting.unknowns import AdditiveBlock, Fiducials, Unknowns
 from napari_shadowinv.options import FitOptions
 

@@ -12,7 +12,7 @@ from helpers.fit_images import bump, counted, distance, noisy, on_pixels
 from napari_shadowinv import BeamPrior, Instrument, ProtonSetup
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.fitting import Fit, FitOptions, fit
+from napari_shadowinv.fitting import Fit, fit
 from napari_shadowinv.fitting.descent import coarser
 from napari_shadowinv.fitting.instrument import (
     Imperfect,
@@ -26,6 +26,7 @@ from napari_shadowinv.fitting.instrument import (
 from napari_shadowinv.fitting.measurements import collect_data
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.inversion.imperfections import SmoothField
+from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.units import shown_fields
 
 SIZE = (48, 56)

@@ -10,11 +10,11 @@ from scipy.fft import idctn
 
 from helpers.fit_images import hessian_times
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.descent import descend, settle
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import Imperfect
 from napari_shadowinv.fitting.posterior import Posterior, Sample, compare_samples, draw_variations
-from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.search import Minimum, estimate_smoothness
 from napari_shadowinv.fitting.unknowns import Unknowns
 

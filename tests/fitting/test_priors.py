@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.rays import KNOT, RayModel, at_rest
+from napari_shadowinv.fitting._ray_kernels import KNOT
+from napari_shadowinv.fitting.rays import RayModel, at_rest
 from napari_shadowinv.fitting.unknowns import Fiducials, Prior, Unknowns
 
 SIZE, PAD = (24, 32), 8

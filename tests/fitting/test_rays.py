@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.rays import KNOT, Pulls, RayModel, at_rest
+from napari_shadowinv.fitting._ray_kernels import KNOT
+from napari_shadowinv.fitting.rays import Pulls, RayModel, at_rest
 from napari_shadowinv.physics.forward import synthetic_image
 
 SIZE = (40, 54)

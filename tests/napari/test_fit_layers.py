@@ -26,8 +26,9 @@ from napari_shadowinv._napari.layers import add_layers, outline
 from napari_shadowinv._napari.result_files import missing_layers
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.fitting import Fit, FitOptions, fit
+from napari_shadowinv.fitting import Fit, fit
 from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.projection import transferred_displacement

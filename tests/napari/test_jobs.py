@@ -7,7 +7,7 @@ import pytest
 from napari_shadowinv import ProtonSetup, fit
 from napari_shadowinv._napari.jobs import FitProgress, Pace, estimate_fit_time
 from napari_shadowinv._system.progress import Progress
-from napari_shadowinv.fitting import FitOptions
+from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 

@@ -9,16 +9,13 @@ import numpy as np
 import pytest
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.beam import number_in_unit
-from napari_shadowinv.physics.setup import (
-    SETUPS,
-    OpticalSetup,
-    ProtonSetup,
+from napari_shadowinv.physics.beam import (
     deflection_warnings,
     geometry_text,
-    setup_from_dict,
+    number_in_unit,
     setup_warnings,
 )
+from napari_shadowinv.physics.setup import SETUPS, OpticalSetup, ProtonSetup, setup_from_dict
 from napari_shadowinv.pipeline import read_recipe
 
 PLAIN = {

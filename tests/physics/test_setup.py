@@ -19,18 +19,15 @@ from napari_shadowinv.cli._summary import setup_text
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.io.pradformat import check_pradformat_setup
+from napari_shadowinv.physics.beam import BeamSetup, Deflector, MainField, SIField
 from napari_shadowinv.physics.phantoms import paper_setup
 from napari_shadowinv.physics.projection import transferred_displacement
 from napari_shadowinv.physics.setup import (
     SETUPS,
     SPECIES,
-    BeamSetup,
-    Deflector,
-    MainField,
     OpticalSetup,
     ProtonSetup,
     Setup,
-    SIField,
     setup_from_dict,
 )
 from napari_shadowinv.physics.units import shown_fields

@@ -10,13 +10,10 @@ from scipy.interpolate import RegularGridInterpolator
 
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.physics.field_grid import FieldGrid, field_grid
+from napari_shadowinv.physics.particle_flight import line_integrals, trace_particles
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-from napari_shadowinv.physics.tracing import (
-    TraceOptions,
-    line_integrals,
-    trace,
-    trace_particles,
-)
+from napari_shadowinv.physics.trace_options import TraceOptions
+from napari_shadowinv.physics.tracing import trace
 
 SETUP = ProtonSetup(
     energy=14.7, source_object_distance=1e-2, object_image_distance=0.2, pixel_size=2e-5

@@ -30,8 +30,9 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
+from napari_shadowinv.physics.beam import BeamSetup
 from napari_shadowinv.physics.phantoms import toroid
-from napari_shadowinv.physics.setup import BeamSetup, OpticalSetup, ProtonSetup
+from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.pipeline.rerun import rerun
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, shot_rows
 from napari_shadowinv.preprocessing import Bin, PolynomialEstimate

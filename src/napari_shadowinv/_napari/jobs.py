@@ -28,9 +28,9 @@ from napari_shadowinv._napari.layers import FullLayerData, result_layers
 from napari_shadowinv._napari.shots import load_radiograph
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, FitOptions, FitShot
+from napari_shadowinv.fitting import Fit, FitShot
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.options import FitChoices
+from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.pipeline import Cache, run_fit, run_refinement
 from napari_shadowinv.pipeline.fit_run import refinement_choices
 from napari_shadowinv.pipeline.inversion_run import run

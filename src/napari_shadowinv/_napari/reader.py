@@ -91,8 +91,9 @@ def _matches(pattern: str) -> list[Path]:
 def _read_file(path: Path) -> list[FullLayerData]:
     from napari_shadowinv._napari.result_files import layers_of_dataset
     from napari_shadowinv._napari.shots import frame_layers, radiograph_layers
-    from napari_shadowinv.io import Radiograph, read
+    from napari_shadowinv.io import read
     from napari_shadowinv.io.frames import FRAMES_FORMAT
+    from napari_shadowinv.preprocessing import Radiograph
 
     content = read(path)
     if isinstance(content, Radiograph):

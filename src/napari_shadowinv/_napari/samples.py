@@ -13,12 +13,12 @@ from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.shots import lazy_stack, radiograph_layers, shot_layer
 from napari_shadowinv._napari.viewer_sync import notify_errors
 from napari_shadowinv._typing import AnyArray, FloatArray
-from napari_shadowinv.io import Radiograph
 from napari_shadowinv.io.public_images import fetch_burner
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.setup import setup_from_dict
 from napari_shadowinv.physics.units import intensity_limits
+from napari_shadowinv.preprocessing import Radiograph
 
 _SHAPE = (200, 200)
 _COUNTS = 400.0  # per pixel: 5 % noise

@@ -30,6 +30,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.physics.units import intensity_limits
+from napari_shadowinv.preprocessing import Radiograph
 
 if TYPE_CHECKING:
     import xarray
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 
-def radiograph_layers(shot: io.Radiograph, name: str = "") -> list[FullLayerData]:
+def radiograph_layers(shot: Radiograph, name: str = "") -> list[FullLayerData]:
     """Describe an image, above its undisturbed beam and its mask of unusable pixels."""
     name = name or ("shot" if shot.path is None else shot.path.stem)
     limits = intensity_limits(shot.image)
@@ -87,7 +88,7 @@ def shot_layer(
     return data, keywords, "image"
 
 
-def _facts(shot: io.Radiograph, origin: str) -> dict[str, Any]:
+def _facts(shot: Radiograph, origin: str) -> dict[str, Any]:
     """Return the metadata of a file for its layers."""
     return {
         "setup_origin": None if shot.setup is None else f"{CAME_WITH} {origin}",
@@ -97,17 +98,17 @@ def _facts(shot: io.Radiograph, origin: str) -> dict[str, Any]:
     }
 
 
-def _frame(shot: io.Radiograph) -> Frame:
+def _frame(shot: Radiograph) -> Frame:
     """Return the frame of the object plane, also if a file contains only the pixel size."""
     side = dict(shot.metadata.get("geometry") or {}).get("pixel_size")
     return frame_for(shot.image.shape, shot.setup, pixel_size=side)
 
 
-def radiograph_of(layer: Any, image: Any, plane: int | None = None) -> io.Radiograph:
+def radiograph_of(layer: Any, image: Any, plane: int | None = None) -> Radiograph:
     """Return a layer's image or a plane of a stack, perhaps lazy, as a radiograph with its file."""
     metadata = metadata_of(layer)
     path = metadata.get("path") or layer.source.path
-    shot = io.Radiograph(image, warnings=tuple(metadata.get("warnings", ())))
+    shot = Radiograph(image, warnings=tuple(metadata.get("warnings", ())))
     if metadata.get("result") is not None:
         return shot  # processed images differ from their file
     paths = metadata.get("paths", ())
@@ -120,8 +121,8 @@ def radiograph_of(layer: Any, image: Any, plane: int | None = None) -> io.Radiog
 
 
 def source_of_shot(
-    layer: Any, image: Any, shot: io.Radiograph, plane: int | None = None
-) -> io.Radiograph:
+    layer: Any, image: Any, shot: Radiograph, plane: int | None = None
+) -> Radiograph:
     """Return a layer's image as the source of a shot, without the file of another shot."""
     beam = radiograph_of(layer, image, plane)
     if role_of(layer) != SOURCE or beam.path == shot.path:
@@ -130,7 +131,7 @@ def source_of_shot(
     return replace(beam, path=None, metadata={})
 
 
-def load_radiograph(shot: io.Radiograph, name: str) -> io.Radiograph:
+def load_radiograph(shot: Radiograph, name: str) -> Radiograph:
     """Return the radiograph with its image in memory, and the checksum of its file."""
     from napari_shadowinv.pipeline.inversion_run import plane_of
 
@@ -189,7 +190,7 @@ def lazy_stack(
     return array.stack(planes)  # type: ignore[no-untyped-call]
 
 
-def _first_readable(paths: Sequence[Path]) -> tuple[io.Radiograph, int]:
+def _first_readable(paths: Sequence[Path]) -> tuple[Radiograph, int]:
     messages: list[str] = []
     for index, path in enumerate(paths):
         try:

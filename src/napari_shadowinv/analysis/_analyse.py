@@ -23,8 +23,6 @@ from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.results import unpack_result
 
-__all__ = ["analyse"]
-
 _MIN_SAMPLES = 20
 
 

@@ -32,14 +32,6 @@ import numpy as np
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 
-__all__ = [
-    "FIRST_OFFSET",
-    "choose_smoothing",
-    "deflection_matrix",
-    "inverse_matrix",
-    "projection_matrix",
-]
-
 FIRST_OFFSET = 0.3027
 """Distance in px of the first deflection from the axis.
 

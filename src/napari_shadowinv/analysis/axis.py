@@ -16,8 +16,6 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.abel import FIRST_OFFSET
 from napari_shadowinv.analysis.paths import interpolate_cubic
 
-__all__ = ["Axis", "asymmetry", "find_axis", "sample_sides"]
-
 _MAX_TILT = math.radians(20)
 _START_RADIUS = 0.3  # of the side across, while the axis is only sought
 _FITTED_RADIUS = 0.9  # of the largest, so that a shifted axis stays inside

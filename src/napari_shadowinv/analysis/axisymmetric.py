@@ -47,8 +47,6 @@ from napari_shadowinv.physics.beam import (
 )
 from napari_shadowinv.physics.units import PIXEL
 
-__all__ = ["AxisymmetricProfile", "AzimuthalProfile"]
-
 _B, _E, _N = "path_integrated_b", "path_integrated_e", "line_integrated_density"
 _INDEX = "line_integrated_log_index"
 _LENGTHS = ("displacement", "deflection_angle", _INDEX)

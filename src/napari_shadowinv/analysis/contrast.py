@@ -22,8 +22,6 @@ from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import number_field
 
-__all__ = ["Contrast"]
-
 _MAX_LINEAR = 0.1  # compression up to which the image's contrast is the Laplacian, to some 10 %
 _NEARLY_CROSSED = 0.8
 _CROSSED = 1.0

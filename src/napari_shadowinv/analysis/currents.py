@@ -23,8 +23,6 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.error_bars import Quantity
 
-__all__ = ["EnclosedCharge", "EnclosedCurrent", "Flux"]
-
 _B, _E = "path_integrated_b", "path_integrated_e"
 _STEP_PX = 0.5
 

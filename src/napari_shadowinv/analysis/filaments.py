@@ -35,8 +35,6 @@ from napari_shadowinv.facts import Fact
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import displacement_from_potential
 
-__all__ = ["Filaments", "field_autocorrelation"]
-
 _TAPER = 0.05
 _STEP_PX = 0.25
 _MIN_LAG_SHARE = 0.4  # of the shorter side, up to which lags are used

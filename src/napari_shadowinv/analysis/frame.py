@@ -17,8 +17,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.units import PIXEL
 
-__all__ = ["FIELD_UNITS", "FieldFrame", "FieldUnit", "field_unit"]
-
 # Error of rods whose rays nearly cross, and their length over the distance to the source, by
 # `benchmarks/tracing.py length`.
 _THIN_SCREEN_ERRORS = (0.015, 0.1), (0.032, 0.2)

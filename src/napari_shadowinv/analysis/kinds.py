@@ -27,8 +27,6 @@ from napari_shadowinv.analysis.product import Product
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing.steps import choices_of
 
-__all__ = ["PRODUCTS", "product_from_dict", "product_from_text", "product_syntax"]
-
 # Their products register themselves.
 _MODULES = (lines, regions, currents, maps, contrast, axisymmetric, spectra, filaments)
 

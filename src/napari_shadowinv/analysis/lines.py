@@ -21,8 +21,6 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import number_field
 
-__all__ = ["LineProfile", "Path"]
-
 _MAX_POINTS = 10_000
 _STEP_PX = 1.0
 

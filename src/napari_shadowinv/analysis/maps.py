@@ -39,15 +39,6 @@ from napari_shadowinv.facts import Fact
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import length_text
 
-__all__ = [
-    "ChargeDensity",
-    "CurrentDensity",
-    "PhaseCurvature",
-    "Smoothed",
-    "chosen_width",
-    "smooth",
-]
-
 ORDER = 3
 MIN_SPACINGS = 1.5  # of the sites, in widths: finer structures are those of the cells
 _WIDTHS_PX = (0.0, *(0.7 * 2 ** (step / 4) for step in range(23)))

@@ -15,8 +15,6 @@ from napari_shadowinv.analysis.paths import circle_path
 from napari_shadowinv.analysis.product import Product
 from napari_shadowinv.physics.beam import number_field
 
-__all__ = ["Outlined", "crosses_itself"]
-
 Point = tuple[float, float]
 _MAX_CORNERS = 2000
 

@@ -24,20 +24,6 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.compiler import njit
 
-__all__ = [
-    "PeakMeasures",
-    "Profile",
-    "circle_path",
-    "edge_midpoints",
-    "interpolate",
-    "interpolate_cubic",
-    "measure_peak",
-    "path_directions",
-    "sample_path",
-    "sample_strip",
-    "table_text",
-]
-
 _MAX_SAMPLES = 5000
 _CIRCLE_CORNERS = 720
 

@@ -32,15 +32,6 @@ from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 
-__all__ = [
-    "RingSpectrum",
-    "fit_exponent",
-    "measure_response",
-    "random_displacement",
-    "ring_spectrum",
-    "window_weights",
-]
-
 _MIN_SIDE_PX = 32
 _MIN_RINGS = 4
 _EXPONENTS = -12.0, 6.0

@@ -23,16 +23,6 @@ from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.units import PIXEL, display_unit, prefix_for
 from napari_shadowinv.preprocessing.steps import Choice
 
-__all__ = [
-    "BANDS",
-    "Coordinate",
-    "FieldNoise",
-    "Product",
-    "Variable",
-    "quantity_text",
-    "value_text",
-]
-
 BANDS = 0.68, 0.95
 """Shares of probability of the bands that files, tables and figures have."""
 

@@ -15,8 +15,6 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.error_bars import Quantity
 
-__all__ = ["Region"]
-
 
 class Region(Outlined):
     """Mean, peak, r.m.s. and centroid of a field in a circle, a rectangle or a polygon.

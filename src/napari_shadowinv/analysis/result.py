@@ -36,8 +36,6 @@ from napari_shadowinv.physics.units import display_unit, label, numbers_of, pref
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["ProductResult", "add_products", "products_in", "products_table"]
-
 _ATTRIBUTE = "products"
 SERIES_AXES: tuple[str, str] = ("time", "shot")
 _COLUMNS = ("product", "quantity", "place", "place_unit", "value", "unit", "bias", "std")

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["TimeSeries", "analyse_shots", "shot_times", "time_series"]
-
 _MIN_SHOTS = 2
 _LEAST = 1e-300
 _SAMPLES = 1000  # of a growth rate by the scatter of the shots

@@ -51,8 +51,6 @@ from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import length_text, number_field
 from napari_shadowinv.physics.units import PIXEL
 
-__all__ = ["TurbulenceSpectrum"]
-
 _B, _E, _N = "path_integrated_b", "path_integrated_e", "line_integrated_density"
 _PLANES = (_N, "line_integrated_log_index")
 _ENERGY_FACTORS = {_B: math.pi, _E: 2 * math.pi, _N: math.pi}

@@ -13,16 +13,17 @@ from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cli import _summary
 from napari_shadowinv.facts import ResultKind
-from napari_shadowinv.physics.setup import beam_quantities, setup_warnings
+from napari_shadowinv.physics.beam import setup_warnings
+from napari_shadowinv.physics.setup import beam_quantities
 
 if TYPE_CHECKING:
     import xarray
     from rich.table import Table
 
     from napari_shadowinv._typing import AnyArray
-    from napari_shadowinv.io import Radiograph
     from napari_shadowinv.io.formats import Format
     from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.preprocessing import Radiograph
     from napari_shadowinv.provenance import Provenance
 
 PACKAGES = (
@@ -40,12 +41,13 @@ def file_table(path: Path, variable: str | None = None) -> Table:
 
 def _rows(path: Path, variable: str | None) -> _summary.Rows:
     from napari_shadowinv.cli._batch import store_rows
-    from napari_shadowinv.io import Radiograph, is_stack, read
+    from napari_shadowinv.io import is_stack, read
     from napari_shadowinv.io.formats import format_of
     from napari_shadowinv.io.frames import find_frames
     from napari_shadowinv.io.hdf5 import read_hdf5
     from napari_shadowinv.io.images import read_npy
     from napari_shadowinv.io.store import StackStore
+    from napari_shadowinv.preprocessing import Radiograph
 
     if is_stack(path):
         return store_rows(StackStore(path))
@@ -69,7 +71,7 @@ def _rows(path: Path, variable: str | None) -> _summary.Rows:
 
 def _frame_rows(frames: Radiograph | xarray.Dataset) -> _summary.Rows:
     """Describe many images by their names and the first."""
-    from napari_shadowinv.io import Radiograph
+    from napari_shadowinv.preprocessing import Radiograph
 
     assert not isinstance(frames, Radiograph)
     names, images = frames["name"].values, frames["image"]

@@ -393,8 +393,8 @@ def simulate_shot(setup: ProtonSetup, dm: float, noise: float) -> tuple[FloatArr
 
 def fields_to_compare(image: FloatArray, truth: FloatArray, inversion: Inversion) -> Fields:
     """Return three displacements: the truth, the inversion, and a linear inversion."""
+    from napari_shadowinv.physics.beam import displacement_from_potential
     from napari_shadowinv.physics.poisson import poisson_invert
-    from napari_shadowinv.physics.setup import displacement_from_potential
 
     poisson = displacement_from_potential(poisson_invert(image))
     return {"True": truth, "Retrieved": inversion.displacement, "Poisson": poisson}
@@ -540,7 +540,7 @@ def _field_of_result(path: Path, dataset: xarray.Dataset) -> Field:
 
 
 def _displacement(path: Path, array: AnyArray) -> FloatArray:
-    from napari_shadowinv.physics.setup import displacement_from_potential
+    from napari_shadowinv.physics.beam import displacement_from_potential
 
     if array.ndim == 2:
         return displacement_from_potential(array)

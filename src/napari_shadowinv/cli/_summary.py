@@ -93,7 +93,7 @@ def setup_text(
 ) -> str:
     """Describe the setup in a line, or name the values that are missing for SI units."""
     if setup is not None:
-        from napari_shadowinv.physics.setup import field_of_view_text
+        from napari_shadowinv.physics.beam import field_of_view_text
 
         text = (
             f"{setup.probe}, magnification {setup.magnification:.4g}, "

@@ -100,7 +100,7 @@ def invert_shot(
 
 def warn_of_setups(experiments: Iterable[tuple[Setup | None, tuple[int, int] | None]]) -> None:
     """Print the doubts about setups and the shapes of their images, before the work begins."""
-    from napari_shadowinv.physics.setup import setup_warnings
+    from napari_shadowinv.physics.beam import setup_warnings
 
     texts = [
         caution.text

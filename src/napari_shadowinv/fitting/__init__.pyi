@@ -1,6 +1,5 @@
 from ._fit import compare, fit
 from ._leave_one_out import leave_one_out
-from .measurements import FitOptions
 from .result import Basin, Fit, FitReport, FittedField
 from .shots import FitShot, point_spread
 from .windows import FitWindows, LeaveOneOut
@@ -8,7 +7,6 @@ from .windows import FitWindows, LeaveOneOut
 __all__ = [
     "Basin",
     "Fit",
-    "FitOptions",
     "FitReport",
     "FitShot",
     "FitWindows",

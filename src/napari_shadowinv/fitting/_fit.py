@@ -72,8 +72,6 @@ from napari_shadowinv.options import FitOptions, Instrument, InversionOptions, K
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["collect_starts", "compare", "fit", "report_steps", "reweight_counts"]
-
 _FROM_FAR = ((4, 2.0), (4, 1.0), (2, 1.0))
 _FROM_NEAR = ((4, 2.0), (2, 2.0), (2, 1.0))
 _FROM_FIELD = ((4, 1.0), (2, 1.0))

@@ -41,8 +41,6 @@ from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.fitting.windows import LeaveOneOut, check_count, explanation_of
 from napari_shadowinv.options import FitOptions
 
-__all__ = ["leave_one_out"]
-
 _LEAST_AGREEING = 2
 _LAST_GAIN = 0.5
 _SAMPLES, _SAMPLE_TOLERANCE = 2, 0.05  # of the Gaussian around the unknowns of a fit

@@ -11,22 +11,6 @@ import numpy as np
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray, IntArray
 from napari_shadowinv.geometry.compiler import njit
 
-__all__ = [
-    "KNOT",
-    "MOST_RAYS",
-    "add_corners",
-    "add_ties",
-    "boxes",
-    "collect",
-    "deposit",
-    "gather",
-    "merge",
-    "normal_times",
-    "rows_times",
-    "spline_tables",
-    "transpose_times",
-]
-
 KNOT = 2  # px between knots
 MOST_RAYS = 64  # along a cell's side
 

@@ -20,8 +20,6 @@ from napari_shadowinv.geometry.compiler import is_code_cached
 from napari_shadowinv.inversion import compilation as of_transport
 from napari_shadowinv.inversion.machine_code import compilation_frequency
 
-__all__ = ["ensure_compiled", "is_compiled"]
-
 _KERNELS: tuple[Any, ...] = tuple(
     kernel
     for name, kernel in vars(_ray_kernels).items()

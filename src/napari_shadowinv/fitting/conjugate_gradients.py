@@ -20,8 +20,6 @@ from scipy.linalg import eigh_tridiagonal
 
 from napari_shadowinv._typing import AnyArray, FloatArray
 
-__all__ = ["SoftModes", "eigensystem", "product", "solve"]
-
 _SOFT = 0.5  # eigenvalues below, where most are about 1
 _MOST_MODES = 120
 _OUTDATED_STEPS = 100  # of a solution with so many modes: they belong to another matrix

@@ -21,20 +21,10 @@ from scipy.fft import dctn, idctn
 
 from napari_shadowinv._system.arrays import block_sums, complete_block_means
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
 from napari_shadowinv.fitting.forward import Linear, Scene
-from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import POWERS, Fiducials, Unknowns
-
-__all__ = [
-    "Preconditioner",
-    "coarser",
-    "descend",
-    "finer",
-    "minimise",
-    "settle",
-    "smoothness_in_pixels",
-]
 
 _PAIRS = 20  # of steps and changes of the gradient that are kept
 _DECREASE, _SLOPE = 1e-4, 0.9  # Wolfe's conditions

@@ -23,8 +23,6 @@ from napari_shadowinv.fitting.instrument import DARKEST, EXACT, Imperfect, Part,
 from napari_shadowinv.fitting.rays import Pulls, RayModel, at_rest
 from napari_shadowinv.fitting.unknowns import Prior, PriorTerms, Unknowns
 
-__all__ = ["Linear", "Scene", "blurred"]
-
 _T = TypeVar("_T")
 
 _SIGMAS = 4.0  # how far Gaussians reach

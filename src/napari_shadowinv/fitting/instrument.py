@@ -29,8 +29,6 @@ from napari_shadowinv.options import BeamPrior, Instrument
 if TYPE_CHECKING:
     from napari_shadowinv.fitting.unknowns import Unknowns
 
-__all__ = ["DARKEST", "EXACT", "Imperfect", "Part", "Shapes", "widen", "widening"]
-
 DARKEST = 1e-4  # of a beam, for a logarithm
 _LEAST_EXPONENT = 0.2
 _OF_RESPONSE = frozenset({"gamma", "blur", "background", "other_field"})

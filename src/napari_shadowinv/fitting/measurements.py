@@ -47,17 +47,9 @@ from napari_shadowinv.options import (
     Instrument,
     KindOfNoise,
 )
+from napari_shadowinv.physics.beam import BeamSetup
 from napari_shadowinv.physics.projection import transferred_displacement
-from napari_shadowinv.physics.setup import BeamSetup, Setup, deflector_titles
-
-__all__ = [
-    "FitData",
-    "FitOptions",
-    "check_point_spread",
-    "collect_data",
-    "estimated_noise",
-    "strengths_of",
-]
+from napari_shadowinv.physics.setup import Setup, deflector_titles
 
 _MIN_SIGMA_PX = 1e-6  # of a fiducial; the square of less overflows
 _BLOCK = 8  # px; sides are filled up to a multiple of it, for pixels four times as wide

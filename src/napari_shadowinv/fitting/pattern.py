@@ -31,20 +31,6 @@ from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.setup import Setup
 
-__all__ = [
-    "SUSPECT_PATTERN",
-    "Pattern",
-    "blur_score",
-    "correlation_length",
-    "find_pattern",
-    "gain_by_blur",
-    "lack_of_noise",
-    "log_evidence",
-    "name_cause",
-    "noise_amplification",
-    "pattern_strength",
-]
-
 _WIDTHS_PX = (2.0, 4.0, 8.0)
 _SMALLEST_VARIANCE = 1e-12  # of the noise
 _DETAIL_PX, _MOSTLY_USED = 2.0, 0.9  # width of a Gaussian, and its share on used pixels

@@ -38,21 +38,6 @@ from napari_shadowinv.inversion.samples import Pairs
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.poisson import border_mean
 
-__all__ = [
-    "BeamError",
-    "BeamShifts",
-    "Posterior",
-    "Response",
-    "Sample",
-    "compare_samples",
-    "draw_variations",
-    "errors_by_noise",
-    "largest_share",
-    "potentials_of",
-    "sampled_potentials",
-    "shifts_by_beam",
-]
-
 _ROUGHLY, _CLOSELY = 0.05, 0.002  # the longest waves, which noise moves most, are found last
 # Fields and numbers of an instrument that explain an image alike are found last of all.
 _IN_VALLEY = 1e-4

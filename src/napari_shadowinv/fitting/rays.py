@@ -22,8 +22,6 @@ from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.fitting import _ray_kernels as kernels
 from napari_shadowinv.fitting._ray_kernels import KNOT, MOST_RAYS
 
-__all__ = ["KNOT", "Pulls", "RayModel", "at_rest"]
-
 _SHARED = 2.0  # spacings at rest: width of an edge where rays count in both pixels, evenly then
 _BANDS = 8  # of cells; each has an image of its own, so that threads do not change a sum
 _PARTS = 2  # of a Jacobian's rows, each with sums of its own

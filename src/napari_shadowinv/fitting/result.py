@@ -61,8 +61,6 @@ from napari_shadowinv.provenance import ImageOrigin, Provenance
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["Basin", "Fit", "FitReport", "FittedField"]
-
 _IMAGES = ("image", "y", "x")
 # Variables beside those of the fields: dimensions, units, long name.
 _VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {

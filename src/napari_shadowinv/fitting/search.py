@@ -13,6 +13,7 @@ from scipy.ndimage import map_coordinates
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnStep, run_in_parallel
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
 from napari_shadowinv.fitting.descent import (
     Preconditioner,
@@ -24,25 +25,9 @@ from napari_shadowinv.fitting.descent import (
 )
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.posterior import Posterior, Response
-from napari_shadowinv.fitting.rays import KNOT
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.poisson import border_mean
-
-__all__ = [
-    "COARSE_GAIN",
-    "FIRST_SMOOTHNESS",
-    "SMALL_PX",
-    "SMOOTHNESS_RATIO",
-    "Minimum",
-    "Start",
-    "estimate_smoothness",
-    "in_recorded_pixels",
-    "posterior_of",
-    "refine_minimum",
-    "search",
-    "settle_minimum",
-]
 
 FIRST_SMOOTHNESS = np.array([50.0, 2000.0])  # λ and κ
 _COARSE_SMOOTHNESS = 3.0  # times that, before the data have told

@@ -21,18 +21,6 @@ from napari_shadowinv.options import KindOfNoise
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing import Radiograph
 
-__all__ = [
-    "FitShot",
-    "Images",
-    "NearField",
-    "common_values",
-    "join_shots",
-    "list_shots",
-    "names_of",
-    "point_spread",
-    "value_of_first",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class NearField:

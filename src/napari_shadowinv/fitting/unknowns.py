@@ -26,20 +26,9 @@ import numpy as np
 from scipy.fft import dctn, idctn
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
-from napari_shadowinv.fitting._ray_kernels import add_ties, spline_tables
-from napari_shadowinv.fitting.rays import KNOT, RayModel, at_rest
+from napari_shadowinv.fitting._ray_kernels import KNOT, add_ties, spline_tables
+from napari_shadowinv.fitting.rays import RayModel, at_rest
 from napari_shadowinv.options import FitOptions
-
-__all__ = [
-    "ADDITIVE",
-    "POWERS",
-    "AdditiveBlock",
-    "Fiducials",
-    "Prior",
-    "PriorTerms",
-    "Unknowns",
-    "additive_blocks",
-]
 
 _COMMON = 3  # blocks that the images share; the others have a row for each image
 

@@ -26,9 +26,6 @@ from napari_shadowinv.inversion.solution_checks import (
 )
 from napari_shadowinv.options import FitOptions
 
-__all__ = ["assess_verdict", "hidden_contrast"]
-
-
 _MIN_HOLE_RADIUS_PX = 6.0
 _RIM_PX = 4
 _SMOOTHED_PX = 1.0

@@ -24,28 +24,13 @@ from napari_shadowinv.fitting.result import (
     normalise_residual,
     setups_in,
 )
-from napari_shadowinv.physics.setup import (
-    BeamQuantity,
-    Setup,
-    beam_values,
-    deflector_titles,
-)
+from napari_shadowinv.physics.beam import BeamQuantity
+from napari_shadowinv.physics.setup import Setup, beam_values, deflector_titles
 from napari_shadowinv.physics.units import PIXEL, label, shown_fields
 from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
     import xarray
-
-__all__ = [
-    "PREFIX",
-    "FitWindows",
-    "LeaveOneOut",
-    "check_count",
-    "explanation_of",
-    "image_numbers",
-    "window_facts",
-]
-
 
 _PLANES = ("image", "y", "x")
 # Attribute: variable, dimensions, units, long name.

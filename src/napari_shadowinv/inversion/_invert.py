@@ -47,8 +47,6 @@ from napari_shadowinv.preprocessing.image_checks import CheckedImage, image_warn
 from napari_shadowinv.transport.sites import RATIO, Levels, Margin, SitePlan, edge_flux, plan_levels
 from napari_shadowinv.transport.solvers import LevelSolution, fit_flux_factor, solve
 
-__all__ = ["count_sites", "invert", "plan_sites"]
-
 # Steps of the read-out: up to the first number the potential, then the re-projection.
 _READ_STEPS = 30
 _STEPS = 100

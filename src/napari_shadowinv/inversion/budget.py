@@ -47,8 +47,6 @@ from napari_shadowinv.transport.minimise import Solution, with_full_cells
 from napari_shadowinv.transport.sites import RATIO, Level, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
 
-__all__ = ["FLUX_ERRORS", "Budget", "ErrorEstimate", "Errors", "discretisation_share"]
-
 _AROUND = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])  # px
 _PLACES = 48  # along the longer side, where levels are compared
 _USUAL_RATE, _RATES = 0.35, (0.25, 0.7)  # of the change between levels to the one before

@@ -68,9 +68,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["Maximum", "Quantity", "Uncertainty", "uncertainty"]
-
-
 Result = TypeVar("Result")
 
 _CHECKED, _SOLVED = 3, 3 * WIDTH  # linear samples that are solved, too; with an instrument

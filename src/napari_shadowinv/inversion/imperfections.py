@@ -20,19 +20,6 @@ from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.inversion.readout import LinearResponse
 from napari_shadowinv.options import BeamPrior, Instrument
 
-__all__ = [
-    "IMPERFECTIONS",
-    "BeamExcess",
-    "Imperfection",
-    "InstrumentDraws",
-    "RecordedShot",
-    "Scene",
-    "SmoothField",
-    "SolvedShot",
-    "motions",
-    "random_waves",
-]
-
 _WAVES = 16
 _SAMPLES = 8
 _STEPS = 96  # along the shorter side, where the object is looked for

@@ -36,12 +36,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.inversion.normalise import Prepared
     from napari_shadowinv.options import InversionOptions
 
-__all__ = [
-    "ImageNoise",
-    "beam_difference",
-]
-
-
 _TILES = 8  # along the shorter side
 _CELLS = 4  # along each side of a tile
 _MIN_USED_SHARE = 0.5  # of a cell's pixels

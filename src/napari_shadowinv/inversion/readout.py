@@ -46,14 +46,6 @@ from napari_shadowinv.transport.linear import FactorisedLaplacian
 from napari_shadowinv.transport.sites import Level, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
 
-__all__ = [
-    "LinearReadout",
-    "LinearResponse",
-    "read_centroids",
-    "read_dual",
-    "read_out",
-]
-
 
 @njit(nogil=True, cache=True)
 def _add_rows(

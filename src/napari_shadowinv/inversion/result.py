@@ -51,8 +51,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-__all__ = ["Inversion", "Report", "RetrievedField"]
-
 
 @dataclass(frozen=True)
 class Report:

@@ -39,18 +39,6 @@ from napari_shadowinv.transport.linear import FactorisedLaplacian, LaplacianSolv
 from napari_shadowinv.transport.sites import Level, Levels, Margin, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target, solve
 
-__all__ = [
-    "Draw",
-    "FullResampling",
-    "LinearResampling",
-    "Measure",
-    "Sample",
-    "Scatter",
-    "Seed",
-    "noise_of",
-]
-
-
 Draw = Callable[[np.random.Generator, float], FloatArray]
 """Returns a noisy image, with noise that a Gaussian of some standard deviation (px) correlates."""
 

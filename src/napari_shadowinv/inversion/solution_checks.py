@@ -74,19 +74,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.inversion.normalise import Prepared
     from napari_shadowinv.options import InversionOptions
 
-__all__ = [
-    "TURNED_BACK",
-    "Assessment",
-    "Sides",
-    "assess_verdict",
-    "find_cautions",
-    "image_residual",
-    "inner_sides",
-    "is_coarse",
-    "turning_displacement",
-]
-
-
 TURNED_BACK = 0.07
 """Mean displacement across the edge over the r.m.s. one: 0.05 if contained, 0.08 if cut."""
 

@@ -30,7 +30,8 @@ from napari_shadowinv.physics.units import (
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import Setup, SIField
+    from napari_shadowinv.physics.beam import SIField
+    from napari_shadowinv.physics.setup import Setup
 
 _FLUX = "1"
 _EARLIER_UNITS = {"px": PIXEL, "px²": PIXEL_AREA, "flux": _FLUX, "flux/px²": FLUX_DENSITY}

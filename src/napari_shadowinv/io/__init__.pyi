@@ -1,11 +1,10 @@
 from .cpsa import read_tracks
 from .field_grids import is_field_grid, read_field_grid
 from .files import check_output, replacing
-from .read_write import Radiograph, read, read_cpsa, read_dataset, read_radiograph, read_toml, write
+from .read_write import read, read_cpsa, read_dataset, read_radiograph, read_toml, write
 from .store import is_stack, read_stack
 
 __all__ = [
-    "Radiograph",
     "check_output",
     "is_field_grid",
     "is_stack",

@@ -162,7 +162,8 @@ def _read_distances(attributes: dict[str, Any]) -> tuple[float | None, float | N
 
 
 def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
-    from napari_shadowinv.physics.setup import displacement_from_potential, setup_from_dict
+    from napari_shadowinv.physics.beam import displacement_from_potential
+    from napari_shadowinv.physics.setup import setup_from_dict
 
     setup = setup_from_dict(_read_geometry(path, attributes, "dr"), str(path))
     arrays = _read_datasets(path, ("phi", "defl_ax1", "defl_ax2"))

@@ -52,16 +52,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.results import AnyResult
 
-__all__ = [
-    "Radiograph",
-    "read",
-    "read_cpsa",
-    "read_dataset",
-    "read_radiograph",
-    "read_toml",
-    "write",
-]
-
 # The parser takes memory and time with the square of a key's parts.
 _DEEPEST_KEY = 16
 _KEY_PART = r"""(?:[A-Za-z0-9_-]+|"[^"\n]*"|'[^'\n]*')"""

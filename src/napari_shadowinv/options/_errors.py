@@ -6,8 +6,6 @@ from typing import Annotated
 
 from pydantic import Field
 
-__all__ = ["MaxError"]
-
 MaxError = Annotated[
     float,
     Field(

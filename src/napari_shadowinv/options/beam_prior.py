@@ -24,8 +24,6 @@ from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 
-__all__ = ["ASSUMED_BEAM", "BeamComponents", "BeamPrior"]
-
 _GRID = 128  # blocks along the longer side
 _DIMMEST = 1e-2  # of the mean beam, for a relative difference
 _MIN_NOISE_RATIO = 1.5  # variance of a component, over its share of the noise

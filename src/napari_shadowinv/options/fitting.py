@@ -17,15 +17,6 @@ from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv.options._errors import MaxError
 from napari_shadowinv.physics.setup import deflector_titles
 
-__all__ = [
-    "KINDS_OF_NOISE",
-    "MAX_STRENGTH",
-    "FitChoices",
-    "FitOptions",
-    "KindOfNoise",
-    "Noise",
-]
-
 MAX_STRENGTH = 1e4
 """Largest ratio of an image's displacement to the first one's."""
 

@@ -25,8 +25,6 @@ from pydantic import (
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv.options.beam_prior import ASSUMED_BEAM, BeamComponents, BeamPrior
 
-__all__ = ["BEAM_SOURCES", "DETECTORS", "Instrument"]
-
 Detector = Literal["film", "image plate", "CR-39", "scintillator", "camera"]
 BeamSource = Literal["TNSA", "implosion", "X-ray tube", "laser"]
 

@@ -9,8 +9,6 @@ from pydantic import ConfigDict, Field, model_validator
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv.options._errors import MaxError
 
-__all__ = ["MAX_DEFAULT_SITES", "InversionOptions"]
-
 _BUDGET: Any = {"panel": "Error budget (docs/uncertainty.md)"}
 
 MAX_DEFAULT_SITES = 1_000_000

@@ -1,10 +1,12 @@
 from .field_grid import FieldGrid, field_grid
 from .forward import jacobian_determinant, synthetic_image
+from .particle_flight import TracedParticles, trace_particles
 from .phantoms import Phantom, ellipse_pair, gaussian_blob, paper_setup, toroid
 from .poisson import border_mean, poisson_invert
 from .projection import project, project_potential, transferred_displacement
 from .setup import OpticalSetup, ProtonSetup, Setup, setup_from_dict
-from .tracing import TracedImage, TracedParticles, TraceOptions, trace, trace_particles
+from .trace_options import TraceOptions
+from .tracing import TracedImage, trace
 
 __all__ = [
     "FieldGrid",

@@ -12,16 +12,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.phantoms import Phantom
 
-__all__ = [
-    "PHANTOMS",
-    "BlobRecipe",
-    "CoaxialRecipe",
-    "FourToroidsRecipe",
-    "PhantomRecipe",
-    "ToroidRecipe",
-    "WakefieldRecipe",
-]
-
 
 class PhantomRecipe(CheckedModel):
     """A simulated object with parameters of its field."""

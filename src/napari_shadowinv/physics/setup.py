@@ -48,41 +48,10 @@ from napari_shadowinv.physics.beam import (
     Deflector,
     MainField,
     SIField,
-    deflection_warnings,
-    displacement_from_potential,
-    field_of_view_text,
-    geometry_text,
     length_text,
     number_field,
     scale_by,
-    setup_warnings,
 )
-
-__all__ = [
-    "SETUPS",
-    "SPECIES",
-    "BeamQuantity",
-    "BeamSetup",
-    "Deflector",
-    "FieldUnit",
-    "MainField",
-    "OpticalSetup",
-    "Particle",
-    "ProtonSetup",
-    "SIField",
-    "Setup",
-    "Species",
-    "beam_quantities",
-    "beam_values",
-    "bin_setup",
-    "deflection_warnings",
-    "deflector_titles",
-    "displacement_from_potential",
-    "field_of_view_text",
-    "geometry_text",
-    "setup_from_dict",
-    "setup_warnings",
-]
 
 Species = Literal["proton", "deuteron", "triton", "helion", "alpha", "electron"]
 FieldUnit = Literal["T m", "MG um"]

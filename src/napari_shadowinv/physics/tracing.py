@@ -48,7 +48,6 @@ from napari_shadowinv.physics.particle_flight import (
     image_range,
     line_integrals,
     pixel_centres,
-    trace_particles,
 )
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.physics.trace_options import TraceOptions
@@ -56,17 +55,6 @@ from napari_shadowinv.physics.units import label, place_coordinates
 
 if TYPE_CHECKING:
     import xarray
-
-__all__ = [
-    "FieldGrid",
-    "TraceOptions",
-    "TracedImage",
-    "TracedParticles",
-    "line_integrals",
-    "trace",
-    "trace_particles",
-    "traced_displacement",
-]
 
 Profile = ArrayLike | Callable[[FloatArray, FloatArray], ArrayLike]
 

@@ -32,10 +32,10 @@ from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.budget import Errors
 from napari_shadowinv.inversion.compilation import ensure_compiled as ensure_inversion_compiled
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions
-from napari_shadowinv.physics.beam import unit_in_title
+from napari_shadowinv.physics.beam import BeamSetup, unit_in_title
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
 from napari_shadowinv.physics.poisson import potential_from_displacement
-from napari_shadowinv.physics.setup import SETUPS, BeamSetup, Setup, deflector_titles
+from napari_shadowinv.physics.setup import SETUPS, Setup, deflector_titles
 from napari_shadowinv.pipeline.experiment_object import PlannedObject, object_of_phantom
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 from napari_shadowinv.pipeline.experiment_result import (
@@ -50,8 +50,6 @@ from napari_shadowinv.pipeline.experiment_shots import (
     ShotSimulator,
     SimulatedShots,
 )
-
-__all__ = ["SWEPT", "plan_experiment", "sweep_experiment"]
 
 _MIN_SIDE_PX = 32
 _MIN_DISPLACEMENT_PX = 1e-6

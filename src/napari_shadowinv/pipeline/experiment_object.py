@@ -22,27 +22,15 @@ from napari_shadowinv._system.arrays import as_numbers, complete_block_means, pl
 from napari_shadowinv._system.validation import suggestion, validate
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.field_grid import FieldGrid
 from napari_shadowinv.physics.forward import checked_displacement, synthetic_image
 from napari_shadowinv.physics.particle_flight import check_particles
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
 from napari_shadowinv.physics.projection import default_deflector, displacement_ratio
-from napari_shadowinv.physics.setup import Setup, deflector_titles, displacement_from_potential
+from napari_shadowinv.physics.setup import Setup, deflector_titles
 from napari_shadowinv.physics.tracing import traced_displacement
 from napari_shadowinv.results import unpack_result
-
-__all__ = [
-    "Grid",
-    "PlannedObject",
-    "TracedObject",
-    "object_of_displacement",
-    "object_of_field",
-    "object_of_phantom",
-    "object_of_potential",
-    "object_of_result",
-    "phantom_of_text",
-    "shape_of_text",
-]
 
 _FINER = 3  # samples of a phantom along a side of a pixel
 _TILES = 9  # of rays, in each sample of a grid

@@ -9,8 +9,6 @@ from pydantic import ConfigDict, Field, model_validator
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv.options import MaxError
 
-__all__ = ["ExperimentOptions"]
-
 _RARE: Any = {"panel": "Rarely used options of a plan"}
 _DETAILS: Any = {"panel": "Point spread, and the reference in detail"}
 

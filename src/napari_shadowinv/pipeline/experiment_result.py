@@ -25,8 +25,6 @@ from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["ExperimentPlan", "ExperimentSweep", "Gain", "PlannedShot", "Spread"]
-
 _DETERMINED_SHARE = 0.9  # of the shots, for a field that would be determined
 _SILENT_TOTALS = 3.0  # an error beyond so many reported ones is wrong in silence
 _LIMITS = (0.16, 0.84)

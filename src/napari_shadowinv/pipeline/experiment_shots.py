@@ -25,8 +25,6 @@ from napari_shadowinv.physics.projection import displacement_ratio
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline.experiment_object import Grid, PlannedObject
 
-__all__ = ["Beam", "Detector", "ShotSimulator", "SimulatedShots"]
-
 _FINER = 3  # samples along a side of a pixel
 _NEGLIGIBLE = 1e-12  # of the largest variance
 _BEYOND_PX = 4  # more than rays are displaced

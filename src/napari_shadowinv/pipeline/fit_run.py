@@ -24,14 +24,9 @@ from napari_shadowinv.fitting.shots import common_values, value_of_first
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.options import BeamPrior, FitChoices, FitOptions, Instrument
+from napari_shadowinv.physics.beam import setup_warnings
 from napari_shadowinv.physics.projection import default_deflector
-from napari_shadowinv.physics.setup import (
-    Setup,
-    beam_quantities,
-    deflector_titles,
-    setup_from_dict,
-    setup_warnings,
-)
+from napari_shadowinv.physics.setup import Setup, beam_quantities, deflector_titles, setup_from_dict
 from napari_shadowinv.pipeline.files import read_part, setup_from
 from napari_shadowinv.pipeline.inversion_run import Inputs, Shot, collect_inputs, radiograph_of
 from napari_shadowinv.pipeline.shot_table import ShotRow, fiducials_from
@@ -44,20 +39,6 @@ from napari_shadowinv.preprocessing import (
 )
 from napari_shadowinv.preprocessing.image_checks import image_warnings
 from napari_shadowinv.provenance import Origin, Provenance, index_masks
-
-__all__ = [
-    "FitInputs",
-    "check_fit",
-    "collect_fit_inputs",
-    "compared_fields",
-    "read_row_images",
-    "refinement_choices",
-    "row_setup",
-    "run_comparison",
-    "run_fit",
-    "run_refinement",
-    "usual_fields",
-]
 
 # Numbers of an image, in rows of a table, shots and provenances.
 _NUMBERS = ("strength", "brightness", "psf", "noise")

@@ -36,7 +36,7 @@ from napari_shadowinv.inversion.normalise import check_source, prepare
 from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.physics.setup import deflection_warnings, setup_warnings
+from napari_shadowinv.physics.beam import deflection_warnings, setup_warnings
 from napari_shadowinv.preprocessing import (
     Estimate,
     MeasuredSource,

@@ -35,8 +35,9 @@ from napari_shadowinv._napari.widgets import _fitting
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.fitting import Fit, FitOptions, FitShot, compilation, fit
+from napari_shadowinv.fitting import Fit, FitShot, compilation, fit
 from napari_shadowinv.fitting.rays import RayModel
+from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.projection import project, transferred_displacement

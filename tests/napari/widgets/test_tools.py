@@ -16,6 +16,7 @@ from napari_shadowinv._napari.layers import add_inversion
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, ModelPicker
 from napari_shadowinv.analysis.paths import measure_peak
 from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import (
     coaxial_line,
@@ -26,7 +27,7 @@ from napari_shadowinv.physics.phantoms import (
     wakefield_setup,
 )
 from napari_shadowinv.physics.projection import project
-from napari_shadowinv.physics.setup import deflector_titles, displacement_from_potential
+from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.preprocessing import polynomial_source
 
 Array = np.ndarray[Any, Any]

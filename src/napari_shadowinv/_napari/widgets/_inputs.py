@@ -37,15 +37,8 @@ from napari_shadowinv.options import (
     Instrument,
     InversionOptions,
 )
-from napari_shadowinv.physics.beam import unit_in_title
-from napari_shadowinv.physics.setup import (
-    SETUPS,
-    Setup,
-    deflector_titles,
-    geometry_text,
-    setup_from_dict,
-    setup_warnings,
-)
+from napari_shadowinv.physics.beam import geometry_text, setup_warnings, unit_in_title
+from napari_shadowinv.physics.setup import SETUPS, Setup, deflector_titles, setup_from_dict
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
 
 _NONE = "none"

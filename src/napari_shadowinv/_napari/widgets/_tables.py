@@ -34,7 +34,8 @@ from napari_shadowinv._napari.widgets._qt import (
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import SITES
-from napari_shadowinv.physics.setup import SETUPS, BeamQuantity, Setup, beam_quantities
+from napari_shadowinv.physics.beam import BeamQuantity
+from napari_shadowinv.physics.setup import SETUPS, Setup, beam_quantities
 from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table
 
 _MAX_SHOWN_ROWS = 8

@@ -28,10 +28,11 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
 from napari_shadowinv.physics.projection import default_deflector, transferred_displacement
-from napari_shadowinv.physics.setup import deflector_titles, displacement_from_potential
+from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.inversion_run import plane_of
 from napari_shadowinv.pipeline.traced_file import trace_file
