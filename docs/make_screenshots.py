@@ -150,7 +150,7 @@ def stack_window(folder: Path) -> None:
     shots = [read_radiograph(path, channel="mean").bin_pixels(4).image for path in frames(folder)]
     viewer.add_image(np.stack(shots), name="burner", axis_labels=("shot", "y", "x"))
     widget = open_widget(viewer, "Invert stack")
-    widget.source.picker.set_kind("polynomial")
+    widget.source.set_kind("polynomial")
     widget.steps.add("hot-pixels")
     widget.steps.folded.expand()
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
@@ -192,7 +192,7 @@ def proton_windows() -> None:
         viewer = new_window("proton radiograph")
         viewer.open("shot.tif")
         invert_shot = open_widget(viewer, "Invert shot")
-        invert_shot.source.picker.set_kind("file")
+        invert_shot.source.set_kind("file")
         invert_shot.source.file.edit.setText("reference.tif")
         invert_shot.setup.picker.set_kind("proton")
         fields = invert_shot.setup.picker.form
@@ -214,7 +214,7 @@ def source_windows() -> None:
     photograph(viewer, "tutorial-source-estimate.png", close=False)
     invert_shot = open_widget(viewer, "Invert shot")
     invert_shot.image.layer = viewer.layers["four toroids"]
-    invert_shot.source.picker.set_kind("polynomial")
+    invert_shot.source.set_kind("polynomial")
     press_run(invert_shot)
     print(invert_shot.report.texts())
     photograph(viewer, "tutorial-source-field.png")
@@ -274,7 +274,7 @@ def fit_window() -> None:
         name, metadata = f"{energy:g} MeV", metadata_for("shot", "counts", film)
         viewer.add_image(counts.astype(float), name=name, metadata=metadata)
     widget = open_widget(viewer, "Fit several images")
-    widget.source.picker.set_kind("unknown")
+    widget.source.set_kind("unknown")
     widget.noise.restore("poisson")
     press_run(widget)
     print(widget.view.verdict.text())
@@ -325,7 +325,7 @@ def two_energies_window() -> None:
     viewer = new_window("two energies instead of a reference beam", height=880)
     viewer.open_sample(PLUGIN, "two_energies")
     widget = open_widget(viewer, "Fit several images")
-    widget.source.picker.set_kind("unknown")
+    widget.source.set_kind("unknown")
     widget.noise.restore("poisson")
     press_run(widget)
     print(widget.view.verdict.text())

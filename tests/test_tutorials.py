@@ -94,7 +94,7 @@ def test_the_recipe_of_the_first_shadowgram_repeats_its_report(
     viewer = make_napari_viewer()
     viewer.open_sample("napari-shadowinv", "toroid")
     tool = InvertShot(viewer)
-    assert tool.source.picker.choice.currentText() == "supplied with the shot"
+    assert tool.source.choice.currentText() == "supplied with the shot"
     tool.recipes.save(Path("recipe.toml"))
     viewer.layers["toroid"].save("toroid.tif")
     page = text_of("first-shadowgram.md")

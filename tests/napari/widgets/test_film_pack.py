@@ -286,7 +286,7 @@ def test_films_become_images_that_can_be_fitted(
     ]
     fit = FitImages(viewer)
     qtbot.addWidget(fit)
-    fit.source.picker.set_kind("unknown")
+    fit.source.set_kind("unknown")
     job = fit.request()
     for shot, layer in zip(job.shots, images, strict=True):
         np.testing.assert_array_equal(shot.mask, usable_of(layer))
@@ -322,7 +322,7 @@ def test_without_a_setup_films_know_how_strongly_they_are_displaced(
     add_layers(viewer, film_layers(bare, pack_frame(bare), "trio"))
     fit = FitImages(viewer)
     qtbot.addWidget(fit)
-    fit.source.picker.set_kind("unknown")
+    fit.source.set_kind("unknown")
     strengths = pack_doses.strengths
     in_fit = [shot.strength[0] for shot in fit.request().shots]
     np.testing.assert_allclose(in_fit, strengths)

@@ -274,11 +274,11 @@ def test_an_unknown_beam_is_fitted_and_shown(window: Any, tool: Any, run: Any) -
     for setup, layer in zip(SETUPS, window.layers, strict=True):
         image = project(TRUTH, SETUPS[0], setup, source=300 * beam)
         layer.data = image + np.random.default_rng(2).normal(0, 3, SHAPE)
-    tool.source.picker.set_kind("unknown")
+    tool.source.set_kind("unknown")
     run(tool)
     fitted = layer_of(window, "source").data
     assert np.abs(fitted / (300 * beam) - 1).max() < 0.1
-    tool.source.picker.set_kind("layer")
+    tool.source.set_kind("layer")
     measured = window.add_image(300 * beam, name="beam")
     assert "beam" in texts(tool, 0)
     tool.source.layers.layer = measured
@@ -299,7 +299,7 @@ def test_steps_are_done_to_all_images_first(window: Any, tool: Any) -> None:
     beam = 300 + np.arange(SHAPE[1]) + np.zeros(SHAPE)
     window.add_image(np.kron(beam, large), name="beam", metadata=metadata_for("source", ""))
     tool.source.layers.layer = window.layers["beam"]
-    tool.source.picker.set_kind("layer")
+    tool.source.set_kind("layer")
     painted = np.zeros((96, 128), np.uint8)
     painted[:4, :6] = 1
     tool.masks.layer = window.add_labels(painted)
@@ -390,8 +390,8 @@ def test_a_mistake_is_one_sentence(tool: Any, messages: list[str]) -> None:
             "1 image is checked, expected two or more",
         ),
         (
-            lambda: tool.source.picker.set_kind("layer"),
-            lambda: tool.source.picker.set_kind("uniform"),
+            lambda: tool.source.set_kind("layer"),
+            lambda: tool.source.set_kind("uniform"),
             "no source layer is selected",
         ),
     ]
@@ -820,7 +820,7 @@ def opened(window: Any, open_widget: Any, files: list[Path]) -> Any:
         window.open(str(path), plugin="napari-shadowinv")
     tool = open_widget("Fit several images")
     tool.options.set_values(QUICK)
-    tool.source.picker.set_kind("layer")
+    tool.source.set_kind("layer")
     tool.source.layers.layer = window.layers["beam"]
     tool.setup.show_setup(SETUPS[0].model_dump())
     type_in(tool, 1, BEAM, "6")
@@ -952,10 +952,10 @@ def test_what_a_file_holds_and_was_not_used_is_not_used_again(
     single.options.set_values({"n_sites": 500})
     single.image.layer = window.layers["b"]
     single.masks.layer = None
-    single.source.picker.set_kind("layer")
+    single.source.set_kind("layer")
     single.source.layers.layer = window.layers["a source"]
     assert single.request().source.path is None
-    single.source.picker.set_kind("uniform")
+    single.source.set_kind("uniform")
     inversion = single.request().run()
     write(tmp_path / "b.shadowinv", inversion)
     assert "bit for bit" in command("rerun", "b.shadowinv", "--out", "again2.shadowinv")
@@ -981,7 +981,7 @@ def test_a_source_of_another_file_is_not_taken_for_that_file(
     window.layers[0].metadata = metadata_for("shot", "", SETUPS[0], **metadata)
     beam = window.add_image(np.full(SHAPE, 300.0), metadata=metadata_for("source", "", **metadata))
     tool.source.layers.layer = beam
-    tool.source.picker.set_kind("layer")
+    tool.source.set_kind("layer")
     first, second = inputs_of(tool).provenance.images
     assert (first.file, first.source.file) == ("a.h5", "a.h5")
     assert (second.file, second.source.file) == ("", "")
@@ -1050,7 +1050,7 @@ def test_a_recipe_is_the_same_for_window_and_command(
     assert_same(Fit.from_dataset(read(tmp_path / "fit.shadowinv")), run(tool))
     # Back again, into controls that ask for something else.
     tool.options.set_values({})
-    tool.source.picker.set_kind("unknown")
+    tool.source.set_kind("unknown")
     for row in (0, 1):
         type_in(tool, row, PSF, "0")
     tool.brightness.restore("known")

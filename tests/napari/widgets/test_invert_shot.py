@@ -206,14 +206,14 @@ def test_crop_mask_and_source_are_used(
     tool.source.file.edit.setText(str(tmp_path / "beam.npy"))
     tool.image.layer = window.layers["measured"]
     assert tool.setup.setup() == proton_setup
-    assert tool.source.picker.kind == "own"
+    assert tool.source.kind == "own"
     for kind in ("own", "layer", "file"):
-        tool.source.picker.set_kind(kind)
+        tool.source.set_kind(kind)
         np.testing.assert_allclose(computed(tool).source, beam)
-    tool.source.picker.set_kind("own")
+    tool.source.set_kind("own")
     tool.image.layer = window.layers["shot"]
-    assert tool.source.picker.kind == "uniform"
-    tool.source.picker.set_kind("low-pass")
+    assert tool.source.kind == "uniform"
+    tool.source.set_kind("low-pass")
     estimated = computed(tool).source
     assert 0 < estimated.std() < 0.2 * estimated.mean()
 
@@ -239,7 +239,7 @@ def test_a_saved_result_tells_how_it_was_made(
     window.open(str(tmp_path / "flame.npy"), plugin="napari")
     tool.image.layer = window.layers["flame"]
     tool.steps.add("low-pass")
-    tool.source.picker.set_kind("polynomial")
+    tool.source.set_kind("polynomial")
     tool.crop.layer = window.add_shapes(np.array([[4, 8], [4, 50], [40, 50], [40, 8]]))
     run(tool)
     window.layers.save(str(tmp_path / "a.shadowinv"), plugin="napari-shadowinv")
@@ -411,15 +411,15 @@ def test_a_mistake_is_told_once_and_the_viewer_lives(
     window.add_image(np.ones((9, 9)), name="small")
     window.add_labels(np.ones((9, 9), int), name="labels")
     tool.image.layer = window.layers["shot"]
-    tool.source.picker.set_kind("layer")
+    tool.source.set_kind("layer")
     tool.source.layers.layer = window.layers["small"]
     expect("ource has shape (9, 9), image (20, 20)")
     tool.masks.layer = window.layers["labels"]
     expect("he mask 'labels' has shape (9, 9)")
     tool.masks.layer = None
-    tool.source.picker.set_kind("file")
+    tool.source.set_kind("file")
     expect("o source file")
-    tool.source.picker.set_kind("uniform")
+    tool.source.set_kind("uniform")
     tool.setup.picker.set_kind("proton")
     expect("energy")
     tool.setup.picker.set_kind("none")
@@ -528,8 +528,8 @@ def test_the_preview_follows_in_its_own_layers(
     follows(lambda: tool.crop.layer.add_rectangles(corners))
     assert field.data.shape == (200, 151)
     follows(lambda: setattr(tool.crop, "layer", None))
-    follows(lambda: tool.source.picker.set_kind("low-pass"))
-    width = tool.source.picker.form.editors["width"]
+    follows(lambda: tool.source.set_kind("low-pass"))
+    width = tool.source.form.editors["width"]
     outcomes: list[Any] = []
     tool.panel.runner.ended.connect(outcomes.append)
     for value in np.linspace(40, 60, 21):
@@ -549,7 +549,7 @@ def test_the_preview_follows_in_its_own_layers(
 
 def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fits: Any) -> None:
     tool.options.set_values({"seed": 5})
-    tool.source.picker.set_kind("interpolated")
+    tool.source.set_kind("interpolated")
     tool.setup.show_setup(paper_setup().model_dump())
     for name in STEPS:
         tool.steps.add(name)
@@ -560,7 +560,7 @@ def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fit
     qtbot.addWidget(again)
     assert again.options.model() == InversionOptions(seed=5)
     assert again.setup.setup() == paper_setup()
-    assert again.source.picker.model() == tool.source.picker.model()
+    assert again.source.model() == tool.source.model()
     assert again.steps.steps() == tuple(step() for step in STEPS.values())
     steps = "Steps: subtract dark level, rotate, crop, remove hot pixels, bin"
     assert again.steps.folded.text().startswith(steps)
@@ -684,7 +684,7 @@ def test_a_layer_of_an_estimated_source_was_not_measured(
     estimate.image.layer = window.layers["shot"]
     run(estimate)
     (source,) = (layer for layer in window.layers if "source" in layer.name)
-    tool.source.picker.set_kind("layer")
+    tool.source.set_kind("layer")
     tool.source.layers.layer = source
     assert tool.recipe().instrument == Instrument(beam_rms=0.05)
     tool.instrument.editors["beam_source"].set_value("laser")
@@ -702,8 +702,8 @@ def test_the_beam_under_a_painted_mask_is_predicted_with_its_error(
     window.add_image(np.random.default_rng(0).poisson(500 * synthetic_image(blob.displacement)))
     tool = open_widget("Invert shot")
     tool.options.set_values(FEW)
-    tool.source.picker.set_kind("kriged")
-    assert tool.source.picker.choice.currentText() == "estimate: predicted under the mask"
+    tool.source.set_kind("kriged")
+    assert tool.source.choice.currentText() == "estimate: predicted under the mask"
     tool.source_masks.paint()
     tool.source_masks.layer.data = (np.hypot(*(np.indices((64, 64)) - 31.5)) < 20).astype(int)
     run(tool)

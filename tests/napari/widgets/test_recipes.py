@@ -412,7 +412,7 @@ def test_a_source_that_is_no_file_is_written_beside_the_recipe(
     tool.source.layers.layer = viewer.add_image(
         beam, name="beam", metadata=metadata_for("source", "")
     )
-    tool.source.picker.set_kind("layer")
+    tool.source.set_kind("layer")
     tool.recipes.save(tmp_path / "how.toml")
     np.testing.assert_array_equal(np.load(tmp_path / "how_source.npy"), beam)
     out = tmp_path / "a.shadowinv"

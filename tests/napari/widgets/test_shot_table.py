@@ -55,7 +55,7 @@ def tool(window: Any, open_widget: Callable[[str], Any], pack: Path) -> Any:
     tool.options.set_values({"tolerance": 1e-3})
     tool.engine.workers.setValue(1)
     tool.store.edit.setText(str(pack.with_name("run.shadowinv.zarr")))
-    tool.shots.picker.set_kind("table")
+    tool.shots.set_kind("table")
     tool.shots.table.file.edit.setText(str(pack))
     tool.shots.table.file.changed.emit()
     tool.setup.show_setup(SETUP.model_dump())

@@ -192,7 +192,7 @@ def test_a_setup_from_a_toml_file_says_so(
 
 def test_other_files_do_not_inherit_a_setup(viewer: ViewerModel, opened: Any) -> None:
     tool = opened(InvertStack)
-    tool.shots.picker.set_kind("files")
+    tool.shots.set_kind("files")
     typed(tool, 5.0)
 
     def choose(pattern: str) -> None:
@@ -222,9 +222,9 @@ def test_a_sample_opened_beside_a_widget_is_the_image_not_its_source(
         assert images.offered == [shot]
         assert images.layer is shot
     first = tools[0]
-    assert first.source.picker.kind == "own"
+    assert first.source.kind == "own"
     assert first.setup.note.text() == "Came with the sample 'toroid'."
-    first.source.picker.set_kind("layer")
+    first.source.set_kind("layer")
     assert first.source.layers.layer is source
 
 
@@ -232,7 +232,7 @@ def test_no_image_is_its_own_source(
     viewer: ViewerModel, opened: Any, plain: Any, shot: Array
 ) -> None:
     tool = opened(InvertShot)
-    tool.source.picker.set_kind("layer")
+    tool.source.set_kind("layer")
     assert tool.source.layers.offered == []
     with pytest.raises(InputError, match="no source layer is selected"):
         tool.request()
@@ -255,7 +255,7 @@ def test_results_are_not_offered_as_shots(
     assert tool.image.offered == [plain]
     assert [role_of(layer) for layer in tool.masks.layers.offered] == []
     assert all(role_of(layer) in (None, "source") for layer in tool.source.layers.offered)
-    tool.source.picker.set_kind("layer")
+    tool.source.set_kind("layer")
     assert tool.source.layers.layer is None
     offered = opened(ForwardModel).potential.offered
     assert {role_of(layer) for layer in offered} == {None, "field"}
@@ -292,12 +292,12 @@ def test_the_source_that_was_chosen_comes_back_after_a_sample(
     viewer: ViewerModel, opened: Any, plain: Any
 ) -> None:
     tool = opened(InvertShot)
-    tool.source.picker.set_kind("low-pass")
+    tool.source.set_kind("low-pass")
     *_, sample = viewer.open_sample(PLUGIN, "toroid")
     tool.image.layer = sample
-    assert tool.source.picker.kind == "own"
+    assert tool.source.kind == "own"
     tool.image.layer = plain
-    assert tool.source.picker.kind == "low-pass"
+    assert tool.source.kind == "low-pass"
 
 
 # The two masks
@@ -343,7 +343,7 @@ def test_both_masks_can_be_chosen(
     if kind is InvertStack:
         tool.store.edit.setText(str(tmp_path / "a.shadowinv.zarr"))
     assert tool.source_masks.isHidden()
-    tool.source.picker.set_kind("polynomial")
+    tool.source.set_kind("polynomial")
     assert not tool.source_masks.isHidden()
     tool.source_masks.paint()
     assert tool.source_masks.layer.name == "shot source mask"
@@ -355,7 +355,7 @@ def test_both_masks_can_be_chosen(
     np.testing.assert_array_equal(masks.source_mask, ~is_object)
     assert (~masks.mask).sum() == 9
     # A mask that is not shown has no say.
-    tool.source.picker.set_kind("uniform")
+    tool.source.set_kind("uniform")
     assert tool.source_masks.isHidden()
     assert the_masks(tool).source_mask is None
 
@@ -371,7 +371,7 @@ def test_a_mask_over_the_object_is_refused(
     image = viewer.add_image(shot, name="shot")
     labels = viewer.add_labels(is_object.astype(int), name="object")
     tool = opened(InvertShot)
-    tool.source.picker.set_kind("polynomial")
+    tool.source.set_kind("polynomial")
     tool.masks.layer = tool.source_masks.layer = labels
     tool.panel.button.click()
     qtbot.waitUntil(lambda: bool(messages) and not tool.panel.runner.running, timeout=PATIENCE)
@@ -391,7 +391,7 @@ def test_a_mask_over_the_object_is_refused(
             later.store.edit.setText("a.shadowinv.zarr")
         else:
             later.image.layer = image
-        later.source.picker.set_kind("layer")
+        later.source.set_kind("layer")
         assert later.source.layers.layer.name == "shot source"
         later.masks.layer = labels
         with pytest.raises(InputError, match=words):
@@ -435,7 +435,7 @@ def test_a_result_says_where_everything_came_from(
 ) -> None:
     tool = opened(InvertShot)
     tool.options.set_values({"n_sites": 300})
-    tool.source.picker.set_kind("polynomial")
+    tool.source.set_kind("polynomial")
     tool.source_masks.paint()
     tool.source_masks.layer.data[10:30, 20:45] = 1
     run(tool)
@@ -479,7 +479,7 @@ def test_the_report_of_one_run_does_not_stand_beside_another(
     plain.data = plain.data + 1
     assert tool.report.texts() == {}
     rerun()
-    tool.source.picker.set_kind("file")
+    tool.source.set_kind("file")
     tool.panel.button.click()
     assert tool.report.texts() == {}
     # The notification goes; the sentence stays until something else happens.

@@ -38,7 +38,7 @@ def out(tmp_path: Path) -> Path:
 def tool(open_widget: Any, folder: Path, out: Path) -> Any:
     tool = open_widget("Invert stack")
     tool.options.set_values({"n_sites": 100})
-    tool.shots.picker.set_kind("folder")
+    tool.shots.set_kind("folder")
     tool.shots.folder.folder.edit.setText(str(folder))
     tool.shots.folder.pattern.setText("*.npy")
     tool.store.edit.setText(str(out))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, get_args, get_origin
 
 import tomli_w
@@ -243,16 +244,22 @@ def kinds_of(models: Mapping[str, Any]) -> Kinds:
 
 
 class ModelPicker(QtWidgets.QWidget):
-    """A choice between kinds, each with its form or with none."""
+    """A choice between kinds, each with its form, with a control in a row below, or with none."""
 
     changed = Signal()
 
-    def __init__(self, label: str, kinds: Kinds) -> None:
+    def __init__(
+        self,
+        label: str,
+        kinds: Kinds,
+        tip: str = "",
+        rows: Mapping[str, QtWidgets.QWidget] = MappingProxyType({}),
+    ) -> None:
         super().__init__()
-        self._kinds = dict(kinds)
+        self._kinds, self._rows = dict(kinds), dict(rows)
         self._forms: dict[str, ModelForm] = {}
-        self.choice = SteadyComboBox({key: title for key, (title, _) in kinds.items()})
-        column(self, labelled(label, self.choice))
+        self.choice = SteadyComboBox({key: title for key, (title, _) in kinds.items()}, tip)
+        column(self, labelled(label, self.choice), *self._rows.values())
         self.choice.currentIndexChanged.connect(self._on_choice)
         self._on_choice()
 
@@ -288,9 +295,9 @@ class ModelPicker(QtWidgets.QWidget):
         self.set_kind(str(state.get("kind", self.kind)))
 
     def _on_choice(self) -> None:
-        selected = self._form_of(self.kind)
-        for form in self._forms.values():
-            form.setVisible(form is selected)
+        self._form_of(self.kind)
+        for kind, widget in (*self._rows.items(), *self._forms.items()):
+            widget.setVisible(kind == self.kind)
         self.changed.emit()
 
     def _form_of(self, kind: str) -> ModelForm | None:
@@ -303,32 +310,6 @@ class ModelPicker(QtWidgets.QWidget):
             self._forms[kind] = form
             self.layout().addWidget(form)
         return self._forms.get(kind)
-
-
-class RowPicker(QtWidgets.QWidget):
-    """A choice between kinds, some with a control in a row below."""
-
-    changed = Signal()
-
-    def __init__(
-        self, label: str, kinds: Kinds, tip: str, rows: Mapping[str, QtWidgets.QWidget]
-    ) -> None:
-        super().__init__()
-        self.picker = ModelPicker(label, kinds)
-        self.picker.choice.setToolTip(f"<qt>{tip}</qt>")
-        self._rows = dict(rows)
-        column(self, self.picker, *self._rows.values())
-        self.picker.changed.connect(self._on_kind)
-        self._on_kind()
-
-    def _on_kind(self) -> None:
-        for kind, row in self._rows.items():
-            row.setVisible(kind == self.picker.kind)
-        self.changed.emit()
-
-
-def dump_toml(values: dict[str, object], path: str | Path) -> Path:
-    return save_text(tomli_w.dumps(values), path, ".toml")
 
 
 def save_text(text: str, name: str | Path, suffix: str) -> Path:

@@ -84,11 +84,9 @@ class SetupPicker(QWidget):
         self._entered: dict[str, _Entry] = {}
         self._shown: dict[str, _Entry] = {}
         self.picker = forms.ModelPicker(
-            "Setup", {_NONE: ("none: results in pixels", None), **forms.kinds_of(SETUPS)}
-        )
-        self.picker.choice.setToolTip(
-            "<qt>With a setup, results are in SI units. Lengths can be entered as 1.3 mm or "
-            "0.0013.</qt>"
+            "Setup",
+            {_NONE: ("none: results in pixels", None), **forms.kinds_of(SETUPS)},
+            "With a setup, results are in SI units. Lengths can be entered as 1.3 mm or 0.0013.",
         )
         self.geometry_label = forms.WrappingLabel()
         self.warning_label = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
@@ -253,14 +251,13 @@ class SetupPicker(QWidget):
         self.show_setup(values, f"loaded from {Path(path).name}{owner}")
 
 
-class SourcePicker(forms.RowPicker):
+class SourcePicker(forms.ModelPicker):
     """The undisturbed beam, of the kinds that a window offers."""
 
     def __init__(self, viewer: Any, kinds: Sequence[str], tip: str) -> None:
         self._image: Any = None
         self._kind_before_supplied = UNIFORM
         self._recipe_source = preprocessing.MeasuredSource()
-        self._offered = kinds
         layer_tip = "Image layer of the undisturbed beam."
         if UNKNOWN in kinds:
             layer_tip = "Image layer of the undisturbed beam, or a stack with one for each image."
@@ -277,10 +274,6 @@ class SourcePicker(forms.RowPicker):
         )
         self.layers.picked.connect(self.changed)
         self.file.changed.connect(self.changed)
-
-    @property
-    def kind(self) -> str:
-        return self.picker.kind
 
     @property
     def layer(self) -> Any | None:
@@ -306,7 +299,7 @@ class SourcePicker(forms.RowPicker):
             return f"file {Path(self.file.path).name}"
         if self.kind in (SUPPLIED, UNKNOWN):
             return "came with the shot" if self.is_supplied else "fitted"
-        model = self.picker.model()
+        model = self.model()
         assert isinstance(model, preprocessing.Estimate)
         return f"estimate: {model.summary}" if self.is_estimated else model.summary
 
@@ -321,7 +314,7 @@ class SourcePicker(forms.RowPicker):
 
     def chosen(self) -> preprocessing.Estimate | preprocessing.MeasuredSource | None:
         """Return the source as a recipe describes it, None if it is fitted; or an `InputError`."""
-        model = self.picker.model()
+        model = self.model()
         if isinstance(model, preprocessing.Estimate):
             return model
         if self.kind != FILE:
@@ -336,20 +329,20 @@ class SourcePicker(forms.RowPicker):
     def show(self, source: Any, beam: str = "known") -> None:
         """Show the source of a recipe; None for uniform, unless the beam is unknown."""
         if beam == "unknown":
-            self.picker.set_kind(UNKNOWN)
+            self.set_kind(UNKNOWN)
         elif isinstance(source, preprocessing.Estimate):
             name = source.name()
             self.restore({"kind": name, "values": {name: source.values()}})
         elif source is None:
-            self.picker.set_kind(UNIFORM)
-        elif FILE not in self._offered:
-            self.picker.set_kind(LAYER)
+            self.set_kind(UNIFORM)
+        elif FILE not in self._kinds:
+            self.set_kind(LAYER)
         elif source.file is None:
-            self.picker.set_kind(SUPPLIED)
+            self.set_kind(SUPPLIED)
         else:
             self._recipe_source = source
             self.file.edit.setText(str(source.file))
-            self.picker.set_kind(FILE)
+            self.set_kind(FILE)
             self.changed.emit()
 
     def measured(self, image_layer: Any) -> preprocessing.Radiograph | None:
@@ -409,13 +402,9 @@ class SourcePicker(forms.RowPicker):
 
     def state(self) -> dict[str, Any]:
         """Return the choice without layers and files, which belong to a session."""
-        state = self.picker.state()
+        state = super().state()
         kind = self._kind_before_supplied if state["kind"] == SUPPLIED else state["kind"]
         return {**state, "kind": UNIFORM if kind in (LAYER, FILE) else kind}
-
-    def restore(self, state: Any) -> None:
-        if isinstance(state, Mapping):
-            self.picker.restore(state)
 
     def follow(self, image_layer: Any) -> None:
         """Select the source supplied with an image; without one, deselect the last image's."""
@@ -424,18 +413,18 @@ class SourcePicker(forms.RowPicker):
         if image_layer is not None and about.source_of(image_layer) is not None:
             if not self.is_supplied:
                 self._kind_before_supplied = self.kind
-            self.picker.set_kind(SUPPLIED)
+            self.set_kind(SUPPLIED)
         elif self.is_supplied:
-            self.picker.set_kind(self._kind_before_supplied)
+            self.set_kind(self._kind_before_supplied)
 
     def _offers(self, layer: Any) -> bool:
         # An image cannot be its own source.
         return layer != self._image and about.may_be_source(layer)
 
-    def _on_kind(self) -> None:
+    def _on_choice(self) -> None:
         if self.kind == LAYER and self.layers.layer is None:
             self.layers.layer = self._only_source()
-        super()._on_kind()
+        super()._on_choice()
 
     def _only_source(self) -> Any | None:
         """Return the source layer that fits the image, if there is exactly one, outside results."""

@@ -16,7 +16,7 @@ from qtpy.QtWidgets import QCheckBox, QFileDialog, QHeaderView, QLabel, QLineEdi
 from napari_shadowinv._napari.layer_metadata import main_layers, may_be_shot, role_of
 from napari_shadowinv._napari.stores import follow_shots, shot_rows
 from napari_shadowinv._napari.widgets._files import result_buttons, shot_to_save
-from napari_shadowinv._napari.widgets._forms import PathEdit, RowPicker, labelled
+from napari_shadowinv._napari.widgets._forms import ModelPicker, PathEdit, labelled
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
 from napari_shadowinv._napari.widgets._panels import Outcome, ReportTable, RunPanel, ToolPanel
@@ -93,14 +93,12 @@ class StoreEdit(PathEdit):
         return path + STORE_SUFFIX
 
 
-class ShotsPicker(RowPicker):
+class ShotsPicker(ModelPicker):
     def __init__(self, viewer: Any) -> None:
         tip = "Stack of images (shot, y, x); data on disk are read one shot at a time."
         self.layers = LayerPicker(viewer, ("image",), tip, suits=may_be_shot)
-        self.files = _FilesEdit("Files of the shots", "shots/*.tif")
-        self.files.edit.setToolTip(
-            "<qt>A pattern such as shots/*.tif, files separated by ;, or a multi-page TIFF.</qt>"
-        )
+        tip = "A pattern such as shots/*.tif, files separated by ;, or a multi-page TIFF."
+        self.files = _FilesEdit("Files of the shots", "shots/*.tif", tip)
         self.table = ShotTable()
         self.folder = FolderEdit()
         super().__init__(
@@ -126,25 +124,25 @@ class ShotsPicker(RowPicker):
     @property
     def layer(self) -> Any | None:
         """The chosen layer; None for files."""
-        return self.layers.layer if self.picker.kind == _LAYER else None
+        return self.layers.layer if self.kind == _LAYER else None
 
     @property
     def is_watched(self) -> bool:
         """Whether the shots come from a watched folder."""
-        return bool(self.picker.kind == _FOLDER)
+        return self.kind == _FOLDER
 
     @property
     def name(self) -> str:
         """The name of the shots, such as a path."""
         edits = {_FOLDER: self.folder.folder, _FILES: self.files, _TABLE: self.table.file}
-        if self.picker.kind in edits:
-            return edits[self.picker.kind].path
+        if self.kind in edits:
+            return edits[self.kind].path
         return "" if self.layer is None else str(self.layer.name)
 
     def shots(self) -> Any:
-        if self.picker.kind == _LAYER:
+        if self.kind == _LAYER:
             return stack_of(self.layers.layer)
-        if self.picker.kind == _TABLE:
+        if self.kind == _TABLE:
             return self.table.shots()
         parts = [part.strip() for part in self.files.path.split(_SEPARATOR.strip())]
         paths = [os.path.expanduser(part) for part in parts if part]
@@ -155,19 +153,15 @@ class ShotsPicker(RowPicker):
         return paths[0] if len(paths) == 1 else paths
 
 
-class EnginePicker(RowPicker):
+class EnginePicker(ModelPicker):
     """The computer of the run: this one, or a dask cluster."""
 
     def __init__(self) -> None:
-        self.workers = QSpinBox()
-        self.workers.setRange(0, 1024)
-        self.workers.setSuffix(" at once")
+        tip = "Number of shots to invert at the same time."
+        self.workers = QSpinBox(maximum=1024, suffix=" at once", toolTip=tip)
         self.workers.setSpecialValueText("one per core")
-        self.workers.setToolTip("Number of shots to invert at the same time.")
-        self.address = QLineEdit()
-        self.address.setPlaceholderText("tcp://host:8786")
-        self.address.setToolTip("Address that 'dask scheduler' prints when it starts.")
-        self.address.setMinimumWidth(60)
+        tip = "Address that 'dask scheduler' prints when it starts."
+        self.address = QLineEdit(placeholderText="tcp://host:8786", toolTip=tip, minimumWidth=60)
         super().__init__(
             "Run on",
             {_LOCAL: ("this computer", None), _SCHEDULER: ("a dask cluster", None)},
@@ -180,7 +174,7 @@ class EnginePicker(RowPicker):
 
     def engine(self) -> tuple[str, int | None]:
         """Return scheduler and number of workers for `run_stack`, or raise an `InputError`."""
-        if self.picker.kind == _LOCAL:
+        if self.kind == _LOCAL:
             return "threads", self.workers.value() or None
         address = self.address.text().strip()
         if "://" not in address:
@@ -192,10 +186,10 @@ class EnginePicker(RowPicker):
 
     def state(self) -> dict[str, Any]:
         workers, address = self.workers.value(), self.address.text()
-        return {"kind": self.picker.kind, "workers": workers, "address": address}
+        return {"kind": self.kind, "workers": workers, "address": address}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        self.picker.set_kind(str(state.get("kind", _LOCAL)))
+        self.set_kind(str(state.get("kind", _LOCAL)))
         self.workers.setValue(int(state.get("workers", 0)))
         self.address.setText(str(state.get("address", "")))
 
@@ -286,7 +280,7 @@ class InvertStack(InversionInputs, ToolPanel):
 
     def choose_folder(self) -> None:
         """Take the shots from a watched folder, and ask which."""
-        self.shots.picker.set_kind(_FOLDER)
+        self.shots.set_kind(_FOLDER)
         self.shots.folder.folder.choose()
 
     def request(self) -> StackJob:
