@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from napari.utils.notifications import show_info
-from qtpy.QtWidgets import QFileDialog, QMenu, QMessageBox, QPushButton, QSizePolicy
+from qtpy.QtWidgets import QFileDialog, QMenu, QPushButton, QSizePolicy
 
 from napari_shadowinv._napari.jobs import name_of_result
 from napari_shadowinv._napari.layer_metadata import (
@@ -34,7 +34,7 @@ from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets._forms import TOML
 from napari_shadowinv._napari.widgets._layers import new_crop, new_mask
 from napari_shadowinv._napari.widgets._panels import Outcome
-from napari_shadowinv._napari.widgets._qt import notify_errors
+from napari_shadowinv._napari.widgets._qt import may_replace, notify_errors
 from napari_shadowinv._napari.widgets._results import ResultLayers
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import BoolArray
@@ -401,12 +401,18 @@ class SaveButton(QPushButton):
         """Ask for a file and save the content, unless the user cancels."""
         content = self._savable()
         path = self._ask(content)
-        if path is not None and self._may_replace(path):
-            self._write(content, path)
+        if path is None or (path.exists() and not may_replace(self, "Save result", path.name)):
+            return
+        write(path, content.content, setup=content.setup, overwrite=True)
+        suffix = path.suffix.lower()
+        title = next(_TITLES[form] for form in content.formats if suffix in form.suffixes)
+        text = f"Saved {title[:1].lower()}{title[1:]} in {path.absolute()}"
+        self._tool.panel.say(text)
+        show_info(text)
 
     def _ask(self, content: Savable) -> Path | None:
         filters = {f"{_TITLES[form]} (*{form.suffix})": form for form in content.formats}
-        # _may_replace asks about the complete name, with its suffix.
+        # may_replace asks about the complete name, with its suffix.
         text, selected_filter = QFileDialog.getSaveFileName(
             self,
             "Save result",
@@ -421,26 +427,6 @@ class SaveButton(QPushButton):
         if path.suffix.lower() in suffixes:
             return path
         return path.with_name(path.name + filters.get(selected_filter, content.formats[0]).suffix)
-
-    def _may_replace(self, path: Path) -> bool:
-        if not path.exists():
-            return True
-        buttons = QMessageBox.StandardButton
-        answer = QMessageBox.question(
-            self,
-            "Save result",
-            f"{path.name} already exists. Replace it?",
-            buttons.Yes | buttons.No,
-        )
-        return bool(answer == buttons.Yes)
-
-    def _write(self, content: Savable, path: Path) -> None:
-        write(path, content.content, setup=content.setup, overwrite=True)
-        suffix = path.suffix.lower()
-        title = next(_TITLES[form] for form in content.formats if suffix in form.suffixes)
-        text = f"Saved {title[:1].lower()}{title[1:]} in {path.absolute()}"
-        self._tool.panel.say(text)
-        show_info(text)
 
 
 class MoreLayersButton(QPushButton):

@@ -15,6 +15,7 @@ from qtpy.QtWidgets import (
     QFrame,
     QHBoxLayout,
     QMainWindow,
+    QMessageBox,
     QPushButton,
     QScrollArea,
     QSizePolicy,
@@ -91,6 +92,12 @@ def _with_action(button: Any, tip: str, action: Callable[[], Any]) -> Any:
     button.setToolTip(f"<qt>{tip}</qt>")
     button.clicked.connect(lambda: action())
     return button
+
+
+def may_replace(parent: QWidget, title: str, file: object) -> bool:
+    """Ask whether an existing file may be replaced."""
+    answer = QMessageBox.question(parent, title, f"{file} already exists. Replace it?")
+    return bool(answer == QMessageBox.StandardButton.Yes)
 
 
 def timer(parent: QObject, interval: int, action: Callable[[], Any], once: bool = False) -> QTimer:

@@ -126,18 +126,14 @@ class NewPackDialog(QtWidgets.QDialog):
         try:
             path = self._folder / PACK_FILE
             self.written = write_new_pack(
-                self._folder, self.entries(), overwrite=path.exists() and self._may_replace(path)
+                self._folder,
+                self.entries(),
+                overwrite=path.exists() and qt.may_replace(self, "New film pack", path),
             )
         except (InputError, OSError, ValueError) as error:
             self._problem.show_text(str(error))
             return
         super().accept()
-
-    def _may_replace(self, path: Path) -> bool:
-        button = QtWidgets.QMessageBox.question(
-            self, "New film pack", f"{path} already exists. Replace it?"
-        )
-        return bool(button == QtWidgets.QMessageBox.StandardButton.Yes)
 
     def _show_layers(self, layers: list[dict[str, Any]]) -> None:
         self.table.setRowCount(len(layers))
