@@ -12,6 +12,7 @@ from napari.utils.notifications import show_info
 from qtpy import QtWidgets
 
 from napari_shadowinv._napari.layer_metadata import (
+    Result,
     frame_of,
     layer_name,
     metadata_for,
@@ -53,7 +54,6 @@ from napari_shadowinv.plotting import make_logarithmic, products_figure, save_fi
 
 if TYPE_CHECKING:
     import napari
-    from napari_shadowinv._napari.layer_metadata import Result
 
 _SAMPLES = 100
 _MIN_SAMPLES, _MAX_SAMPLES = 20, 2000
@@ -69,61 +69,11 @@ _MAX_COLUMN = 3  # entries of a legend inside the axes; longer ones are above
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """A product of a result to be measured, and the layer of the result."""
+    """A product to be measured, of a result or of the shots of a store, and a layer of it."""
 
-    origin: Result[Any]
+    origin: Result[Any] | Path
     layer: Any
-    product: Product
-    unit: str | None
-    samples: int
-
-    def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
-        return analyse(
-            self.origin.content,
-            self.product,
-            samples=self.samples,
-            unit=self.unit,
-            setup=self.origin.setup,
-            on_progress=on_progress,
-            should_stop=should_stop,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _SeriesRequest:
-    """A product to be followed through the shots of a store, and a layer of the store."""
-
-    origin: Path
-    layer: Any
-    product: Product
-    unit: str | None
-    shots: str | None
-    times: str
-
-    def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
-        stack = open_shots(self.origin, self.shots)
-        series = analyse_shots(
-            stack,
-            self.product,
-            self._seconds(stack["index"].values.tolist()),
-            unit=self.unit,
-            on_progress=on_progress,
-            should_stop=should_stop,
-        )
-        return [each.result for each in series]
-
-    def _seconds(self, shots: list[int]) -> list[float] | None:
-        """Return the time of each shot in s; None if shots are numbered."""
-        if not self.times:
-            return None
-        received = f"{_TIMES} is '{self.times}'"
-        try:
-            numbers = [parse_number(part, "s") for part in self.times.split(",")]
-        except InputError:
-            raise InputError(
-                f"{received}, expected times separated by commas, such as 1 ns or 0, 1 ns, 3 ns"
-            ) from None
-        return shot_times(numbers, shots, received)
+    work: Callable[[OnProgress, ShouldStop], list[ProductResult]]
 
 
 class ProductPlot(Plot):
@@ -277,7 +227,7 @@ class ProductForm(QtWidgets.QWidget):
         self.unit.addItems([_BY_SETUP, *symbols])
         self.unit.setCurrentText(before if before in symbols else _BY_SETUP)
 
-    def request(self) -> _Request | _SeriesRequest:
+    def request(self) -> _Request:
         """Return what is to be measured, or raise an `InputError`."""
         layer = self.result.layer
         if layer is None:
@@ -292,12 +242,24 @@ class ProductForm(QtWidgets.QWidget):
             values |= self._outline(layer)
         symbol = self.unit.currentText()
         product, unit = product_from_dict(values), None if symbol == _BY_SETUP else symbol
-        store, result = _store_of(layer), result_of(layer)
-        if store is not None:
-            shots, times = self.shots.text().strip(), self.times.text().strip()
-            return _SeriesRequest(store, layer, product, unit, shots or None, times)
-        assert result is not None
-        return _Request(result, layer, product, unit, self.samples.value())
+        origin: Any = _store_of(layer) or result_of(layer)
+        shots, times = self.shots.text().strip() or None, self.times.text().strip()
+        samples = self.samples.value()
+
+        def work(on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
+            common: dict[str, Any] = {
+                "unit": unit,
+                "on_progress": on_progress,
+                "should_stop": should_stop,
+            }
+            if isinstance(origin, Path):
+                stack = open_shots(origin, shots)
+                seconds = _seconds(times, stack["index"].values.tolist())
+                return [each.result for each in analyse_shots(stack, product, seconds, **common)]
+            setup = origin.setup
+            return analyse(origin.content, product, samples=samples, setup=setup, **common)
+
+        return _Request(origin, layer, work)
 
     def _outline(self, layer: Any) -> dict[str, Any]:
         """Return the fields of a product that the selected shape stands for, in px."""
@@ -345,10 +307,10 @@ class ProductForm(QtWidgets.QWidget):
     def _on_end(self, outcome: Outcome) -> None:
         if outcome.value is None:
             return
-        request: _Request | _SeriesRequest = outcome.tag
-        if self._measured is not None and self._measured.origin != request.origin:
+        request: _Request = outcome.tag
+        if self._origin != request.origin:
             self.results = []
-        self._measured = request
+        self._origin = request.origin
         for measured in outcome.value:
             taken = {each.name for each in self.results}
             numbers = (f"{measured.name}_{number}" for number in range(2, 10_000))
@@ -356,14 +318,14 @@ class ProductForm(QtWidgets.QWidget):
             self.results.append(replace(measured, name=name))
             self._show(self.results[-1], request)
 
-    def _show(self, measured: ProductResult, request: _Request | _SeriesRequest) -> None:
+    def _show(self, measured: ProductResult, request: _Request) -> None:
         rows = [(fact.title, fact.text) for fact in measured.facts]
         rows += [("Note", sentence) for sentence in measured.limits]
         self.report.show_rows(rows)
         self.plot.setVisible(self.plot.show_curves(measured))
         for widget in (self.export, self.picture, self.clear):
             widget.setEnabled(True)
-        self.save.setEnabled(isinstance(request, _Request))
+        self.save.setEnabled(isinstance(request.origin, Result))
         for name, variable in measured.variables.items():
             if variable.dims == PLANE:
                 add_layers(self.viewer, [map_layer(measured, name, request.layer)])
@@ -375,7 +337,7 @@ class ProductForm(QtWidgets.QWidget):
             widget.setEnabled(False)
 
     def _clear(self) -> None:
-        self.results, self._measured = [], None
+        self.results, self._origin = [], None
         self._empty()
 
     def show_problem(self, text: str) -> None:
@@ -411,20 +373,33 @@ class ProductForm(QtWidgets.QWidget):
 
     @qt.notify_errors
     def _save(self) -> None:
-        assert isinstance(self._measured, _Request)
+        result: Any = self._origin
         name, _ = QtWidgets.QFileDialog.getSaveFileName(
             self, "Save with result", f"products{RESULT.suffix}", f"Result (*{RESULT.suffix})"
         )
         if not name:
             return
-        result = self._measured.origin
-        content: Any = result.content
+        content = result.content
         has_setup = result.setup is not None and content.setup is None
         dataset = content.to_dataset(result.setup) if has_setup else content.to_dataset()
         show_info(f"Wrote {write(name, add_products(dataset, self.results), overwrite=True)}")
 
 
 def _store_of(layer: Any) -> Path | None:
+def _seconds(times: str, shots: list[int]) -> list[float] | None:
+    """Return the time of each shot in s; None if shots are numbered."""
+    if not times:
+        return None
+    received = f"{_TIMES} is '{times}'"
+    try:
+        numbers = [parse_number(part, "s") for part in times.split(",")]
+    except InputError:
+        raise InputError(
+            f"{received}, expected times separated by commas, such as 1 ns or 0, 1 ns, 3 ns"
+        ) from None
+    return shot_times(numbers, shots, received)
+
+
     """Return the store of shots that a layer shows, or None."""
     store = metadata_of(layer).get("store")
     return None if store is None else Path(store)
