@@ -191,11 +191,10 @@ class _Quantity(Editor):
     shows_unit = True
 
     def __init__(self, unit: str) -> None:
-        super().__init__(QLineEdit())
+        hint = f"in {unit}" if unit else "a number"
+        super().__init__(QLineEdit(placeholderText=hint, minimumWidth=80))
         self._unit = unit
         self._value: float | None = None
-        self.inner.setPlaceholderText(f"in {unit}" if unit else "a number")
-        self.inner.setMinimumWidth(80)
         self.inner.editingFinished.connect(self._read_text)
 
     def value(self) -> float | str | None:
@@ -230,9 +229,7 @@ class _Text(Editor):
     """Text that the model validates; empty if the field is unset."""
 
     def __init__(self, hint: str) -> None:
-        super().__init__(QLineEdit())
-        self.inner.setPlaceholderText(hint)
-        self.inner.setMinimumWidth(80)
+        super().__init__(QLineEdit(placeholderText=hint, minimumWidth=80))
         self.inner.editingFinished.connect(self.changed)
 
     def value(self) -> str | None:

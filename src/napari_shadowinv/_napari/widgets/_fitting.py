@@ -36,15 +36,12 @@ class RefineSection(QWidget):
 
     def __init__(self, refine: Callable[[float], None]) -> None:
         super().__init__()
-        self.psf = QDoubleSpinBox()
-        self.psf.setRange(0.0, _MAX_BLUR_PX)
-        self.psf.setSingleStep(0.1)
-        self.psf.setSuffix(" px")
-        self.psf.setSpecialValueText("none")
-        self.psf.setToolTip(
+        tip = (
             "<qt>Standard deviation of the image's blur from source size and detector, in pixels "
             "of the object plane.</qt>"
         )
+        self.psf = QDoubleSpinBox(maximum=_MAX_BLUR_PX, singleStep=0.1, suffix=" px", toolTip=tip)
+        self.psf.setSpecialValueText("none")
         self.button = push_button(
             "Refine",
             "Fit the forward model to the image, starting from its last inversion. The fit "

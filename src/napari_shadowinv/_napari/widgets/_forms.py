@@ -45,8 +45,7 @@ _ALTERNATIVES = ("pixel_size", "detector_pixel_size")
 
 def labelled(text: str, widget: QtWidgets.QWidget) -> QtWidgets.QWidget:
     """Put a label of the common width before a widget."""
-    label = QtWidgets.QLabel(text)
-    label.setMinimumWidth(_LABEL_WIDTH_PX)
+    label = QtWidgets.QLabel(text, minimumWidth=_LABEL_WIDTH_PX)
     return side_by_side((label, 0), (widget, 1))
 
 
@@ -73,8 +72,7 @@ class WrappingLabel(QtWidgets.QLabel):
     """A label that wraps at the available width, and is hidden without text."""
 
     def __init__(self, text: str = "", style: str = "") -> None:
-        super().__init__()
-        self.setWordWrap(True)
+        super().__init__(wordWrap=True)
         self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Minimum)
         self.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
         self.show_text(text, style)
@@ -97,9 +95,7 @@ class LineEdit(QtWidgets.QLineEdit):
     """An entry that can be saved between sessions."""
 
     def __init__(self, example: str, tip: str) -> None:
-        super().__init__()
-        self.setPlaceholderText(example)
-        self.setToolTip(f"<qt>{tip}</qt>")
+        super().__init__(placeholderText=example, toolTip=f"<qt>{tip}</qt>" if tip else "")
 
     def state(self) -> str:
         return str(self.text())
@@ -111,11 +107,12 @@ class LineEdit(QtWidgets.QLineEdit):
 class PathEdit(QtWidgets.QWidget):
     changed = Signal()
 
-    def __init__(self, title: str, example: str = "path of a file", files: str = "") -> None:
+    def __init__(
+        self, title: str, example: str = "path of a file", tip: str = "", files: str = ""
+    ) -> None:
         super().__init__()
         self._title, self._files = title, files
-        self.edit = QtWidgets.QLineEdit()
-        self.edit.setPlaceholderText(example)
+        self.edit = LineEdit(example, tip)
         self.edit.setMinimumWidth(60)
         side_by_side((with_button(self.edit, "…", title, self.choose), 0), holder=self)
         self.edit.editingFinished.connect(self.changed)
@@ -123,6 +120,12 @@ class PathEdit(QtWidgets.QWidget):
     @property
     def path(self) -> str:
         return str(self.edit.text()).strip()
+
+    def state(self) -> str:
+        return self.path
+
+    def restore(self, path: Any) -> None:
+        self.edit.setText(str(path))
 
     def ask(self) -> str:
         """Open a dialog and return the chosen path, or an empty string."""
@@ -319,6 +322,10 @@ def save_text(text: str, name: str | Path, suffix: str) -> Path:
     with replacing(path, overwrite=path == entered) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
     return path
+
+
+def dump_toml(values: dict[str, object], path: str | Path) -> Path:
+    return save_text(tomli_w.dumps(values), path, ".toml")
 
 
 class TomlButtons(QtWidgets.QWidget):

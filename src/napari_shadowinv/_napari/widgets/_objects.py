@@ -30,25 +30,6 @@ class GridFile:
         return Path(self.path).stem
 
 
-class GridFileEdit(forms.PathEdit):
-    """The file of a 3-D field."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            "Choose a 3-D field", "openPMD or NetCDF file", "3-D fields (*.h5 *.hdf5 *.nc)"
-        )
-        self.setToolTip(
-            "<qt>openPMD file (HDF5), or NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez; particles "
-            "are traced through it.</qt>"
-        )
-
-    def state(self) -> str:
-        return self.path
-
-    def restore(self, path: Any) -> None:
-        self.edit.setText(str(path))
-
-
 class ObjectPanel(ToolPanel):
     """A panel for an object that deflects the beam: a phantom, a 3-D field, or a layer's field."""
 
@@ -61,7 +42,15 @@ class ObjectPanel(ToolPanel):
         }
         self.object = forms.ModelPicker("Object", kinds)
         self.object.choice.setToolTip("Object that deflects the beam.")
-        self.file = GridFileEdit()
+        self.file = forms.PathEdit(
+            "Choose a 3-D field",
+            "openPMD or NetCDF file",
+            files="3-D fields (*.h5 *.hdf5 *.nc)",
+        )
+        self.file.setToolTip(
+            "<qt>openPMD file (HDF5), or NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez; particles "
+            "are traced through it.</qt>"
+        )
         self.file_row = forms.labelled("File", self.file)
         self.file.changed.connect(self.keep)
         self.setup = SetupPicker()

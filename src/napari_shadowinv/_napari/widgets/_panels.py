@@ -255,14 +255,11 @@ class RunPanel(QtWidgets.QWidget):
         super().__init__()
         self._task, self._run_text = task, run_text
         self.runner = Runner(self, **keywords)
-        self.button = QtWidgets.QPushButton(run_text)
-        self.button.setToolTip(run_tip)
-        self.bar = QtWidgets.QProgressBar()
-        self.bar.setTextVisible(False)
+        self.button = QtWidgets.QPushButton(run_text, toolTip=run_tip)
+        # A bar with a range is not animated by the style of napari or the system.
+        self.bar = QtWidgets.QProgressBar(maximum=1, textVisible=False)
         self.bar.setFixedHeight(8)
         self.bar.setVisible(False)
-        # A bar with a range is not animated by the style of napari or the system.
-        self.bar.setRange(0, 1)
         self.status = WrappingLabel()
         qt.column(self, self.button, self.bar, self.status)
         self._activity = _Activity()

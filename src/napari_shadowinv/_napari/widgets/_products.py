@@ -55,8 +55,6 @@ from napari_shadowinv.plotting import make_logarithmic, products_figure, save_fi
 if TYPE_CHECKING:
     import napari
 
-_SAMPLES = 100
-_MIN_SAMPLES, _MAX_SAMPLES = 20, 2000
 _ELLIPSE_CORNERS = 90
 _ROUND = 0.02  # largest difference of the axes of a circle
 _OPACITIES = (0.35, 0.18)  # of the bands
@@ -130,7 +128,7 @@ class ProductForm(QtWidgets.QWidget):
         super().__init__()
         self.viewer = viewer
         self.results: list[ProductResult] = []
-        self._measured: _Request | _SeriesRequest | None = None
+        self._origin: Result[Any] | Path | None = None
         tip = "<qt>Layer of the result of an inversion or a fit, or of a store of shots.</qt>"
         self.result = LayerPicker(
             viewer, ("image",), tip, suits=lambda layer: bool(result_of(layer) or _store_of(layer))
@@ -141,13 +139,10 @@ class ProductForm(QtWidgets.QWidget):
         tip = "<qt>Shapes layer with the line or outline. Of several, the selected is used.</qt>"
         self.shapes = LayerPicker(viewer, ("shapes",), tip, "none yet")
         self.unit = SteadyComboBox(tip="Unit of the field, which chooses the field, too.")
-        self.width_edit = QtWidgets.QDoubleSpinBox()
-        self.width_edit.setRange(0.0, 1e4)
-        self.width_edit.setToolTip("<qt>Width of the strip across a profile's line, in px.</qt>")
-        self.samples = QtWidgets.QSpinBox()
-        self.samples.setRange(_MIN_SAMPLES, _MAX_SAMPLES)
-        self.samples.setValue(_SAMPLES)
-        self.samples.setToolTip("<qt>Number of samples of the field for the bands.</qt>")
+        tip = "<qt>Width of the strip across a profile's line, in px.</qt>"
+        self.width_edit = QtWidgets.QDoubleSpinBox(maximum=1e4, toolTip=tip)
+        tip = "<qt>Number of samples of the field for the bands.</qt>"
+        self.samples = QtWidgets.QSpinBox(minimum=20, maximum=2000, value=100, toolTip=tip)
         self.times = forms.LineEdit(
             "shots are numbered",
             "Time between two shots of the store, such as 1 ns, or the times of all shots "
@@ -386,6 +381,11 @@ class ProductForm(QtWidgets.QWidget):
 
 
 def _store_of(layer: Any) -> Path | None:
+    """Return the store of shots that a layer shows, or None."""
+    store = metadata_of(layer).get("store")
+    return None if store is None else Path(store)
+
+
 def _seconds(times: str, shots: list[int]) -> list[float] | None:
     """Return the time of each shot in s; None if shots are numbered."""
     if not times:
@@ -398,11 +398,6 @@ def _seconds(times: str, shots: list[int]) -> list[float] | None:
             f"{received}, expected times separated by commas, such as 1 ns or 0, 1 ns, 3 ns"
         ) from None
     return shot_times(numbers, shots, received)
-
-
-    """Return the store of shots that a layer shows, or None."""
-    store = metadata_of(layer).get("store")
-    return None if store is None else Path(store)
 
 
 def export_csv(parent: QtWidgets.QWidget, name: str, text: str) -> None:

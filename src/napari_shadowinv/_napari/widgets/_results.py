@@ -187,11 +187,11 @@ class LastResults:
     def __init__(self, viewer: Any, parent: QObject) -> None:
         self._viewer, self._parent = viewer, parent
         self._last: list[tuple[Any, ResultLayers]] = []
-        self.keep_earlier = QCheckBox("Keep earlier results")
-        self.keep_earlier.setToolTip(
+        tip = (
             "<qt>Keep the layers of earlier runs. Otherwise each new result replaces the previous "
             "result of the same shot.</qt>"
         )
+        self.keep_earlier = QCheckBox("Keep earlier results", toolTip=tip)
 
     def layers_of(self, shot: Any) -> list[Any]:
         """Return the layers of a shot's last result that are still in the viewer."""

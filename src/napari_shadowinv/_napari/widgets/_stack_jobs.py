@@ -205,14 +205,14 @@ class FolderEdit(QtWidgets.QWidget):
 
     def __init__(self) -> None:
         super().__init__()
-        self.folder = _FolderEdit("Folder to watch", "folder")
-        self.folder.edit.setToolTip(
-            "<qt>Each new file in this folder is inverted as soon as it is complete, until you "
-            "press Cancel.</qt>"
+        self.folder = _FolderEdit(
+            "Folder to watch",
+            "folder",
+            "Each new file in this folder is inverted as soon as it is complete, until you press "
+            "Cancel.",
         )
-        self.pattern = QtWidgets.QLineEdit(WatchOptions().pattern)
-        self.pattern.setToolTip("Pattern of the shots' file names, such as *.tif.")
-        self.pattern.setMinimumWidth(60)
+        tip = "Pattern of the shots' file names, such as *.tif."
+        self.pattern = QtWidgets.QLineEdit(WatchOptions().pattern, toolTip=tip, minimumWidth=60)
         column(self, labelled("", self.folder), labelled("Names", self.pattern))
         self.folder.changed.connect(self.changed)
         self.pattern.editingFinished.connect(self.changed)

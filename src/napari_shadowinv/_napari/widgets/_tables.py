@@ -398,10 +398,12 @@ class ShotTable(QWidget):
         super().__init__()
         self._rows: list[ShotRow] = []
         self._loaded = ""
-        self.file = PathEdit("Table of the shots", "shots.csv", _FILE_FILTER)
-        self.file.edit.setToolTip(
-            "<qt>A table (.csv) with a row for each shot and the columns file, setup, energy "
-            "or wavelength, brightness, mask, source, exclude.</qt>"
+        self.file = PathEdit(
+            "Table of the shots",
+            "shots.csv",
+            "A table (.csv) with a row for each shot and the columns file, setup, energy or "
+            "wavelength, brightness, mask, source, exclude.",
+            _FILE_FILTER,
         )
         self.save_button = small_button("Save…", "Save the rows as a table (.csv).", self._save)
         self._kind = "proton"

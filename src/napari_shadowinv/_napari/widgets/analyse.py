@@ -87,18 +87,12 @@ class Analyse(qt.Docked):
         self.layers.setToolTip("Layers to plot.")
         self.layers.setMaximumHeight(110)
         self.layers.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        self.width_edit = QtWidgets.QDoubleSpinBox()
-        self.width_edit.setRange(0.0, _MAX_WIDTH)
-        self.width_edit.setDecimals(2)
+        tip = "Width of the strip, perpendicular to the line, over which values are averaged."
+        self.width_edit = QtWidgets.QDoubleSpinBox(maximum=_MAX_WIDTH, toolTip=f"<qt>{tip}</qt>")
         self.width_edit.setSpecialValueText("0: line only")
         self.width_edit.setKeyboardTracking(False)
-        self.width_unit = SteadyComboBox()
+        self.width_unit = SteadyComboBox(tip=tip)
         self.width_unit.addItem(_PIXELS)
-        for widget in (self.width_edit, self.width_unit):
-            widget.setToolTip(
-                "<qt>Width of the strip, perpendicular to the line, over which values are "
-                "averaged.</qt>"
-            )
         self.plot = ProfilePlot()
         self.measures = forms.WrappingLabel()
         self.measures.setToolTip(

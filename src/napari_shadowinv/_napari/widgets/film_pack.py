@@ -349,10 +349,11 @@ class FilmPack(ToolPanel):
         self._ready = True
 
     def _build(self) -> None:
-        self.path = PathEdit("Pack file", "pack.toml")
-        self.path.edit.setToolTip(
-            "<qt>TOML file with films, filters, scans and calibrations, as for the command "
-            "<code>shadowinv film</code>.</qt>"
+        self.path = PathEdit(
+            "Pack file",
+            "pack.toml",
+            "TOML file with films, filters, scans and calibrations, as for the command "
+            "<code>shadowinv film</code>.",
         )
         self.report = ReportTable()
         self.packs = LayerPicker(

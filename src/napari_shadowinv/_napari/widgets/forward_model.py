@@ -248,7 +248,10 @@ class ForwardModel(ObjectPanel):
             "Field that deflects the beam. Used only to predict the object's image in another "
             "experiment, when the setup differs from the result's setup.",
         )
-        self.height_px, self.width_px = _side("Height"), _side("Width")
+        self.height_px, self.width_px = (
+            QSpinBox(minimum=4, maximum=_MAX_SIDE_PX, toolTip=f"{side} of the image in px.")
+            for side in ("Height", "Width")
+        )
         tip = "Image layer of the undisturbed beam."
         self.source = LayerPicker(viewer, ("image",), tip, "uniform", about.may_be_source)
         self.warning = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
@@ -390,10 +393,3 @@ class ForwardModel(ObjectPanel):
         self.results.show(finished.layer_data)
         self.viewer.reset_view()
         self.warning.show_text(finished.content.warning)
-
-
-def _side(name: str) -> QSpinBox:
-    side = QSpinBox()
-    side.setRange(4, _MAX_SIDE_PX)
-    side.setToolTip(f"{name} of the image in px.")
-    return side

@@ -59,11 +59,8 @@ class StoreEdit(PathEdit):
     """The folder to which results are written, new or to be resumed."""
 
     def __init__(self) -> None:
-        super().__init__("Store of the results", f"results{STORE_SUFFIX}")
-        self.edit.setToolTip(
-            f"<qt>Folder for the results, named …{STORE_SUFFIX}. If it exists, the run is "
-            "resumed.</qt>"
-        )
+        tip = f"Folder for the results, named …{STORE_SUFFIX}. If it exists, the run is resumed."
+        super().__init__("Store of the results", f"results{STORE_SUFFIX}", tip)
 
     @property
     def store(self) -> Path:
@@ -245,12 +242,10 @@ class InvertStack(InversionInputs, ToolPanel):
             "uses these pixels.",
         )
         self.store = StoreEdit()
-        self.overwrite = QCheckBox("overwrite the store")
-        self.overwrite.setToolTip(
-            "<qt>Delete the results in the store first. Otherwise the run is resumed.</qt>"
-        )
-        self.redo_failed = QCheckBox("retry failed shots")
-        self.redo_failed.setToolTip("<qt>Retry the shots that failed in an earlier run.</qt>")
+        tip = "<qt>Delete the results in the store first. Otherwise the run is resumed.</qt>"
+        self.overwrite = QCheckBox("overwrite the store", toolTip=tip)
+        tip = "<qt>Retry the shots that failed in an earlier run.</qt>"
+        self.redo_failed = QCheckBox("retry failed shots", toolTip=tip)
         self.engine = EnginePicker()
         self.report = ReportTable()
         self.save_result, self.more_layers = result_buttons(
