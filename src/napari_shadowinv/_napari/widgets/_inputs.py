@@ -576,21 +576,31 @@ class InversionInputs:
             return instrument
         return Instrument(**instrument.stated, beam_rms=ASSUMED_BEAM.rms)
 
-    def companions(self, image: Any, *others: Any) -> tuple[Any, ...]:
-        """Return the layers that lie on an image: masks, source and others, if chosen."""
-        chosen = (self.masks.layer, self.source_masks.layer, *others, self.source.layers.layer)
-        return tuple(layer for layer in chosen if layer is not None and layer is not image)
+    def job_inputs(
+        self, image: Any, name: str, recipe: preprocessing.Recipe, *others: Any
+    ) -> dict[str, Any]:
+        """Return the fields of a job about its inputs: an image, or files of that name.
 
-    def origins(self, layer: Any, name: str) -> Origins:
-        """Return the origins of all inputs, for an image or for files of that name."""
-        return Origins(
+        Its companions are masks, source and other layers that lie on the image, if chosen.
+        """
+        origins = Origins(
             name,
             self.source.summary,
-            self.masks.summary(layer),
-            self.source_masks.summary(layer) if self.source.is_estimated else "",
+            self.masks.summary(image),
+            self.source_masks.summary(image) if self.source.is_estimated else "",
             self.setup.summary,
             self.setup.origin,
         )
+        chosen = (self.masks.layer, self.source_masks.layer, *others, self.source.layers.layer)
+        return {
+            "recipe": recipe,
+            "inputs": origins.rows(),
+            "attributes": origins.attributes(),
+            "image": image,
+            "companions": tuple(
+                layer for layer in chosen if layer is not None and layer is not image
+            ),
+        }
 
 
 BOTH = " and "

@@ -20,7 +20,6 @@ from napari_shadowinv._napari.layer_metadata import (
     Result,
     frame_of,
     metadata_for,
-    metadata_of,
     result_of,
     setup_of,
     setup_origin_of,
@@ -202,25 +201,15 @@ class InvertShot(InversionInputs, LivePanel):
             source_mask=self.hidden_from_source(layer),
         )
         source = self.source.measured(layer)
-        origins = self.origins(layer, layer.name)
         return InversionJob(
-            recipe=recipe,
-            name=self._result_name(layer),
+            name=", ".join(filter(None, (name_of_result(layer), self.source.short_name))),
             frame=result_frame(layer, recipe),
-            inputs=origins.rows(),
-            attributes=origins.attributes(),
-            image=layer,
-            companions=self.companions(layer, self.crop.layer),
             shot=shot,
             source=source,
             cache=self._cache,
             preview=preview,
+            **self.job_inputs(layer, layer.name, recipe, self.crop.layer),
         )
-
-    def _result_name(self, layer: Any) -> str:
-        """Return the name of a result: of its image, or of that image's result, and its source."""
-        name = metadata_of(layer).get("name") or layer.name
-        return ", ".join(filter(None, (name, self.source.short_name)))
 
     @notify_errors
     def refine(self, psf: float) -> None:
