@@ -224,9 +224,12 @@ class RecipeButton(QPushButton):
         return {"mask": tool.masks.usable(image), "source_mask": tool.hidden_from_source(image)}
 
     def _beam(self, recipe: Recipe, image: Any) -> Radiograph | None:
-        """Return a measured source that a command would not find, else None."""
+        """Return a measured source that is in no file where a command finds it, else None."""
         source = self._tool.source
-        return None if _is_in_file(recipe, image, source) else source.measured(image)
+        if not isinstance(recipe.source, MeasuredSource) or recipe.source.file is not None:
+            return None
+        is_in_shot = source.is_supplied and bool(metadata_of(image).get("path"))
+        return None if is_in_shot else source.measured(image)
 
 
 class FitRecipeButton(RecipeButton):
@@ -317,13 +320,6 @@ def _usable_source(recipe: Recipe, image: Any, path: Path) -> Any:
             "with a source"
         )
     return source
-
-
-def _is_in_file(recipe: Recipe, image: Any, source: Any) -> bool:
-    """Whether a command finds the source: an estimate, a file, or supplied with the shot."""
-    if not isinstance(recipe.source, MeasuredSource) or recipe.source.file is not None:
-        return True
-    return source.is_supplied and bool(metadata_of(image).get("path"))
 
 
 _TITLES = {

@@ -120,7 +120,11 @@ def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> BoolArr
             )
     else:
         assert shape is not None
-        painted = _rasterise(layer, image, shape)
+        painted = np.zeros(shape, bool)
+        if len(layer.data):
+            corners = _corners_in_pixels(layer, image)
+            on_pixels = Shapes(corners, shape_type=list(layer.shape_type))
+            painted = on_pixels.to_masks(mask_shape=shape).astype(np.bool_).any(axis=0)
     if not painted.any():
         return None
     return ~painted if painted_is_unusable else painted
@@ -139,13 +143,6 @@ def crop_of(layer: Any | None, image: Any) -> Crop | None:
         for a, b, side in zip(least, most, image_of(image).shape, strict=True)
     )
     return Crop(y=y, x=x)
-
-
-def _rasterise(layer: Any, image: Any, shape: tuple[int, ...]) -> BoolArray:
-    if not len(layer.data):
-        return np.zeros(shape, bool)
-    on_pixels = Shapes(_corners_in_pixels(layer, image), shape_type=list(layer.shape_type))
-    return on_pixels.to_masks(mask_shape=shape).astype(np.bool_).any(axis=0)
 
 
 def _corners_in_pixels(layer: Any, image: Any) -> list[FloatArray]:

@@ -82,7 +82,10 @@ class FitImages(ToolPanel):
             "The beam without the object. An unknown beam is fitted as a smooth beam, the same in "
             "all images except for its brightness.",
         )
-        self.images = ImageTable(self.viewer, self._may_be_image)
+        self.images = ImageTable(
+            self.viewer,
+            lambda layer: about.may_be_shot(layer) and layer is not self.source.layer,
+        )
         self.fields = ChoiceBox(
             {}, "Field that deflects the beam. Two fields require images at two energies."
         )
@@ -355,9 +358,6 @@ class FitImages(ToolPanel):
         setup = self.setup.complete_setup()
         if self._ready and row is not None and row.setup not in (None, setup):
             self.setup.suggest(row.setup, about.setup_origin_of(row.layer))
-
-    def _may_be_image(self, layer: Any) -> bool:
-        return about.may_be_shot(layer) and layer is not self.source.layer
 
     def _on_reference(self) -> None:
         """Show the setup of a new reference; without a setup it gets the last one."""

@@ -60,7 +60,7 @@ from napari_shadowinv._napari.widgets._qt import (
     while_alive,
     with_button,
 )
-from napari_shadowinv._napari.widgets._results import ResultLayers, place_inputs, result_frame
+from napari_shadowinv._napari.widgets._results import place_inputs, result_frame
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
@@ -164,7 +164,7 @@ class InvertShot(InversionInputs, LivePanel):
         self._reported: Result[Any] | None = None
         self.save_result, self.more_layers = result_buttons(
             self,
-            self._last_results,
+            lambda: self.fit_view.results if self.fit_view.results.layers else self.results,
             "Save the selected or last result: complete with its layers (.shadowinv), for other "
             "programs (.h5), or its sites (.csv).",
         )
@@ -256,10 +256,6 @@ class InvertShot(InversionInputs, LivePanel):
         self._reported = None
         self.verdict.empty()
         self.report.empty()
-
-    def _last_results(self) -> ResultLayers:
-        """Return the layers of the last refinement or inversion."""
-        return self.fit_view.results if self.fit_view.results.layers else self.results
 
     def _follow_result(self, _: Any = None) -> None:
         """Show the report of the result whose layer is selected, such as a layer from a file."""

@@ -264,7 +264,7 @@ class InvertStack(InversionInputs, ToolPanel):
 
     def _connect(self) -> None:
         self.shots.changed.connect(self._on_layer)
-        self.setup.changed.connect(self._show_beams)
+        self.setup.changed.connect(lambda: self.shots.table.show_kind(self.setup.picker.kind))
         for part in self.parts().values():
             part.changed.connect(self.keep)
         self.panel.runner.progressed.connect(self._on_progress)
@@ -285,16 +285,12 @@ class InvertStack(InversionInputs, ToolPanel):
         self.source.check(mask)
         common: dict[str, Any] = {
             "out": self.store.store,
-            "recipe": recipe,
             "source": self._source(layer),
             "mask": mask,
             "source_mask": self.hidden_from_source(layer),
-            "image": layer,
-            "companions": self.companions(layer),
             "placement": {} if layer is None else placement_on(layer, recipe),
+            **self.job_inputs(layer, self.shots.name, recipe),
         }
-        origins = self.origins(layer, self.shots.name)
-        common |= {"inputs": origins.rows(), "attributes": origins.attributes()}
         choices: dict[str, Any] = {
             "overwrite": self.overwrite.isChecked(),
             "redo_failed": self.redo_failed.isChecked(),
@@ -428,9 +424,6 @@ class InvertStack(InversionInputs, ToolPanel):
         self.panel.status.setToolTip(str(job.out.absolute()))
 
     # Layers
-
-    def _show_beams(self) -> None:
-        self.shots.table.show_kind(self.setup.picker.kind)
 
     def _on_layer(self) -> None:
         layer = self.shots.layer

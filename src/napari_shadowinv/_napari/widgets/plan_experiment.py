@@ -141,7 +141,10 @@ class PlanExperiment(ObjectPanel):
         )
         super().__init__(viewer, "plan-experiment", panel, "the field of a result")
         self.field = LayerPicker(
-            viewer, ("image",), "A layer of a result, whose field is the object.", suits=_has_field
+            viewer,
+            ("image",),
+            "A layer of a result, whose field is the object.",
+            suits=lambda layer: about.displacement_of(layer) is not None,
         )
         self._field_row = forms.labelled("Result", self.field)
         self.energies = forms.LineEdit(
@@ -274,10 +277,6 @@ class PlanExperiment(ObjectPanel):
         self._field_row.setVisible(self.object.kind == LAYER)
         self._values_row.setVisible(bool(self.quantity.state()))
         self.keep()
-
-
-def _has_field(layer: Any) -> bool:
-    return about.displacement_of(layer) is not None
 
 
 def _numbers(name: str, text: str, unit: str = "") -> Sequence[float]:
