@@ -14,18 +14,8 @@ from typing import TYPE_CHECKING, Any
 from napari.utils.notifications import show_info
 from qtpy.QtWidgets import QFileDialog, QMenu, QPushButton, QSizePolicy
 
+from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import name_of_result
-from napari_shadowinv._napari.layer_metadata import (
-    Frame,
-    Result,
-    belongs_to_result,
-    frame_of,
-    main_layers,
-    metadata_of,
-    result_of,
-    role_of,
-    source_of,
-)
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.result_files import dataset_to_save, layers_of_result, missing_layers
 from napari_shadowinv._napari.shots import radiograph_layers
@@ -75,22 +65,22 @@ if TYPE_CHECKING:
 class _Repetition:
     """A result to repeat, with the files that are open, and the place of its layers."""
 
-    result: Result[Any]
+    result: about.Result[Any]
     images: list[Path] | None
     source: Path | None
     folder: Path
-    frame: Frame
+    frame: about.Frame
     name: str
     again: Rerun | None = None
 
     @classmethod
     def of(cls, layer: Any, viewer: Any) -> _Repetition:
         """Return the repetition of a layer's result; an `InputError` if it has none."""
-        result = None if layer is None else result_of(layer)
+        result = None if layer is None else about.result_of(layer)
         if result is None:
             raise InputError("select a layer of the result to repeat")
         provenance = result.content.provenance
-        paths = [metadata_of(each).get("path") or each.source.path for each in viewer.layers]
+        paths = [about.metadata_of(each).get("path") or each.source.path for each in viewer.layers]
         by_name = {Path(path).name: Path(path) for path in paths if path}
         origins = () if provenance is None else provenance.images
         images = [by_name[origin.file] for origin in origins if origin.file in by_name]
@@ -101,7 +91,7 @@ class _Repetition:
             images if images and len(images) == len(origins) else None,
             by_name.get(measured[0]) if measured else None,
             files[0].parent if files else Path(),
-            frame_of(layer),
+            about.frame_of(layer),
             f"{name_of_result(layer)} repeated",
         )
 
@@ -114,8 +104,8 @@ class _Repetition:
     def show(self, viewer: Any) -> None:
         """Add the layers of the repeated result, and report the difference."""
         assert self.again is not None
-        repeated = Result(self.again.content, self.result.setup, self.result.attributes)
-        add_layers(viewer, main_layers(layers_of_result(repeated, self.frame, self.name)))
+        repeated = about.Result(self.again.content, self.result.setup, self.result.attributes)
+        add_layers(viewer, about.main_layers(layers_of_result(repeated, self.frame, self.name)))
         changes = "; ".join(self.again.changes) or "nothing"
         show_info(f"Difference: {self.again.difference}. Changed: {changes}")
 
@@ -228,7 +218,7 @@ class RecipeButton(QPushButton):
         source = self._tool.source
         if not isinstance(recipe.source, MeasuredSource) or recipe.source.file is not None:
             return None
-        is_in_shot = source.is_supplied and bool(metadata_of(image).get("path"))
+        is_in_shot = source.is_supplied and bool(about.metadata_of(image).get("path"))
         return None if is_in_shot else source.measured(image)
 
 
@@ -307,13 +297,13 @@ def _read_mask(file: Path | None, shape: tuple[int, ...] | None) -> BoolArray | 
 def _usable_source(recipe: Recipe, image: Any, path: Path) -> Any:
     """Return the source of a recipe for the controls; None for uniform."""
     source = recipe.source
-    is_supplied = image is not None and source_of(image) is not None
+    is_supplied = image is not None and about.source_of(image) is not None
     if source is None:
         return MeasuredSource() if is_supplied else None
     if not isinstance(source, MeasuredSource) or source.file is not None:
         return source
-    if source.variable is not None and image is not None and metadata_of(image).get("path"):
-        return MeasuredSource(file=metadata_of(image)["path"], variable=source.variable)
+    if source.variable is not None and image is not None and about.metadata_of(image).get("path"):
+        return MeasuredSource(file=about.metadata_of(image)["path"], variable=source.variable)
     if not is_supplied:
         raise InputError(
             f"{path} uses the source in the shot's file, but this image has none: choose an image "
@@ -350,32 +340,34 @@ def shown_result(viewer: Any, preferred: Iterable[Any] = ()) -> Any:
     """
     visible = [layer for layer in reversed(viewer.layers) if layer.visible]
     for layer in (viewer.layers.selection.active, *preferred, *visible):
-        if layer is not None and belongs_to_result(layer):
+        if layer is not None and about.belongs_to_result(layer):
             return layer
     raise InputError("there is no result yet: press Run first, or select a layer of a result")
 
 
 def result_to_save(viewer: Any, layer: Any) -> Savable:
     """Collect the result that a layer belongs to, with the appearance of its layers."""
-    result = result_of(layer)
+    result = about.result_of(layer)
     if result is None:
         raise InputError(f"'{layer.name}' shows no result: select a layer of a result")
-    layer_data = [each.as_layer_data_tuple() for each in viewer.layers if result_of(each) is result]
+    layer_data = [
+        each.as_layer_data_tuple() for each in viewer.layers if about.result_of(each) is result
+    ]
     formats = _formats_for(result.content.kind, result.setup)
     return Savable(name_of_result(layer), dataset_to_save(layer_data), formats)
 
 
 def shot_to_save(viewer: Any, layer: Any) -> Savable:
     """Collect the displayed shot of a store."""
-    store = metadata_of(layer).get("store")
+    store = about.metadata_of(layer).get("store")
     if store is None:
         return result_to_save(viewer, layer)
     index = plane_in_view(viewer, layer)
-    shots = metadata_of(layer).get("shots", ())
+    shots = about.metadata_of(layer).get("shots", ())
     name = Path(shots[index]).stem if index < len(shots) else str(index)
     dataset = shot_of_store(Path(store), index)
     formats = _formats_for(ResultKind.of(dataset.attrs), setup_from_dataset(dataset))
-    return Savable(f"{metadata_of(layer).get('name', '')} {name}", dataset, formats)
+    return Savable(f"{about.metadata_of(layer).get('name', '')} {name}", dataset, formats)
 
 
 def _formats_for(kind: ResultKind, setup: Setup | None) -> tuple[Format, ...]:
@@ -469,7 +461,7 @@ def result_buttons(
 
 def field_of(layers: Iterable[Any]) -> list[Any]:
     """Select the layers that show a field's strength."""
-    return [layer for layer in layers if role_of(layer) == "field"]
+    return [layer for layer in layers if about.role_of(layer) == "field"]
 
 
 def _file_name(name: str) -> str:

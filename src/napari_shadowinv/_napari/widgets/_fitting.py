@@ -13,13 +13,8 @@ from qtpy.QtWidgets import QDoubleSpinBox, QWidget
 from napari_shadowinv._napari.fit_layers import alternative_layers, start_name
 from napari_shadowinv._napari.jobs import Finished, FitJob
 from napari_shadowinv._napari.layer_metadata import Result, main_layers, result_of
+from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
-from napari_shadowinv._napari.widgets._forms import (
-    PROBLEM_STYLE,
-    WrappingLabel,
-    labelled,
-    section,
-)
 from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, fact_rows
 from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, push_button, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
@@ -49,7 +44,9 @@ class RefineSection(QWidget):
             "says whether the image determines the field.",
             lambda: refine(self.psf.value()),
         )
-        self.folded = section("Refine the result", labelled("Blur σ", self.psf), self.button)
+        self.folded = forms.section(
+            "Refine the result", forms.labelled("Blur σ", self.psf), self.button
+        )
         column(self, self.folded)
 
 
@@ -64,12 +61,12 @@ class FitView(QWidget):
         self._alternative = ResultLayers(viewer, self)
         self.results = ResultLayers(viewer, self)
         self.curve = ObjectiveCurve()
-        self.verdict = WrappingLabel()
+        self.verdict = forms.WrappingLabel()
         self.solutions = SteadyComboBox(
             tip="Alternative solutions from other starting points. Select one to show it next to "
             "the best."
         )
-        self._solutions_row = labelled("Solution", self.solutions)
+        self._solutions_row = forms.labelled("Solution", self.solutions)
         self.report = ReportTable()
         column(self, self.verdict, self._solutions_row, self.curve, self.report)
         self._redraw_timer = timer(self, _REDRAW_MS, self._draw)
@@ -116,7 +113,7 @@ class FitView(QWidget):
     def _show_report(
         self, fit: Fit, facts: Iterable[Fact], inputs: Sequence[tuple[str, str]] = ()
     ) -> None:
-        style = "" if fit.verdict is Verdict.DETERMINED else PROBLEM_STYLE
+        style = "" if fit.verdict is Verdict.DETERMINED else forms.PROBLEM_STYLE
         self.verdict.show_titled(f"Verdict: {fit.verdict.value}", f"{fit.explanation}.", style)
         warnings = [("Warning", caution.text) for caution in fit.warnings]
         rows = [row for row in warnings if row not in inputs]

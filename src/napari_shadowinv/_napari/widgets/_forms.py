@@ -16,15 +16,8 @@ from qtpy.QtGui import QColor
 from qtpy.QtWidgets import QSizePolicy, QWidget
 from superqt import QCollapsible
 
+from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._editors import Editor, SteadyComboBox, editor_for
-from napari_shadowinv._napari.widgets._qt import (
-    column,
-    notify_errors,
-    push_button,
-    side_by_side,
-    small_button,
-    with_button,
-)
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import read_toml, replacing
@@ -46,7 +39,7 @@ _ALTERNATIVES = ("pixel_size", "detector_pixel_size")
 def labelled(text: str, widget: QtWidgets.QWidget) -> QtWidgets.QWidget:
     """Put a label of the common width before a widget."""
     label = QtWidgets.QLabel(text, minimumWidth=_LABEL_WIDTH_PX)
-    return side_by_side((label, 0), (widget, 1))
+    return qt.side_by_side((label, 0), (widget, 1))
 
 
 def section(title: str, *widgets: QtWidgets.QWidget) -> QCollapsible:
@@ -114,7 +107,7 @@ class PathEdit(QtWidgets.QWidget):
         self._title, self._files = title, files
         self.edit = LineEdit(example, tip)
         self.edit.setMinimumWidth(60)
-        side_by_side((with_button(self.edit, "…", title, self.choose), 0), holder=self)
+        qt.side_by_side((qt.with_button(self.edit, "…", title, self.choose), 0), holder=self)
         self.edit.editingFinished.connect(self.changed)
 
     @property
@@ -158,7 +151,7 @@ class ModelForm(QtWidgets.QWidget):
         rows.setRowWrapPolicy(QtWidgets.QFormLayout.RowWrapPolicy.DontWrapRows)
         rows.setFieldGrowthPolicy(QtWidgets.QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
         rows.setLabelAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignVCenter)
-        layout = column(self)
+        layout = qt.column(self)
         layout.addLayout(rows)
         for name, field in model_class.model_fields.items():
             if get_origin(field.annotation) is Literal and len(get_args(field.annotation)) == 1:
@@ -262,7 +255,7 @@ class ModelPicker(QtWidgets.QWidget):
         self._kinds, self._rows = dict(kinds), dict(rows)
         self._forms: dict[str, ModelForm] = {}
         self.choice = SteadyComboBox({key: title for key, (title, _) in kinds.items()}, tip)
-        column(self, labelled(label, self.choice), *self._rows.values())
+        qt.column(self, labelled(label, self.choice), *self._rows.values())
         self.choice.currentIndexChanged.connect(self._on_choice)
         self._on_choice()
 
@@ -340,19 +333,19 @@ class TomlButtons(QtWidgets.QWidget):
         super().__init__()
         self._subject, self._values, self._load_values = subject, values, load
         tip = f"Write {subject} to a TOML file, for use here or on the command line."
-        self.load_button = push_button(
+        self.load_button = qt.push_button(
             f"Load {subject}…", f"Read {subject} from a TOML file.", self._load
         )
-        self.save_button = push_button("Save…", tip, self._save)
-        side_by_side((self.load_button, 0), (self.save_button, 0), (QWidget(), 1), holder=self)
+        self.save_button = qt.push_button("Save…", tip, self._save)
+        qt.side_by_side((self.load_button, 0), (self.save_button, 0), (QWidget(), 1), holder=self)
 
-    @notify_errors
+    @qt.notify_errors
     def _load(self) -> None:
         path, _ = QtWidgets.QFileDialog.getOpenFileName(self, f"Load {self._subject}", "", TOML)
         if path:
             self._load_values(read_toml(path), path)
 
-    @notify_errors
+    @qt.notify_errors
     def _save(self) -> None:
         values = self._values()
         if not values:
@@ -374,19 +367,19 @@ class StepForm(QWidget):
         self.kind = kind
         self.form = ModelForm(kind)
         self.form.layout().setContentsMargins(INDENT, 0, 0, 0)
-        self.title = small_button(
+        self.title = qt.small_button(
             "", "Show or hide the parameters.", lambda: self.fold(not self.form.isHidden())
         )
         self.title.setToolButtonStyle(Qt.ToolButtonStyle.ToolButtonTextBesideIcon)
         self.title.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
-        self.up = small_button("↑", "Move this step up.", lambda: move(self, -1))
-        self.down = small_button("↓", "Move this step down.", lambda: move(self, 1))
-        self.remove = small_button("✕", "Remove this step.", lambda: move(self, None))
+        self.up = qt.small_button("↑", "Move this step up.", lambda: move(self, -1))
+        self.down = qt.small_button("↓", "Move this step down.", lambda: move(self, 1))
+        self.remove = qt.small_button("✕", "Remove this step.", lambda: move(self, None))
         for button in (self.title, self.up, self.down, self.remove):
             button.setAutoRaise(True)
-        line = side_by_side((self.title, 1), (self.up, 0), (self.down, 0), (self.remove, 0))
+        line = qt.side_by_side((self.title, 1), (self.up, 0), (self.down, 0), (self.remove, 0))
         line.layout().setSpacing(0)
-        column(self, line, self.form)
+        qt.column(self, line, self.form)
         self.form.changed.connect(self._show_title)
         self.form.changed.connect(self.changed)
         self.fold(False)
@@ -421,9 +414,9 @@ class StepsSection(QWidget):
             "Processing of image, source and masks before the inversion or fit.",
         )
         self._list = QWidget()
-        column(self._list)
+        qt.column(self._list)
         self.folded = titled_section(self._list, labelled("", self.choice))
-        column(self, self.folded)
+        qt.column(self, self.folded)
         self.choice.activated.connect(self._on_choice)
         self._on_change()
 

@@ -19,12 +19,8 @@ from napari_shadowinv._napari.preferences import preference
 from napari_shadowinv._napari.shots import radiograph_of, source_of_shot
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
-from napari_shadowinv._napari.widgets._editors import (
-    SteadyComboBox,
-    format_number,
-)
+from napari_shadowinv._napari.widgets._editors import SteadyComboBox, format_number
 from napari_shadowinv._napari.widgets._files import RecipeButton
-from napari_shadowinv._napari.widgets._forms import StepsSection
 from napari_shadowinv._napari.widgets._qt import column
 from napari_shadowinv._napari.widgets._results import Origins
 from napari_shadowinv._system.validation import validate
@@ -522,7 +518,7 @@ class InversionInputs:
             self.viewer, image, kinds, source_mask_tip, "Source mask"
         )
         self.setup = SetupPicker()
-        self.steps = StepsSection()
+        self.steps = forms.StepsSection()
         self.instrument = InstrumentForm()
         self.options = OptionsForm()
         self.recipes = RecipeButton(self)

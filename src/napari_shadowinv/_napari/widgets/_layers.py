@@ -11,16 +11,9 @@ from qtpy.QtCore import QObject, QSignalBlocker, Signal
 from qtpy.QtWidgets import QCheckBox, QWidget
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.layer_metadata import frame_of
+from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import labelled
-from napari_shadowinv._napari.widgets._qt import (
-    column,
-    layers_while_alive,
-    notify_errors,
-    while_alive,
-    with_button,
-)
 from napari_shadowinv._system.arrays import complete_block_means, join_masks
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
@@ -188,7 +181,7 @@ def new_shapes(viewer: Any, image: Any, title: str, mode: str) -> Any:
 def _add_layer(viewer: Any, image: Any, kind: str, data: Any, title: str, **keywords: Any) -> Any:
     keywords["name"] = title
     if image is not None:  # None for files
-        keywords |= {"name": f"{image.name} {title}", **frame_of(image).keywords()}
+        keywords |= {"name": f"{image.name} {title}", **about.frame_of(image).keywords()}
     layer = Layer.create(data, keywords, kind)
     viewer.layers.append(layer)
     viewer.layers.selection.active = layer
@@ -218,8 +211,8 @@ class LayerPicker(SteadyComboBox):
         self.setToolTip(tip)
         self.fill()
         self.currentIndexChanged.connect(lambda _: self.picked.emit())
-        while_alive(self, viewer.layers, ("inserted", "removed"), self.fill)
-        layers_while_alive(self, viewer.layers, "name", self.fill)
+        qt.while_alive(self, viewer.layers, ("inserted", "removed"), self.fill)
+        qt.layers_while_alive(self, viewer.layers, "name", self.fill)
 
     @property
     def layer(self) -> Any | None:
@@ -269,7 +262,7 @@ class ShotPicker(LayerPicker):
             viewer, ("image",), "Layer of the shot, a greyscale image.", suits=about.may_be_shot
         )
         self.activated.connect(self._choose)
-        while_alive(self, viewer.layers, "inserted", self._on_insertion)
+        qt.while_alive(self, viewer.layers, "inserted", self._on_insertion)
 
     def _choose(self, _: int = 0) -> None:
         self.is_chosen = True
@@ -333,9 +326,11 @@ class MaskPicker(QWidget):
         self.painted_is_unusable = QCheckBox(f"painted = {target}")
         self.painted_is_unusable.setChecked(True)
         self.painted_is_unusable.setToolTip(f"<qt>{meaning}</qt>")
-        column(
+        qt.column(
             self,
-            labelled(title, with_button(self.layers, "✎", f"Paint a {title.lower()}.", self.paint)),
+            labelled(
+                title, qt.with_button(self.layers, "✎", f"Paint a {title.lower()}.", self.paint)
+            ),
             labelled("", self.painted_is_unusable),
         )
         self.layers.picked.connect(self.picked)
@@ -381,7 +376,7 @@ class MaskPicker(QWidget):
     def restore(self, state: Any) -> None:
         self.painted_is_unusable.setChecked(bool(state))
 
-    @notify_errors
+    @qt.notify_errors
     def paint(self) -> None:
         self.layer = new_mask(self._viewer, self._image(), self.title.lower())
 
@@ -404,7 +399,7 @@ class LayerWatch(QObject):
             if layer is None or any(layer is watched for watched in self._watched):
                 continue
             self._watched.append(layer)
-            while_alive(self, layer, ("data", "paint"), self._on_edit)
+            qt.while_alive(self, layer, ("data", "paint"), self._on_edit)
 
     def _on_edit(self, layer: Any) -> None:
         if any(layer is picker.layer for picker in self._pickers):

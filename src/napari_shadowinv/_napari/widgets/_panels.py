@@ -24,13 +24,8 @@ from napari_shadowinv._napari.viewer_sync import (
     error_text,
     show_user_error,
 )
+from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._forms import (
-    PROBLEM_COLOUR,
-    PROBLEM_STYLE,
-    WrappingLabel,
-    section,
-)
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.cautions import CAUTION_CODES
@@ -214,7 +209,7 @@ _POLL_MS = 500
 _MIN_SHOWN_TIME_S = 2.0
 _LEVEL_STYLES = {
     Level.SOUND: "color: #4caf72;",
-    Level.DOUBTFUL: PROBLEM_STYLE,
+    Level.DOUBTFUL: forms.PROBLEM_STYLE,
     Level.FAILED: "color: #e05252;",
 }
 _ROW_SPACING_PX = 4
@@ -260,7 +255,7 @@ class RunPanel(QtWidgets.QWidget):
         self.bar = QtWidgets.QProgressBar(maximum=1, textVisible=False)
         self.bar.setFixedHeight(8)
         self.bar.setVisible(False)
-        self.status = WrappingLabel()
+        self.status = forms.WrappingLabel()
         qt.column(self, self.button, self.bar, self.status)
         self._activity = _Activity()
         self._quiet = False
@@ -285,7 +280,7 @@ class RunPanel(QtWidgets.QWidget):
             self.say("")
 
     def say(self, text: str, problem: bool = False) -> None:
-        self.status.show_text(text, PROBLEM_STYLE if problem else "")
+        self.status.show_text(text, forms.PROBLEM_STYLE if problem else "")
 
     def _on_start(self) -> None:
         if self._quiet:
@@ -379,7 +374,7 @@ class ReportTable(QtWidgets.QTableWidget):
                 item.setTextAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignTop)
                 item.setToolTip(text)
                 if texts[0] == "Warning":
-                    item.setForeground(PROBLEM_COLOUR)
+                    item.setForeground(forms.PROBLEM_COLOUR)
                 self.setItem(row, column, item)
         self.setVisible(True)
         self._fit()
@@ -409,7 +404,7 @@ class FoldedReport(QtWidgets.QWidget):
     def __init__(self) -> None:
         super().__init__()
         self.table, self._details = ReportTable(), ReportTable()
-        self.details = section("Solver and timing", self._details)
+        self.details = forms.section("Solver and timing", self._details)
         self.details.toggled.connect(lambda _: self._details.setVisible(True))
         qt.column(self, self.table, self.details)
         self.empty()
@@ -431,7 +426,7 @@ class FoldedReport(QtWidgets.QWidget):
         return self.table.texts() | self._details.texts()
 
 
-class VerdictLine(WrappingLabel):
+class VerdictLine(forms.WrappingLabel):
     """A coloured line below Run with level of trust, warnings in a few words, and peak."""
 
     def show_headline(self, headline: Headline, prefix: str = "") -> None:

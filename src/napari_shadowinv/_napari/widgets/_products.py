@@ -11,15 +11,7 @@ import numpy as np
 from napari.utils.notifications import show_info
 from qtpy import QtWidgets
 
-from napari_shadowinv._napari.layer_metadata import (
-    Result,
-    frame_of,
-    layer_name,
-    metadata_for,
-    metadata_of,
-    result_of,
-    setup_of,
-)
+from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.widgets import _forms as forms
@@ -27,7 +19,6 @@ from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
 from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes
 from napari_shadowinv._napari.widgets._panels import Outcome, ReportTable, RunPanel
-from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
 from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import FloatArray
@@ -69,12 +60,12 @@ _MAX_COLUMN = 3  # entries of a legend inside the axes; longer ones are above
 class _Request:
     """A product to be measured, of a result or of the shots of a store, and a layer of it."""
 
-    origin: Result[Any] | Path
+    origin: about.Result[Any] | Path
     layer: Any
     work: Callable[[OnProgress, ShouldStop], list[ProductResult]]
 
 
-class ProductPlot(Plot):
+class ProductPlot(qt.Plot):
     """The curves of a product with their bands of 68 and 95 %, or its series over shots."""
 
     def __init__(self) -> None:
@@ -103,7 +94,7 @@ class ProductPlot(Plot):
         scale, unit = result.shown_scale(names)
         marker = "." if result.is_series else ""
         for number, name in enumerate(names):
-            colour = COLOURS[number % len(COLOURS)]
+            colour = qt.COLOURS[number % len(qt.COLOURS)]
             axis.plot(places, scale * result[name].value, color=colour, marker=marker, label=name)
             for share, opacity in zip(BANDS, _OPACITIES, strict=True):
                 if (band := result.band(name, share)) is not None:
@@ -128,10 +119,13 @@ class ProductForm(QtWidgets.QWidget):
         super().__init__()
         self.viewer = viewer
         self.results: list[ProductResult] = []
-        self._origin: Result[Any] | Path | None = None
+        self._origin: about.Result[Any] | Path | None = None
         tip = "<qt>Layer of the result of an inversion or a fit, or of a store of shots.</qt>"
         self.result = LayerPicker(
-            viewer, ("image",), tip, suits=lambda layer: bool(result_of(layer) or _store_of(layer))
+            viewer,
+            ("image",),
+            tip,
+            suits=lambda layer: bool(about.result_of(layer) or _store_of(layer)),
         )
         self.product = SteadyComboBox(
             {name: f"{kind.title[:1].upper()}{kind.title[1:]}" for name, kind in PRODUCTS.items()}
@@ -213,8 +207,8 @@ class ProductForm(QtWidgets.QWidget):
         if is_store:
             tip = "Only for a single result; of a store, export a table or save a figure."
         self.save.setToolTip(f"<qt>{tip}</qt>")
-        result = None if layer is None else result_of(layer)
-        setup = setup_of(layer) if is_store else None if result is None else result.setup
+        result = None if layer is None else about.result_of(layer)
+        setup = about.setup_of(layer) if is_store else None if result is None else result.setup
         fields = {"displacement"} if setup is None else {each.name for each in setup.si_fields}
         symbols = [s for s, unit in FIELD_UNITS.items() if unit.field in fields | {"displacement"}]
         before = self.unit.currentText()
@@ -237,7 +231,7 @@ class ProductForm(QtWidgets.QWidget):
             values |= self._outline(layer)
         symbol = self.unit.currentText()
         product, unit = product_from_dict(values), None if symbol == _BY_SETUP else symbol
-        origin: Any = _store_of(layer) or result_of(layer)
+        origin: Any = _store_of(layer) or about.result_of(layer)
         shots, times = self.shots.text().strip() or None, self.times.text().strip()
         samples = self.samples.value()
 
@@ -279,11 +273,11 @@ class ProductForm(QtWidgets.QWidget):
 
     def choose(self, layer: Any) -> None:
         """Select the result that a layer belongs to, or raise an `InputError`."""
-        result = None if layer is None else result_of(layer) or _store_of(layer)
+        result = None if layer is None else about.result_of(layer) or _store_of(layer)
         of_result = [
             each
             for each in self.result.offered
-            if result is not None and result in (result_of(each), _store_of(each))
+            if result is not None and result in (about.result_of(each), _store_of(each))
         ]
         if not of_result:
             raise InputError(
@@ -320,7 +314,7 @@ class ProductForm(QtWidgets.QWidget):
         self.plot.setVisible(self.plot.show_curves(measured))
         for widget in (self.export, self.picture, self.clear):
             widget.setEnabled(True)
-        self.save.setEnabled(isinstance(request.origin, Result))
+        self.save.setEnabled(isinstance(request.origin, about.Result))
         for name, variable in measured.variables.items():
             if variable.dims == PLANE:
                 add_layers(self.viewer, [map_layer(measured, name, request.layer)])
@@ -382,7 +376,7 @@ class ProductForm(QtWidgets.QWidget):
 
 def _store_of(layer: Any) -> Path | None:
     """Return the store of shots that a layer shows, or None."""
-    store = metadata_of(layer).get("store")
+    store = about.metadata_of(layer).get("store")
     return None if store is None else Path(store)
 
 
@@ -454,10 +448,10 @@ def map_layer(measured: ProductResult, name: str, layer: Any) -> Any:
     factor, prefix = prefix_for(largest)
     unit = f"{prefix}{measured.variables[name].unit}"
     keywords = {
-        "name": layer_name(f"{measured.title} ({unit})", layer.name.partition(" – ")[2]),
+        "name": about.layer_name(f"{measured.title} ({unit})", layer.name.partition(" – ")[2]),
         "colormap": colour_map("signed"),
         "contrast_limits": (-factor * largest, factor * largest),
-        "metadata": metadata_for("product", unit),
-        **frame_of(layer).keywords(),
+        "metadata": about.metadata_for("product", unit),
+        **about.frame_of(layer).keywords(),
     }
     return factor * values, keywords, "image"

@@ -11,13 +11,7 @@ from napari.utils.notifications import show_warning
 from qtpy.QtCore import QObject, Signal
 from qtpy.QtWidgets import QCheckBox
 
-from napari_shadowinv._napari.layer_metadata import (
-    Frame,
-    frame_for,
-    frame_of,
-    layer_key,
-    place_image,
-)
+from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layers import FullLayerData, add_layers
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import timer
@@ -29,11 +23,11 @@ if TYPE_CHECKING:
 _MIN_LIMITS_CHANGE = 0.02  # relative to their range
 
 
-def result_frame(image: Any, recipe: Recipe) -> Frame:
+def result_frame(image: Any, recipe: Recipe) -> about.Frame:
     """Return the frame of a result on its image, with the setup's pixels."""
-    frame = frame_of(image)
+    frame = about.frame_of(image)
     if recipe.setup is not None:
-        upright = frame_for(image.data.shape, recipe.setup)
+        upright = about.frame_for(image.data.shape, recipe.setup)
         frame = replace(frame, scale=upright.scale, units=upright.units)
     height, width = image.data.shape[-2:]
     return frame.beneath(recipe.matrix((height, width)))
@@ -42,7 +36,7 @@ def result_frame(image: Any, recipe: Recipe) -> Frame:
 def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any]) -> bool:
     """Place an image and the layers on it with the setup's pixels; return whether it moved."""
     # napari warns about each layer while pixels and lengths are mixed.
-    old_frame = frame_of(image)
+    old_frame = about.frame_of(image)
     same_size = [
         layer
         for layer in viewer.layers
@@ -50,9 +44,9 @@ def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any
         and kind_of(layer) in ("image", "labels")
         and tuple(layer.data.shape[-2:]) == tuple(image.data.shape[-2:])
     ]
-    followers = [layer for layer in (*companions, *same_size) if frame_of(layer) == old_frame]
-    place_image(image, setup)
-    if frame_of(image) == old_frame:
+    followers = [layer for layer in (*companions, *same_size) if about.frame_of(layer) == old_frame]
+    about.place_image(image, setup)
+    if about.frame_of(image) == old_frame:
         return False
     for layer in followers:
         layer.scale = (*layer.scale[:-2], *image.scale[-2:])
@@ -110,14 +104,14 @@ class ResultLayers(QObject):
         self._select, self._fit = select, fit
         self._before = self._viewer.layers.selection.active
         present = self.layers
-        self._order = [layer_key(keywords) for _, keywords, _ in layer_data]
+        self._order = [about.layer_key(keywords) for _, keywords, _ in layer_data]
         for key in [key for key in self._layers if key not in self._order]:
             layer = self._layers.pop(key)
             if layer in present:
                 self._viewer.layers.remove(layer)
         waiting = []
         for data, keywords, kind in layer_data:
-            layer = self._layers.get(layer_key(keywords))
+            layer = self._layers.get(about.layer_key(keywords))
             if layer is None or layer not in present:
                 waiting.append((data, keywords, kind))
             elif kind_of(layer) == kind and _can_be_updated(layer, keywords):
@@ -135,7 +129,7 @@ class ResultLayers(QObject):
     def extend(self, layer_data: Sequence[FullLayerData]) -> None:
         """Add layers of the same result below the others, keeping the selection."""
         self._select, self._before = False, self._viewer.layers.selection.active
-        self._order = [layer_key(keywords) for _, keywords, _ in layer_data] + self._order
+        self._order = [about.layer_key(keywords) for _, keywords, _ in layer_data] + self._order
         self._waiting += layer_data
         self._timer.start()
 
@@ -156,7 +150,7 @@ class ResultLayers(QObject):
     def _add_next(self) -> None:
         if self._waiting:
             layer = self._waiting.pop(0)
-            key = layer_key(layer[1])
+            key = about.layer_key(layer[1])
             (self._layers[key],) = add_layers(self._viewer, [layer], below=self._next_above(key))
             # Hidden layers must not take the selection.
             main = self._layers.get("field") or self._layers.get("fluence")
@@ -253,7 +247,7 @@ def _can_be_updated(layer: Any, keywords: dict[str, Any]) -> bool:
     """Whether a layer can be updated; a new type or rotation needs a new layer."""
     if kind_of(layer) not in ("image", "labels", "vectors"):
         return False
-    frame, upright = frame_of(layer), Frame()
+    frame, upright = about.frame_of(layer), about.Frame()
     rotate = np.asarray(keywords.get("rotate", upright.rotate))[-2:, -2:]
     shear = np.ravel(keywords.get("shear", upright.shear))[-1]
     affine = np.asarray(keywords.get("affine", upright.affine))[-3:, -3:]

@@ -20,17 +20,10 @@ from qtpy.QtWidgets import (
 )
 
 from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._editors import format_number, parse_number
 from napari_shadowinv._napari.widgets._forms import PROBLEM_COLOUR, PathEdit, labelled
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, kind_of, stack_of
-from napari_shadowinv._napari.widgets._qt import (
-    column,
-    layers_while_alive,
-    notify_errors,
-    side_by_side,
-    small_button,
-    while_alive,
-)
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import SITES
@@ -244,11 +237,11 @@ class ImageTable(QWidget):
         )
         self.table = NumberTable("Image", (self.beam, *_IMAGE_COLUMNS))
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
-        column(self, labelled("Images", self.stacks), self.table)
+        qt.column(self, labelled("Images", self.stacks), self.table)
         self.stacks.picked.connect(self.fill)
         self.table.itemChanged.connect(self._on_edit)
-        while_alive(self, viewer.layers, ("inserted", "removed", "reordered"), self.fill)
-        layers_while_alive(self, viewer.layers, "name", self.fill)
+        qt.while_alive(self, viewer.layers, ("inserted", "removed", "reordered"), self.fill)
+        qt.layers_while_alive(self, viewer.layers, "name", self.fill)
         self.fill()
 
     @property
@@ -405,11 +398,12 @@ class ShotTable(QWidget):
             "wavelength, brightness, mask, source, exclude.",
             _FILE_FILTER,
         )
-        self.save_button = small_button("Save…", "Save the rows as a table (.csv).", self._save)
+        self.save_button = qt.small_button("Save…", "Save the rows as a table (.csv).", self._save)
         self._kind = "proton"
         self.table = NumberTable("Shot", self._columns)
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
-        column(self, labelled("", side_by_side((self.file, 1), (self.save_button, 0))), self.table)
+        file = qt.side_by_side((self.file, 1), (self.save_button, 0))
+        qt.column(self, labelled("", file), self.table)
         self.file.changed.connect(self._load)
         self.table.itemChanged.connect(self._on_edit)
         self._fill()
@@ -460,7 +454,7 @@ class ShotTable(QWidget):
     def _folder(self) -> Path:
         return Path(self._loaded).expanduser().parent
 
-    @notify_errors
+    @qt.notify_errors
     def _load(self) -> None:
         if self.file.path != self._loaded:
             self._read()
@@ -499,7 +493,7 @@ class ShotTable(QWidget):
             self.table.enter(item)
         self.changed.emit()
 
-    @notify_errors
+    @qt.notify_errors
     def _save(self) -> None:
         rows = self.shots()
         path, _ = QFileDialog.getSaveFileName(

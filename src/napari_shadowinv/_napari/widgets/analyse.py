@@ -11,18 +11,10 @@ from qtpy.QtCore import QSignalBlocker, Qt
 
 from napari_shadowinv._napari.layer_metadata import role_of, unit_of
 from napari_shadowinv._napari.widgets import _forms as forms
+from napari_shadowinv._napari.widgets import _products as products
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._layers import LayerPicker, kind_of, new_shapes, shown_plane
-from napari_shadowinv._napari.widgets._products import (
-    OPEN_SHAPES,
-    ProductForm,
-    export_csv,
-    pixel_mapper,
-    selected_shape,
-    world_corners,
-)
-from napari_shadowinv._napari.widgets._qt import COLOURS, Plot
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.paths import (
     Profile,
@@ -44,7 +36,7 @@ _MAX_WIDTH = 1e6
 _MAX_NAME_LENGTH = 34
 
 
-class ProfilePlot(Plot):
+class ProfilePlot(qt.Plot):
     """A plot for each unit, in a column with a common distance axis."""
 
     def __init__(self) -> None:
@@ -60,7 +52,7 @@ class ProfilePlot(Plot):
             axis.set_ylabel(of_unit or "value", color=self.ink)
             for number, profile in enumerate(profiles):
                 if profile.unit == of_unit:
-                    colour, name = COLOURS[number % len(COLOURS)], profile.name
+                    colour, name = qt.COLOURS[number % len(qt.COLOURS)], profile.name
                     if len(name) > _MAX_NAME_LENGTH:
                         name = f"…{name[1 - _MAX_NAME_LENGTH :]}"
                     axis.plot(distance, profile.values, color=colour, label=name)
@@ -110,7 +102,7 @@ class Analyse(qt.Docked):
             forms.labelled("Width", width),
             self.hint,
         )
-        page, self.products = QtWidgets.QWidget(), ProductForm(viewer)
+        page, self.products = QtWidgets.QWidget(), products.ProductForm(viewer)
         self.tabs = QtWidgets.QTabWidget()
         self.tabs.addTab(page, "Layers along a line")
         self.tabs.addTab(self.products, "Products of a result")
@@ -184,7 +176,7 @@ class Analyse(qt.Docked):
                 Profile(
                     layer.name,
                     unit_of(layer),
-                    interpolate(shown_plane(layer, position), points, pixel_mapper(layer)),
+                    interpolate(shown_plane(layer, position), points, products.pixel_mapper(layer)),
                     averaging,
                 )
                 for layer in layers
@@ -238,8 +230,8 @@ class Analyse(qt.Docked):
         shapes = self.lines.layer
         if shapes is None:
             return None
-        line = selected_shape(shapes, lambda kind: kind in OPEN_SHAPES)
-        return None if line is None else world_corners(shapes, line)
+        line = products.selected_shape(shapes, lambda kind: kind in products.OPEN_SHAPES)
+        return None if line is None else products.world_corners(shapes, line)
 
     def _schedule_plot(self, _: Any = None) -> None:
         if not self._timer.isActive():
@@ -282,4 +274,4 @@ class Analyse(qt.Docked):
 
     @qt.notify_errors
     def _export(self) -> None:
-        export_csv(self, "profile.csv", self.table())
+        products.export_csv(self, "profile.csv", self.table())

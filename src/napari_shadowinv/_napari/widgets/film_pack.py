@@ -13,37 +13,16 @@ from napari.utils.notifications import show_info
 from qtpy import QtWidgets
 from qtpy.QtCore import QObject, Qt
 
+from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari import packs
 from napari_shadowinv._napari.jobs import Finished
-from napari_shadowinv._napari.layer_metadata import (
-    Result,
-    frame_of,
-    may_be_mask,
-    metadata_for,
-    metadata_of,
-    result_of,
-    role_of,
-)
 from napari_shadowinv._napari.packs import PackJob
 from napari_shadowinv._napari.result_files import dataset_of_layers
 from napari_shadowinv._napari.viewer_sync import plane_in_view
+from napari_shadowinv._napari.widgets import _forms as forms
+from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._forms import (
-    PROBLEM_STYLE,
-    ModelForm,
-    PathEdit,
-    WrappingLabel,
-    labelled,
-)
 from napari_shadowinv._napari.widgets._layers import LayerPicker, LayerWatch, mask_of, new_shapes
-from napari_shadowinv._napari.widgets._panels import (
-    ReportTable,
-    RunPanel,
-    ToolPanel,
-    fact_rows,
-    warning_rows,
-)
-from napari_shadowinv._napari.widgets._qt import COLOURS, Plot, push_button
 from napari_shadowinv._napari.widgets._results import ResultLayers
 from napari_shadowinv._system.hidden_files import temporary_folder
 from napari_shadowinv._typing import AnyArray, FloatArray
@@ -79,7 +58,7 @@ class NewPackDialog(QtWidgets.QDialog):
         self.setMinimumSize(*_MIN_SIZE_PX)
         self._folder = folder
         self.written: Path | None = None  # the pack file after saving
-        self.form = ModelForm(NewPack)
+        self.form = forms.ModelForm(NewPack)
         self.table = QtWidgets.QTableWidget(0, len(_COLUMNS))
         self.table.setHorizontalHeaderLabels(_COLUMNS)
         self.table.horizontalHeader().setStretchLastSection(True)
@@ -87,7 +66,7 @@ class NewPackDialog(QtWidgets.QDialog):
             "<qt>Films in the order in which the beam passes them. Filters as thickness, unit and "
             "material, such as 13 um Al; 25 um Fe.</qt>"
         )
-        self._problem = WrappingLabel(style=PROBLEM_STYLE)
+        self._problem = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
         choices = QtWidgets.QDialogButtonBox.StandardButton
         self.buttons = QtWidgets.QDialogButtonBox(choices.Save | choices.Cancel)
         self.buttons.accepted.connect(self.accept)
@@ -235,7 +214,7 @@ class CornerEditor(QObject):
         self._plane = plane
         title = f"film {plane + 1}"
         # The scan has the pixel size of the films, and its film lies over them.
-        frame = frame_of(self._films)
+        frame = about.frame_of(self._films)
         size = np.array(self._films.data.shape[-2:])
         centre = np.asarray(frame.translate) + (size - 1) / 2 * frame.scale
         placement = frame.keywords()
@@ -260,7 +239,7 @@ class CornerEditor(QObject):
             **placement,
         )
         for layer, role in ((self.scan, "scan"), (self.polygon, "corners")):
-            layer.metadata = metadata_for(role, "")
+            layer.metadata = about.metadata_for(role, "")
             self._viewer.layers.append(layer)
         self._viewer.layers.selection.active = self.polygon
         self.polygon.mode = "direct"
@@ -291,7 +270,7 @@ _PLOT_HEIGHT_PX = 260
 _BRUSH_PX = 10
 
 
-class SpectrumPlot(Plot):
+class SpectrumPlot(qt.Plot):
     """Mean fluence against energy."""
 
     def __init__(self) -> None:
@@ -313,7 +292,7 @@ class SpectrumPlot(Plot):
             spectrum.fluence,
             spectrum.error,
             fmt="o-",
-            color=COLOURS[0],
+            color=qt.COLOURS[0],
             markersize=4,
             capsize=2,
         )
@@ -332,12 +311,12 @@ class SpectrumPlot(Plot):
         self.draw()
 
 
-class FilmPack(ToolPanel):
+class FilmPack(panels.ToolPanel):
     """Choose a pack file, then press Run; correct corners and masks, and run again."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         tip = "Compute dose and fluence of each film of the pack."
-        super().__init__(viewer, "film-pack", RunPanel("Film pack", "Run", tip))
+        super().__init__(viewer, "film-pack", panels.RunPanel("Film pack", "Run", tip))
         resources = ExitStack()
         self._scratch = resources.enter_context(temporary_folder("film-pack"))
         qt.when_destroyed(self, resources.close)
@@ -349,25 +328,25 @@ class FilmPack(ToolPanel):
         self._ready = True
 
     def _build(self) -> None:
-        self.path = PathEdit(
+        self.path = forms.PathEdit(
             "Pack file",
             "pack.toml",
             "TOML file with films, filters, scans and calibrations, as for the command "
             "<code>shadowinv film</code>.",
         )
-        self.report = ReportTable()
+        self.report = panels.ReportTable()
         self.packs = LayerPicker(
             self.viewer,
             ("image",),
             "<qt>Fluence of a pack, from a run or from a .shadowinv file.</qt>",
-            suits=lambda layer: role_of(layer) == packs.FLUENCE,
+            suits=lambda layer: about.role_of(layer) == packs.FLUENCE,
         )
         self.regions = LayerPicker(
             self.viewer,
             ("shapes", "labels"),
             "<qt>Shapes or labels. The spectrum is the mean over the usable pixels inside.</qt>",
             "whole film",
-            may_be_mask,
+            about.may_be_mask,
         )
         self.plot = SpectrumPlot()
         self.plot.setToolTip(
@@ -376,47 +355,47 @@ class FilmPack(ToolPanel):
             "Hatched layers are not a measurement: they have no usable pixels or a fluence below "
             "twice its error, or are the last layer, which also records all protons beyond it.</qt>"
         )
-        self.show_corners = push_button(
+        self.show_corners = qt.push_button(
             "Show corners",
             "Show the scan of the displayed film, with corners to drag.",
             self._show_corners,
         )
-        self.paint = push_button(
+        self.paint = qt.push_button(
             "Paint mask", "Paint pixels of the displayed film to exclude them.", self._paint
         )
-        self.run_again = push_button(
+        self.run_again = qt.push_button(
             "Run again",
             "Evaluate the pack again with the dragged corners and without the painted pixels.",
             self._run_again,
         )
-        self.to_fit = push_button(
+        self.to_fit = qt.push_button(
             "Layers for a fit",
             "Add each film as an image with energy, setup and mask, for Invert shot and Fit "
             "several images.",
             self._add_fit_images,
         )
-        self.write = push_button(
+        self.write = qt.push_button(
             "Write layers…",
             "Save each film as an image, with a table of all films.",
             self._write_layers,
         )
-        self.save = push_button("Save…", "Save the result as a .shadowinv file.", self._save)
+        self.save = qt.push_button("Save…", "Save the result as a .shadowinv file.", self._save)
         self.actions = QtWidgets.QWidget()
         region = qt.with_button(self.regions, "✎", "Draw a region.", self._draw_region)
         column = qt.column(
             self.actions,
-            labelled("Result", self.packs),
+            forms.labelled("Result", self.packs),
             self.report,
-            labelled("Region", region),
+            forms.labelled("Region", region),
             self.plot,
             qt.side_by_side((self.show_corners, 1), (self.paint, 1), (self.run_again, 1)),
             qt.side_by_side((self.to_fit, 1), (self.write, 1), (self.save, 1)),
         )
         column.setAlignment(Qt.AlignmentFlag.AlignTop)
         tip = "Create a pack file from a folder of scans."
-        self.new = push_button("New pack…", tip, self._new_pack)
+        self.new = qt.push_button("New pack…", tip, self._new_pack)
         pack_row = qt.side_by_side((self.path, 1), (self.new, 0))
-        self.add(labelled("Pack", pack_row), self.keep_earlier, self.panel, self.actions)
+        self.add(forms.labelled("Pack", pack_row), self.keep_earlier, self.panel, self.actions)
         self.corners = CornerEditor(self.viewer, self)
 
     def _connect(self) -> None:
@@ -453,7 +432,7 @@ class FilmPack(ToolPanel):
     def _corrected_job(self) -> PackJob:
         """Return the job for the selected pack with the user's corrections."""
         layer, doses = self._selected()
-        metadata = metadata_of(layer)
+        metadata = about.metadata_of(layer)
         labels = self._partner(layer, packs.UNUSABLE)
         by_hand = None if labels is None else packs.painted_by_hand(labels.data, doses)
         return PackJob(
@@ -484,7 +463,7 @@ class FilmPack(ToolPanel):
 
     def _on_layers(self, results: ResultLayers, is_first: bool) -> None:
         for layer in results.layers:
-            if role_of(layer) == packs.FLUENCE:
+            if about.role_of(layer) == packs.FLUENCE:
                 self.packs.layer = layer
         if is_first:
             self.viewer.reset_view()
@@ -494,7 +473,7 @@ class FilmPack(ToolPanel):
 
     def _selected(self) -> tuple[Any, FilmDoses]:
         layer = self.packs.layer
-        result = None if layer is None else result_of(layer)
+        result = None if layer is None else about.result_of(layer)
         if result is None:
             raise InputError(
                 "there is no result of a film pack: press Run first, or open a .shadowinv file"
@@ -504,16 +483,18 @@ class FilmPack(ToolPanel):
 
     def _partner(self, layer: Any, role: str) -> Any | None:
         """Return the layer of the same result with a role, or None."""
-        result = result_of(layer)
-        partners = (partner for partner in self.viewer.layers if result_of(partner) is result)
-        return next((partner for partner in partners if role_of(partner) == role), None)
+        result = about.result_of(layer)
+        partners = (partner for partner in self.viewer.layers if about.result_of(partner) is result)
+        return next((partner for partner in partners if about.role_of(partner) == role), None)
 
     def _on_pack(self) -> None:
         has_result = self.packs.layer is not None
         self.actions.setVisible(has_result)
         if has_result:
             _, doses = self._selected()
-            self.report.show_rows([*fact_rows(doses.facts), *warning_rows(doses.facts)])
+            self.report.show_rows(
+                [*panels.fact_rows(doses.facts), *panels.warning_rows(doses.facts)]
+            )
         self.update_plot()
 
     def _schedule_plot(self) -> None:
@@ -571,7 +552,7 @@ class FilmPack(ToolPanel):
             partner = self._partner(layer, role)
             if partner is not None:
                 partner.visible = False
-        layer_data = packs.film_layers(doses, frame_of(layer), layer.name)
+        layer_data = packs.film_layers(doses, about.frame_of(layer), layer.name)
         self.fit_images = ResultLayers(self.viewer, self)
         self.fit_images.show(layer_data, select=False)
 
@@ -594,11 +575,11 @@ class FilmPack(ToolPanel):
             return
         has_suffix = name.lower().endswith(RESULT.suffix)
         path = Path(name if has_suffix else name + RESULT.suffix)
-        result = result_of(layer)
+        result = about.result_of(layer)
         assert result is not None
         doses = packs.copy_edits(doses, self._scratch, path)
-        saved = Result(doses, result.setup, result.attributes)
-        layers = [each for each in self.viewer.layers if result_of(each) is result]
+        saved = about.Result(doses, result.setup, result.attributes)
+        layers = [each for each in self.viewer.layers if about.result_of(each) is result]
         layer_data = [each.as_layer_data_tuple() for each in layers]
         show_info(
             f"Wrote {write(path, dataset_of_layers(layer_data, saved), overwrite=has_suffix)}"

@@ -11,23 +11,10 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import PACE, Finished, FitJob, estimate_fit_time
 from napari_shadowinv._napari.shots import radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
+from napari_shadowinv._napari.widgets import _inputs as inputs
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._files import FitRecipeButton, result_buttons
 from napari_shadowinv._napari.widgets._fitting import FitView
-from napari_shadowinv._napari.widgets._forms import StepsSection
-from napari_shadowinv._napari.widgets._inputs import (
-    BOTH,
-    FIT_SOURCES,
-    NOISES,
-    UNKNOWN,
-    ChoiceBox,
-    InstrumentForm,
-    OptionsForm,
-    SetupPicker,
-    SourcePicker,
-    field_key,
-    fields_of,
-)
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._qt import side_by_side, while_alive
 from napari_shadowinv._napari.widgets._results import Origins, result_frame
@@ -76,9 +63,9 @@ class FitImages(ToolPanel):
         self._ready = True
 
     def _build(self) -> None:
-        self.source = SourcePicker(
+        self.source = inputs.SourcePicker(
             self.viewer,
-            FIT_SOURCES,
+            inputs.FIT_SOURCES,
             "The beam without the object. An unknown beam is fitted as a smooth beam, the same in "
             "all images except for its brightness.",
         )
@@ -86,7 +73,7 @@ class FitImages(ToolPanel):
             self.viewer,
             lambda layer: about.may_be_shot(layer) and layer is not self.source.layer,
         )
-        self.fields = ChoiceBox(
+        self.fields = inputs.ChoiceBox(
             {}, "Field that deflects the beam. Two fields require images at two energies."
         )
         self.masks = layers.MaskPicker(
@@ -96,21 +83,23 @@ class FitImages(ToolPanel):
             "Labels or shapes on bad detector pixels, for all images. The fit ignores masked "
             "pixels.",
         )
-        self.brightness = ChoiceBox(
+        self.brightness = inputs.ChoiceBox(
             {"known": "known (in the table)", "free": "unknown (fit it)"},
             "Brightness of each image relative to the source: known, or fitted. With an unknown "
             "source, it is always fitted.",
         )
-        self.noise = ChoiceBox(
-            NOISES,
+        self.noise = inputs.ChoiceBox(
+            inputs.NOISES,
             "Noise model for χ² and error bars. Poisson counts: the images are numbers of "
             "particles or photons.",
         )
-        self.setup = SetupPicker()
+        self.setup = inputs.SetupPicker()
         self.setup_section = forms.titled_section(self.setup)
-        self.steps = StepsSection(FIT_STEPS)
-        self.instrument = InstrumentForm()
-        self.options = OptionsForm(FitOptions, {"smoothness": 1.0, "margin": 16, "threads": 1})
+        self.steps = forms.StepsSection(FIT_STEPS)
+        self.instrument = inputs.InstrumentForm()
+        self.options = inputs.OptionsForm(
+            FitOptions, {"smoothness": 1.0, "margin": 16, "threads": 1}
+        )
         self.recipes = FitRecipeButton(self)
         self.cost = forms.WrappingLabel()
         self.view = FitView(self.viewer, self.panel)
@@ -172,8 +161,8 @@ class FitImages(ToolPanel):
 
     def recipe(self) -> Recipe:
         """Return the recipe of the controls, without table and layers; or raise an `InputError`."""
-        fields = tuple(self.fields.state().split(BOTH))
-        beam = "unknown" if self.source.kind == UNKNOWN else "known"
+        fields = tuple(self.fields.state().split(inputs.BOTH))
+        beam = "unknown" if self.source.kind == inputs.UNKNOWN else "known"
         choices = FitChoices(
             fields=fields,
             beam=beam,
@@ -204,14 +193,14 @@ class FitImages(ToolPanel):
     def check_choices(self, choices: FitChoices, setup: Setup | None, path: Path) -> None:
         """Refuse choices that do not match a setup, or else the shown setup."""
         fields = choices.fields
-        available = fields_of(self.setup.picker.kind if setup is None else setup.kind)
+        available = inputs.fields_of(self.setup.picker.kind if setup is None else setup.kind)
         in_metres = choices.source_size is not None or choices.resolution is not None
         if in_metres and setup is None and self.setup.complete_setup() is None:
             raise InputError(
                 f"{path} gives source size or resolution in m, which require a setup: select the "
                 "setup first, or give the point spread in px"
             )
-        if fields is not None and field_key(fields) not in available:
+        if fields is not None and inputs.field_key(fields) not in available:
             raise InputError(
                 f"{path} fits the fields {', '.join(fields)}: with this setup expected one of "
                 f"{', '.join(available)}; select another kind of setup first"
@@ -220,10 +209,12 @@ class FitImages(ToolPanel):
     def show_choices(self, choices: FitChoices) -> None:
         """Show the choices of a recipe."""
         if choices.fields is not None:
-            self.fields.restore(field_key(choices.fields))
+            self.fields.restore(inputs.field_key(choices.fields))
         self.brightness.restore(choices.brightness)
         noise = "" if choices.noise is None else str(choices.noise)
-        self.noise.offer(NOISES | {noise: NOISES.get(noise, f"σ = {noise} in each pixel")})
+        self.noise.offer(
+            inputs.NOISES | {noise: inputs.NOISES.get(noise, f"σ = {noise} in each pixel")}
+        )
         self.noise.restore(noise)
         self.options.set_values(choices.options.model_dump())
         for row in self.images.used:
@@ -308,8 +299,8 @@ class FitImages(ToolPanel):
         except InputError:
             self.cost.setVisible(False)  # Run reports the problem
             return
-        source = UNKNOWN if self.source.kind == UNKNOWN else None
-        fields = len(self.fields.state().split(BOTH))
+        source = inputs.UNKNOWN if self.source.kind == inputs.UNKNOWN else None
+        fields = len(self.fields.state().split(inputs.BOTH))
         estimate = estimate_fit_time(shape, len(rows), fields, source, options)  # type: ignore[arg-type]
         self.cost.show_text(estimate.text(PACE))
 
@@ -393,7 +384,7 @@ class FitImages(ToolPanel):
             self.setup.show_setup({**form.values(), self.images.beam.name: value})
 
     def _on_setup(self) -> None:
-        self.fields.offer(fields_of(self.setup.picker.kind))
+        self.fields.offer(inputs.fields_of(self.setup.picker.kind))
         setup = self.setup.complete_setup()
         summary = "none" if setup is None else f"{setup.probe}, {self.setup.origin}"
         self.setup_section.setText(f"Setup: {summary}")

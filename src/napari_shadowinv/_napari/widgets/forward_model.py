@@ -12,7 +12,6 @@ from qtpy.QtWidgets import QLabel, QSpinBox
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
-from napari_shadowinv._napari.layer_metadata import Frame, frame_for, frame_of
 from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.viewer_sync import error_text
@@ -80,7 +79,7 @@ class ForwardJob(Job):
     source: ArrayLike | None = None  # None for a uniform beam
     caustic_jacobian: float = InversionOptions.model_fields["caustic_jacobian"].default
     name: str = ""  # of the image
-    frame: Frame = Frame()  # noqa: RUF009
+    frame: about.Frame = about.Frame()  # noqa: RUF009
     unit: str = ""  # of the source
     setup_origin: str = ""
     subject: Any = None  # the layer of the field, or the name of an object
@@ -117,7 +116,7 @@ class ForwardJob(Job):
         # In another experiment the object may have other pixels.
         frame = self.frame
         if self.field_setup is not None and self.field_setup != self.setup:
-            frame = frame_for(content.image.shape, self.setup)
+            frame = about.frame_for(content.image.shape, self.setup)
         layer = shot_layer(
             content.image,
             self.name,
@@ -319,7 +318,7 @@ class ForwardModel(ObjectPanel):
                 field_setup=field.field_setup,
                 deflector=self.deflector.currentData(),
                 name=f"{about.metadata_of(layer).get('name') or layer.name} image",
-                frame=frame_of(layer),
+                frame=about.frame_of(layer),
                 subject=layer,
                 **common,
             )
@@ -332,7 +331,7 @@ class ForwardModel(ObjectPanel):
             shape=shape,
             setup=setup,
             name=f"{simulated.title} image",
-            frame=frame_for(shape, setup),
+            frame=about.frame_for(shape, setup),
             subject=simulated.title,
             **common,
         )

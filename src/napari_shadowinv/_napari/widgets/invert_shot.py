@@ -6,60 +6,18 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from napari_shadowinv._napari.jobs import (
-    Finished,
-    FitJob,
-    InversionJob,
-    Job,
-    duration_in_words,
-    name_of_result,
-    refinement,
-)
-from napari_shadowinv._napari.layer_metadata import (
-    SOURCE,
-    Result,
-    frame_of,
-    metadata_for,
-    result_of,
-    setup_of,
-    setup_origin_of,
-)
+from napari_shadowinv._napari import jobs
+from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.shots import load_radiograph, radiograph_of
 from napari_shadowinv._napari.viewer_sync import show_caution
+from napari_shadowinv._napari.widgets import _forms as forms
+from napari_shadowinv._napari.widgets import _layers as layers
+from napari_shadowinv._napari.widgets import _panels as panels
+from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._files import field_of, result_buttons
 from napari_shadowinv._napari.widgets._fitting import FitView, RefineSection
-from napari_shadowinv._napari.widgets._forms import (
-    PROBLEM_STYLE,
-    ModelPicker,
-    WrappingLabel,
-    kinds_of,
-    labelled,
-)
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
-from napari_shadowinv._napari.widgets._layers import (
-    LayerPicker,
-    LayerWatch,
-    MaskPicker,
-    ShotPicker,
-    image_of,
-    new_shapes,
-    warnings_of,
-)
-from napari_shadowinv._napari.widgets._panels import (
-    FoldedReport,
-    LivePanel,
-    RunPanel,
-    VerdictLine,
-    fact_rows,
-    warning_rows,
-)
-from napari_shadowinv._napari.widgets._qt import (
-    notify_errors,
-    side_by_side,
-    while_alive,
-    with_button,
-)
 from napari_shadowinv._napari.widgets._results import place_inputs, result_frame
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
@@ -104,7 +62,7 @@ class CostEstimate:
             return ""
         text = (
             f"{self.pixels / 1e6:.3g} Mpx with {self.sites:,} sites: about "
-            f"{duration_in_words(self.seconds)} and up to {self.memory / 1e9:.1f} GB"
+            f"{jobs.duration_in_words(self.seconds)} and up to {self.memory / 1e9:.1f} GB"
         )
         if not self.exceeds_memory:
             return f"{text}."
@@ -128,11 +86,13 @@ def estimate_cost(
     )
 
 
-class InvertShot(InversionInputs, LivePanel):
+class InvertShot(InversionInputs, panels.LivePanel):
     """Choose an image, then press Run; everything else has a default."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        panel = RunPanel("Invert shot", "Run", "Invert the image and show the result as layers.")
+        panel = panels.RunPanel(
+            "Invert shot", "Run", "Invert the image and show the result as layers."
+        )
         super().__init__(viewer, "invert-shot", panel)
         self._cache = Cache()
         self._build()
@@ -143,7 +103,7 @@ class InvertShot(InversionInputs, LivePanel):
         self._ready = True
 
     def _build(self) -> None:
-        self.image = ShotPicker(self.viewer)
+        self.image = layers.ShotPicker(self.viewer)
         self.make_inputs(
             lambda: self.image.layer,
             ("labels", "shapes"),
@@ -153,56 +113,56 @@ class InvertShot(InversionInputs, LivePanel):
             "inversion still uses these pixels.",
         )
         tip = "<qt>Shapes layer with a rectangle; only the image inside is inverted.</qt>"
-        self.crop = LayerPicker(self.viewer, ("shapes",), tip, none="none")
+        self.crop = layers.LayerPicker(self.viewer, ("shapes",), tip, none="none")
         self.live.setToolTip(
             f"<qt>Update the field after each change, with at most {PREVIEW_SITES:,} sites.</qt>"
         )
-        self.cost, self._pace = WrappingLabel(), 1.0
+        self.cost, self._pace = forms.WrappingLabel(), 1.0
         self.refine_section = RefineSection(self.refine)
         self.fit_view = FitView(self.viewer, self.panel)
-        self.verdict, self.report = VerdictLine(), FoldedReport()
-        self._reported: Result[Any] | None = None
+        self.verdict, self.report = panels.VerdictLine(), panels.FoldedReport()
+        self._reported: about.Result[Any] | None = None
         self.save_result, self.more_layers = result_buttons(
             self,
             lambda: self.fit_view.results if self.fit_view.results.layers else self.results,
             "Save the selected or last result: complete with its layers (.shadowinv), for other "
             "programs (.h5), or its sites (.csv).",
         )
-        crop = with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
-        self.add(labelled("Image", self.image), *self.beam, labelled("Crop", crop))
+        crop = qt.with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
+        self.add(forms.labelled("Image", self.image), *self.beam, forms.labelled("Crop", crop))
         self.add(*self.settings, self.live, self.keep_earlier, self.cost, self.panel)
-        self.add(self.verdict, side_by_side((self.save_result, 1), (self.more_layers, 1)))
+        self.add(self.verdict, qt.side_by_side((self.save_result, 1), (self.more_layers, 1)))
         self.add(self.report, self.refine_section, self.fit_view)
 
     def _connect(self) -> None:
         self.image.picked.connect(self._on_image)
-        edits = LayerWatch(
+        edits = layers.LayerWatch(
             self, (self.image, self.masks, self.source_masks, self.crop, self.source.layers)
         )
-        LayerWatch(self, (self.image,)).edited.connect(self._forget_report)
+        layers.LayerWatch(self, (self.image,)).edited.connect(self._forget_report)
         # Also for runs that are cancelled, or refused before they start.
         self.panel.button.clicked.connect(self._empty_report)
         self.panel.runner.started.connect(self._on_start)
-        while_alive(self, self.viewer.layers.selection, "active", self._follow_result)
+        qt.while_alive(self, self.viewer.layers.selection, "active", self._follow_result)
         changes = [control.changed for control in self.parts().values()]
         for signal in (*changes, self.crop.picked, edits.edited):
             signal.connect(self.on_change)
 
-    def request(self, preview: bool = False) -> InversionJob:
+    def request(self, preview: bool = False) -> jobs.InversionJob:
         layer: Any = self.image.layer
-        image = image_of(layer)
+        image = layers.image_of(layer)
         recipe = self.recipe()
         mask = self.masks.usable(layer)
         self.source.check(mask)
         shot = replace(
             radiograph_of(layer, image),
-            warnings=warnings_of(layer),
+            warnings=layers.warnings_of(layer),
             mask=mask,
             source_mask=self.hidden_from_source(layer),
         )
         source = self.source.measured(layer)
-        return InversionJob(
-            name=", ".join(filter(None, (name_of_result(layer), self.source.short_name))),
+        return jobs.InversionJob(
+            name=", ".join(filter(None, (jobs.name_of_result(layer), self.source.short_name))),
             frame=result_frame(layer, recipe),
             shot=shot,
             source=source,
@@ -211,7 +171,7 @@ class InvertShot(InversionInputs, LivePanel):
             **self.job_inputs(layer, layer.name, recipe, self.crop.layer),
         )
 
-    @notify_errors
+    @qt.notify_errors
     def refine(self, psf: float) -> None:
         """Fit the forward model to the last inversion's image, starting from its field."""
         if self.panel.runner.running and not self._running_preview:
@@ -222,15 +182,15 @@ class InvertShot(InversionInputs, LivePanel):
             raise InputError(
                 "there is no inversion of this image to refine: press Run first, then Refine"
             )
-        self.start(refinement(fields[0], image, str(image.name), psf))
+        self.start(jobs.refinement(fields[0], image, str(image.name), psf))
 
-    @notify_errors
+    @qt.notify_errors
     def refine_layer(self, layer: Any) -> None:
         """Refine the inversion that a layer belongs to, such as a result from a file."""
         self.refine_section.folded.expand()
         image = self._last.shot_of(layer)
-        name = name_of_result(layer) if image is None else str(image.name)
-        job = refinement(
+        name = jobs.name_of_result(layer) if image is None else str(image.name)
+        job = jobs.refinement(
             layer, layer if image is None else image, name, self.refine_section.psf.value()
         )
         if self.panel.runner.running and not self._running_preview:
@@ -239,8 +199,8 @@ class InvertShot(InversionInputs, LivePanel):
             )
         self.start(job)
 
-    def show_result(self, finished: Finished, job: InversionJob | FitJob) -> None:
-        if isinstance(job, InversionJob):
+    def show_result(self, finished: jobs.Finished, job: jobs.InversionJob | jobs.FitJob) -> None:
+        if isinstance(job, jobs.InversionJob):
             self._show_inversion(finished, job)
             return
         self.previewed.hide()
@@ -263,7 +223,7 @@ class InvertShot(InversionInputs, LivePanel):
             self._empty_report()
             return
         layer = self.viewer.layers.selection.active
-        result = None if layer is None else result_of(layer)
+        result = None if layer is None else about.result_of(layer)
         if result is None or result is self._reported or self.panel.runner.running:
             return
         if isinstance(result.content, Inversion):
@@ -277,10 +237,10 @@ class InvertShot(InversionInputs, LivePanel):
     ) -> None:
         self.verdict.show_headline(inversion.headline_in(setup))
         facts = inversion.facts_in(setup)
-        rows = [*warning_rows(facts), *input_rows, *fact_rows(facts)]
-        self.report.show_rows(rows, fact_rows(facts, details=True))
+        rows = [*panels.warning_rows(facts), *input_rows, *panels.fact_rows(facts)]
+        self.report.show_rows(rows, panels.fact_rows(facts, details=True))
 
-    def _show_inversion(self, finished: Finished, job: InversionJob) -> None:
+    def _show_inversion(self, finished: jobs.Finished, job: jobs.InversionJob) -> None:
         inversion = finished.content
         headline = inversion.headline
         moved = place_inputs(self.viewer, job, quiet=job.preview)
@@ -307,12 +267,12 @@ class InvertShot(InversionInputs, LivePanel):
         """Show the estimated time and memory for large images."""
         try:
             recipe = Recipe(steps=self.all_steps())
-            shape = recipe.shape_after(image_of(self.image.layer).shape)
+            shape = recipe.shape_after(layers.image_of(self.image.layer).shape)
             cost = estimate_cost(shape, self.options.model(), self._pace)  # type: ignore[arg-type]
         except InputError:
             self.cost.setVisible(False)  # Run reports the problem
             return
-        self.cost.show_text(cost.text, PROBLEM_STYLE if cost.exceeds_memory else "")
+        self.cost.show_text(cost.text, forms.PROBLEM_STYLE if cost.exceeds_memory else "")
 
     def _learn_pace(self, inversion: Inversion) -> None:
         seconds = inversion.report.seconds
@@ -340,14 +300,14 @@ class InvertShot(InversionInputs, LivePanel):
         if not self.panel.runner.running:
             self.panel.say("")
 
-    @notify_errors
+    @qt.notify_errors
     def _draw_crop(self) -> None:
-        image_of(self.image.layer)
-        self.crop.layer = new_shapes(self.viewer, self.image.layer, "crop", "add_rectangle")
+        layers.image_of(self.image.layer)
+        self.crop.layer = layers.new_shapes(self.viewer, self.image.layer, "crop", "add_rectangle")
 
 
 @dataclass(frozen=True, eq=False)
-class SourceJob(Job):
+class SourceJob(jobs.Job):
     estimate: Estimate
     shot: Radiograph  # its image may be lazy
     image: Any
@@ -367,11 +327,11 @@ class SourceJob(Job):
     def layers(self, content: FloatArray) -> list[FullLayerData]:
         """Describe the source as a layer over its image."""
         layer: Any = self.image
-        metadata = metadata_for(
-            SOURCE,
+        metadata = about.metadata_for(
+            about.SOURCE,
             "",
-            setup_of(layer),
-            setup_origin=setup_origin_of(layer),
+            about.setup_of(layer),
+            setup_origin=about.setup_origin_of(layer),
             made_from=self.made_from,
             source_mask=self.shot.source_mask,
         )
@@ -380,26 +340,28 @@ class SourceJob(Job):
             "metadata": metadata,
             "colormap": layer.colormap.name,
             "contrast_limits": tuple(layer.contrast_limits),
-            **frame_of(layer).keywords(),
+            **about.frame_of(layer).keywords(),
         }
         return [(content, keywords, "image")]
 
 
-class EstimateSource(LivePanel):
+class EstimateSource(panels.LivePanel):
     """Choose a shot and a method, and add the estimated source as an image layer."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         tip = "Estimate the beam and add it as an image layer."
-        super().__init__(viewer, "estimate-source", RunPanel("Estimate source", "Estimate", tip))
-        self.image = ShotPicker(viewer)
+        super().__init__(
+            viewer, "estimate-source", panels.RunPanel("Estimate source", "Estimate", tip)
+        )
+        self.image = layers.ShotPicker(viewer)
         tip = "Labels or shapes on pixels that the estimate ignores."
-        self.masks = MaskPicker(viewer, lambda: self.image.layer, ("labels", "shapes"), tip)
-        self.method = ModelPicker("Method", kinds_of(ESTIMATES))
+        self.masks = layers.MaskPicker(viewer, lambda: self.image.layer, ("labels", "shapes"), tip)
+        self.method = forms.ModelPicker("Method", forms.kinds_of(ESTIMATES))
         self.method.set_kind("total-variation")
         self.live.setToolTip("Update the estimate after each change.")
-        self.add(labelled("Image", self.image), self.masks, self.method)
+        self.add(forms.labelled("Image", self.image), self.masks, self.method)
         self.add(self.live, self.keep_earlier, self.panel)
-        edits = LayerWatch(self, (self.image, self.masks))
+        edits = layers.LayerWatch(self, (self.image, self.masks))
         for signal in (self.image.picked, self.masks.changed, self.method.changed, edits.edited):
             signal.connect(self.on_change)
         self.restore_last()
@@ -410,14 +372,14 @@ class EstimateSource(LivePanel):
 
     def request(self, preview: bool = False) -> SourceJob:
         layer: Any = self.image.layer
-        image = image_of(layer)
+        image = layers.image_of(layer)
         mask = self.masks.usable(layer)
         model: Any = self.method.model()
-        estimate = model.adapt_to(setup_of(layer), image.shape)
+        estimate = model.adapt_to(about.setup_of(layer), image.shape)
         made_from = {"image": layer.name, "estimate": estimate.summary}
         if mask is not None:
             made_from["source_mask"] = self.masks.summary(layer)
         return SourceJob(estimate, Radiograph(image, source_mask=mask), layer, made_from, preview)
 
-    def show_result(self, finished: Finished, job: SourceJob) -> None:
+    def show_result(self, finished: jobs.Finished, job: SourceJob) -> None:
         self.show_layers(job.image, finished.layer_data, job.preview)

@@ -15,6 +15,7 @@ from qtpy.QtWidgets import QCheckBox, QFileDialog, QHeaderView, QLabel, QLineEdi
 
 from napari_shadowinv._napari.layer_metadata import main_layers, may_be_shot, role_of
 from napari_shadowinv._napari.stores import follow_shots, shot_rows
+from napari_shadowinv._napari.widgets import _stack_jobs as stack_jobs
 from napari_shadowinv._napari.widgets._files import result_buttons, shot_to_save
 from napari_shadowinv._napari.widgets._forms import ModelPicker, PathEdit, labelled
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
@@ -22,16 +23,6 @@ from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
 from napari_shadowinv._napari.widgets._panels import Outcome, ReportTable, RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, timer, while_alive
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
-from napari_shadowinv._napari.widgets._stack_jobs import (
-    FolderEdit,
-    StackJob,
-    WatchJob,
-    is_newest_in_view,
-    newest_shot,
-    placement_on,
-    shot_in_view,
-    show_shot,
-)
 from napari_shadowinv._napari.widgets._tables import ShotTable
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -97,7 +88,7 @@ class ShotsPicker(ModelPicker):
         tip = "A pattern such as shots/*.tif, files separated by ;, or a multi-page TIFF."
         self.files = _FilesEdit("Files of the shots", "shots/*.tif", tip)
         self.table = ShotTable()
-        self.folder = FolderEdit()
+        self.folder = stack_jobs.FolderEdit()
         super().__init__(
             "Shots",
             {
@@ -219,7 +210,7 @@ class InvertStack(InversionInputs, ToolPanel):
         # A cancelled run may take as long as it needs to finish writing to the store.
         panel = RunPanel("Invert stack", "Run", tip, patience=math.inf)
         super().__init__(viewer, "invert-stack", panel)
-        self._shown: StackJob | None = None
+        self._shown: stack_jobs.StackJob | None = None
         self._ended, self._resets_view = 0, False
         self._arrows: Any = None
         self._read_arrows: Callable[[], None] | None = None
@@ -278,7 +269,7 @@ class InvertStack(InversionInputs, ToolPanel):
         self.shots.set_kind(_FOLDER)
         self.shots.folder.folder.choose()
 
-    def request(self) -> StackJob:
+    def request(self) -> stack_jobs.StackJob:
         layer = self.shots.layer
         recipe = self.recipe()
         mask = self.masks.usable(layer)
@@ -288,7 +279,7 @@ class InvertStack(InversionInputs, ToolPanel):
             "source": self._source(layer),
             "mask": mask,
             "source_mask": self.hidden_from_source(layer),
-            "placement": {} if layer is None else placement_on(layer, recipe),
+            "placement": {} if layer is None else stack_jobs.placement_on(layer, recipe),
             **self.job_inputs(layer, self.shots.name, recipe),
         }
         choices: dict[str, Any] = {
@@ -298,11 +289,11 @@ class InvertStack(InversionInputs, ToolPanel):
         if self.shots.is_watched:
             folder = self.shots.folder
             watch = WatchOptions(pattern=folder.pattern.text().strip(), **choices)
-            return WatchJob(shots=folder.path, watch_options=watch, **common)
+            return stack_jobs.WatchJob(shots=folder.path, watch_options=watch, **common)
         scheduler, workers = self.engine.engine()
         options = RunOptions(workers=workers, **choices)
         shots = self.shots.shots()
-        return StackJob(shots=shots, run_options=options, scheduler=scheduler, **common)
+        return stack_jobs.StackJob(shots=shots, run_options=options, scheduler=scheduler, **common)
 
     def _source(self, layer: Any) -> ArrayLike | None:
         # A stack of sources has one for each shot.
@@ -318,7 +309,7 @@ class InvertStack(InversionInputs, ToolPanel):
         if progress.stage == "shots" or (progress.stage == "wait" and progress.step):
             self._show(self.panel.runner.tag)
 
-    def _show(self, job: StackJob) -> None:
+    def _show(self, job: stack_jobs.StackJob) -> None:
         # Once only: pressing Run again must not discard these shots.
         self.overwrite.setChecked(False)
         self.redo_failed.setChecked(False)
@@ -331,7 +322,7 @@ class InvertStack(InversionInputs, ToolPanel):
             self._refresh_timer.start()
         self._ended = status.ended
 
-    def _show_layers(self, job: StackJob) -> None:
+    def _show_layers(self, job: stack_jobs.StackJob) -> None:
         earlier, self._shown = self._shown, job
         is_resumed = earlier is not None and earlier.out == job.out
         setup = job.recipe.setup
@@ -351,8 +342,8 @@ class InvertStack(InversionInputs, ToolPanel):
         if self._resets_view:
             self._resets_view = False
             self.viewer.reset_view()
-            if isinstance(self._shown, WatchJob):
-                show_shot(self.viewer, newest_shot(self.results.layers))
+            if isinstance(self._shown, stack_jobs.WatchJob):
+                stack_jobs.show_shot(self.viewer, stack_jobs.newest_shot(self.results.layers))
         layers = self.results.layers
         arrows = next((layer for layer in layers if role_of(layer) == "arrows"), None)
         if arrows is not self._arrows:
@@ -361,7 +352,7 @@ class InvertStack(InversionInputs, ToolPanel):
         self._refresh_timer.start()
 
     def _refresh(self) -> None:
-        if isinstance(self._shown, WatchJob):
+        if isinstance(self._shown, stack_jobs.WatchJob):
             self._grow(self._shown)
         if self._shown is not None:
             self._shown.update_limits(self.results.layers)
@@ -370,15 +361,15 @@ class InvertStack(InversionInputs, ToolPanel):
         if self._read_arrows is not None:
             self._read_arrows()
 
-    def _grow(self, shown: WatchJob) -> None:
+    def _grow(self, shown: stack_jobs.WatchJob) -> None:
         """Add new shots to the layers; follow them only if the newest shot was in view."""
         if self.results.busy:
             self._refresh_timer.start()
             return
-        is_at_end = is_newest_in_view(self.viewer, self.results.layers)
+        is_at_end = stack_jobs.is_newest_in_view(self.viewer, self.results.layers)
         newest = shown.add_new_shots(self.results.layers)
         if is_at_end and newest is not None:
-            show_shot(self.viewer, newest)
+            stack_jobs.show_shot(self.viewer, newest)
 
     def forget(self) -> None:
         self._ended = 0
@@ -395,7 +386,7 @@ class InvertStack(InversionInputs, ToolPanel):
         if job is None or self.panel.runner.running:
             return
         rows = list(job.inputs)
-        shot = shot_in_view(self.viewer, self.results.layers)
+        shot = stack_jobs.shot_in_view(self.viewer, self.results.layers)
         with suppress(FileFormatError):  # a damaged shot
             rows += [] if shot is None else shot_rows(job.out, shot)
         self.report.show_rows(rows)
@@ -407,7 +398,7 @@ class InvertStack(InversionInputs, ToolPanel):
     @notify_errors
     def _on_end(self, outcome: Outcome) -> None:
         job = outcome.tag
-        if not isinstance(job, StackJob):  # but the repetition of a result
+        if not isinstance(job, stack_jobs.StackJob):  # but the repetition of a result
             return
         status = job.status
         if not status.total:
