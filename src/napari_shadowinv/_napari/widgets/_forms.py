@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal, get_args, get_origin
 
 import tomli_w
@@ -24,8 +23,8 @@ from napari_shadowinv.io import read_toml, replacing
 from napari_shadowinv.physics.beam import unit_in_title
 from napari_shadowinv.preprocessing import STEPS, Step
 
-# For each key a title, and the model's class, if any.
-Kinds = dict[str, tuple[str, type[BaseModel] | None]]
+# For each key a title, and the class of its form's model, a widget, or None.
+Kinds = dict[str, tuple[str, type[BaseModel] | QWidget | None]]
 
 PROBLEM_COLOUR = QColor("#d9822b")
 PROBLEM_STYLE = f"color: {PROBLEM_COLOUR.name()};"
@@ -240,19 +239,14 @@ def kinds_of(models: Mapping[str, Any]) -> Kinds:
 
 
 class ModelPicker(QtWidgets.QWidget):
-    """A choice between kinds, each with its form, with a control in a row below, or with none."""
+    """A choice between kinds, each with its form or widget below, or with none."""
 
     changed = Signal()
 
-    def __init__(
-        self,
-        label: str,
-        kinds: Kinds,
-        tip: str = "",
-        rows: Mapping[str, QtWidgets.QWidget] = MappingProxyType({}),
-    ) -> None:
+    def __init__(self, label: str, kinds: Kinds, tip: str = "") -> None:
         super().__init__()
-        self._kinds, self._rows = dict(kinds), dict(rows)
+        self._kinds = dict(kinds)
+        self._rows = {kind: row for kind, (_, row) in kinds.items() if isinstance(row, QWidget)}
         self._forms: dict[str, ModelForm] = {}
         self.choice = SteadyComboBox({key: title for key, (title, _) in kinds.items()}, tip)
         qt.column(self, labelled(label, self.choice), *self._rows.values())
@@ -282,12 +276,10 @@ class ModelPicker(QtWidgets.QWidget):
         return {"kind": self.kind, "values": values}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        values = state.get("values", {})
-        for kind, form_values in values.items() if isinstance(values, Mapping) else ():
-            if kind in self._kinds and isinstance(form_values, Mapping):
-                form = self._form_of(kind)
-                if form is not None:
-                    form.set_values(form_values)
+        for kind, values in state.get("values", {}).items():
+            form = self._form_of(kind) if kind in self._kinds else None
+            if form is not None:
+                form.set_values(values)
         self.set_kind(str(state.get("kind", self.kind)))
 
     def _on_choice(self) -> None:
@@ -298,7 +290,7 @@ class ModelPicker(QtWidgets.QWidget):
 
     def _form_of(self, kind: str) -> ModelForm | None:
         _, model_class = self._kinds[kind]
-        if model_class is not None and kind not in self._forms:
+        if isinstance(model_class, type) and kind not in self._forms:
             form = ModelForm(model_class)
             form.layout().setContentsMargins(INDENT, 0, 0, 0)
             form.setVisible(False)

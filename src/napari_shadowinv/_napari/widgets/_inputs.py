@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from pydantic import BaseModel
@@ -52,6 +51,8 @@ UNIFORM, LAYER, FILE, SUPPLIED, UNKNOWN = "uniform", "layer", "file", "own", "un
 SHOT_SOURCES = tuple(dict.fromkeys((UNIFORM, LAYER, FILE, SUPPLIED, *preprocessing.ESTIMATES)))
 FIT_SOURCES = (UNIFORM, LAYER, UNKNOWN)
 _SOURCE_TITLES = {
+    **{kind: f"estimate: {each.title}" for kind, each in preprocessing.ESTIMATES.items()},
+    UNIFORM: preprocessing.ESTIMATES[UNIFORM].title,
     LAYER: "a layer",
     FILE: "a file",
     SUPPLIED: "supplied with the shot",
@@ -122,8 +123,7 @@ class SetupPicker(QWidget):
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Restore the entered setups; select the last one only if the user prefers that."""
-        saved = state.get("own")
-        for kind, entry in saved.items() if isinstance(saved, Mapping) else ():
+        for kind, entry in state.get("own", {}).items():
             origin = str(entry["origin"]).removesuffix(_EARLIER) + _EARLIER
             self._entered[kind] = _Entry(dict(entry["values"]), origin)
         self._last = str(state.get("last", _NONE))
@@ -241,7 +241,6 @@ class SetupPicker(QWidget):
         return {} if setup is None else setup.model_dump()
 
     def load(self, entries: dict[str, Any], path: str) -> None:
-        """Show a setup from the entries of a file."""
         values = setup_from_dict(entries, path).model_dump()
         owner = self._typed_origin().removeprefix("typed")
         self.show_setup(values, f"loaded from {Path(path).name}{owner}")
@@ -262,12 +261,9 @@ class SourcePicker(forms.ModelPicker):
         )
         self.file = forms.PathEdit("Image of the undisturbed beam")
         rows = {LAYER: forms.labelled("", self.layers), FILE: forms.labelled("", self.file)}
-        super().__init__(
-            "Source",
-            {kind: _source_kind(kind) for kind in kinds},
-            tip,
-            {kind: row for kind, row in rows.items() if kind in kinds},
-        )
+        below = preprocessing.ESTIMATES | rows
+        described = {kind: (_SOURCE_TITLES[kind], below.get(kind)) for kind in kinds}
+        super().__init__("Source", described, tip)
         self.layers.picked.connect(self.changed)
         self.file.changed.connect(self.changed)
 
@@ -435,23 +431,11 @@ class SourcePicker(forms.ModelPicker):
         return sources[0] if len(sources) == 1 else None
 
 
-def _source_kind(kind: str) -> tuple[str, type[BaseModel] | None]:
-    """Return title and form of a kind of source."""
-    if kind in _SOURCE_TITLES:
-        return _SOURCE_TITLES[kind], None
-    title = preprocessing.ESTIMATES[kind].title
-    return title if kind == UNIFORM else f"estimate: {title}", preprocessing.ESTIMATES[kind]
-
-
 class OptionsForm(forms.ModelForm):
     """A form of options, with buttons to load and save them."""
 
-    def __init__(
-        self,
-        model_class: type[BaseModel] = InversionOptions,
-        initial: Mapping[str, Any] = MappingProxyType({"n_sites": PREVIEW_SITES}),
-    ) -> None:
-        super().__init__(model_class, initial=initial)
+    def __init__(self, model_class: type[BaseModel], initial: Mapping[str, Any]) -> None:
+        super().__init__(model_class, initial)
         self.files = forms.TomlButtons("options", self._to_save, self._load)
         self.layout().addWidget(self.files)
 
@@ -520,7 +504,7 @@ class InversionInputs:
         self.setup = SetupPicker()
         self.steps = forms.StepsSection()
         self.instrument = InstrumentForm()
-        self.options = OptionsForm()
+        self.options = OptionsForm(InversionOptions, {"n_sites": PREVIEW_SITES})
         self.recipes = RecipeButton(self)
         self.chosen_image = image
         self.beam = (self.source, self.source_masks, self.masks)
@@ -580,12 +564,12 @@ class InversionInputs:
         Its companions are masks, source and other layers that lie on the image, if chosen.
         """
         origins = Origins(
-            name,
             self.source.summary,
             self.masks.summary(image),
-            self.source_masks.summary(image) if self.source.is_estimated else "",
             self.setup.summary,
             self.setup.origin,
+            image=name,
+            source_mask=self.source_masks.summary(image) if self.source.is_estimated else "",
         )
         chosen = (self.masks.layer, self.source_masks.layer, *others, self.source.layers.layer)
         return {

@@ -211,12 +211,12 @@ class LastResults:
 class Origins:
     """Origins of the inputs of an inversion or fit, in words; empty without a mask or setup."""
 
-    image: str
     source: str
     mask: str
-    source_mask: str
     setup: str
     setup_origin: str
+    image: str = ""  # none for several images
+    source_mask: str = ""
     steps: str = ""  # of a fit
 
     def attributes(self) -> dict[str, str]:

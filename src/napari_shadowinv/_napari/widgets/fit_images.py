@@ -157,8 +157,6 @@ class FitImages(ToolPanel):
             "painted_is_unusable": self.masks,
         }
 
-    # A run
-
     def recipe(self) -> Recipe:
         """Return the recipe of the controls, without table and layers; or raise an `InputError`."""
         fields = tuple(self.fields.state().split(inputs.BOTH))
@@ -177,8 +175,6 @@ class FitImages(ToolPanel):
             instrument=self.instrument.model(),
             fit=choices,
         )
-
-    # Recipes
 
     def chosen_image(self) -> Any | None:
         """Return the layer of the reference, to which masks and source of a recipe belong."""
@@ -242,12 +238,10 @@ class FitImages(ToolPanel):
             f"{row.name}: {_beam_summary(shot)}" for row, shot in zip(rows, shots, strict=True)
         ]
         origins = Origins(
-            image="",  # the report has no row for several images
-            source=self.source.summary,
-            mask=self.masks.summary(first.layer),
-            source_mask="",
-            setup=self.setup.summary,
-            setup_origin=self.setup.origin,
+            self.source.summary,
+            self.masks.summary(first.layer),
+            self.setup.summary,
+            self.setup.origin,
             steps="; ".join(step.summary for step in recipe.steps),
         )
         used_layers = (*(row.layer for row in rows), self.masks.layer, self.source.layer)
@@ -291,7 +285,6 @@ class FitImages(ToolPanel):
         self._show_cost()
 
     def _show_cost(self) -> None:
-        """Show the estimated time."""
         try:
             rows = self._rows()
             shape = Recipe(steps=self.steps.steps()).shape_after(rows[0].data.shape)
@@ -339,8 +332,6 @@ class FitImages(ToolPanel):
     def _base_setup(self, row: ImageRow, setup: Setup) -> Setup:
         row_setup = row.setup if row.plane is None and row != self.images.reference else None
         return row_setup if row_setup is not None and row_setup.kind == setup.kind else setup
-
-    # Controls that depend on each other
 
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)

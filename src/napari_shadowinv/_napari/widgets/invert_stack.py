@@ -92,18 +92,12 @@ class ShotsPicker(ModelPicker):
         super().__init__(
             "Shots",
             {
-                _LAYER: ("a stack layer", None),
-                _FILES: ("files", None),
-                _TABLE: ("a table (.csv)", None),
-                _FOLDER: ("a watched folder", None),
+                _LAYER: ("a stack layer", labelled("", self.layers)),
+                _FILES: ("files", labelled("", self.files)),
+                _TABLE: ("a table (.csv)", self.table),
+                _FOLDER: ("a watched folder", self.folder),
             },
             "Where the shots come from.",
-            {
-                _LAYER: labelled("", self.layers),
-                _FILES: labelled("", self.files),
-                _TABLE: self.table,
-                _FOLDER: self.folder,
-            },
         )
         self.layers.picked.connect(self.changed)
         for control in (self.files, self.table, self.folder):
@@ -152,10 +146,12 @@ class EnginePicker(ModelPicker):
         self.address = QLineEdit(placeholderText="tcp://host:8786", toolTip=tip, minimumWidth=60)
         super().__init__(
             "Run on",
-            {_LOCAL: ("this computer", None), _SCHEDULER: ("a dask cluster", None)},
+            {
+                _LOCAL: ("this computer", labelled("Jobs", self.workers)),
+                _SCHEDULER: ("a dask cluster", labelled("Address", self.address)),
+            },
             "Where to run the inversions. The results are the same. Cluster workers need access to "
             "the shots and the store at the same paths.",
-            {_LOCAL: labelled("Jobs", self.workers), _SCHEDULER: labelled("Address", self.address)},
         )
         self.workers.valueChanged.connect(lambda _: self.changed.emit())
         self.address.editingFinished.connect(self.changed)
@@ -217,7 +213,12 @@ class InvertStack(InversionInputs, ToolPanel):
         self._refresh_timer = timer(self, _REFRESH_INTERVAL_MS, self._refresh, once=True)
         self._report_timer = timer(self, _REFRESH_INTERVAL_MS, self._show_report, once=True)
         self._build()
-        self._connect()
+        self.shots.changed.connect(self._on_layer)
+        self.setup.changed.connect(lambda: self.shots.table.show_kind(self.setup.picker.kind))
+        for part in self.parts().values():
+            part.changed.connect(self.keep)
+        self.panel.runner.progressed.connect(self._on_progress)
+        while_alive(self, self.viewer.dims, "current_step", self._on_step)
         self.restore_last()
         self._on_layer()
         self._ready = True
@@ -252,14 +253,6 @@ class InvertStack(InversionInputs, ToolPanel):
         self.add(labelled("", self.overwrite), labelled("", self.redo_failed), self.engine)
         self.add(self.panel, side_by_side((self.save_result, 1), (self.more_layers, 1)))
         self.add(self.report, self.failures_title, self.failures)
-
-    def _connect(self) -> None:
-        self.shots.changed.connect(self._on_layer)
-        self.setup.changed.connect(lambda: self.shots.table.show_kind(self.setup.picker.kind))
-        for part in self.parts().values():
-            part.changed.connect(self.keep)
-        self.panel.runner.progressed.connect(self._on_progress)
-        while_alive(self, self.viewer.dims, "current_step", self._on_step)
 
     def parts(self) -> dict[str, Any]:
         return {**super().parts(), "engine": self.engine}
@@ -302,8 +295,6 @@ class InvertStack(InversionInputs, ToolPanel):
             return stack_of(layer_of_source)
         beam = self.source.measured(layer)
         return None if beam is None else beam.image
-
-    # A run
 
     def _on_progress(self, progress: Progress) -> None:
         if progress.stage == "shots" or (progress.stage == "wait" and progress.step):
@@ -413,8 +404,6 @@ class InvertStack(InversionInputs, ToolPanel):
         else:
             self.panel.say(f"{status.text}, in {job.out.name}")
         self.panel.status.setToolTip(str(job.out.absolute()))
-
-    # Layers
 
     def _on_layer(self) -> None:
         layer = self.shots.layer
