@@ -229,7 +229,6 @@ class FitRecipeButton(RecipeButton):
 
     @notify_errors
     def load(self, path: Path) -> None:
-        """Show a recipe; change nothing unless all of it is usable."""
         tool, image = self._tool, self._tool.chosen_image()
         recipe = read_recipe(path)
         check_fit(recipe)
@@ -379,9 +378,8 @@ class SaveButton(QPushButton):
     """Asks for a file, saves the result of `savable`, and reports the path."""
 
     def __init__(self, tool: ToolPanel, savable: Callable[[], Savable], tip: str) -> None:
-        super().__init__("Save result…")
+        super().__init__("Save result…", toolTip=f"<qt>{tip}</qt>")
         self._tool, self._savable = tool, savable
-        self.setToolTip(f"<qt>{tip}</qt>")
         self.clicked.connect(lambda: self.ask_and_save())
 
     @notify_errors

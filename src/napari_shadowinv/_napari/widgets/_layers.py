@@ -323,9 +323,8 @@ class MaskPicker(QWidget):
         self._viewer, self._image, self.title = viewer, image, title
         self.layers = LayerPicker(viewer, kinds, f"<qt>{tip}</qt>", "none", about.may_be_mask)
         target, meaning = _PAINT[title]
-        self.painted_is_unusable = QCheckBox(f"painted = {target}")
-        self.painted_is_unusable.setChecked(True)
-        self.painted_is_unusable.setToolTip(f"<qt>{meaning}</qt>")
+        tip = f"<qt>{meaning}</qt>"
+        self.painted_is_unusable = QCheckBox(f"painted = {target}", checked=True, toolTip=tip)
         qt.column(
             self,
             labelled(

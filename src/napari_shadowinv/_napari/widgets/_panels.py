@@ -351,13 +351,11 @@ class ReportTable(QtWidgets.QTableWidget):
     """A table of names and values, as high as its rows."""
 
     def __init__(self) -> None:
-        super().__init__(0, 2)
+        super().__init__(0, 2, showGrid=False, wordWrap=True)
         self.horizontalHeader().setVisible(False)
         self.verticalHeader().setVisible(False)
         self.verticalHeader().setMinimumSectionSize(1)
         self.setEditTriggers(QtWidgets.QAbstractItemView.EditTrigger.NoEditTriggers)
-        self.setShowGrid(False)
-        self.setWordWrap(True)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.setSizePolicy(QtWidgets.QSizePolicy.Policy.Ignored, QtWidgets.QSizePolicy.Policy.Fixed)
@@ -473,13 +471,12 @@ class ToolPanel(qt.Docked):
         for row in rows:
             self.column.addWidget(row)
 
-    # State that is saved between sessions, as JSON values
-
     def parts(self) -> dict[str, Any]:
         """Return the controls with a saved state, by name; they have `state` and `restore`."""
         return {}
 
     def state(self) -> dict[str, Any]:
+        """Return the state that is saved between sessions, as JSON values."""
         return {name: part.state() for name, part in self.parts().items()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -499,8 +496,6 @@ class ToolPanel(qt.Docked):
         if self._ready:
             self._keeper.write()
         super().hideEvent(event)
-
-    # A run
 
     def request(self) -> Job:
         """Return the job of the controls, or raise an `InputError`."""

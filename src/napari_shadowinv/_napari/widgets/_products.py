@@ -184,11 +184,10 @@ class ProductForm(QtWidgets.QWidget):
         self.product.currentIndexChanged.connect(lambda _: self._enable())
         self._on_result()
         self._enable()
-        self._empty()
+        self._clear()
 
     @property
     def kind(self) -> type[Product]:
-        """Chosen kind of product."""
         return PRODUCTS[self.product.currentData()]
 
     def _enable(self) -> None:
@@ -319,15 +318,12 @@ class ProductForm(QtWidgets.QWidget):
             if variable.dims == PLANE:
                 add_layers(self.viewer, [map_layer(measured, name, request.layer)])
 
-    def _empty(self) -> None:
+    def _clear(self) -> None:
+        self.results, self._origin = [], None
         self.report.setVisible(False)
         self.plot.setVisible(False)
         for widget in (self.export, self.picture, self.save, self.clear):
             widget.setEnabled(False)
-
-    def _clear(self) -> None:
-        self.results, self._origin = [], None
-        self._empty()
 
     def show_problem(self, text: str) -> None:
         """Show a problem until the next measurement."""
@@ -375,7 +371,6 @@ class ProductForm(QtWidgets.QWidget):
 
 
 def _store_of(layer: Any) -> Path | None:
-    """Return the store of shots that a layer shows, or None."""
     store = about.metadata_of(layer).get("store")
     return None if store is None else Path(store)
 

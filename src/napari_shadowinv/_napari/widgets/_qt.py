@@ -79,9 +79,7 @@ def with_button(widget: QWidget, text: str, tip: str, action: Callable[[], Any])
 
 
 def small_button(text: str, tip: str, action: Callable[[], Any]) -> QToolButton:
-    button = QToolButton()
-    button.setText(text)
-    return _with_action(button, tip, action)
+    return _with_action(QToolButton(text=text), tip, action)
 
 
 def push_button(text: str, tip: str, action: Callable[[], Any]) -> QPushButton:
@@ -102,9 +100,7 @@ def may_replace(parent: QWidget, title: str, file: object) -> bool:
 
 def timer(parent: QObject, interval: int, action: Callable[[], Any], once: bool = False) -> QTimer:
     """Create a timer without starting it; `interval` in ms."""
-    qt_timer = QTimer(parent)
-    qt_timer.setSingleShot(once)
-    qt_timer.setInterval(interval)
+    qt_timer = QTimer(parent, singleShot=once, interval=interval)
     qt_timer.timeout.connect(action)
     return qt_timer
 

@@ -146,7 +146,6 @@ class StackJob(Job):
             self._include_shot(self.layer_data, index)
 
     def _include_shot(self, layer_data: Sequence[FullLayerData], index: int) -> None:
-        """Extend the limits to one more shot."""
         for data, keywords, kind in layer_data:
             if kind == "image":
                 role = str(role_of(keywords))

@@ -75,9 +75,7 @@ class Analyse(qt.Docked):
         self.profiles: list[Profile] = []
         tip = "<qt>Shapes layer with the line. Of several lines, the selected one is used.</qt>"
         self.lines = LayerPicker(viewer, ("shapes",), tip, "none yet")
-        self.layers = QtWidgets.QListWidget()
-        self.layers.setToolTip("Layers to plot.")
-        self.layers.setMaximumHeight(110)
+        self.layers = QtWidgets.QListWidget(toolTip="Layers to plot.", maximumHeight=110)
         self.layers.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         tip = "Width of the strip, perpendicular to the line, over which values are averaged."
         self.width_edit = QtWidgets.QDoubleSpinBox(maximum=_MAX_WIDTH, toolTip=f"<qt>{tip}</qt>")
@@ -96,21 +94,14 @@ class Analyse(qt.Docked):
         self.export = qt.push_button("Export CSV…", "Save the profile as a table.", self._export)
         lines = qt.with_button(self.lines, "✎", "Draw a new line.", self._draw)
         width = qt.side_by_side((self.width_edit, 2), (self.width_unit, 1))
-        rows = (
-            forms.labelled("Line", lines),
-            self.layers,
-            forms.labelled("Width", width),
-            self.hint,
-        )
+        controls = (forms.labelled("Line", lines), self.layers, forms.labelled("Width", width))
+        results = (self.hint, self.plot, self.measures, self.export, self.problem)
         page, self.products = QtWidgets.QWidget(), products.ProductForm(viewer)
         self.tabs = QtWidgets.QTabWidget()
         self.tabs.addTab(page, "Layers along a line")
         self.tabs.addTab(self.products, "Products of a result")
         qt.column(self, self.tabs)
-        layout = qt.column(page, *rows, margin=6)
-        layout.addWidget(self.plot, 1)
-        for widget in (self.measures, self.export, self.problem):
-            layout.addWidget(widget)
+        qt.column(page, *controls, *results, margin=6).setStretchFactor(self.plot, 1)
         self._connect()
         self._fill()
 
@@ -129,7 +120,6 @@ class Analyse(qt.Docked):
             signal.connect(lambda _: self._schedule_plot())
 
     def _items(self) -> list[tuple[Any, Any]]:
-        """Return the items of the list with their layers."""
         items = [self.layers.item(row) for row in range(self.layers.count())]
         return [(item, item.data(_LAYER_ROLE)) for item in items]
 

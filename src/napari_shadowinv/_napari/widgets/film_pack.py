@@ -323,7 +323,11 @@ class FilmPack(panels.ToolPanel):
         self._folders = count(1)
         self.fit_images = ResultLayers(viewer, self)
         self._build()
-        self._connect()
+        self._timer = qt.timer(self, _REDRAW_MS, self.update_plot, once=True)
+        edits = LayerWatch(self, (self.regions,))
+        for signal in (self.regions.picked, edits.edited):
+            signal.connect(self._schedule_plot)
+        self.packs.picked.connect(self._on_pack)
         self._on_pack()
         self._ready = True
 
@@ -398,15 +402,6 @@ class FilmPack(panels.ToolPanel):
         self.add(forms.labelled("Pack", pack_row), self.keep_earlier, self.panel, self.actions)
         self.corners = CornerEditor(self.viewer, self)
 
-    def _connect(self) -> None:
-        self._timer = qt.timer(self, _REDRAW_MS, self.update_plot, once=True)
-        edits = LayerWatch(self, (self.regions,))
-        for signal in (self.regions.picked, edits.edited):
-            signal.connect(self._schedule_plot)
-        self.packs.picked.connect(self._on_pack)
-
-    # A run
-
     def request(self) -> PackJob:
         path = self.path.path
         if not path:
@@ -468,8 +463,6 @@ class FilmPack(panels.ToolPanel):
         if is_first:
             self.viewer.reset_view()
         self._on_pack()
-
-    # The chosen result
 
     def _selected(self) -> tuple[Any, FilmDoses]:
         layer = self.packs.layer

@@ -111,7 +111,6 @@ class ForwardJob(Job):
         )
 
     def layers(self, content: Prediction) -> list[FullLayerData]:
-        """Describe the predicted image."""
         origin = f"{about.CAME_WITH} the forward model, {self.setup_origin}"
         # In another experiment the object may have other pixels.
         frame = self.frame

@@ -282,8 +282,6 @@ class InvertShot(InversionInputs, panels.LivePanel):
             self._pace = sum(seconds.values()) / estimated_s
             self._show_cost()
 
-    # Layers
-
     def _on_image(self) -> None:
         layer = self.image.layer
         self.source.follow(layer)
@@ -325,7 +323,6 @@ class SourceJob(jobs.Job):
         return source
 
     def layers(self, content: FloatArray) -> list[FullLayerData]:
-        """Describe the source as a layer over its image."""
         layer: Any = self.image
         metadata = about.metadata_for(
             about.SOURCE,
