@@ -48,13 +48,7 @@ from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.pipeline.inversion_run import picture_mask, plane_of
 from napari_shadowinv.pipeline.rerun import Rerun, collect_rerun
-from napari_shadowinv.preprocessing import (
-    Crop,
-    MeasuredSource,
-    Radiograph,
-    Recipe,
-    UniformEstimate,
-)
+from napari_shadowinv.preprocessing import Crop, MeasuredSource, Radiograph, Recipe, UniformEstimate
 
 if TYPE_CHECKING:
     from napari_shadowinv._napari.widgets._panels import ToolPanel

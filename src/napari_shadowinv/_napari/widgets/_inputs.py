@@ -177,7 +177,7 @@ class SetupPicker(QWidget):
         values = blank | {name: state.values for name, state in self._shown.items()}
         with QSignalBlocker(self.picker):
             self.picker.restore({"kind": kind, "values": values})
-        self._show_origin()
+        self._show_notes()
 
     def _on_edit(self) -> None:
         kind, before = self.picker.kind, self._state
@@ -191,7 +191,7 @@ class SetupPicker(QWidget):
                 origin = old_entry.origin.removesuffix(_CHANGED) + _CHANGED
             self._remember(kind, _Entry(values, origin))
         self._last = kind
-        self._show_origin()
+        self._show_notes()
         self._store_with_image()
         self.changed.emit()
 
@@ -216,17 +216,13 @@ class SetupPicker(QWidget):
         name = self._name if self._layer is None else self._layer.name
         return f"typed for '{name}'" if name else "typed"
 
-    def _show_origin(self) -> None:
-        """Show where the values come from, unless the form is empty."""
+    def _show_notes(self) -> None:
+        """Show where the values come from, field of view, magnification and warnings."""
         self._state = self.picker.state()
         form = self.picker.form
         is_filled = form is not None and not form.is_empty
         origin = f"{self.origin[:1].upper()}{self.origin[1:]}."
         self.note.show_text(origin if is_filled else "")
-        self._show_geometry()
-
-    def _show_geometry(self) -> None:
-        """Show field of view, magnification and warnings below the form."""
         setup = self.complete_setup()
         shape = None
         if self._layer is not None and not getattr(self._layer, "rgb", False):

@@ -43,9 +43,7 @@ class ObjectPanel(ToolPanel):
         self.object = forms.ModelPicker("Object", kinds)
         self.object.choice.setToolTip("Object that deflects the beam.")
         self.file = forms.PathEdit(
-            "Choose a 3-D field",
-            "openPMD or NetCDF file",
-            files="3-D fields (*.h5 *.hdf5 *.nc)",
+            "Choose a 3-D field", "openPMD or NetCDF file", files="3-D fields (*.h5 *.hdf5 *.nc)"
         )
         self.file.setToolTip(
             "<qt>openPMD file (HDF5), or NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez; particles "

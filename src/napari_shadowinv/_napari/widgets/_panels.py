@@ -19,11 +19,7 @@ from qtpy.QtCore import QObject, Qt, Signal
 from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import main_layers
 from napari_shadowinv._napari.preferences import use_preferred_threads
-from napari_shadowinv._napari.viewer_sync import (
-    USER_ERRORS,
-    error_text,
-    show_user_error,
-)
+from napari_shadowinv._napari.viewer_sync import USER_ERRORS, error_text, show_user_error
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers

@@ -147,10 +147,7 @@ class ProductForm(QtWidgets.QWidget):
             "all finished ones",
             "Shots of the store, such as 3:20 or 0,2,5. Empty: all finished ones.",
         )
-        self._store_rows = (
-            forms.labelled(_SHOTS, self.shots),
-            forms.labelled(_TIMES, self.times),
-        )
+        self._store_rows = (forms.labelled(_SHOTS, self.shots), forms.labelled(_TIMES, self.times))
         self.panel = RunPanel("analysis", "Measure", "Measure the product with its bands.")
         self.panel.button.clicked.connect(lambda: self._run_or_cancel())
         self.panel.runner.ended.connect(self._on_end)

@@ -70,8 +70,7 @@ class FitImages(ToolPanel):
             "all images except for its brightness.",
         )
         self.images = ImageTable(
-            self.viewer,
-            lambda layer: about.may_be_shot(layer) and layer is not self.source.layer,
+            self.viewer, lambda layer: about.may_be_shot(layer) and layer is not self.source.layer
         )
         self.fields = inputs.ChoiceBox(
             {}, "Field that deflects the beam. Two fields require images at two energies."

@@ -77,7 +77,6 @@ class ForwardJob(Job):
     field_setup: Setup | None = None  # of the field's measurement
     deflector: str | None = None
     source: ArrayLike | None = None  # None for a uniform beam
-    caustic_jacobian: float = InversionOptions.model_fields["caustic_jacobian"].default
     name: str = ""  # of the image
     frame: about.Frame = about.Frame()  # noqa: RUF009
     unit: str = ""  # of the source
@@ -102,7 +101,7 @@ class ForwardJob(Job):
             source, shadow = self._source(displacement.shape[1:])
             image = synthetic_image(displacement, source, **keywords)
             flux = image.size if source is None else source.sum()
-        caustic = jacobian_determinant(displacement) < self.caustic_jacobian
+        caustic = jacobian_determinant(displacement) < InversionOptions().caustic_jacobian
         if shadow is not None:
             caustic &= ~shadow
         flux_inside = float(image.sum() / flux) if flux else 1.0
