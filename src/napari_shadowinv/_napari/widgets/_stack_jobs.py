@@ -268,9 +268,12 @@ class WatchJob(StackJob):
         """Describe the longer layers from time to time, so that the shots need not wait."""
         if index is not None:
             self._new_shots.append(index)
+        is_behind = self.waiting > 1 and time.monotonic() <= self._updated_at + _UPDATE_INTERVAL_S
         if not self.layer_data:
-            self._begin(index)
-        elif index is not None and not self._is_due():
+            with suppress(InputError, OSError):
+                self._reference_shot = first_shot(self.out) if index is None else index
+                self._describe(self._reference_shot)
+        elif index is not None and is_behind:
             return
         else:
             self._longer_data = self._store_layers(self._reference_shot) or None
@@ -279,15 +282,6 @@ class WatchJob(StackJob):
             self._include_shot(current, number)
         self._new_shots.clear()
         self._updated_at = time.monotonic()
-
-    def _begin(self, index: int | None) -> None:
-        with suppress(InputError, OSError):
-            self._reference_shot = first_shot(self.out) if index is None else index
-            self._describe(self._reference_shot)
-
-    def _is_due(self) -> bool:
-        is_behind = self.waiting > 1
-        return not is_behind or time.monotonic() > self._updated_at + _UPDATE_INTERVAL_S
 
 
 def shot_in_view(viewer: Any, layers: Sequence[Any]) -> int | None:
