@@ -268,7 +268,11 @@ class Plot(QWidget):
         self.figure.set_facecolor(self.paper)
         axes = list(self.figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
         for axis in axes:
-            self._style_axis(axis)
+            axis.set_facecolor(self.paper)
+            axis.tick_params(colors=self.ink, which="both", labelsize=8)
+            for spine in axis.spines.values():
+                spine.set_color(self.ink)
+            axis.grid(color=self.ink, alpha=0.15)
         return axes
 
     def add_legend(self, holder: Any, size: int = 8, **keywords: Any) -> None:
@@ -300,13 +304,6 @@ class Plot(QWidget):
         except (KeyError, AttributeError, ValueError):
             palette = self.palette()
             return palette.windowText().color().name(), palette.window().color().name()
-
-    def _style_axis(self, axis: Any) -> None:
-        axis.set_facecolor(self.paper)
-        axis.tick_params(colors=self.ink, which="both", labelsize=8)
-        for spine in axis.spines.values():
-            spine.set_color(self.ink)
-        axis.grid(color=self.ink, alpha=0.15)
 
 
 class ObjectiveCurve(Plot):

@@ -151,10 +151,13 @@ class Analyse(qt.Docked):
         self.products.choose(layer)
 
     def update_plot(self) -> None:
-        vertices = self._vertices()
-        layers = self.checked()
+        shapes, layers = self.lines.layer, self.checked()
+        line = None
+        if shapes is not None:
+            line = products.selected_shape(shapes, lambda kind: kind in products.OPEN_SHAPES)
         self.profiles = []
-        if vertices is not None and layers:
+        if line is not None and layers:
+            vertices = products.world_corners(shapes, line)
             step = min(float(np.min(np.abs(layer.scale[-2:]))) for layer in layers)
             _, self._distance = sample_path(vertices, step)
             self._unit = f"{layers[0].units[-1]:~P}"
@@ -214,14 +217,6 @@ class Analyse(qt.Docked):
         if not self.profiles:
             raise InputError("there is no profile to export: draw a line and check a layer first")
         return table_text(self._distance, self._unit, self.profiles)
-
-    def _vertices(self) -> Any | None:
-        """Return the corners of the selected line in world coordinates."""
-        shapes = self.lines.layer
-        if shapes is None:
-            return None
-        line = products.selected_shape(shapes, lambda kind: kind in products.OPEN_SHAPES)
-        return None if line is None else products.world_corners(shapes, line)
 
     def _schedule_plot(self, _: Any = None) -> None:
         if not self._timer.isActive():
