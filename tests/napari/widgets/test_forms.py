@@ -134,7 +134,7 @@ def test_an_instrument_shows_its_defaults_in_grey(qtbot: Any) -> None:
 
 @pytest.mark.parametrize("values", ["stated", "all"])
 def test_an_instrument_is_shown_by_what_is_stated(qtbot: Any, values: str) -> None:
-    """Earlier versions saved all numbers."""
+    """A recipe contains all numbers."""
     form = InstrumentForm()
     qtbot.addWidget(form)
     instrument = Instrument.of("film", source="laser", gamma=0, noise_correlation=0)

@@ -22,7 +22,6 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.layers import add_inversion
 from napari_shadowinv._napari.widgets._forms import dump_toml
-from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
 from napari_shadowinv._napari.widgets.forward_model import ForwardModel
 from napari_shadowinv._napari.widgets.invert_shot import EstimateSource, InvertShot
@@ -100,15 +99,6 @@ def test_the_setup_of_a_file_is_not_there_in_the_next_session(
     assert later.setup.setup() is None
     later.setup.picker.set_kind("proton")
     assert later.setup.picker.form.is_empty
-
-
-def test_what_an_older_version_kept_is_not_taken_for_the_users(qtbot: Any) -> None:
-    picker = SetupPicker()
-    qtbot.addWidget(picker)
-    picker.restore({"kind": "proton", "values": {"proton": paper_setup().model_dump()}})
-    assert picker.setup() is None
-    picker.picker.set_kind("proton")
-    assert picker.picker.form.is_empty
 
 
 def test_what_the_user_typed_is_at_hand_and_says_for_what(

@@ -195,7 +195,7 @@ class ModelForm(QtWidgets.QWidget):
                 try:
                     editor.set_value(value)
                 except (TypeError, ValueError, OverflowError):
-                    # The state of an older version may have another type.
+                    # A saved entry may be text that is no number.
                     editor.set_value(default)
         self._on_change()
 

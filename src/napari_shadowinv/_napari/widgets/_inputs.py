@@ -457,7 +457,7 @@ class InstrumentForm(forms.ModelForm):
 
     def set_values(self, values: Mapping[str, Any]) -> None:
         """Show the values that differ from their defaults."""
-        with suppress(InputError):  # of another version, whose values are shown one by one
+        with suppress(InputError):  # invalid entries are shown one by one
             values = validate(Instrument, values, "instrument").stated
         super().set_values(values)
 

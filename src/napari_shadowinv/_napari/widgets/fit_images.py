@@ -52,9 +52,8 @@ class FitImages(ToolPanel):
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         tip = "Fit the fields, and an unknown beam, to all images together."
-        super().__init__(
-            viewer, "fit-images", RunPanel("Fit several images", "Run", tip, patience=0.4)
-        )
+        panel = RunPanel("Fit several images", "Run", tip, patience=0.4)
+        super().__init__(viewer, "fit-images", panel)
         self._build()
         self._connect()
         self.restore_last()

@@ -147,10 +147,8 @@ class ForwardJob(Job):
         moved = transferred_displacement(
             displacement, field_setup, setup, deflector=deflector, shape=shape
         )
-        return (
-            moved,
-            f"Converted to another setup, assuming that only a {deflector} deflects the beam.",
-        )
+        text = f"Converted to another setup, assuming that only a {deflector} deflects the beam."
+        return moved, text
 
     def _displacement(self) -> FloatArray:
         if isinstance(self.field, PhantomRecipe):

@@ -90,9 +90,8 @@ class InvertShot(InversionInputs, panels.LivePanel):
     """Choose an image, then press Run; everything else has a default."""
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
-        panel = panels.RunPanel(
-            "Invert shot", "Run", "Invert the image and show the result as layers."
-        )
+        tip = "Invert the image and show the result as layers."
+        panel = panels.RunPanel("Invert shot", "Run", tip)
         super().__init__(viewer, "invert-shot", panel)
         self._cache = Cache()
         self._build()
@@ -347,9 +346,8 @@ class EstimateSource(panels.LivePanel):
 
     def __init__(self, viewer: napari.viewer.Viewer) -> None:
         tip = "Estimate the beam and add it as an image layer."
-        super().__init__(
-            viewer, "estimate-source", panels.RunPanel("Estimate source", "Estimate", tip)
-        )
+        panel = panels.RunPanel("Estimate source", "Estimate", tip)
+        super().__init__(viewer, "estimate-source", panel)
         self.image = layers.ShotPicker(viewer)
         tip = "Labels or shapes on pixels that the estimate ignores."
         self.masks = layers.MaskPicker(viewer, lambda: self.image.layer, ("labels", "shapes"), tip)
