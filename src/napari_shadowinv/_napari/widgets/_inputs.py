@@ -252,9 +252,7 @@ class SourcePicker(forms.ModelPicker):
         layer_tip = "Image layer of the undisturbed beam."
         if UNKNOWN in kinds:
             layer_tip = "Image layer of the undisturbed beam, or a stack with one for each image."
-        self.layers = layers.LayerPicker(
-            viewer, ("image",), layer_tip, "choose a layer", self._offers
-        )
+        self.layers = layers.LayerPicker(viewer, layer_tip, "choose a layer", self._offers)
         self.file = forms.PathEdit("Image of the undisturbed beam")
         rows = {LAYER: forms.labelled("", self.layers), FILE: forms.labelled("", self.file)}
         below = preprocessing.ESTIMATES | rows

@@ -200,10 +200,11 @@ class LayerPicker(SteadyComboBox):
     def __init__(
         self,
         viewer: Any,
-        kinds: tuple[str, ...],
         tip: str,
         none: str = "",
         suits: Callable[[Any], bool] = lambda _: True,
+        *,
+        kinds: tuple[str, ...] = ("image",),
     ) -> None:
         super().__init__()
         self._viewer, self._kinds, self._none, self._suits = viewer, kinds, none, suits
@@ -258,9 +259,8 @@ class ShotPicker(LayerPicker):
 
     def __init__(self, viewer: Any) -> None:
         self.is_chosen = False
-        super().__init__(
-            viewer, ("image",), "Layer of the shot, a greyscale image.", suits=about.may_be_shot
-        )
+        tip = "Layer of the shot, a greyscale image."
+        super().__init__(viewer, tip, suits=about.may_be_shot)
         self.activated.connect(self._choose)
         qt.while_alive(self, viewer.layers, "inserted", self._on_insertion)
 
@@ -321,7 +321,8 @@ class MaskPicker(QWidget):
     ) -> None:
         super().__init__()
         self._viewer, self._image, self.title = viewer, image, title
-        self.layers = LayerPicker(viewer, kinds, f"<qt>{tip}</qt>", "none", about.may_be_mask)
+        tip = f"<qt>{tip}</qt>"
+        self.layers = LayerPicker(viewer, tip, "none", about.may_be_mask, kinds=kinds)
         target, meaning = _PAINT[title]
         tip = f"<qt>{meaning}</qt>"
         self.painted_is_unusable = QCheckBox(f"painted = {target}", checked=True, toolTip=tip)

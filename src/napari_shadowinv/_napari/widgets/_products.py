@@ -122,16 +122,13 @@ class ProductForm(QtWidgets.QWidget):
         self._origin: about.Result[Any] | Path | None = None
         tip = "<qt>Layer of the result of an inversion or a fit, or of a store of shots.</qt>"
         self.result = LayerPicker(
-            viewer,
-            ("image",),
-            tip,
-            suits=lambda layer: bool(about.result_of(layer) or _store_of(layer)),
+            viewer, tip, suits=lambda layer: bool(about.result_of(layer) or _store_of(layer))
         )
         self.product = SteadyComboBox(
             {name: f"{kind.title[:1].upper()}{kind.title[1:]}" for name, kind in PRODUCTS.items()}
         )
         tip = "<qt>Shapes layer with the line or outline. Of several, the selected is used.</qt>"
-        self.shapes = LayerPicker(viewer, ("shapes",), tip, "none yet")
+        self.shapes = LayerPicker(viewer, tip, "none yet", kinds=("shapes",))
         self.unit = SteadyComboBox(tip="Unit of the field, which chooses the field, too.")
         tip = "<qt>Width of the strip across a profile's line, in px.</qt>"
         self.width_edit = QtWidgets.QDoubleSpinBox(maximum=1e4, toolTip=tip)

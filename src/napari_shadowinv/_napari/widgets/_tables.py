@@ -230,7 +230,6 @@ class ImageTable(QWidget):
         self.rows: list[ImageRow] = []
         self.stacks = LayerPicker(
             viewer,
-            ("image",),
             "<qt>All 2-D image layers, or the planes of a stack.</qt>",
             "2-D image layers",
             lambda layer: layer.ndim == 3 and suits(layer),

@@ -74,7 +74,7 @@ class Analyse(qt.Docked):
         self._distance, self._unit = np.zeros(0), "px"
         self.profiles: list[Profile] = []
         tip = "<qt>Shapes layer with the line. Of several lines, the selected one is used.</qt>"
-        self.lines = LayerPicker(viewer, ("shapes",), tip, "none yet")
+        self.lines = LayerPicker(viewer, tip, "none yet", kinds=("shapes",))
         self.layers = QtWidgets.QListWidget(toolTip="Layers to plot.", maximumHeight=110)
         self.layers.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         tip = "Width of the strip, perpendicular to the line, over which values are averaged."

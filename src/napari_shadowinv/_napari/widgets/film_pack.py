@@ -341,16 +341,15 @@ class FilmPack(panels.ToolPanel):
         self.report = panels.ReportTable()
         self.packs = LayerPicker(
             self.viewer,
-            ("image",),
             "<qt>Fluence of a pack, from a run or from a .shadowinv file.</qt>",
             suits=lambda layer: about.role_of(layer) == packs.FLUENCE,
         )
         self.regions = LayerPicker(
             self.viewer,
-            ("shapes", "labels"),
             "<qt>Shapes or labels. The spectrum is the mean over the usable pixels inside.</qt>",
             "whole film",
             about.may_be_mask,
+            kinds=("shapes", "labels"),
         )
         self.plot = SpectrumPlot()
         self.plot.setToolTip(

@@ -232,7 +232,6 @@ class ForwardModel(ObjectPanel):
         super().__init__(viewer, "forward-model", panel, "a result or potential")
         self.potential = LayerPicker(
             viewer,
-            ("image",),
             "<qt>The field or potential of a result, or a potential in px² from a file; for a "
             "stack, the shot in view.</qt>",
             suits=may_be_field,
@@ -248,7 +247,7 @@ class ForwardModel(ObjectPanel):
             for side in ("Height", "Width")
         )
         tip = "Image layer of the undisturbed beam."
-        self.source = LayerPicker(viewer, ("image",), tip, "uniform", about.may_be_source)
+        self.source = LayerPicker(viewer, tip, "uniform", about.may_be_source)
         self.warning = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
         self.save_result = SaveButton(
             self,

@@ -24,7 +24,6 @@ class ImageSetup(qt.Docked):
         self.viewer = viewer
         self.image = LayerPicker(
             viewer,
-            ("image",),
             "Layer of an image, or of a stack of shots with a common setup.",
             suits=lambda layer: not about.belongs_to_result(layer),
         )

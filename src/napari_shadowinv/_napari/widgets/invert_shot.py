@@ -112,7 +112,7 @@ class InvertShot(InversionInputs, panels.LivePanel):
             "inversion still uses these pixels.",
         )
         tip = "<qt>Shapes layer with a rectangle; only the image inside is inverted.</qt>"
-        self.crop = layers.LayerPicker(self.viewer, ("shapes",), tip, none="none")
+        self.crop = layers.LayerPicker(self.viewer, tip, "none", kinds=("shapes",))
         self.live.setToolTip(
             f"<qt>Update the field after each change, with at most {PREVIEW_SITES:,} sites.</qt>"
         )

@@ -84,7 +84,7 @@ class StoreEdit(PathEdit):
 class ShotsPicker(ModelPicker):
     def __init__(self, viewer: Any) -> None:
         tip = "Stack of images (shot, y, x); data on disk are read one shot at a time."
-        self.layers = LayerPicker(viewer, ("image",), tip, suits=may_be_shot)
+        self.layers = LayerPicker(viewer, tip, suits=may_be_shot)
         tip = "A pattern such as shots/*.tif, files separated by ;, or a multi-page TIFF."
         self.files = _FilesEdit("Files of the shots", "shots/*.tif", tip)
         self.table = ShotTable()

@@ -142,7 +142,6 @@ class PlanExperiment(ObjectPanel):
         super().__init__(viewer, "plan-experiment", panel, "the field of a result")
         self.field = LayerPicker(
             viewer,
-            ("image",),
             "A layer of a result, whose field is the object.",
             suits=lambda layer: about.displacement_of(layer) is not None,
         )
