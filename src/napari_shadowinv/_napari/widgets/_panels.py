@@ -403,11 +403,9 @@ class FoldedReport(QtWidgets.QWidget):
         qt.column(self, self.table, self.details)
         self.empty()
 
-    def show_rows(
-        self, rows: list[tuple[str, str]], details: list[tuple[str, str]] | None = None
-    ) -> None:
+    def show_rows(self, rows: list[tuple[str, str]], details: list[tuple[str, str]]) -> None:
         self.table.show_rows(rows)
-        self._details.show_rows(details or [])
+        self._details.show_rows(details)
         self.details.setVisible(bool(details))
         self.setVisible(True)
 

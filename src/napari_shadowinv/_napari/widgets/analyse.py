@@ -190,8 +190,7 @@ class Analyse(qt.Docked):
 
     def show_problem(self, text: str) -> None:
         """Show a problem until the next profile."""
-        self.problem.setText(text)
-        self.problem.setVisible(True)
+        self.problem.show_text(text)
 
     def _offer_width_in(self, unit: str) -> None:
         """Offer the width in pixels and in the world's unit."""

@@ -183,7 +183,7 @@ class PlanExperiment(ObjectPanel):
             self.plot,
             self.report,
         )
-        self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
+        self.object.choice.currentIndexChanged.connect(lambda _: self.choose_setup())
         self.quantity.currentIndexChanged.connect(lambda _: self._on_change())
         for part in (self.object, self.setup, self.instrument, self.options):
             part.changed.connect(self._on_change)
@@ -191,7 +191,8 @@ class PlanExperiment(ObjectPanel):
             line.textChanged.connect(lambda _: self.keep())
         self.restore_last()
         self._ready = True
-        self._on_object()
+        self.choose_setup()
+        self._on_change()
 
     def parts(self) -> dict[str, Any]:
         return {
@@ -264,10 +265,6 @@ class PlanExperiment(ObjectPanel):
             validate(type(setup), {**setup.model_dump(), quantity.name: value}, quantity.plural)
             for value in _numbers(quantity.plural, text, quantity.unit)
         )
-
-    def _on_object(self) -> None:
-        self.choose_setup()
-        self._on_change()
 
     def _on_change(self) -> None:
         is_phantom = self.object.kind in PHANTOMS
