@@ -32,14 +32,7 @@ from napari_shadowinv.film.scans import checked_corners
 from napari_shadowinv.io import write
 from napari_shadowinv.io.formats import RESULT
 from napari_shadowinv.io.images import read_scan
-from napari_shadowinv.pipeline import read_pack, write_layers
-from napari_shadowinv.pipeline.film_files import (
-    PACK_FILE,
-    NewPack,
-    draft_pack,
-    missing_entries,
-    write_new_pack,
-)
+from napari_shadowinv.pipeline import film_files, read_pack, write_layers
 
 if TYPE_CHECKING:
     import napari
@@ -58,7 +51,7 @@ class NewPackDialog(QtWidgets.QDialog):
         self.setMinimumSize(*_MIN_SIZE_PX)
         self._folder = folder
         self.written: Path | None = None  # the pack file after saving
-        self.form = forms.ModelForm(NewPack)
+        self.form = forms.ModelForm(film_files.NewPack)
         self.table = QtWidgets.QTableWidget(0, len(_COLUMNS))
         self.table.setHorizontalHeaderLabels(_COLUMNS)
         self.table.horizontalHeader().setStretchLastSection(True)
@@ -74,13 +67,13 @@ class NewPackDialog(QtWidgets.QDialog):
         column = QtWidgets.QVBoxLayout(self)
         for widget in (self.form, self.table, self._problem, self.buttons):
             column.addWidget(widget)
-        self._show_layers(draft_pack(folder)["layers"])
+        self._show_layers(film_files.draft_pack(folder)["layers"])
         self.form.editors["film"].changed.connect(self._on_film)
 
     def entries(self) -> dict[str, Any]:
         """Return the entries of the pack file."""
         facts = self.form.model()
-        assert isinstance(facts, NewPack)
+        assert isinstance(facts, film_files.NewPack)
         layers = [
             {
                 "film": self.table.cellWidget(row, 1).currentText(),
@@ -93,18 +86,18 @@ class NewPackDialog(QtWidgets.QDialog):
             }
             for row in range(self.table.rowCount())
         ]
-        return draft_pack(self._folder, facts, layers)
+        return film_files.draft_pack(self._folder, facts, layers)
 
     def missing_text(self) -> str:
         """Return a sentence on entries still missing in the pack file, or the next action."""
-        missing = missing_entries(self.entries())
+        missing = film_files.missing_entries(self.entries())
         return f"Add to this file: {'; '.join(missing)}." if missing else "Press Run."
 
     def accept(self) -> None:
         """Write the pack file, or show the problem."""
         try:
-            path = self._folder / PACK_FILE
-            self.written = write_new_pack(
+            path = self._folder / film_files.PACK_FILE
+            self.written = film_files.write_new_pack(
                 self._folder,
                 self.entries(),
                 overwrite=path.exists() and qt.may_replace(self, "New film pack", path),
@@ -128,8 +121,8 @@ class NewPackDialog(QtWidgets.QDialog):
 
     def _on_film(self) -> None:
         """Show the selected type for all films whose file names contain no type."""
-        facts = NewPack(film=self.form.editors["film"].value())
-        for row, layer in enumerate(draft_pack(self._folder, facts)["layers"]):
+        facts = film_files.NewPack(film=self.form.editors["film"].value())
+        for row, layer in enumerate(film_files.draft_pack(self._folder, facts)["layers"]):
             self.table.cellWidget(row, 1).setCurrentText(layer["film"])
 
 
