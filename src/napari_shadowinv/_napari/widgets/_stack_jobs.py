@@ -183,9 +183,8 @@ def is_image(layer: Any) -> bool:
 def placement_on(layer: Any, recipe: Recipe) -> dict[str, Any]:
     """Return the keywords that place results on their stack, with the setup's pixels."""
     keywords = result_frame(layer, recipe).keywords(stacked=True)
-    of_layer = {"scale": layer.scale, "translate": layer.translate, "units": layer.units}
-    for name, values in of_layer.items():
-        keywords[name] = (values[0], *keywords[name][1:])
+    for name in ("scale", "translate", "units"):
+        keywords[name] = (getattr(layer, name)[0], *keywords[name][1:])
     return keywords
 
 
