@@ -80,12 +80,10 @@ class SteadyComboBox(QComboBox):
     """A narrow combo box that ignores the mouse wheel; `choices` are titles by key."""
 
     def __init__(self, choices: Mapping[Any, str] | None = None, tip: str = "") -> None:
-        super().__init__()
+        super().__init__(minimumContentsLength=6, toolTip=f"<qt>{tip}</qt>" if tip else "")
         for key, title in (choices or {}).items():
             self.addItem(title, key)
-        self.setToolTip(f"<qt>{tip}</qt>" if tip else "")
         self.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon)
-        self.setMinimumContentsLength(6)
         self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
         _ignore_wheel(self)
 

@@ -44,9 +44,8 @@ class RefineSection(QWidget):
             "says whether the image determines the field.",
             lambda: refine(self.psf.value()),
         )
-        self.folded = forms.section(
-            "Refine the result", forms.labelled("Blur σ", self.psf), self.button
-        )
+        blur = forms.labelled("Blur σ", self.psf)
+        self.folded = forms.section("Refine the result", blur, self.button)
         column(self, self.folded)
 
 

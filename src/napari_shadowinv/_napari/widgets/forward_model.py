@@ -341,8 +341,12 @@ class ForwardModel(ObjectPanel):
         self.warning.setVisible(False)
 
     def _on_object(self) -> None:
-        if self.object.kind == LAYER and self._ready:
-            self._select_field()
+        layer = self.potential.layer
+        if self.object.kind == LAYER and self._ready and (layer is None or not is_field(layer)):
+            # Layers labelled as a field are preferred to unlabelled images.
+            fields = list(filter(is_field, self.viewer.layers))
+            if fields:
+                self.potential.layer = fields[-1]
         self._follow_potential()
         self.choose_setup()
 
@@ -352,14 +356,6 @@ class ForwardModel(ObjectPanel):
         self.setup.follow(layer, store=False)
         if self._ready:
             self._on_change()
-
-    def _select_field(self) -> None:
-        """Prefer layers labelled as a field to unlabelled images."""
-        layer = self.potential.layer
-        if layer is None or not is_field(layer):
-            fields = list(filter(is_field, self.viewer.layers))
-            if fields:
-                self.potential.layer = fields[-1]
 
     def _on_change(self) -> None:
         is_layer = self.object.kind == LAYER
