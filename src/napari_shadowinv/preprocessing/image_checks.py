@@ -334,7 +334,9 @@ class ReferencePair:
         pair = ring[:, 1:] & ring[:, :-1]
         noise = float(np.median(np.diff(shot - beam, axis=1)[pair] ** 2)) / 2
         if blur:
-            shot, beam = (_blurred(plane, ring, blur) for plane in (shot, beam))
+            weights = np.where(ring, ndimage.gaussian_filter(ring.astype(float), blur), 1.0)
+            inside = (np.where(ring, plane, 0.0) for plane in (shot, beam))
+            shot, beam = (ndimage.gaussian_filter(plane, blur) / weights for plane in inside)
             noise /= 4 * math.pi * blur**2
         mismatch = _mismatch(shot, beam, ring)
         reach = [max(2, round(_MAX_SHIFT * side)) for side in shot.shape]
@@ -344,9 +346,40 @@ class ReferencePair:
         if (np.abs(shift) == reach).any() or not shift.any():
             return None
         down, right = shift
-        if not _fits_after(shot, beam, ring, noise, (down, right), _MAX_MATCH[blur]):
+        if not self._fits_after(shot, beam, noise, (down, right), _MAX_MATCH[blur]):
             return None
         return float(down * step), float(right * step)
+
+    def _fits_after(
+        self, shot: FloatArray, beam: FloatArray, noise: float, shift: tuple[int, int], match: float
+    ) -> bool:
+        """Whether a shift by blocks makes most sides fit; an object displaces some of them."""
+        (height, width), (down, right) = shot.shape, shift
+        rows = slice(max(down, 0), height + min(down, 0))
+        columns = slice(max(right, 0), width + min(right, 0))
+        behind = (
+            slice(rows.start - down, rows.stop - down),
+            slice(columns.start - right, columns.stop - right),
+        )
+        common = self._ring[rows, columns] & self._ring[behind]
+        moved = (shot[rows, columns] - beam[behind]) ** 2
+        unmoved = (shot - beam)[rows, columns] ** 2
+
+        def gain(part: BoolArray) -> float:
+            """Return the share of the mismatch that remains, apart from noise."""
+            before, after = (float(np.median(values[part])) for values in (unmoved, moved))
+            return (after - noise) / max(before - noise, 1e-300)
+
+        if common.sum() < _MIN_BLOCKS or np.median(unmoved[common]) < _ABOVE_NOISE * noise:
+            return False
+        if gain(common) > match:
+            return False
+        y, x = np.ogrid[rows, columns]
+        y_top, x_left = height * _RING_SHARE, width * _RING_SHARE
+        sides = (y < y_top, y >= height - y_top, x < x_left, x >= width - x_left)
+        parts = [common & side for side in sides]
+        better = [gain(part) < 1 for part in parts if part.sum() >= _MIN_BLOCKS]
+        return len(better) >= _MIN_SIDES and sum(better) >= len(better) - 1
 
     @cached_property
     def _blocks(self) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -422,50 +455,6 @@ def _mismatch(image: FloatArray, source: FloatArray, ring: BoolArray) -> FloatAr
     return np.asarray(np.where(overlaps, total / np.where(overlaps, count, 1.0), np.inf))
 
 
-def _blurred(values: FloatArray, usable: BoolArray, blur: float) -> FloatArray:
-    """Return a Gaussian blur of the usable values."""
-    weights = ndimage.gaussian_filter(usable.astype(float), blur)
-    total = ndimage.gaussian_filter(np.where(usable, values, 0.0), blur)
-    return np.asarray(total / np.where(usable, weights, 1.0))
-
-
-def _fits_after(
-    shot: FloatArray,
-    beam: FloatArray,
-    ring: BoolArray,
-    noise: float,
-    shift: tuple[int, int],
-    match: float,
-) -> bool:
-    """Whether a shift by blocks makes most sides fit; an object displaces some of them."""
-    (height, width), (down, right) = shot.shape, shift
-    rows = slice(max(down, 0), height + min(down, 0))
-    columns = slice(max(right, 0), width + min(right, 0))
-    behind = (
-        slice(rows.start - down, rows.stop - down),
-        slice(columns.start - right, columns.stop - right),
-    )
-    common = ring[rows, columns] & ring[behind]
-    moved = (shot[rows, columns] - beam[behind]) ** 2
-    unmoved = (shot - beam)[rows, columns] ** 2
-
-    def gain(part: BoolArray) -> float:
-        """Return the share of the mismatch that remains, apart from noise."""
-        before, after = (float(np.median(values[part])) for values in (unmoved, moved))
-        return (after - noise) / max(before - noise, 1e-300)
-
-    if common.sum() < _MIN_BLOCKS or np.median(unmoved[common]) < _ABOVE_NOISE * noise:
-        return False
-    if gain(common) > match:
-        return False
-    y, x = np.ogrid[rows, columns]
-    y_top, x_left = height * _RING_SHARE, width * _RING_SHARE
-    sides = (y < y_top, y >= height - y_top, x < x_left, x >= width - x_left)
-    parts = [common & side for side in sides]
-    better = [gain(part) < 1 for part in parts if part.sum() >= _MIN_BLOCKS]
-    return len(better) >= _MIN_SIDES and sum(better) >= len(better) - 1
-
-
 _WINDOW_PX = 4  # side of the squares in which noise is measured
 _MAX_NOISE_SAMPLES = 80_000
 _N_BRIGHTNESS_BINS = 20
@@ -499,9 +488,8 @@ def dark_level(planes: Sequence[CheckedImage]) -> float:
         0 unless the noise cannot be explained without an offset, by any sum of a constant
         variance, one in proportion to the signal, and one to its square.
     """
-    if min(planes[0].image.shape) < _WINDOW_PX:
-        return 0.0
-    if any(plane.brightness.size < _MIN_PIXELS for plane in planes):
+    is_small = min(planes[0].image.shape) < _WINDOW_PX
+    if is_small or any(plane.brightness.size < _MIN_PIXELS for plane in planes):
         return 0.0
     mean = float(planes[0].brightness.mean())
     if not mean > 0:
