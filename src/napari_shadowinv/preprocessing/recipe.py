@@ -246,7 +246,17 @@ def estimate_source(
     beam, usable = _for_estimate(shot)
     estimated = estimate.source if by is None else by
     source = estimated(beam, usable, should_stop=should_stop, on_caution=on_caution)
-    _check_fall(source, beam, shot.mask, shot.source_mask, on_caution)
+    bare = shot.source_mask
+    if bare is None:
+        return source
+    around, object_ = (bare, ~bare) if shot.mask is None else (bare & shot.mask, ~bare & shot.mask)
+    if object_.any() and source[object_].min() < beam[around].min() / _MAX_FALL:
+        text = (
+            f"the estimated source falls to {source[object_].min():.3g} under the source mask, "
+            f"while the image is at least {beam[around].min():.3g} elsewhere: compare it with "
+            "another estimate"
+        )
+        (on_caution or warn_of)(Caution("source", text))
     return source
 
 
@@ -269,23 +279,3 @@ def _for_estimate(shot: Radiograph) -> tuple[FloatArray, BoolArray | None]:
     usable = np.logical_and.reduce(masks) if masks else None
     image = shot.image if shot.mask is None else np.where(shot.mask, shot.image, 0)
     return np.maximum(image, 0), usable
-
-
-def _check_fall(
-    source: FloatArray,
-    image: FloatArray,
-    mask: BoolArray | None,
-    bare: BoolArray | None,
-    on_caution: OnCaution | None,
-) -> None:
-    """Report a source that is much darker behind the source mask than anywhere around it."""
-    if bare is None:
-        return
-    surroundings, object_ = (bare, ~bare) if mask is None else (bare & mask, ~bare & mask)
-    if object_.any() and source[object_].min() < image[surroundings].min() / _MAX_FALL:
-        text = (
-            f"the estimated source falls to {source[object_].min():.3g} under the source mask, "
-            f"while the image is at least {image[surroundings].min():.3g} elsewhere: compare it "
-            "with another estimate"
-        )
-        (on_caution or warn_of)(Caution("source", text))
