@@ -57,11 +57,10 @@ class Estimate(Choice):
     """A way to estimate the undisturbed beam from the shot."""
 
     key = "method"
-    # Makes the source; takes the image, the parameters, ``mask`` and ``should_stop``.
+    # Takes the image and the parameters, and may take `mask`, `should_stop` and `on_caution`.
     function: ClassVar[Callable[..., FloatArray]]
     needs_mask: ClassVar[bool] = False  # does it nothing without a mask
     uses_mask: ClassVar[bool] = True  # does it anything with one
-    is_checked: ClassVar[bool] = False  # does its function know `on_caution`
 
     def adapt_to(
         self, setup: Setup | None, shape: tuple[int, int], matrix: FloatArray | None = None
@@ -90,10 +89,8 @@ class Estimate(Choice):
                 f"got the estimate '{self.title}' without a mask: it fills in the masked pixels; "
                 "choose a mask that covers the object"
             )
-        values = self.values()
-        if self.is_checked:
-            values["on_caution"] = on_caution
-        return self.function(image, mask=mask, should_stop=should_stop, **values)
+        options = {"mask": mask, "should_stop": should_stop, "on_caution": on_caution}
+        return self.call(self.function, image, **options)
 
     def beam_prior(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
@@ -132,18 +129,10 @@ class UniformEstimate(Estimate):
     """The same everywhere."""
 
     title = "uniform"
+    function = staticmethod(uniform_source)
     uses_mask = False
     place = 10
     method: Literal["uniform"] = "uniform"
-
-    def source(
-        self,
-        image: FloatArray,
-        mask: BoolArray | None,
-        should_stop: ShouldStop | None = None,
-        on_caution: OnCaution | None = None,
-    ) -> FloatArray:
-        return uniform_source(image, mask=mask)
 
 
 def polynomial_source(
@@ -348,7 +337,6 @@ class KrigedEstimate(Estimate):
     """A smooth random beam, predicted from around the object with its error."""
 
     needs_mask = True
-    is_checked = True
     title = "predicted under the mask"
     function = staticmethod(kriged_source)
     place = 80
@@ -404,8 +392,7 @@ def gaussian_source(
     values, usable = pixels.beam_pixels(image, mask)
     side, mean = max(values.shape), values[usable].mean()
     y, x, sample = _block_samples(values / mean, usable)
-    report = Reporter(None, should_stop)
-    parameters = _fit_gaussian(y / side, x / side, sample, report)
+    parameters = _fit_gaussian(y / side, x / side, sample, Reporter(None, should_stop))
     rows, columns = (np.arange(n) / side for n in values.shape)
     beam = _gaussian(parameters, rows[:, None], columns)
     rise = float(beam.max() / sample.max())
@@ -429,7 +416,6 @@ def gaussian_source(
 class GaussianEstimate(Estimate):
     """A fitted elliptical spot."""
 
-    is_checked = True
     title = "fitted Gaussian"
     function = staticmethod(gaussian_source)
     place = 30
@@ -453,7 +439,14 @@ def _block_samples(
 
 def _fit_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray, report: Reporter) -> FloatArray:
     """Fit the parameters of `_gaussian` to samples, by repeated robust least squares."""
-    bounds = _bounds(y, x)
+    # Without bounds it may hide behind a mask.
+    steepest = math.sqrt(_MAX_FITTED_PIXELS)  # one over the width of a block of pixels
+    ranges = [
+        *[(0, _MAX_HEIGHT)] * 2,
+        *((axis.mean() - _MAX_DISTANCE, axis.mean() + _MAX_DISTANCE) for axis in (y, x)),
+        *[(-steepest, steepest)] * 3,
+    ]
+    bounds = tuple(np.transpose(ranges))
 
     def excess(p: FloatArray) -> FloatArray:
         report("source", 0)
@@ -476,19 +469,6 @@ def _fit_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray, report: Repo
             break
         parameters = fitted(parameters, "soft_l1", scale)
     return parameters
-
-
-def _bounds(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return bounds of the parameters of `_gaussian`, without which it may hide behind a mask."""
-    steepest = math.sqrt(_MAX_FITTED_PIXELS)  # one over the width of a block of pixels
-    ranges = [
-        (0, _MAX_HEIGHT),
-        (0, _MAX_HEIGHT),
-        *((axis.mean() - _MAX_DISTANCE, axis.mean() + _MAX_DISTANCE) for axis in (y, x)),
-        *[(-steepest, steepest)] * 3,
-    ]
-    least, most = np.transpose(ranges)
-    return least, most
 
 
 def _guess_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatArray:
@@ -563,8 +543,6 @@ class IsotropicEstimate(Estimate):
     def adapt_to(
         self, setup: Setup | None, shape: tuple[int, int], matrix: FloatArray | None = None
     ) -> Estimate:
-        if setup is None:
-            raise _without_setup()
         point_distance(setup)  # refuses a collimated beam before any work
         return self._at(*centre_within(shape, matrix, self.centre_y, self.centre_x), setup)
 
@@ -574,18 +552,11 @@ class IsotropicEstimate(Estimate):
         y, x = ((c + 0.5) / factor - 0.5 for c in (self.centre_y, self.centre_x))
         return self._at(y, x, bin_setup(self._setup, factor))
 
-    def source(
-        self,
-        image: FloatArray,
-        mask: BoolArray | None,
-        should_stop: ShouldStop | None = None,
-        on_caution: OnCaution | None = None,
-    ) -> FloatArray:
-        if self._setup is None:
-            raise _without_setup()
+    def source(self, image: FloatArray, mask: BoolArray | None, *_: Any, **__: Any) -> FloatArray:
+        point_distance(self._setup)  # refuses a missing setup before a wrong image
         return isotropic_source(image, self._setup, mask=mask, **self.values())
 
-    def _at(self, y: float, x: float, setup: Setup) -> Self:
+    def _at(self, y: float, x: float, setup: Setup | None) -> Self:
         estimate = self.model_copy(update={"centre_y": y, "centre_x": x})
         estimate._setup = setup
         return estimate
@@ -603,13 +574,6 @@ def centre_within(
     if matrix is not None:
         recorded = [float(v) for v in np.linalg.solve(matrix, [*recorded, 1.0])[:2]]
     return recorded[0], recorded[1]
-
-
-def _without_setup() -> InputError:
-    return InputError(
-        "got the source 'isotropic' without a setup, which is needed for the distance of the "
-        "point source and the pixel size: give a setup, or choose the source 'uniform'"
-    )
 
 
 def uniform_warnings(
@@ -686,9 +650,14 @@ def isotropic_source(
     """
     values, usable = pixels.beam_pixels(image, mask)
     distance = point_distance(setup)
+    height, width = values.shape
+    centre = centre_within((height, width), y=centre_y, x=centre_x)
+    for axis, place in zip("yx", centre, strict=True):
+        if not math.isfinite(place):
+            raise InputError(f"centre_{axis} is {place!r}, expected a finite number of px")
     y, x = (
-        _edges(side, "centre_" + axis, centre) / distance
-        for side, axis, centre in zip(values.shape, "yx", (centre_y, centre_x), strict=True)
+        (np.arange(-0.5, side) - place) / distance
+        for side, place in zip(values.shape, centre, strict=True)
     )
     y = y[:, None]
     # Solid angle of the rectangle between the axis and each corner of the pixels.
@@ -697,8 +666,13 @@ def isotropic_source(
     return np.asarray(beam * (values[usable].mean() / beam[usable].mean()))
 
 
-def point_distance(setup: Setup) -> float:
+def point_distance(setup: Setup | None) -> float:
     """Return the distance from the point source to the detector, in px of the detector."""
+    if setup is None:
+        raise InputError(
+            "got the source 'isotropic' without a setup, which is needed for the distance of the "
+            "point source and the pixel size: give a setup, or choose the source 'uniform'"
+        )
     if setup.is_collimated:
         raise InputError(
             "got the source 'isotropic' and a setup with a collimated beam (the distance from "
@@ -707,10 +681,3 @@ def point_distance(setup: Setup) -> float:
         )
     # The magnification enlarges distance and pixel alike.
     return setup.source_object_distance / setup.object_pixel_size
-
-
-def _edges(side: int, name: str, centre: float | None) -> FloatArray:
-    """Return the edges of `side` pixels, relative to the centre, by default their middle."""
-    if centre is not None and not math.isfinite(centre):
-        raise InputError(f"{name} is {centre!r}, expected a finite number of px")
-    return np.arange(-0.5, side) - ((side - 1) / 2 if centre is None else centre)

@@ -43,19 +43,22 @@ class Filter(Step):
 
     moves_pixels = False
     function: ClassVar[Callable[..., FloatArray]]
-    """Filters an image by the parameters."""
+    """Filters an image by the parameters; may take ``mask`` and ``should_stop``."""
 
     def filter_image(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
     ) -> FloatArray:
         """Apply the filter, so that masked pixels, even NaN, do not affect the others."""
         values = np.asarray(image, dtype=np.float64)
-        return self._filter(pixels.fill_masked_pixels(values, mask, should_stop), mask, should_stop)
+        if mask is not None and mask.any() and not mask.all():
+            filled = pixels.interpolated_source(values, mask, should_stop=should_stop)
+            values = np.where(mask, values, filled)
+        return self._filter(values, mask, should_stop)
 
     def _filter(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
     ) -> FloatArray:
-        return self.function(image, **self.values())
+        return self.call(self.function, image, mask=mask, should_stop=should_stop)
 
     def note(self, before: FloatArray, after: FloatArray, mask: BoolArray | None) -> str:
         """Return a note on the changes by the filter."""
@@ -299,6 +302,7 @@ class BackgroundFilter(Filter):
     """Flatten by a polynomial."""
 
     title = "flatten (polynomial)"
+    function = staticmethod(remove_background)
     place = 50
     flattens: ClassVar[bool] = True
     step: Literal["background"] = "background"
@@ -308,13 +312,6 @@ class BackgroundFilter(Filter):
         title="How",
         description="'divide' by the polynomial (uneven beam) or 'subtract' it (stray light).",
     )
-
-    def _filter(
-        self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
-    ) -> FloatArray:
-        return remove_background(
-            image, self.degree, kind=self.kind, mask=mask, should_stop=should_stop
-        )
 
 
 def _wave_numbers(shape: tuple[int, ...]) -> FloatArray:

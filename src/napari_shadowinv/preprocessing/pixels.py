@@ -3,8 +3,7 @@
 - values and usable pixels of an image: `checked_pixels`; of a beam, which has flux: `beam_pixels`
 - one number or integer: `checked_number`, `checked_integer`
 - fit a polynomial: `fit_polynomial`
-- fill in, from the surroundings, the beam under an object: `interpolated_source`; masked pixels:
-  `fill_masked_pixels`
+- fill in, from the surroundings, the beam under an object: `interpolated_source`
 """
 
 from __future__ import annotations
@@ -32,15 +31,6 @@ from napari_shadowinv.errors import InputError
 FILL_WIDTH = 5.0  # px
 _COARSEST_SIDE_PX = 32
 _TOLERANCE = 1e-6
-
-
-def fill_masked_pixels(
-    image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
-) -> FloatArray:
-    """Return an image with masked pixels filled in, so that filters do not spread their values."""
-    if mask is None or mask.all() or not mask.any():
-        return image
-    return np.where(mask, image, interpolated_source(image, mask, should_stop=should_stop))
 
 
 def interpolated_source(
@@ -107,6 +97,12 @@ def _spline(
     weighted: FloatArray, share: FloatArray, width: float, power: int, report: Reporter
 ) -> FloatArray:
     """Minimise ∑ share·(u - value)² + width^2p ∑ u(-Δ)ᵖu, `weighted` being share·value."""
+    if min(weighted.shape) < _COARSEST_SIDE_PX:
+        start = np.full(weighted.shape, weighted.sum() / share.sum())
+    else:  # from pixels twice as large
+        coarse = _spline(block_means(weighted, 2), block_means(share, 2), width / 2, power, report)
+        start = _double_rows(coarse, weighted.shape[0]).T
+        start = _double_rows(start, weighted.shape[1]).T
     squares = [4 * np.sin(0.5 * np.pi * np.arange(side) / side) ** 2 for side in weighted.shape]
     roughness = (width**2 * np.add.outer(*squares)) ** power
 
@@ -116,35 +112,22 @@ def _spline(
         bent = scipy.fft.idctn(roughness * scipy.fft.dctn(u, norm="ortho"), norm="ortho")
         return np.asarray(share * u + bent).ravel()
 
-    typical = float(share.mean())
+    typical = float(share.mean()) + roughness
 
     def nearly_inverse(flat: FloatArray) -> FloatArray:
-        coefficients = scipy.fft.dctn(flat.reshape(weighted.shape), norm="ortho") / (
-            typical + roughness
-        )
-        return np.asarray(scipy.fft.idctn(coefficients, norm="ortho")).ravel()
+        coefficients = scipy.fft.dctn(flat.reshape(weighted.shape), norm="ortho")
+        return np.asarray(scipy.fft.idctn(coefficients / typical, norm="ortho")).ravel()
 
     shape = (weighted.size, weighted.size)
     solution, _ = scipy.sparse.linalg.cg(
         scipy.sparse.linalg.LinearOperator(shape, matvec=stiffness, dtype=np.float64),
         weighted.ravel(),
-        x0=_coarse_spline(weighted, share, width, power, report).ravel(),
+        x0=start.ravel(),
         M=scipy.sparse.linalg.LinearOperator(shape, matvec=nearly_inverse, dtype=np.float64),
         rtol=_TOLERANCE,
         maxiter=500,
     )
     return np.asarray(solution.reshape(weighted.shape))
-
-
-def _coarse_spline(
-    weighted: FloatArray, share: FloatArray, width: float, power: int, report: Reporter
-) -> FloatArray:
-    """Return a first guess of `_spline`, from pixels twice as large."""
-    if min(weighted.shape) < _COARSEST_SIDE_PX:
-        return np.full(weighted.shape, weighted.sum() / share.sum())
-    coarse = _spline(block_means(weighted, 2), block_means(share, 2), width / 2, power, report)
-    height, length = weighted.shape
-    return _double_rows(_double_rows(coarse, height).T, length).T
 
 
 def _double_rows(coarse: FloatArray, side: int) -> FloatArray:

@@ -8,10 +8,10 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -164,6 +164,12 @@ class Choice(CheckedModel):
         """Return the values of its parameters."""
         return {name: getattr(self, name) for name in self.parameters()}
 
+    def call(self, function: Callable[..., FloatArray], *args: Any, **options: Any) -> FloatArray:
+        """Call a function with the parameters, and with those of the options that it takes."""
+        names = inspect.signature(function).parameters
+        taken = {name: value for name, value in options.items() if name in names}
+        return function(*args, **self.values(), **taken)
+
     @property
     def summary(self) -> str:
         """Title and parameters, the same for the same choices."""
@@ -252,15 +258,7 @@ def _as_level(value: Any) -> Any:
     return number
 
 
-def _as_plain(level: float | Path) -> float | str:
-    return str(level) if isinstance(level, Path) else level
-
-
-Level = Annotated[
-    float | Path,
-    BeforeValidator(_as_level),
-    PlainSerializer(_as_plain, when_used="json"),
-]
+Level = Annotated[float | Path, BeforeValidator(_as_level)]
 """A number of counts, or a file with an image of them."""
 
 
@@ -312,10 +310,6 @@ class Dark(Step):
         return replace(shot, image=image, source=source).add_notes(f"dark {name} subtracted")
 
 
-def _turn(array: AnyArray, turns: int) -> Any:
-    return np.ascontiguousarray(np.rot90(array, turns))
-
-
 class Rotate(Step):
     """Rotate about the image centre; exact for multiples of 90°.
 
@@ -347,10 +341,11 @@ class Rotate(Step):
 
     def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
         turns = self._turns
-        if turns is None:
-            rotated = self._interpolate(shot)
-        else:
-            rotated = shot.map_planes(partial(_turn, turns=turns), partial(_turn, turns=turns))
+
+        def turn(array: AnyArray) -> Any:
+            return np.ascontiguousarray(np.rot90(array, turns or 0))
+
+        rotated = self._interpolate(shot) if turns is None else shot.map_planes(turn, turn)
         return rotated.add_notes(f"rotated by {self.angle:g}°")
 
     def _interpolate(self, shot: Radiograph) -> Radiograph:
