@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -52,6 +53,7 @@ _DOSE_STEPS = 24  # of the map from the dose of one film to that of another
 _MAX_STEPS = 25
 _STEP_TOLERANCE = 1e-3  # samples
 _N_PARTS = (3, 5)  # along y and x; they must agree
+_MIN_SHARE = 0.99  # of usable pixels around a place that counts
 _MIN_USABLE_SHARE = 0.5  # of a part that counts
 _MIN_CORRELATION = 0.3
 _MIN_AGREEING_SHARE = 0.6  # of the parts
@@ -214,7 +216,10 @@ def check_orientation(images: ArrayLike, usable: ArrayLike, names: Sequence[str]
     InputError
         If a film lies another way round; the message says how each of them was scanned.
     """
-    planes = [_large(*film) for film in zip(np.asarray(images), np.asarray(usable), strict=True)]
+    # Large structure in few pixels, and how much of each of them is known.
+    counts = block_sums(np.asarray(usable), _BLOCK_PX)
+    sums = block_sums(np.where(usable, images, 0.0), _BLOCK_PX)
+    planes = np.stack([sums / np.maximum(counts, 1.0), counts / _BLOCK_PX**2], axis=1)
     flips = [(False, False)]  # of the rows and columns, so that films lie as the first
     clues = {}
     for number in range(1, len(planes)):
@@ -251,11 +256,8 @@ def check_orientation(images: ArrayLike, usable: ArrayLike, names: Sequence[str]
     )
 
 
-def _flip(
-    planes: tuple[FloatArray, FloatArray], flip: tuple[bool, bool]
-) -> tuple[FloatArray, FloatArray]:
-    turn = np.s_[:: -1 if flip[0] else 1, :: -1 if flip[1] else 1]
-    return planes[0][turn], planes[1][turn]
+def _flip(planes: FloatArray, flip: tuple[bool, bool]) -> FloatArray:
+    return planes[:, :: -1 if flip[0] else 1, :: -1 if flip[1] else 1]
 
 
 def _credible(
@@ -340,28 +342,29 @@ def _compare(first: int, second: int, films: list[_Film]) -> _Pair | None:
     if correlation < _MIN_CORRELATION:
         return None
     pose = np.array([*shift, 0.0])
-    slope_y, slope_x = (np.gradient(texture, axis=axis) for axis in (0, 1))
+    planes = [texture, mask.astype(np.float64), *np.gradient(texture)]
     y, x = _from_middle(reference.shape)
     for _ in range(_MAX_STEPS):
-        moved, both, along_y, along_x = _move(pose, texture, reference_mask, mask, slope_y, slope_x)
+        moved, share, *slopes = _move(pose, planes)
+        both = reference_mask & (share > _MIN_SHARE)
         c, s = np.cos(pose[2]), np.sin(pose[2])
-        turning = along_y * (-s * y - c * x) + along_x * (c * y - s * x)
-        slopes = np.stack([along_y[both], along_x[both], turning[both]], axis=1)
+        turning = slopes[0] * (-s * y - c * x) + slopes[1] * (c * y - s * x)
+        design = np.stack([slope[both] for slope in (*slopes, turning)], axis=1)
         power = moved[both] @ moved[both]
         if not (power > 0 and (gain := (moved[both] @ reference[both]) / power) > 0):
             return None
         residual = reference[both] - gain * moved[both]
         usual = NORMAL_MAD * np.median(np.abs(residual)) + 1e-300
         weight = 1 / (1 + (residual / (2 * usual)) ** 2)
-        normal = gain * slopes.T @ (weight[:, None] * slopes)
-        step = np.linalg.lstsq(normal, slopes.T @ (weight * residual), rcond=None)[0]
+        normal = gain * design.T @ (weight[:, None] * design)
+        step = np.linalg.lstsq(normal, design.T @ (weight * residual), rcond=None)[0]
         pose += step
         if np.abs(pose[:2]).max() > 2 * _MAX_SHIFT_SAMPLES or abs(pose[2]) > 10 * _TURN_ERROR_RAD:
             return None
         if np.abs(step[:2]).max() < _STEP_TOLERANCE:
             break
-    moved, both, along_y, along_x = _move(pose, texture, reference_mask, mask, slope_y, slope_x)
-    error = _disagreement(reference, moved, both, along_y, along_x)
+    moved, share, *slopes = _move(pose, planes)
+    error = _disagreement(reference, moved, reference_mask & (share > _MIN_SHARE), slopes)
     if error is None:
         return None
     shift_error = max(_MIN_ERROR_PX, error)
@@ -378,20 +381,12 @@ def _from_middle(shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
     return y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2
 
 
-def _move(
-    pose: FloatArray,
-    image: FloatArray,
-    reference_mask: BoolArray,
-    mask: BoolArray,
-    *slopes: FloatArray,
-) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
-    """The second film, where both count, and its slopes, as they lie on the first."""
-    y, x = _from_middle(image.shape)
+def _move(pose: FloatArray, planes: list[FloatArray]) -> list[FloatArray]:
+    """Planes of the second film as they lie on the first."""
+    y, x = _from_middle(planes[0].shape)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     at = [c * y - s * x - y[0, 0] + pose[0], s * y + c * x - x[0, 0] + pose[1]]
-    planes = (image, mask.astype(np.float64), *slopes)
-    sampled = [ndimage.map_coordinates(plane, at, order=1) for plane in planes]
-    return sampled[0], reference_mask & (sampled[1] > 0.99), sampled[2], sampled[3]
+    return [ndimage.map_coordinates(plane, at, order=1) for plane in planes]
 
 
 def _coarse_shift(
@@ -417,36 +412,30 @@ def _coarse_shift(
 
 
 def _disagreement(
-    reference: FloatArray,
-    moved: FloatArray,
-    both: BoolArray,
-    along_y: FloatArray,
-    along_x: FloatArray,
+    reference: FloatArray, moved: FloatArray, both: BoolArray, slopes: list[FloatArray]
 ) -> float | None:
     """Error of a shift by how far parts of the films are from it, or None if too few agree."""
-    parts, away, weights, alike = 0, [], [], 0
-    for rows in np.array_split(np.arange(reference.shape[0]), _N_PARTS[0]):
-        for columns in np.array_split(np.arange(reference.shape[1]), _N_PARTS[1]):
-            part = np.ix_(rows, columns)
-            counts = both[part]
-            if counts.mean() < _MIN_USABLE_SHARE:
-                continue
-            parts += 1
-            fixed_part, moved_part = reference[part][counts], moved[part][counts]
-            size = np.sqrt((fixed_part @ fixed_part) * (moved_part @ moved_part))
-            if size == 0 or fixed_part @ moved_part < _MIN_CORRELATION * size:
-                continue
-            alike += 1
-            gain = (fixed_part @ moved_part) / (moved_part @ moved_part)
-            slopes = gain * np.stack([along_y[part][counts], along_x[part][counts]], axis=1)
-            step = np.linalg.lstsq(slopes, fixed_part - gain * moved_part, rcond=None)[0]
-            away.append(
-                (np.clip(_SAMPLING_PX * step, -_MAX_DISTANCE_PX, _MAX_DISTANCE_PX) ** 2).mean()
-            )
-            weights.append((slopes**2).sum())
-    if alike < max(2, _MIN_AGREEING_SHARE * parts):
+    n_parts, away, weights = 0, [], []
+    sides = zip(reference.shape, _N_PARTS, strict=True)
+    for places in product(*(np.array_split(np.arange(side), count) for side, count in sides)):
+        part = np.ix_(*places)
+        counts = both[part]
+        if counts.mean() < _MIN_USABLE_SHARE:
+            continue
+        n_parts += 1
+        fixed_part, moved_part = reference[part][counts], moved[part][counts]
+        size = np.sqrt((fixed_part @ fixed_part) * (moved_part @ moved_part))
+        if size == 0 or fixed_part @ moved_part < _MIN_CORRELATION * size:
+            continue
+        gain = (fixed_part @ moved_part) / (moved_part @ moved_part)
+        design = gain * np.stack([slope[part][counts] for slope in slopes], axis=1)
+        step = np.linalg.lstsq(design, fixed_part - gain * moved_part, rcond=None)[0]
+        distance = np.clip(_SAMPLING_PX * step, -_MAX_DISTANCE_PX, _MAX_DISTANCE_PX)
+        away.append((distance**2).mean())
+        weights.append((design**2).sum())
+    if len(away) < max(2, _MIN_AGREEING_SHARE * n_parts):
         return None
-    return float(np.sqrt(np.average(away, weights=weights) / alike))
+    return float(np.sqrt(np.average(away, weights=weights) / len(away)))
 
 
 def _fit_poses(pairs: list[_Pair], edges: FloatArray) -> Poses:
@@ -480,35 +469,20 @@ def _fit_poses(pairs: list[_Pair], edges: FloatArray) -> Poses:
     )
 
 
-def _large(image: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Large structure in few pixels, and how much of each of them is known."""
-    planes = (usable.astype(np.float64), np.where(usable, image, 0.0))
-    counts, sums = (block_sums(plane, _BLOCK_PX) for plane in planes)
-    return np.asarray(sums / np.maximum(counts, 1.0)), np.asarray(counts / _BLOCK_PX**2)
-
-
-def _greatest_correlation(
-    first: tuple[FloatArray, FloatArray], second: tuple[FloatArray, FloatArray]
-) -> float:
-    """Of two images, over shifts by the reach."""
+def _greatest_correlation(first: FloatArray, second: FloatArray) -> float:
+    """Of two images with their known shares, over shifts by the reach."""
     steps = _MAX_SHIFT_SAMPLES // _BLOCK_PX
     greatest = -1.0
-    for down in range(-steps, steps + 1):
-        for right in range(-steps, steps + 1):
-            parts = [
-                plane[
-                    max(0, sign * down) or None : min(0, sign * down) or None,
-                    max(0, sign * right) or None : min(0, sign * right) or None,
-                ]
-                for planes, sign in ((first, 1), (second, -1))
-                for plane in planes
-            ]
-            both = (parts[1] > 0.5) & (parts[3] > 0.5)
-            if both.sum() < both.size / 4:
-                continue
-            fixed_part, moved_part = parts[0][both], parts[2][both]
-            if np.ptp(fixed_part) > 0 and np.ptp(moved_part) > 0:
-                greatest = max(greatest, float(np.corrcoef(fixed_part, moved_part)[0, 1]))
+    for shift in product(range(-steps, steps + 1), repeat=2):
+        there = tuple(slice(max(0, step) or None, min(0, step) or None) for step in shift)
+        back = tuple(slice(max(0, -step) or None, min(0, -step) or None) for step in shift)
+        (fixed, fixed_share), (moved, moved_share) = first[:, *there], second[:, *back]
+        both = (fixed_share > 0.5) & (moved_share > 0.5)
+        if both.sum() < both.size / 4:
+            continue
+        fixed_part, moved_part = fixed[both], moved[both]
+        if np.ptp(fixed_part) > 0 and np.ptp(moved_part) > 0:
+            greatest = max(greatest, float(np.corrcoef(fixed_part, moved_part)[0, 1]))
     return greatest
 
 
@@ -568,7 +542,10 @@ def poses_by_fiducials(
         shifts[marked] -= shifts[marked].mean(axis=0)
         turns[marked] -= turns[marked].mean()
     common = _mean_places(film_marks, shifts, turns)
-    misfits = [_misfit(film_marks[k], common, shifts[k], turns[k]) for k in range(count)]
+    misfits = []
+    for marks, shift, turn in zip(film_marks, shifts, turns, strict=True):
+        away = (place - shift - common[name] @ _rotation(turn) for name, place in marks.items())
+        misfits.append(np.array([np.hypot(*distance) for distance in away]))
     for name, misfit in zip(names, misfits, strict=True):
         if misfit.size and misfit.max() > _MAX_MISFIT_PX:
             raise InputError(
@@ -629,14 +606,3 @@ def _fit_rigid(
         across = common_y * film_x - common_x * film_y
         turn = float(np.arctan2(across.sum(), along.sum()))
     return (on_film - expected @ _rotation(turn)).mean(axis=0), turn
-
-
-def _misfit(
-    marks: dict[str, FloatArray], common: dict[str, FloatArray], shift: FloatArray, turn: float
-) -> FloatArray:
-    return np.array(
-        [
-            np.hypot(*(place - shift - common[name] @ _rotation(turn)))
-            for name, place in marks.items()
-        ]
-    )
