@@ -425,8 +425,6 @@ def _find_columns(table: Table) -> list[int]:
         names.append(next((name for name in table.header if name.startswith(colour)), colour))
     columns = [table.position_of(name) for name in names]
     spreads = [position + 1 for position in columns[1:]]
-    has_spreads = all(
-        position < len(table.header) and table.header[position].startswith("std")
-        for position in spreads
-    )
+    header = [*table.header, ""]
+    has_spreads = all(header[position].startswith("std") for position in spreads)
     return columns + spreads if has_spreads else columns

@@ -54,10 +54,6 @@ class _CornerRow(CheckedModel):
     y4: float
     x4: float
 
-    @property
-    def places(self) -> FloatArray:
-        return np.array(list(self.model_dump(exclude={"film"}).values())).reshape(4, 2)
-
 
 def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[FloatArray]:
     """Return the corners of the films on a scan, row by row as one reads.
@@ -80,8 +76,10 @@ def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[Floa
         If there is no film, or the scan has no colours.
     """
     values = checked_scan(scan)
-    inside = _darker_than_bed(values)
-    height, width = inside.shape
+    darkest = values.min(axis=-1)
+    dark = darkest < _MAX_FILM_BRIGHTNESS * np.percentile(darkest, _BED_PERCENTILE)
+    inside = ndimage.binary_opening(dark, np.ones((3, 3)), iterations=_DUST_PX)
+    height, width = dark.shape
     area = _MIN_FILM_SHARE * height * width if least_side is None else least_side**2
     labels, count = ndimage.label(inside)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
@@ -91,12 +89,13 @@ def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[Floa
             "no film was found on the scan: expected films darker than a bright bed around them; "
             "give their corners"
         )
-    slices = ndimage.find_objects(labels)
+    boxes = ndimage.find_objects(labels)
     corners = []
     for number in film_labels:
-        y_top, x_left = (part.start for part in slices[number - 1])
-        film = ndimage.binary_fill_holes(labels[slices[number - 1]] == number)
-        corners.append(_sharpen_corners(values, _fit_rectangle(film) + np.array([y_top, x_left])))
+        box = boxes[number - 1]
+        film = ndimage.binary_fill_holes(labels[box] == number)
+        top_left = np.array([part.start for part in box])
+        corners.append(_sharpen_corners(values, _fit_rectangle(film) + top_left))
     return _in_reading_order(corners)
 
 
@@ -163,13 +162,6 @@ def checked_corners(corners: ArrayLike) -> FloatArray:
             "reading: expected top left, top right, bottom right, bottom left, each as (y, x)"
         )
     return places
-
-
-def _darker_than_bed(values: AnyArray) -> BoolArray:
-    darkest = values.min(axis=-1)
-    bed = np.percentile(darkest, _BED_PERCENTILE)
-    dark = darkest < _MAX_FILM_BRIGHTNESS * bed
-    return np.asarray(ndimage.binary_opening(dark, np.ones((3, 3)), iterations=_DUST_PX))
 
 
 def _fit_rectangle(film: BoolArray) -> FloatArray:
@@ -328,8 +320,9 @@ def read_corners(path: str | Path) -> dict[str, FloatArray]:
     """
     corners = {}
     for line, row in read_rows(Path(path), _CornerRow).items():
+        name, *places = row.model_dump().values()
         try:
-            corners[row.film] = checked_corners(row.places)
+            corners[name] = checked_corners(np.reshape(places, (4, 2)))
         except InputError as error:
             raise error.about(f"{path}, line {line}") from None
     return corners
@@ -412,9 +405,9 @@ def usable_pixels(
         net_optical_density(np.maximum(values, 1), unexposed, channel)
         for channel in ("red", "blue")
     )
-    excess = ndimage.gaussian_filter(
-        blue - _expected_blue(calibration, unexposed, red), _MARK_BLUR_PX
-    )
+    table = np.log10(unexposed / calibration.pixels[np.argsort(calibration.doses)])
+    expected = np.interp(red, np.maximum.accumulate(table[:, 0]), table[:, 2])
+    excess = ndimage.gaussian_filter(blue - expected, _MARK_BLUR_PX)
     first = _SAMPLE_STEP_PX // 2
     samples = excess[first::_SAMPLE_STEP_PX, first::_SAMPLE_STEP_PX]
     usual = ndimage.median_filter(samples, _BACKGROUND_SAMPLES, mode="nearest")
@@ -481,12 +474,6 @@ def _burnt_top(logarithm: FloatArray) -> BoolArray:
     ends = np.where(ends > 0, ends, np.median(ends[ends > 0]))
     ends = ndimage.maximum_filter1d(ends + _CUT_PX + _FALL_PX + _MARGIN_PX, _ALONG_PX)
     return np.asarray(np.arange(height)[:, None] < ends)
-
-
-def _expected_blue(calibration: Calibration, unexposed: FloatArray, red: FloatArray) -> FloatArray:
-    """Return the density of exposed film in blue by its density in red."""
-    table = np.log10(unexposed / calibration.pixels[np.argsort(calibration.doses)])
-    return np.asarray(np.interp(red, np.maximum.accumulate(table[:, 0]), table[:, 2]))
 
 
 def _resample(samples: FloatArray, image: FloatArray) -> FloatArray:
