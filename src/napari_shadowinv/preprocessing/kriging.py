@@ -216,10 +216,7 @@ class _Waves:
         """Wave numbers along y and x, rad/px."""
         steps = [np.pi / (_DOMAIN * side) for side in self.shape]
         counts = [max(2, int(_SHORTEST_WAVE / (self.length * step)) + 1) for step in steps]
-        return [
-            step * np.arange(count, dtype=np.float64)
-            for step, count in zip(steps, counts, strict=True)
-        ]
+        return [step * np.arange(float(n)) for step, n in zip(steps, counts, strict=True)]
 
     @cached_property
     def _spectrum(self) -> FloatArray:
@@ -229,24 +226,23 @@ class _Waves:
         variances = np.where(squares <= _SHORTEST_WAVE**2, np.exp(-0.5 * squares), 0.0)
         return np.asarray(variances / variances.sum())
 
-    def _cosines(self, axis: int, places: FloatArray) -> FloatArray:
-        """Return cosines along an axis with a mean square of 1, shape (places, waves)."""
-        numbers = self._numbers[axis]
-        beyond = (_DOMAIN - 1) / 2 * self.shape[axis]
-        cosines = np.cos(np.outer(places + 0.5 + beyond, numbers))
-        return np.asarray(np.where(numbers > 0, math.sqrt(2), 1.0) * cosines)
+    def _cosines(self, block: int) -> list[FloatArray]:
+        """Return cosines with a mean square of 1 at blocks along y and x, shape (blocks, waves)."""
+        return [
+            np.where(numbers > 0, math.sqrt(2), 1.0)
+            * np.cos(np.outer(_middles(side, block) + 0.5 + (_DOMAIN - 1) / 2 * side, numbers))
+            for side, numbers in zip(self.shape, self._numbers, strict=True)
+        ]
 
-    def _middles(self, side: int) -> FloatArray:
-        """Return the middles of blocks along a side, px."""
-        count = -(-side // self.block)
-        return np.asarray(self.block * (np.arange(count, dtype=np.float64) + 0.5) - 0.5)
+    def _powers(self, block: int) -> list[FloatArray]:
+        """Return the powers 0 to 2 of places from -1 to 1 at blocks along y and x, (blocks, 3)."""
+        places = [(2 * _middles(side, block) + 1) / side - 1 for side in self.shape]
+        return [place[:, None] ** np.arange(3) for place in places]
 
     @cached_property
     def at_blocks(self) -> FloatArray:
         """Waves of one standard deviation at the middles of blocks, shape (h, w, waves)."""
-        along_y, along_x = (
-            self._cosines(axis, self._middles(side)) for axis, side in enumerate(self.shape)
-        )
+        along_y, along_x = self._cosines(self.block)
         rows, columns = np.nonzero(self._spectrum)
         waves = along_y[:, None, rows] * along_x[None, :, columns]
         return np.asarray(waves * np.sqrt(self._spectrum[rows, columns]))
@@ -254,7 +250,7 @@ class _Waves:
     @cached_property
     def terms_at_blocks(self) -> FloatArray:
         """Terms of a quadratic at the middles of blocks, shape (h, w, terms)."""
-        along_y, along_x = (_powers(self._middles(side), side) for side in self.shape)
+        along_y, along_x = self._powers(self.block)
         powers = _TERMS[: self.terms]
         return np.stack([np.outer(along_y[:, i], along_x[:, j]) for i, j in powers], axis=2)
 
@@ -262,20 +258,17 @@ class _Waves:
         """Return the sum of the waves and a quadratic at all pixels."""
         table = np.sqrt(self._spectrum)
         table[table > 0] *= coefficients
-        along_y, along_x = (
-            self._cosines(axis, np.arange(side, dtype=np.float64))
-            for axis, side in enumerate(self.shape)
-        )
+        along_y, along_x = self._cosines(1)
         waves = along_y @ table @ along_x.T
         table = np.zeros((3, 3))
         table[tuple(np.transpose(_TERMS[: self.terms]))] = trend
-        along_y, along_x = (_powers(np.arange(side, dtype=np.float64), side) for side in self.shape)
+        along_y, along_x = self._powers(1)
         return np.asarray(waves + along_y @ table @ along_x.T)
 
 
-def _powers(places: FloatArray, side: int) -> FloatArray:
-    """Return the powers 0 to 2 of places in pixels, from -1 to 1 over a side, (places, 3)."""
-    return np.asarray(((2 * places + 1) / side - 1)[:, None] ** np.arange(3))
+def _middles(side: int, block: int) -> FloatArray:
+    """Return the middles of blocks along a side, px."""
+    return block * (np.arange(-(-side // block), dtype=np.float64) + 0.5) - 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,15 +359,28 @@ def _square_root(covariance: FloatArray) -> FloatArray:
 
 
 def _joint(fits: list[_Fit]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the logarithm of the beam, the beam in blocks, its components, and the weights."""
+    """Return the logarithm of the beam, the beam in blocks, its components, and the weights.
+
+    The squares of the components, shape (k, h, w), sum to the variance of the beam in each block.
+    """
     evidence = np.array([fit.evidence for fit in fits])
     weights = np.exp(evidence - evidence.max())
     weights[weights < _MIN_WEIGHT * weights.sum()] = 0.0
     weights /= weights.sum()
     likely = [(weight, fit) for weight, fit in zip(weights, fits, strict=True) if weight]
-    beam = sum(weight * fit.at_pixels for weight, fit in likely)
-    light = np.exp(sum(weight * fit.mean for weight, fit in likely))
-    return np.asarray(beam), np.asarray(light), _components(likely), weights
+    beam = np.asarray(sum(weight * fit.at_pixels for weight, fit in likely))
+    mean = np.asarray(sum(weight * fit.mean for weight, fit in likely))
+    columns = [
+        math.sqrt(weight) * np.concatenate([fit.deviations, (fit.mean - mean)[..., None]], axis=2)
+        for weight, fit in likely
+    ]
+    flat = np.concatenate(columns, axis=2).reshape(mean.size, -1)
+    # Few of the many columns matter.
+    powers, turned = scipy.linalg.eigh(flat.T @ flat)
+    beyond = np.cumsum(powers) < _LEFT_OUT * powers.sum()
+    chosen = turned[:, ~beyond][:, -_MAX_COMPONENTS:]
+    components = np.ascontiguousarray((flat @ chosen).T.reshape(-1, *mean.shape))
+    return beam, np.exp(mean), components, weights
 
 
 def _one_thread() -> threadpool_limits:
@@ -382,21 +388,3 @@ def _one_thread() -> threadpool_limits:
     import scipy.linalg  # noqa: F401  only libraries that are loaded are limited
 
     return threadpool_limits(limits=1, user_api="blas")
-
-
-def _components(fits: list[tuple[float, _Fit]]) -> FloatArray:
-    """Return shapes whose squares sum to the variance of the beam in each block, (k, h, w)."""
-    mean = sum(weight * fit.mean for weight, fit in fits)
-    columns = [
-        math.sqrt(weight) * np.concatenate([fit.deviations, shift], axis=2)
-        for weight, fit in fits
-        for shift in [(fit.mean - mean)[..., None]]
-    ]
-    joint = np.concatenate(columns, axis=2)
-    height, width, count = joint.shape
-    flat = joint.reshape(-1, count)
-    # Few of the many columns matter.
-    powers, turned = scipy.linalg.eigh(flat.T @ flat)
-    beyond = np.cumsum(powers) < _LEFT_OUT * powers.sum()
-    chosen = turned[:, ~beyond][:, -_MAX_COMPONENTS:]
-    return np.ascontiguousarray((flat @ chosen).T.reshape(-1, height, width))
