@@ -27,7 +27,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import BinaryIO, Literal, cast
 
 from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv.errors import FileFormatError
@@ -43,13 +43,9 @@ _swept: set[Path] = set()
 
 
 def hidden_name(path: Path, ending: str = "") -> Path:
-    """Return an unused hidden name in the folder of a path, however long the path's name is.
+    """Return an unused hidden name in the folder of a path, with an ending such as ``.tif``.
 
-    Parameters
-    ----------
-    path : Path
-    ending : str, optional
-        Of the name, such as ``.tif``.
+    It is no longer than file systems allow, however long the path's own name is.
     """
     stem = path.name.removesuffix(ending)
     tail = f"-{_signature()}-{secrets.token_hex(4)}{ending}"
@@ -59,14 +55,8 @@ def hidden_name(path: Path, ending: str = "") -> Path:
 
 
 @contextmanager
-def temporary_folder(kind: str) -> Iterator[Path]:
-    """Make a folder in the system's temporary folder, which is removed with the block.
-
-    Parameters
-    ----------
-    kind : {"shadowinv", "film-pack"}
-        Begins its name.
-    """
+def temporary_folder(kind: Literal["shadowinv", "film-pack"]) -> Iterator[Path]:
+    """Make a folder in the system's temporary folder, which is removed with the block."""
     sweep(Path(tempfile.gettempdir()))
     with tempfile.TemporaryDirectory(prefix=f"{kind}-{_signature()}-") as name:
         yield Path(name)

@@ -29,23 +29,12 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 class Table(NamedTuple):
-    """Cells of a table.
-
-    Attributes
-    ----------
-    path : Path
-    header : list of str
-        Column names in lower case.
-    titles : list of str
-        Column names as in the file.
-    rows : dict of int to list of str
-        Cells of each row, as many as there are columns, by its line in the file.
-    """
+    """Cells of a table."""
 
     path: Path
-    header: list[str]
-    titles: list[str]
-    rows: dict[int, list[str]]
+    header: list[str]  # column names in lower case
+    titles: list[str]  # column names as in the file
+    rows: dict[int, list[str]]  # by line in the file, each with as many cells as there are columns
 
     def position_of(self, column: str) -> int:
         """Return the position of a column that occurs once, or raise an `InputError`."""
@@ -63,13 +52,8 @@ class Table(NamedTuple):
 def read_table(path: Path) -> Table:
     """Read the column names and rows of a table.
 
-    Raises
-    ------
-    FileFormatError
-        If the file cannot be read as a table.
-    InputError
-        If it has no rows, or one with more cells than there are columns; the message names the
-        line.
+    A `FileFormatError` if the file cannot be read as a table, an `InputError` if it has no rows, or
+    one with more cells than there are columns; the message names the line.
     """
     records = _records(path, small_text(path, _EXPECTED, "utf-8-sig"))
     _, names = next(records, (0, []))
@@ -97,24 +81,11 @@ def read_rows(
 ) -> dict[int, Model]:
     """Return the rows of a table as models, by their lines in the file.
 
-    Parameters
-    ----------
-    path : Path
-    model : type
-        Model of a row. Empty cells stand for its defaults, file names are relative to the folder
-        of the table.
-    columns : collection of str, optional
-        Names of the columns. Default: the model's fields.
-    shared : mapping, optional
-        Values of all rows where cells are empty.
-
-    Raises
-    ------
-    FileFormatError
-        If the file cannot be read as a table.
-    InputError
-        If a column is unknown, missing or given twice, or a row is invalid; the message names the
-        line.
+    The names of the columns are those of the model's fields, unless `columns` are given. Empty
+    cells stand for the `shared` values of all rows, or else for the model's defaults; file names
+    are relative to the folder of the table. A `FileFormatError` if the file cannot be read as a
+    table, an `InputError` if a column is unknown, missing or given twice, or a row is invalid; the
+    message names the line.
     """
     table = read_table(path)
     known = {name.lower(): name for name in columns or model.model_fields}

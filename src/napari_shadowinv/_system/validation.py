@@ -42,10 +42,7 @@ class _CheckedMeta(ModelMetaclass):
 class CombinationError(ValueError):
     """Values of several fields that exclude each other.
 
-    Parameters
-    ----------
-    sentence : str
-        The mistake, with the keys of the fields in braces: "{flux} is 'known' and {boundary} is …".
+    Its sentence has the keys of the fields in braces: "{flux} is 'known' and {boundary} is …".
     """
 
     def text(self, name_of: Callable[[str], str]) -> str:

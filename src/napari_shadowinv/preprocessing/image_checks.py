@@ -67,16 +67,9 @@ _MIN_SWAPPED_RATIO = 0.75  # see `is_swapped`
 
 @dataclass(frozen=True, eq=False)
 class CheckedImage:
-    """An image and the findings of its checks, each computed once.
+    """An image and the findings of its checks, each computed once."""
 
-    Attributes
-    ----------
-    image : ndarray, shape (H, W)
-        0 at pixels that are not usable.
-    usable : ndarray of bool, shape (H, W)
-    """
-
-    image: FloatArray
+    image: FloatArray  # 0 at pixels that are not usable
     usable: BoolArray
 
     @classmethod
@@ -476,17 +469,9 @@ _PATTERN_DEVIATIONS = 2.0
 def dark_level(planes: Sequence[CheckedImage]) -> float:
     """Estimate an offset that was left in an image, as a share of its mean, from its noise.
 
-    Parameters
-    ----------
-    planes : sequence of CheckedImage
-        The image, and the recorded beam, if any, in the same unit. It has an offset of its own, or
-        shares the image's.
-
-    Returns
-    -------
-    float
-        0 unless the noise cannot be explained without an offset, by any sum of a constant
-        variance, one in proportion to the signal, and one to its square.
+    After the image comes the recorded beam, if any, in the same unit; it has an offset of its own,
+    or shares the image's. The offset is 0 unless the noise cannot be explained without it, by any
+    sum of a constant variance, one in proportion to the signal, and one to its square.
     """
     is_small = min(planes[0].image.shape) < _WINDOW_PX
     if is_small or any(plane.brightness.size < _MIN_PIXELS for plane in planes):
