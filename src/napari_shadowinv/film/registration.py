@@ -517,10 +517,11 @@ def poses_by_fiducials(
     InputError
         If no mark is on two films, or one disagrees with the other marks of its film.
     """
-    film_marks = [
-        {name: _on_film(np.asarray(place, np.float64), film) for name, place in marks.items()}
-        for marks, film in zip(points, np.asarray(corners, np.float64), strict=True)
-    ]
+    film_marks = []  # px down and right from the film's middle
+    for marks, film in zip(points, np.asarray(corners, np.float64), strict=True):
+        axes, middle, _ = upright(film)
+        places = {name: np.asarray(place, np.float64) - middle for name, place in marks.items()}
+        film_marks.append({name: place @ axes.T for name, place in places.items()})
     counts = Counter(name for marks in film_marks for name in marks)
     shared = {name for name, count in counts.items() if count > 1}
     if not shared:
@@ -568,12 +569,6 @@ def poses_by_fiducials(
         np.zeros(count, dtype=bool),
         closure,
     )
-
-
-def _on_film(place: FloatArray, corners: FloatArray) -> FloatArray:
-    """Return px down and right from the film's middle."""
-    axes, middle, _ = upright(corners)
-    return np.asarray((place - middle) @ axes.T)
 
 
 def _rotation(turn: float) -> FloatArray:

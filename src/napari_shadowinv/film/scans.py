@@ -81,18 +81,17 @@ def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[Floa
     inside = ndimage.binary_opening(dark, np.ones((3, 3)), iterations=_DUST_PX)
     height, width = dark.shape
     area = _MIN_FILM_SHARE * height * width if least_side is None else least_side**2
-    labels, count = ndimage.label(inside)
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    film_labels = [number for number in range(1, count + 1) if sizes[number] >= area]
-    if not film_labels:
+    labels, _ = ndimage.label(inside)
+    sizes = np.bincount(labels.ravel())
+    boxes = enumerate(ndimage.find_objects(labels), 1)
+    films = [(number, box) for number, box in boxes if sizes[number] >= area]
+    if not films:
         raise InputError(
             "no film was found on the scan: expected films darker than a bright bed around them; "
             "give their corners"
         )
-    boxes = ndimage.find_objects(labels)
     corners = []
-    for number in film_labels:
-        box = boxes[number - 1]
+    for number, box in films:
         film = ndimage.binary_fill_holes(labels[box] == number)
         top_left = np.array([part.start for part in box])
         corners.append(_sharpen_corners(values, _fit_rectangle(film) + top_left))
@@ -174,11 +173,7 @@ def _fit_rectangle(film: BoolArray) -> FloatArray:
     axes = _axes_of_smallest_box(hull)
     for _ in range(2):  # the second time in the direction of the film, not of its hull
         turned = border @ axes.T
-        low, high = turned.min(axis=0), turned.max(axis=0)
-        lines = []
-        for axis in (0, 1):
-            for edge in (low[axis], high[axis]):
-                lines.append(_fit_side(turned, axis, edge, low, high))
+        lines = [_fit_side(turned, axis, end) for axis in (0, 1) for end in (0, 1)]
         # From the middle of the border's pixels to their outer edge.
         outward = 0.5 * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
         places = (_intersections(lines) + outward) @ axes
@@ -200,14 +195,13 @@ def _axes_of_smallest_box(hull: FloatArray) -> FloatArray:
     return np.stack([down, [-down[1], down[0]]])
 
 
-def _fit_side(
-    turned: FloatArray, axis: int, edge: float, low: FloatArray, high: FloatArray
-) -> _Line:
-    """Fit offset and slope of the line along most of a side's pixels."""
+def _fit_side(border: FloatArray, axis: int, end: int) -> _Line:
+    """Fit offset and slope of the line along most of the pixels at one end of an axis."""
+    low, high = ends = border.min(axis=0), border.max(axis=0)
+    along, across = border[:, 1 - axis], border[:, axis]
     size = (high - low)[1 - axis]
-    along, across = turned[:, 1 - axis], turned[:, axis]
     inner = np.abs(along - (low + high)[1 - axis] / 2) < (0.5 - _END_SHARE) * size
-    near = np.abs(across - edge) < _MAX_OFFSET_SHARE * max(high - low)
+    near = np.abs(across - ends[end][axis]) < _MAX_OFFSET_SHARE * max(high - low)
     return _fit_line(along[inner & near], across[inner & near], 0.5)
 
 
@@ -414,17 +408,14 @@ def usable_pixels(
     scatter = ndimage.median_filter(np.abs(samples - usual), _SCATTER_SAMPLES, mode="nearest")
     least = np.maximum(_resample(_MIN_SCATTERS * NORMAL_MAD * scatter, excess), _MIN_DENSITY)
     marked = np.abs(excess - _resample(usual, excess)) > least
-    labels, count = ndimage.label(marked)
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    marked &= sizes[labels] >= _MIN_MARK_PX
+    labels, _ = ndimage.label(marked)
+    marked &= np.bincount(labels.ravel())[labels] >= _MIN_MARK_PX
     disc = ndimage.iterate_structure(ndimage.generate_binary_structure(2, 1), _GAP_PX)
     border = 2 * _GAP_PX
     closed = ndimage.binary_closing(np.pad(marked, border), disc)[border:-border, border:-border]
     usable = ~ndimage.binary_dilation(closed, iterations=_MARGIN_PX)
-    if rim > 0:
-        inner = np.zeros_like(usable)
-        inner[rim:-rim, rim:-rim] = True
-        usable &= inner
+    for view in (usable, usable[::-1], usable.T, usable.T[::-1]):
+        view[:rim] = False
     return np.asarray(usable)
 
 

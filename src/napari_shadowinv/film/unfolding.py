@@ -206,11 +206,10 @@ class _Basis(NamedTuple):
         ]
         apart = -np.diff(places)
         bends = np.diff(np.eye(len(peaks)), 2, axis=0)
-        if len(bends):
-            both = apart[1:] + apart[:-1]
-            rows = np.arange(len(bends))
-            bends[rows, rows] = 2 * apart[1:] / both
-            bends[rows, rows + 2] = 2 * apart[:-1] / both
+        both = apart[1:] + apart[:-1]
+        rows = np.arange(len(bends))
+        bends[rows, rows] = 2 * apart[1:] / both
+        bends[rows, rows + 2] = 2 * apart[:-1] / both
         return cls(usual, kernel, energies, kernel @ np.array(shares).T, bends)
 
     def seen_energies(self, per_error: FloatArray, curvature: float) -> FloatArray:
