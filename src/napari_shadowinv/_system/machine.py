@@ -92,11 +92,9 @@ def available_threads(threads: int | None) -> int:
     In a thread of a `Crew`: its current share of them.
     """
     threads = _default_threads if threads is None else threads
-    if threads is None:
-        try:
-            threads = len(os.sched_getaffinity(0))
-        except AttributeError:  # not on macOS or Windows
-            threads = os.cpu_count() or 1
+    if threads is None:  # macOS and Windows do not report the cores of a process
+        affinity = getattr(os, "sched_getaffinity", None)
+        threads = len(affinity(0)) if affinity else os.cpu_count() or 1
     crew = _crew_of_this_thread()
     return threads if crew is None else max(1, threads // crew.size)
 

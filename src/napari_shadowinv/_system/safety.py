@@ -104,9 +104,10 @@ def check_regular(path: Path, expected: str) -> None:
             f"{path} does not exist: expected {expected}; check the path"
         ) from None
     except OSError as error:
+        text = str(path)
+        shown = text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
         raise FileFormatError(
-            f"{_shorten_path(path)} cannot be opened ({error.strerror}): check its permissions and "
-            "the path"
+            f"{shown} cannot be opened ({error.strerror}): check its permissions and the path"
         ) from None
     except ValueError:
         raise FileFormatError(
@@ -127,11 +128,6 @@ def resolved_path(path: str | Path) -> Path:
         raise FileFormatError(
             f"{str(path)!r} has a null character, which no path has: correct it"
         ) from None
-
-
-def _shorten_path(path: Path) -> str:
-    text = str(path)
-    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
 
 
 def size_limit() -> int:
