@@ -563,7 +563,7 @@ class IsotropicEstimate(Estimate):
 
 
 def centre_within(
-    shape: tuple[int, int],
+    shape: tuple[int, ...],
     matrix: FloatArray | None = None,
     y: float | None = None,
     x: float | None = None,
@@ -598,9 +598,10 @@ def uniform_warnings(
     if setup is None or setup.is_collimated:
         return ()
     distance = point_distance(setup)
-    axis = [(side - 1) / 2 for side in shape] if centre is None else centre
-    near = [max(0.0, place - (side - 1), -place) for place, side in zip(axis, shape, strict=True)]
-    far = [max(place, side - 1 - place) for place, side in zip(axis, shape, strict=True)]
+    axis = centre_within(shape) if centre is None else centre
+    places = list(zip(axis, shape, strict=True))
+    near = [max(0.0, place - (side - 1), -place) for place, side in places]
+    far = [max(place, side - 1 - place) for place, side in places]
     highest, lowest = ((1 + (math.hypot(*r) / distance) ** 2) ** -1.5 for r in (near, far))
     fall = 1 - lowest / highest
     if fall <= _NOTABLE_FALL:
@@ -650,8 +651,7 @@ def isotropic_source(
     """
     values, usable = pixels.beam_pixels(image, mask)
     distance = point_distance(setup)
-    height, width = values.shape
-    centre = centre_within((height, width), y=centre_y, x=centre_x)
+    centre = centre_within(values.shape, y=centre_y, x=centre_x)
     for axis, place in zip("yx", centre, strict=True):
         if not math.isfinite(place):
             raise InputError(f"centre_{axis} is {place!r}, expected a finite number of px")

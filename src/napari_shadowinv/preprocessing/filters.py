@@ -461,7 +461,10 @@ def _noise(difference: FloatArray, brightness: FloatArray) -> FloatArray:
     n_bins = min(max(difference.size // _PIXELS_PER_NOISE_BIN, 1), _MAX_NOISE_BINS)
     groups = np.array_split(np.argsort(brightness, axis=None, kind="stable"), n_bins)
     flat, positive = difference.ravel(), np.maximum(brightness, 0).ravel()
-    variance = np.array([_deviation(flat[group]) ** 2 for group in groups])
+    sizes = [np.abs(flat[group]) for group in groups]
+    # In few-bit images more than half the pixels can equal their median.
+    deviations = [NORMAL_MAD * np.median(size) or _NORMAL_MEAN * size.mean() for size in sizes]
+    variance = np.array([float(deviation) ** 2 for deviation in deviations])
     if not variance.any():
         return np.zeros_like(difference)
     levels = np.array([positive[group].mean() for group in groups])
@@ -474,10 +477,3 @@ def _noise(difference: FloatArray, brightness: FloatArray) -> FloatArray:
     constant, slope = terms * unit
     fitted: FloatArray = np.sqrt(constant + slope * np.maximum(brightness, 0) / scale)
     return fitted
-
-
-def _deviation(difference: FloatArray) -> float:
-    """Return the robust standard deviation about zero."""
-    size = np.abs(difference)
-    # In few-bit images more than half the pixels can equal their median.
-    return float(NORMAL_MAD * np.median(size)) or float(_NORMAL_MEAN * size.mean())

@@ -83,10 +83,7 @@ def kriged_source(
 
 
 def kriged_beam(
-    image: ArrayLike,
-    mask: ArrayLike,
-    *,
-    should_stop: ShouldStop | None = None,
+    image: ArrayLike, mask: ArrayLike, *, should_stop: ShouldStop | None = None
 ) -> tuple[FloatArray, BeamPrior]:
     """Return the beam of `kriged_source`, and the prior of its error."""
     blocks = _Blocks.of(image, mask)
@@ -331,13 +328,14 @@ class _Fit:
         evidence = evidences[best] + _evidence_of_trend(
             roots * terms, trend - trend_of_waves @ coefficients
         )
+        variances, shapes = scipy.linalg.eigh(noise[best] * (inverse @ inverse.T))
         return cls(
             waves,
             trend,
             trend_of_waves,
             coefficients,
             turned * np.sqrt(noise[best] * gain[best]),
-            _square_root(noise[best] * (inverse @ inverse.T)),
+            shapes * np.sqrt(np.maximum(variances, 0.0)),
             float(evidence),
         )
 
@@ -350,12 +348,6 @@ def _evidence_of_trend(terms: FloatArray, trend: FloatArray) -> float:
     count = slopes.shape[1]
     square = float((trend[1:] ** 2).sum()) / _TREND**2
     return float(-0.5 * (log_volume + count * _LOG_2PI + square))
-
-
-def _square_root(covariance: FloatArray) -> FloatArray:
-    """Return columns whose squares sum to a covariance."""
-    powers, shapes = scipy.linalg.eigh(covariance)
-    return np.asarray(shapes * np.sqrt(np.maximum(powers, 0.0)))
 
 
 def _joint(fits: list[_Fit]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

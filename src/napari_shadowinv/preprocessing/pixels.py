@@ -89,8 +89,7 @@ def fill_masked(
     """Fit a smoothing spline to the usable pixels and continue it over the others."""
     mean = values[usable].mean()
     weighted = np.where(usable, values / mean, 0.0)
-    share = usable.astype(np.float64)
-    return np.asarray(_spline(weighted, share, width, power, report) * mean)
+    return np.asarray(_spline(weighted, usable.astype(float), width, power, report) * mean)
 
 
 def _spline(

@@ -289,15 +289,14 @@ class Dark(Step):
         return self.level if isinstance(self.level, Path) else None
 
     def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
-        dark: Any = self.level
-        name = f"level {dark:g}" if self.frame_file is None else f"frame {self.frame_file.name}"
-        if self.frame_file is not None:
-            if shot.dark is None:
-                raise InputError(
-                    f"the dark {name} has not been read: run the recipe, or put the image in the "
-                    "shot's 'dark'"
-                )
-            dark = shot.dark
+        file = self.frame_file
+        dark: Any = self.level if file is None else shot.dark
+        name = f"level {dark:g}" if file is None else f"frame {file.name}"
+        if dark is None:
+            raise InputError(
+                f"the dark {name} has not been read: run the recipe, or put the image in the "
+                "shot's 'dark'"
+            )
         usable = shot.usable
         image = shot.image - dark
         if usable.any() and not image[usable].mean() > 0:
