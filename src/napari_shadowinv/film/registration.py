@@ -112,8 +112,48 @@ class _Film(NamedTuple):
     image: FloatArray
     usable: BoolArray
     level: FloatArray  # smoothed, on the pixels that are compared
-    texture: FloatArray
+    texture: FloatArray  # fine structure there
     counts: BoolArray  # where the texture is known
+
+    @classmethod
+    def of(cls, image: FloatArray, usable: BoolArray) -> _Film:
+        weight = usable.astype(np.float64)
+        filled = np.where(usable, image, 0.0)
+
+        def smooth(size: float) -> tuple[FloatArray, FloatArray]:
+            share = ndimage.gaussian_filter(weight, size)
+            return ndimage.gaussian_filter(filled, size) / np.maximum(share, 1e-6), share
+
+        (fine, share), (coarse, _) = smooth(_FINE_BLUR_PX), smooth(_COARSE_BLUR_PX)
+        inner = np.zeros_like(usable)
+        margin = min(_MARGIN_PX, min(image.shape) // 8)
+        inner[margin:-margin, margin:-margin] = True
+        counts = inner & usable & (share > 0.9)
+        few = np.s_[_SAMPLING_PX // 2 :: _SAMPLING_PX, _SAMPLING_PX // 2 :: _SAMPLING_PX]
+        texture = np.where(counts, fine - coarse, 0.0)
+        return cls(image, usable, fine[few], texture[few], counts[few])
+
+    def with_dose_of(self, other: _Film) -> _Film:
+        """Return the film with its dose mapped to that of another by a monotone function."""
+        both = self.counts & other.counts
+        if both.sum() < _DOSE_STEPS**2:
+            return self
+        order = np.argsort(self.level[both])
+        levels, values = (
+            np.array([part.mean() for part in np.array_split(plane[both][order], _DOSE_STEPS)])
+            for plane in (self.level, other.level)
+        )
+        values = isotonic_regression(values).x
+        levels, starts = np.unique(levels, return_index=True)
+        values = values[starts]
+        if len(levels) < 2:
+            return self
+        mapped = np.asarray(np.interp(self.image, levels, values))
+        # It goes on straight beyond its ends, where it would otherwise have kinks.
+        slopes = np.diff(values) / np.diff(levels)
+        mapped += slopes[0] * np.minimum(self.image - levels[0], 0.0)
+        mapped += slopes[-1] * np.maximum(self.image - levels[-1], 0.0)
+        return _Film.of(mapped, self.usable)
 
 
 class _Pair(NamedTuple):
@@ -171,7 +211,7 @@ def register(
     edges = np.broadcast_to(np.asarray(spread, np.float64), len(values))
     alike: list[Hashable] = [None] * len(values) if kinds is None else list(kinds)
     planes = zip(values, is_usable, strict=True)
-    films = [_Film(image, mask, *_texture(image, mask)) for image, mask in planes]
+    films = [_Film.of(image, mask) for image, mask in planes]
     compared = []
     for first in range(len(films)):
         report("register", first, len(films))
@@ -181,13 +221,12 @@ def register(
                 compared.append(pair)
     pairs = _credible(compared, edges, alike, values.shape[1:])
     poses = _fit_poses(pairs, edges)
-    errors = poses.errors.copy()
     for k in np.flatnonzero(~poses.by_images):
         # Edges are as far off as those of films of the same kind that can be compared.
         peers = [j for j in np.flatnonzero(poses.by_images) if alike[j] == alike[k]]
         if peers:
-            errors[k] = max(errors[k], np.sqrt(np.mean(poses.shifts[peers] ** 2)))
-    poses = poses._replace(errors=errors)
+            by_peers = np.sqrt(np.mean(poses.shifts[peers] ** 2))
+            poses.errors[k] = max(poses.errors[k], by_peers)
     if not pairs or max(np.abs(pair.shift).max() for pair in pairs) > _EDGE_AGREEMENT_PX:
         return poses
     return poses._replace(
@@ -293,56 +332,15 @@ def _is_confirmed(pair: _Pair, pairs: list[_Pair], kinds: list[Hashable]) -> boo
     return False
 
 
-def _with_dose_of(film: _Film, onto: _Film) -> tuple[FloatArray, BoolArray]:
-    """Texture of a film whose dose is mapped to the dose of another by a monotone function."""
-    both = film.counts & onto.counts
-    if both.sum() < _DOSE_STEPS**2:
-        return film.texture, film.counts
-    order = np.argsort(film.level[both])
-    levels, values = (
-        np.array([part.mean() for part in np.array_split(plane[both][order], _DOSE_STEPS)])
-        for plane in (film.level, onto.level)
-    )
-    values = isotonic_regression(values).x
-    levels, starts = np.unique(levels, return_index=True)
-    values = values[starts]
-    if len(levels) < 2:
-        return film.texture, film.counts
-    mapped = np.asarray(np.interp(film.image, levels, values))
-    # It goes on straight beyond its ends, where it would otherwise have kinks.
-    slopes = np.diff(values) / np.diff(levels)
-    mapped += slopes[0] * np.minimum(film.image - levels[0], 0.0)
-    mapped += slopes[-1] * np.maximum(film.image - levels[-1], 0.0)
-    return _texture(mapped, film.usable)[1:]
-
-
-def _texture(image: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Smoothed image, fine structure, and where that is known, on fewer pixels."""
-    weight = usable.astype(np.float64)
-    filled = np.where(usable, image, 0.0)
-
-    def smooth(size: float) -> tuple[FloatArray, FloatArray]:
-        share = ndimage.gaussian_filter(weight, size)
-        return ndimage.gaussian_filter(filled, size) / np.maximum(share, 1e-6), share
-
-    (fine, share), (coarse, _) = smooth(_FINE_BLUR_PX), smooth(_COARSE_BLUR_PX)
-    inner = np.zeros_like(usable)
-    margin = min(_MARGIN_PX, min(image.shape) // 8)
-    inner[margin:-margin, margin:-margin] = True
-    counts = inner & usable & (share > 0.9)
-    few = np.s_[_SAMPLING_PX // 2 :: _SAMPLING_PX, _SAMPLING_PX // 2 :: _SAMPLING_PX]
-    return fine[few], np.where(counts, fine - coarse, 0.0)[few], counts[few]
-
-
 def _compare(first: int, second: int, films: list[_Film]) -> _Pair | None:
     """Pose of the second film against the first, or None if they do not show the same."""
     reference, reference_mask = films[first].texture, films[first].counts
-    texture, mask = _with_dose_of(films[second], films[first])
-    shift, correlation = _coarse_shift(reference, reference_mask, texture, mask)
+    film = films[second].with_dose_of(films[first])
+    shift, correlation = _coarse_shift(films[first], film)
     if correlation < _MIN_CORRELATION:
         return None
     pose = np.array([*shift, 0.0])
-    planes = [texture, mask.astype(np.float64), *np.gradient(texture)]
+    planes = [film.texture, film.counts.astype(np.float64), *np.gradient(film.texture)]
     y, x = _from_middle(reference.shape)
     for _ in range(_MAX_STEPS):
         moved, share, *slopes = _move(pose, planes)
@@ -389,21 +387,19 @@ def _move(pose: FloatArray, planes: list[FloatArray]) -> list[FloatArray]:
     return [ndimage.map_coordinates(plane, at, order=1) for plane in planes]
 
 
-def _coarse_shift(
-    reference: FloatArray, reference_mask: BoolArray, texture: FloatArray, mask: BoolArray
-) -> tuple[FloatArray, float]:
+def _coarse_shift(first: _Film, second: _Film) -> tuple[FloatArray, float]:
     """Whole pixels by which the second film correlates best, each counting where it is known."""
-    shape = tuple(
-        fft.next_fast_len(length + _MAX_SHIFT_SAMPLES, real=True) for length in reference.shape
-    )
+    sides = first.texture.shape
+    shape = tuple(fft.next_fast_len(side + _MAX_SHIFT_SAMPLES, real=True) for side in sides)
 
     def products(left: AnyArray, right: AnyArray) -> FloatArray:
         spectra = [fft.rfft2(plane.astype(np.float64), shape) for plane in (left, right)]
         return np.asarray(fft.irfft2(np.conj(spectra[0]) * spectra[1], shape))
 
-    common = products(reference, texture)
-    powers = products(reference**2, mask) * products(reference_mask, texture**2)
-    least = 0.05 * float((reference**2).sum() * (texture**2).sum())
+    squares, moved_squares = first.texture**2, second.texture**2
+    common = products(first.texture, second.texture)
+    powers = products(squares, second.counts) * products(first.counts, moved_squares)
+    least = 0.05 * float(squares.sum() * moved_squares.sum())
     alike = common / np.sqrt(np.maximum(powers, max(least, 1e-300)))
     near = np.arange(-_MAX_SHIFT_SAMPLES, _MAX_SHIFT_SAMPLES + 1)
     window = alike[np.ix_(near, near)]
@@ -443,9 +439,11 @@ def _fit_poses(pairs: list[_Pair], edges: FloatArray) -> Poses:
     count = len(edges)
     normal, sides = np.diag(1 / np.square(edges)), np.zeros((count, 2))
     turns, turned = np.eye(count) / _TURN_ERROR_RAD**2, np.zeros(count)
+    is_compared = np.zeros(count, dtype=bool)
     for pair in pairs:
         difference = np.zeros(count)
-        difference[[pair.first, pair.second]] = -1.0, 1.0
+        films = [pair.first, pair.second]
+        difference[films], is_compared[films] = (-1.0, 1.0), True
         both = np.outer(difference, difference)
         normal += both / pair.error**2
         sides += difference[:, None] * pair.shift / pair.error**2
@@ -455,9 +453,6 @@ def _fit_poses(pairs: list[_Pair], edges: FloatArray) -> Poses:
     variance = np.diag(covariance)
     between = variance[:, None] + variance - 2 * covariance + np.diag(np.full(count, np.inf))
     shifts = np.asarray(covariance @ sides)
-    is_compared = np.isin(
-        np.arange(count), [k for pair in pairs for k in (pair.first, pair.second)]
-    )
     apart = [shifts[pair.second] - shifts[pair.first] - pair.shift for pair in pairs]
     closes = len(pairs) > is_compared.sum() - 1 if pairs else False
     return Poses(
@@ -562,13 +557,8 @@ def poses_by_fiducials(
     errors = np.array(
         [error / np.sqrt(len(marks)) if marks else EDGE_ERROR_PX for marks in film_marks]
     )
-    return Poses(
-        shifts / np.asarray(scales, np.float64)[:, None],
-        turns,
-        errors,
-        np.zeros(count, dtype=bool),
-        closure,
-    )
+    shifts /= np.asarray(scales, np.float64)[:, None]
+    return Poses(shifts, turns, errors, np.zeros(count, dtype=bool), closure)
 
 
 def _rotation(turn: float) -> FloatArray:
