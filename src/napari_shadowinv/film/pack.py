@@ -462,16 +462,12 @@ class Pack(CheckedModel):
         first = setup_from_dict({**values, "energy": float(in_mev[0])}, "setup")
         assert isinstance(first, ProtonSetup)
         common = {"pixel_size": first.object_pixel_size, "detector_pixel_size": None}
-        return tuple(
-            first.model_copy(
-                update={
-                    **common,
-                    "energy": float(energy),
-                    "object_image_distance": first.object_image_distance + float(depth),
-                }
-            )
-            for energy, depth in zip(in_mev, self.depths(), strict=True)
-        )
+        setups = []
+        for energy, depth in zip(in_mev, self.depths(), strict=True):
+            distance = first.object_image_distance + float(depth)
+            changes = {**common, "energy": float(energy), "object_image_distance": distance}
+            setups.append(first.model_copy(update=changes))
+        return tuple(setups)
 
     def depths(self) -> FloatArray:
         """Return the distance of each film's active layer from the first film's, in m."""
