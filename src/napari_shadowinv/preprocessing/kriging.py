@@ -216,14 +216,14 @@ class _Waves:
         return [step * np.arange(float(n)) for step, n in zip(steps, counts, strict=True)]
 
     @cached_property
-    def _spectrum(self) -> FloatArray:
+    def spectrum(self) -> FloatArray:
         """Variance of each product of cosines, 0 for those that are not used."""
         along_y, along_x = self._numbers
         squares = self.length**2 * (along_y[:, None] ** 2 + along_x**2)
         variances = np.where(squares <= _SHORTEST_WAVE**2, np.exp(-0.5 * squares), 0.0)
         return np.asarray(variances / variances.sum())
 
-    def _cosines(self, block: int) -> list[FloatArray]:
+    def cosines(self, block: int) -> list[FloatArray]:
         """Return cosines with a mean square of 1 at blocks along y and x, shape (blocks, waves)."""
         return [
             np.where(numbers > 0, math.sqrt(2), 1.0)
@@ -231,7 +231,7 @@ class _Waves:
             for side, numbers in zip(self.shape, self._numbers, strict=True)
         ]
 
-    def _powers(self, block: int) -> list[FloatArray]:
+    def powers(self, block: int) -> list[FloatArray]:
         """Return the powers 0 to 2 of places from -1 to 1 at blocks along y and x, (blocks, 3)."""
         places = [(2 * _middles(side, block) + 1) / side - 1 for side in self.shape]
         return [place[:, None] ** np.arange(3) for place in places]
@@ -239,28 +239,17 @@ class _Waves:
     @cached_property
     def at_blocks(self) -> FloatArray:
         """Waves of one standard deviation at the middles of blocks, shape (h, w, waves)."""
-        along_y, along_x = self._cosines(self.block)
-        rows, columns = np.nonzero(self._spectrum)
+        along_y, along_x = self.cosines(self.block)
+        rows, columns = np.nonzero(self.spectrum)
         waves = along_y[:, None, rows] * along_x[None, :, columns]
-        return np.asarray(waves * np.sqrt(self._spectrum[rows, columns]))
+        return np.asarray(waves * np.sqrt(self.spectrum[rows, columns]))
 
     @cached_property
     def terms_at_blocks(self) -> FloatArray:
         """Terms of a quadratic at the middles of blocks, shape (h, w, terms)."""
-        along_y, along_x = self._powers(self.block)
+        along_y, along_x = self.powers(self.block)
         powers = _TERMS[: self.terms]
         return np.stack([np.outer(along_y[:, i], along_x[:, j]) for i, j in powers], axis=2)
-
-    def at_pixels(self, coefficients: FloatArray, trend: FloatArray) -> FloatArray:
-        """Return the sum of the waves and a quadratic at all pixels."""
-        table = np.sqrt(self._spectrum)
-        table[table > 0] *= coefficients
-        along_y, along_x = self._cosines(1)
-        waves = along_y @ table @ along_x.T
-        table = np.zeros((3, 3))
-        table[tuple(np.transpose(_TERMS[: self.terms]))] = trend
-        along_y, along_x = self._powers(1)
-        return np.asarray(waves + along_y @ table @ along_x.T)
 
 
 def _middles(side: int, block: int) -> FloatArray:
@@ -299,8 +288,15 @@ class _Fit:
     @property
     def at_pixels(self) -> FloatArray:
         """Mean of the logarithm of the beam in each pixel."""
-        trend = self.trend - self.trend_of_waves @ self.coefficients
-        return self.waves.at_pixels(self.coefficients, trend)
+        table = np.sqrt(self.waves.spectrum)
+        table[table > 0] *= self.coefficients
+        along_y, along_x = self.waves.cosines(1)
+        waves = along_y @ table @ along_x.T
+        table = np.zeros((3, 3))
+        terms = tuple(np.transpose(_TERMS[: self.waves.terms]))
+        table[terms] = self.trend - self.trend_of_waves @ self.coefficients
+        along_y, along_x = self.waves.powers(1)
+        return np.asarray(waves + along_y @ table @ along_x.T)
 
     @classmethod
     def to(cls, waves: _Waves, bare: BoolArray, logs: FloatArray, counts: FloatArray) -> _Fit:

@@ -15,20 +15,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.cautions import Caution, warn_of
+from napari_shadowinv.cautions import Caution, OnCaution, warn_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import FitChoices, Instrument, InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing.estimates import Estimate
 from napari_shadowinv.preprocessing.filters import Filter, HotPixelFilter
 from napari_shadowinv.preprocessing.steps import Choice, Dark, Radiograph, Step, choices_of
-
-if TYPE_CHECKING:
-    from napari_shadowinv._system.progress import ShouldStop
-    from napari_shadowinv.cautions import OnCaution
-
 
 _MIN_VISIBLE_SHARE = 0.1  # of an object under the source mask, for the inversion to see it
 _MIN_OBJECT_PIXELS = 10  # pixels

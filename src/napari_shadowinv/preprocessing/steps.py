@@ -195,7 +195,6 @@ def degree_field(description: str) -> Any:
         default=2,
         ge=0,
         le=10,
-        title="Degree",
         description=f"Total degree of the polynomial{description}",
         json_schema_extra={"slider": [0, 10]},
     )
