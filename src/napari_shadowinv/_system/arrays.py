@@ -171,10 +171,9 @@ def check_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str = "imag
 
 def as_numbers(name: str, values: ArrayLike) -> FloatArray:
     """Return a copy of values as floats, or raise an `InputError` that shows the values."""
+    refuse_masked(values, name)
     try:
-        return np.array(refuse_masked(values, name), dtype=np.float64)
-    except InputError:
-        raise
+        return np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         text = " ".join(repr(values).split())
         raise InputError(f"{name} is {text:.60}: expected numbers, as many in each row") from error

@@ -134,7 +134,6 @@ def _crew_of_this_thread() -> Crew | None:
 
 
 LIGHT_ITEMS = 1 << 14  # the smallest range of a kernel that does little with each item
-
 _UNEVEN_RANGES = 4  # for each thread
 
 
@@ -164,13 +163,13 @@ def in_ranges(
     run_together([partial(kernel, *pair, *args) for pair in pairwise(bounds)], threads)
 
 
-def run_together(works: Sequence[Callable[[], Any]], threads: int) -> None:
-    """Call functions that release the GIL and write nothing in common, in threads."""
-    remaining = iter(works)
+def run_together(works: Sequence[Callable[[], _T]], threads: int) -> list[_T]:
+    """Call functions that release the GIL and write nothing in common, and return their results."""
+    remaining, results = iter(enumerate(works)), dict[int, _T]()
 
     def run() -> None:
-        for work in remaining:
-            work()
+        for number, work in remaining:
+            results[number] = work()
 
     futures = [_kernel_pool().submit(run) for _ in range(min(threads, len(works)) - 1)]
     try:
@@ -180,17 +179,13 @@ def run_together(works: Sequence[Callable[[], Any]], threads: int) -> None:
         wait(begun)
     for future in begun:
         future.result()
+    return [results[number] for number in range(len(works))]
 
 
 def results_of(works: Sequence[Callable[[], _T]], threads: int) -> list[_T]:
     """Call functions side by side, and return their results; their kernels share the threads."""
-    crew, results = Crew(len(works), threads), {}
-
-    def call(number: int) -> None:
-        results[number] = crew.call(works[number])
-
-    run_together([partial(call, number) for number in range(len(works))], threads)
-    return [results[number] for number in range(len(works))]
+    crew = Crew(len(works), threads)
+    return run_together([partial(crew.call, work) for work in works], threads)
 
 
 def begin(work: Callable[[], _T], threads: int | None) -> Callable[[], _T]:

@@ -51,10 +51,8 @@ def as_file_errors(
             return read(Path(path), *args, **kwargs)
         except _DamagedContentError as error:
             raise _damage_error(path, error.__cause__ or error) from error
-        except (FileFormatError, InputError, InversionCancelled):
-            raise
-        except (ImportError, NameError):  # a mistake in a program, which no file can cause
-            raise
+        except (FileFormatError, InputError, InversionCancelled, ImportError, NameError):
+            raise  # the last two are mistakes in a program, which no file can cause
         except MemoryError as error:
             raise FileFormatError(
                 f"{path} needs more memory than is available: close other programs, or crop or "

@@ -13,19 +13,15 @@ import csv
 import io
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, get_args
-
-from pydantic import BaseModel
+from typing import Any, NamedTuple, get_args
 
 from napari_shadowinv._system.safety import as_file_errors, check_regular, small_text
-from napari_shadowinv._system.validation import suggestion, validate
+from napari_shadowinv._system.validation import Model, suggestion, validate
 from napari_shadowinv.errors import FileFormatError, InputError
 
 _MAX_HEADER_BYTES = 100_000
 _SEPARATORS = ";\t,"
 _EXPECTED = "a table as comma-separated values"
-
-Model = TypeVar("Model", bound=BaseModel)
 
 
 class Table(NamedTuple):
