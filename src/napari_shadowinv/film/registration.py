@@ -210,8 +210,7 @@ def register(
     report = report or Reporter(None, None)
     edges = np.broadcast_to(np.asarray(spread, np.float64), len(values))
     alike: list[Hashable] = [None] * len(values) if kinds is None else list(kinds)
-    planes = zip(values, is_usable, strict=True)
-    films = [_Film.of(image, mask) for image, mask in planes]
+    films = [_Film.of(*planes) for planes in zip(values, is_usable, strict=True)]
     compared = []
     for first in range(len(films)):
         report("register", first, len(films))
@@ -583,11 +582,7 @@ def _fit_rigid(
     """Fit the shift and turn from the common places to a film's marks, by least squares."""
     on_film = np.array(list(marks.values()))
     expected = np.array([common[name] for name in marks])
-    turn = 0.0
-    if len(marks) > 1:
-        common_y, common_x = (expected - expected.mean(axis=0)).T
-        film_y, film_x = (on_film - on_film.mean(axis=0)).T
-        along = (expected - expected.mean(axis=0)) * (on_film - on_film.mean(axis=0))
-        across = common_y * film_x - common_x * film_y
-        turn = float(np.arctan2(across.sum(), along.sum()))
+    common_away, film_away = (places - places.mean(axis=0) for places in (expected, on_film))
+    across = common_away[:, 0] * film_away[:, 1] - common_away[:, 1] * film_away[:, 0]
+    turn = float(np.arctan2(across.sum(), (common_away * film_away).sum()))  # 0 for one mark
     return (on_film - expected @ _rotation(turn)).mean(axis=0), turn
