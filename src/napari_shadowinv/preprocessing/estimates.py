@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -223,19 +224,14 @@ def _blur_masked(
     values: FloatArray, usable: BoolArray, width: float, report: Reporter
 ) -> tuple[FloatArray, BoolArray]:
     """Blur the usable pixels; return also where enough of them are within reach."""
+    blur: Callable[[FloatArray], FloatArray] = partial(low_pass, width=width)
+    if width < _MIN_WAVE_BLUR_PX:  # its time, unlike the other's, depends on the width
+        blur = partial(scipy.ndimage.gaussian_filter, sigma=width, mode="reflect")
     report("source", 0, 2)
-    support = _blur(usable.astype(np.float64), width)
+    support = blur(usable.astype(np.float64))
     report("source", 1, 2)
-    blurred = _blur(np.where(usable, values, 0.0), width)
+    blurred = blur(np.where(usable, values, 0.0))
     return blurred / np.maximum(support, _MIN_SUPPORT), support >= _MIN_SUPPORT
-
-
-def _blur(values: FloatArray, width: float) -> FloatArray:
-    """Blur by a Gaussian with a mirrored border."""
-    if width < _MIN_WAVE_BLUR_PX:
-        return np.asarray(scipy.ndimage.gaussian_filter(values, width, mode="reflect"))
-    # Its time does not depend on the width.
-    return low_pass(values, width)
 
 
 def total_variation_source(
@@ -652,14 +648,12 @@ def isotropic_source(
     values, usable = pixels.beam_pixels(image, mask)
     distance = point_distance(setup)
     centre = centre_within(values.shape, y=centre_y, x=centre_x)
-    for axis, place in zip("yx", centre, strict=True):
+    edges = []
+    for axis, side, place in zip("yx", values.shape, centre, strict=True):
         if not math.isfinite(place):
             raise InputError(f"centre_{axis} is {place!r}, expected a finite number of px")
-    y, x = (
-        (np.arange(-0.5, side) - place) / distance
-        for side, place in zip(values.shape, centre, strict=True)
-    )
-    y = y[:, None]
+        edges.append((np.arange(-0.5, side) - place) / distance)
+    y, x = edges[0][:, None], edges[1]
     # Solid angle of the rectangle between the axis and each corner of the pixels.
     angles = np.arctan2(y * x, np.sqrt(1 + y**2 + x**2))
     beam = np.diff(np.diff(angles, axis=0), axis=1)

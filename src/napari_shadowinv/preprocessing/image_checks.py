@@ -136,7 +136,9 @@ class CheckedImage:
         order = order[: int((1 - _BRIGHTEST_LEFT_OUT) * order.size)]
         parts = np.array_split(order, _N_BRIGHTNESS_BINS)
         levels = np.array([brightness[part].mean() for part in parts])
-        noise = np.sqrt([_clipped_variance(differences[part]) for part in parts])
+        sizes = [np.abs(differences[part]) for part in parts]
+        clipped = [size[size <= _clip_limit(size)] for size in sizes]
+        noise = np.sqrt([float((size**2).mean()) / _CLIPPED_VARIANCE for size in clipped])
         counts = np.array([len(part) for part in parts]) * _INDEPENDENT_SHARE
         return np.array([levels, noise, noise / np.sqrt(counts)])
 
@@ -289,8 +291,13 @@ class ReferencePair:
     @cached_property
     def is_negative(self) -> bool:
         """Whether the image is dark at its borders where its beam is bright."""
-        shot, beam = (plane[self._ring] for plane in self._blocks[:2])
-        return self._has_border and _correlation(shot, beam) < _NEGATIVE_CORRELATION
+        if not self._has_border:
+            return False
+        shot, beam = (plane[self._ring] - plane[self._ring].mean() for plane in self._blocks[:2])
+        # Not by BLAS, whose threads would wait in circles.
+        product = float((shot * beam).sum())
+        size = float(np.sqrt((shot**2).sum() * (beam**2).sum()))
+        return product / max(size, 1e-300) < _NEGATIVE_CORRELATION
 
     @cached_property
     def is_swapped(self) -> bool:
@@ -425,13 +432,6 @@ def _details(values: FloatArray) -> FloatArray:
     return np.asarray(values - ndimage.uniform_filter(values, _DETAIL_BLOCKS))
 
 
-def _correlation(first: FloatArray, second: FloatArray) -> float:
-    first, second = first - first.mean(), second - second.mean()
-    # Not by BLAS, whose threads would wait in circles.
-    product = float((first * second).sum())
-    return product / max(float(np.sqrt((first**2).sum() * (second**2).sum())), 1e-300)
-
-
 def _mismatch(image: FloatArray, source: FloatArray, ring: BoolArray) -> FloatArray:
     """Return the mean square difference at every shift of image against source, in a ring."""
     shape = [fft.next_fast_len(2 * side, real=True) for side in image.shape]
@@ -489,12 +489,6 @@ def dark_level(planes: Sequence[CheckedImage]) -> float:
 def _clip_limit(sizes: FloatArray) -> float:
     """Return the largest absolute difference that counts."""
     return _CLIP_DEVIATIONS * NORMAL_MAD * float(np.median(sizes))
-
-
-def _clipped_variance(differences: FloatArray) -> float:
-    sizes = np.abs(differences)
-    limit = _clip_limit(sizes)
-    return float((sizes[sizes <= limit] ** 2).mean()) / _CLIPPED_VARIANCE
 
 
 def _common_pattern(first: CheckedImage, second: CheckedImage) -> float:
