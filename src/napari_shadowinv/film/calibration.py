@@ -152,8 +152,7 @@ class Calibration:
                 "Gy: expected at least two; widen the range of doses"
             )
         empty = np.empty(0) if background is None else np.asarray(background, float)
-        spreads = used[:, 4:] if used.shape[1] == 7 else np.empty(0)
-        return cls(used[:, 0], used[:, 1:4], empty, spreads)
+        return cls(used[:, 0], used[:, 1:4], empty, used[:, 4:])
 
     def curve(self, channel: str = "red") -> tuple[FloatArray, FloatArray]:
         """Return net optical density and dose of one channel, both strictly increasing, shape (m,).
@@ -236,8 +235,7 @@ def net_optical_density(
     plane = _check_plane(np.asarray(scan), channel, "scan")
     unexposed = _unexposed_level(np.asarray(background), channel)
     with np.errstate(divide="ignore"):
-        density: FloatArray = np.log10(unexposed) - np.log10(plane)
-    return density
+        return np.asarray(np.log10(unexposed) - np.log10(plane))
 
 
 def _check_plane(scan: AnyArray, channel: str, name: str) -> FloatArray:

@@ -242,13 +242,13 @@ def _sharpen_corners(scan: AnyArray, corners: FloatArray) -> FloatArray:
 
             def sample(across: FloatArray) -> FloatArray:
                 """Interpolate the scan on lines across the side, from inside outwards."""
-                places = np.empty((*across.shape, 2))
+                places = np.empty((len(along), across.shape[-1], 2))  # noqa: B023
                 places[..., axis] = sign * (half + across)  # noqa: B023
                 places[..., 1 - axis] = along[:, None]  # noqa: B023
                 at = np.moveaxis(places @ axes + middle, -1, 0)
                 return np.asarray(ndimage.map_coordinates(darkest, at, order=1, mode="nearest"))
 
-            edge, clear = _find_edge(sample, count)
+            edge, clear = _find_edge(sample)
             if clear.mean() < 0.5:
                 return corners
             offset, slope = _fit_line(along[clear], edge[clear], _MIN_OUTLIER_PX)
@@ -256,17 +256,15 @@ def _sharpen_corners(scan: AnyArray, corners: FloatArray) -> FloatArray:
     return np.asarray(middle + _intersections(lines) @ axes)
 
 
-def _find_edge(
-    sample: Callable[[FloatArray], FloatArray], count: int
-) -> tuple[FloatArray, BoolArray]:
+def _find_edge(sample: Callable[[FloatArray], FloatArray]) -> tuple[FloatArray, BoolArray]:
     """Return where lines cross the edge from film to bed, and which of them do so clearly."""
-    across = np.tile(np.arange(-_REACH_PX, _REACH_PX + _STEP_PX, _STEP_PX), (count, 1))
+    across = np.arange(-_REACH_PX, _REACH_PX + _STEP_PX, _STEP_PX)
     values = sample(across)
     bed, film = values[:, -1], values[:, 0]
     inside = values < ((bed + film) / 2)[:, None]
     last = inside.shape[1] - 1 - np.argmax(inside[:, ::-1], axis=1)
     clear = (film < _MAX_FILM_BRIGHTNESS * bed) & inside.any(axis=1) & (last < inside.shape[1] - 1)
-    about = across[0, last] + _STEP_PX / 2
+    about = across[last] + _STEP_PX / 2
     # Pixels are means over their squares: their deficit against the bed gives the edge exactly.
     near = np.arange(-_BLUR_PX, _BLUR_PX + _STEP_PX, _STEP_PX)
     values = sample(about[:, None] + near)

@@ -115,11 +115,10 @@ class Response:
                     "the thicknesses of the pack, which are in m"
                 )
             above = np.flatnonzero(deposit >= _BAND_SHARE * deposit[top])
-            first = above[0]
             # The first gap ends it; protons that are much faster cross all films.
             gaps = np.flatnonzero(np.diff(above[above >= top]) > 1)
             last = above[above >= top][gaps[0]] if gaps.size else above[-1]
-            low, peak, high = (float(self.energies[k]) for k in (first, top, last))
+            low, peak, high = (float(self.energies[k]) for k in (above[0], top, last))
             bands.append(Band(peak, low, high))
         return tuple(bands)
 
