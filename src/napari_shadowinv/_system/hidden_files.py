@@ -163,7 +163,9 @@ def locked(path: Path) -> Iterator[None]:
             file, is_new = _open_lock(path, lock)
             stack.enter_context(file)
             taken = _try_lock(file)
-            is_certain = _is_certain(file, is_new, taken)
+            # No other process can hold a new lock, or one that was left on this machine.
+            is_left = taken and _read_owner(file).get("host") in (None, socket.gethostname())
+            is_certain = taken is not False and bool(is_new or is_left)
             if is_certain:
                 stack.callback(_release, file, lock)
         if taken is False or not (is_certain or _is_silent(lock)):
@@ -217,13 +219,6 @@ def _not_a_file_error(path: Path, lock: Path) -> FileFormatError:
     return FileFormatError(
         f"{path} cannot be written: its lock {lock} is a link or not a file; remove it"
     )
-
-
-def _is_certain(file: BinaryIO, is_new: bool, taken: bool | None) -> bool:
-    """Return whether no other process can hold the lock."""
-    if taken is False:
-        return False
-    return is_new or bool(taken and _read_owner(file).get("host") in (None, socket.gethostname()))
 
 
 def _sign(path: Path, lock: Path, file: BinaryIO, *, settle: bool) -> None:

@@ -565,8 +565,7 @@ def centre_within(
     x: float | None = None,
 ) -> tuple[float, float]:
     """Return the coordinates of a pixel of the recorded image, by default its centre, in a part."""
-    middle = [(side - 1) / 2 for side in shape]
-    recorded = [m if c is None else c for m, c in zip(middle, (y, x), strict=True)]
+    recorded = [(n - 1) / 2 if c is None else c for n, c in zip(shape, (y, x), strict=True)]
     if matrix is not None:
         recorded = [float(v) for v in np.linalg.solve(matrix, [*recorded, 1.0])[:2]]
     return recorded[0], recorded[1]

@@ -475,5 +475,4 @@ def _noise(difference: FloatArray, brightness: FloatArray) -> FloatArray:
     columns = np.stack([np.ones_like(levels), levels / scale], axis=1) * unit
     terms, _ = pixels.nonnegative_fit(columns * share[:, None], variance * share)
     constant, slope = terms * unit
-    fitted: FloatArray = np.sqrt(constant + slope * np.maximum(brightness, 0) / scale)
-    return fitted
+    return np.asarray(np.sqrt(constant + slope * np.maximum(brightness, 0) / scale))

@@ -315,5 +315,4 @@ def _weighted_fit(
     coefficients = np.zeros(n * n)
     square = gram.reshape(n * n, n * n)[np.ix_(low_degree, low_degree)]
     coefficients[low_degree] = np.linalg.lstsq(square, moments[low_degree], rcond=None)[0]
-    fit: FloatArray = rows @ coefficients.reshape(n, n) @ columns.T
-    return fit
+    return np.asarray(rows @ coefficients.reshape(n, n) @ columns.T)

@@ -240,8 +240,8 @@ def estimate_source(
         Called instead of `Estimate.source`, such as a cached one.
     """
     beam, usable = _for_estimate(shot)
-    estimated = estimate.source if by is None else by
-    source = estimated(beam, usable, should_stop=should_stop, on_caution=on_caution)
+    by = by or estimate.source
+    source = by(beam, usable, should_stop=should_stop, on_caution=on_caution)
     bare = shot.source_mask
     if bare is None:
         return source

@@ -363,8 +363,7 @@ class Rotate(Step):
 
         height, width = plane.shape
         matrix = self.matrix((height, width))
-        moved: FloatArray = affine_transform(plane, matrix[:2, :2], matrix[:2, 2], order=1)
-        return moved
+        return np.asarray(affine_transform(plane, matrix[:2, :2], matrix[:2, 2], order=1))
 
     def shape_after(self, shape: tuple[int, int]) -> tuple[int, int]:
         return shape[::-1] if self._turns in (1, 3) else shape
@@ -439,11 +438,10 @@ class Crop(Step):
         return rows, columns
 
     def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
-        part = self.slices(shot.shape)
-        rows, columns = part
+        rows, columns = self.slices(shot.shape)
 
         def cut(array: AnyArray) -> Any:
-            return np.ascontiguousarray(array[part])
+            return np.ascontiguousarray(array[rows, columns])
 
         return shot.map_planes(cut, cut).add_notes(
             f"cropped to rows {rows.start}:{rows.stop}, columns {columns.start}:{columns.stop}"
