@@ -126,9 +126,8 @@ class Tracks:
         for name, limits in ranges.items():
             if limits is not None:
                 is_inside &= _within(getattr(self, name), name, limits)
-        return replace(
-            self, **{name: getattr(self, name)[is_inside] for name in ("y", "x", *ranges)}
-        )
+        columns = {name: getattr(self, name)[is_inside] for name in ("y", "x", *ranges)}
+        return replace(self, **columns)
 
     def image(self, bin: float | None = None) -> TrackImage:
         """Count the tracks in square bins from the top left corner.

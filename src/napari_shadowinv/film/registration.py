@@ -215,8 +215,7 @@ def register(
     for first in range(len(films)):
         report("register", first, len(films))
         for second in range(first + 1, min(first + 1 + _N_NEIGHBOURS, len(films))):
-            pair = _compare(first, second, films)
-            if pair is not None:
+            if (pair := _compare(first, second, films)) is not None:
                 compared.append(pair)
     pairs = _credible(compared, edges, alike, values.shape[1:])
     poses = _fit_poses(pairs, edges)
@@ -553,11 +552,9 @@ def poses_by_fiducials(
     every = np.concatenate(misfits)
     closure = float(np.sqrt((every**2).sum() / spare)) if spare > 0 else float("nan")
     error = float(np.fmax(_MIN_MARK_ERROR_PX, closure))
-    errors = np.array(
-        [error / np.sqrt(len(marks)) if marks else EDGE_ERROR_PX for marks in film_marks]
-    )
+    errors = [error / np.sqrt(len(marks)) if marks else EDGE_ERROR_PX for marks in film_marks]
     shifts /= np.asarray(scales, np.float64)[:, None]
-    return Poses(shifts, turns, errors, np.zeros(count, dtype=bool), closure)
+    return Poses(shifts, turns, np.array(errors), np.zeros(count, dtype=bool), closure)
 
 
 def _rotation(turn: float) -> FloatArray:

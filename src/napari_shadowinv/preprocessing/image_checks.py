@@ -310,8 +310,9 @@ class ReferencePair:
         shot, beam, usable = self._blocks
         if usable.sum() < _MIN_BLOCKS:
             return False
-        difference = _details(np.where(usable, shot - beam, 0.0))
-        beam = _details(np.where(usable, beam - 1, 0.0))
+        difference, beam = (np.where(usable, plane, 0.0) for plane in (shot - beam, beam - 1))
+        difference -= ndimage.uniform_filter(difference, _DETAIL_BLOCKS)
+        beam -= ndimage.uniform_filter(beam, _DETAIL_BLOCKS)
         size = _neighbour_covariance(difference, difference, usable)
         if size < _MIN_CONTRAST**2:
             return False
@@ -426,10 +427,6 @@ def _neighbour_covariance(first: FloatArray, second: FloatArray, usable: BoolArr
     forth = first[:, 1:][pair], second[:, :-1][pair]
     back = first[:, :-1][pair], second[:, 1:][pair]
     return float(np.mean([((a - a.mean()) * (b - b.mean())).mean() for a, b in (forth, back)]))
-
-
-def _details(values: FloatArray) -> FloatArray:
-    return np.asarray(values - ndimage.uniform_filter(values, _DETAIL_BLOCKS))
 
 
 def _mismatch(image: FloatArray, source: FloatArray, ring: BoolArray) -> FloatArray:

@@ -148,11 +148,10 @@ class _Blocks:
     def fits(self, report: Reporter) -> list[_Fit]:
         """Return the process of each length."""
         fits = []
-        for length in _LENGTHS:
+        for length in _LENGTHS * min(self.values.shape):
             report("source", 0)
             for terms in (1, len(_TERMS)):
-                side = min(self.values.shape)
-                waves = _Waves(self.values.shape, self.block, length * side, terms)
+                waves = _Waves(self.values.shape, self.block, length, terms)
                 fits.append(_Fit.to(waves, self.bare, self.logs[self.bare], self.counts[self.bare]))
         return fits
 

@@ -87,15 +87,13 @@ class Recipe(CheckedModel):
         description="The undisturbed beam. Default: as measured if there is one, else uniform.",
     )
     source_mask: Path | None = Field(
-        default=None,
-        description="Image of the same size, 0 where the object covers the beam.",
+        default=None, description="Image of the same size, 0 where the object covers the beam."
     )
     mask: Path | None = Field(
         default=None, description="Image of the same size, 0 at unusable pixels."
     )
     setup: Setup | None = Field(
-        default=None,
-        description="The experimental geometry, for results in SI units.",
+        default=None, description="The experimental geometry, for results in SI units."
     )
     instrument: Instrument = Field(
         default=Instrument(),
