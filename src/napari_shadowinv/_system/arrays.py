@@ -62,9 +62,8 @@ def unpack_array(
 
 def plain_array(values: Any, name: str, dims: Sequence[str] = PLANE, *, unit: str = "") -> AnyArray:
     """Return the values in the order of `dims`; refuse masked ones, which have no meaning here."""
-    plain: AnyArray = np.asarray(
-        unpack_array(refuse_masked(values, name), name, dims, unit=unit)[0]
-    )
+    refuse_masked(values, name)
+    plain: AnyArray = np.asarray(unpack_array(values, name, dims, unit=unit)[0])
     if plain.dtype.kind not in "buif":
         raise InputError(f"{name} has values of type {plain.dtype}, expected real numbers")
     return plain

@@ -117,6 +117,7 @@ class _Film(NamedTuple):
 
     @classmethod
     def of(cls, image: FloatArray, usable: BoolArray) -> _Film:
+        """Return a film with its smooth and its fine structure, on fewer pixels."""
         weight = usable.astype(np.float64)
         filled = np.where(usable, image, 0.0)
 

@@ -461,7 +461,7 @@ def _noise(difference: FloatArray, brightness: FloatArray) -> FloatArray:
     n_bins = min(max(difference.size // _PIXELS_PER_NOISE_BIN, 1), _MAX_NOISE_BINS)
     groups = np.array_split(np.argsort(brightness, axis=None, kind="stable"), n_bins)
     flat, positive = difference.ravel(), np.maximum(brightness, 0).ravel()
-    sizes = [np.abs(flat[group]) for group in groups]
+    sizes = (np.abs(flat[group]) for group in groups)
     # In few-bit images more than half the pixels can equal their median.
     deviations = [NORMAL_MAD * np.median(size) or _NORMAL_MEAN * size.mean() for size in sizes]
     variance = np.array([float(deviation) ** 2 for deviation in deviations])

@@ -136,8 +136,8 @@ class CheckedImage:
         order = order[: int((1 - _BRIGHTEST_LEFT_OUT) * order.size)]
         parts = np.array_split(order, _N_BRIGHTNESS_BINS)
         levels = np.array([brightness[part].mean() for part in parts])
-        sizes = [np.abs(differences[part]) for part in parts]
-        clipped = [size[size <= _clip_limit(size)] for size in sizes]
+        sizes = (np.abs(differences[part]) for part in parts)
+        clipped = (size[size <= _clip_limit(size)] for size in sizes)
         noise = np.sqrt([float((size**2).mean()) / _CLIPPED_VARIANCE for size in clipped])
         counts = np.array([len(part) for part in parts]) * _INDEPENDENT_SHARE
         return np.array([levels, noise, noise / np.sqrt(counts)])

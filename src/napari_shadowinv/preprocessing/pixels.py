@@ -111,11 +111,11 @@ def _spline(
         bent = scipy.fft.idctn(roughness * scipy.fft.dctn(u, norm="ortho"), norm="ortho")
         return np.asarray(share * u + bent).ravel()
 
-    typical = float(share.mean()) + roughness
+    diagonal = float(share.mean()) + roughness
 
     def nearly_inverse(flat: FloatArray) -> FloatArray:
         coefficients = scipy.fft.dctn(flat.reshape(weighted.shape), norm="ortho")
-        return np.asarray(scipy.fft.idctn(coefficients / typical, norm="ortho")).ravel()
+        return np.asarray(scipy.fft.idctn(coefficients / diagonal, norm="ortho")).ravel()
 
     shape = (weighted.size, weighted.size)
     solution, _ = scipy.sparse.linalg.cg(

@@ -238,8 +238,7 @@ def estimate_source(
         Called instead of `Estimate.source`, such as a cached one.
     """
     beam, usable = _for_estimate(shot)
-    by = by or estimate.source
-    source = by(beam, usable, should_stop=should_stop, on_caution=on_caution)
+    source = (by or estimate.source)(beam, usable, should_stop=should_stop, on_caution=on_caution)
     bare = shot.source_mask
     if bare is None:
         return source
