@@ -122,12 +122,11 @@ def straighten_film(
         Cubic between the scan's pixels, within their range; constant beyond its edge.
     """
     values = np.asarray(scan)
-    places = checked_corners(corners)
-    (along_y, along_x), middle, size = upright(places)
+    axes, middle, size = upright(checked_corners(corners))
     height, width = (round(side / scale) for side in size) if shape is None else shape
     y, x = np.mgrid[:height, :width].astype(np.float64)
     steps = scale * np.stack([y - (height - 1) / 2, x - (width - 1) / 2])
-    at = middle[:, None, None] + np.einsum("kc,kyx->cyx", np.stack([along_y, along_x]), steps)
+    at = middle[:, None, None] + np.einsum("kc,kyx->cyx", axes, steps)
     planes = values[..., None] if values.ndim == 2 else values
     cut = []
     for c in range(planes.shape[-1]):
