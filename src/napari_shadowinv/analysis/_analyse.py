@@ -185,11 +185,7 @@ class _Task:
         return np.concatenate([value.ravel() for _, _, value in values])
 
     def results(
-        self,
-        evaluation: Evaluation,
-        rng: np.random.Generator,
-        names: Sequence[str],
-        headline: Fact,
+        self, evaluation: Evaluation, rng: np.random.Generator, names: Sequence[str], headline: Fact
     ) -> list[ProductResult]:
         """Return the results, with systematic errors of random sign added to the samples."""
         systematic = {**evaluation.systematic, **self._by_energy(evaluation.value)}

@@ -40,11 +40,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact
 from napari_shadowinv.inversion.error_bars import Quantity
-from napari_shadowinv.physics.beam import (
-    displacement_from_potential,
-    length_text,
-    number_field,
-)
+from napari_shadowinv.physics.beam import displacement_from_potential, length_text, number_field
 from napari_shadowinv.physics.units import PIXEL
 
 _B, _E, _N = "path_integrated_b", "path_integrated_e", "line_integrated_density"
@@ -97,8 +93,7 @@ class AxisymmetricProfile(Product):
         json_schema_extra={"metavar": "Y,X Y,X"},
     )
     direction: Literal["vertical", "horizontal"] = Field(
-        default="vertical",
-        description="Rough direction of an axis that is to be found.",
+        default="vertical", description="Rough direction of an axis that is to be found."
     )
     find_tilt: bool = Field(
         default=True,

@@ -10,12 +10,7 @@ import numpy as np
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis._derivatives import first_derivative, second_derivative
 from napari_shadowinv.analysis.frame import FieldFrame
-from napari_shadowinv.analysis.maps import (
-    MIN_SPACINGS,
-    ORDER,
-    Smoothed,
-    smooth,
-)
+from napari_shadowinv.analysis.maps import MIN_SPACINGS, ORDER, Smoothed, smooth
 from napari_shadowinv.analysis.product import Variable
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Fact, Level

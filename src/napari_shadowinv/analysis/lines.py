@@ -37,9 +37,7 @@ def _checked_path(path: Any) -> Any:
 
 
 Path = Annotated[
-    tuple[tuple[float, float], ...],
-    Field(max_length=_MAX_POINTS),
-    AfterValidator(_checked_path),
+    tuple[tuple[float, float], ...], Field(max_length=_MAX_POINTS), AfterValidator(_checked_path)
 ]
 """Corners (y, x) of a line or path in px."""
 
@@ -47,9 +45,7 @@ Path = Annotated[
 def path_field(description: str) -> Any:
     """Return the field of a line or path."""
     return Field(
-        title="Path (px)",
-        description=description,
-        json_schema_extra={"metavar": "Y,X Y,X …"},
+        title="Path (px)", description=description, json_schema_extra={"metavar": "Y,X Y,X …"}
     )
 
 

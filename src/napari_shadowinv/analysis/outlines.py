@@ -36,12 +36,7 @@ class Outlined(Product):
         description="Centre (y, x) of a circle, in px.",
         json_schema_extra={"metavar": "Y,X"},
     )
-    radius: float | None = number_field(
-        "Radius (px)",
-        "Radius of the circle, in px.",
-        None,
-        gt=0,
-    )
+    radius: float | None = number_field("Radius (px)", "Radius of the circle, in px.", None, gt=0)
     rectangle: Annotated[tuple[Point, Point] | None, AfterValidator(_checked_corners)] = Field(
         default=None,
         title="Rectangle (px)",

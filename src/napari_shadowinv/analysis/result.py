@@ -21,13 +21,7 @@ from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.frame import FieldUnit, field_unit, si_unit_of
 from napari_shadowinv.analysis.kinds import product_from_dict
-from napari_shadowinv.analysis.product import (
-    BANDS,
-    Coordinate,
-    Product,
-    Variable,
-    has_bands,
-)
+from napari_shadowinv.analysis.product import BANDS, Coordinate, Product, Variable, has_bands
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.inversion.error_bars import Quantity

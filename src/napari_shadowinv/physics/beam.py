@@ -22,13 +22,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import (
-    Field,
-    ValidationInfo,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
+from pydantic import Field, ValidationInfo, field_validator, model_serializer, model_validator
 
 from napari_shadowinv._system.arrays import check_plane, plain_array, refuse_masked
 from napari_shadowinv._system.validation import CheckedModel, CombinationError

@@ -180,11 +180,7 @@ def transferred_displacement(
 
 
 def displacement_ratio(
-    recorded_with: Setup,
-    setup: Setup,
-    *,
-    deflector: str | None = None,
-    dispersion: float = 1.0,
+    recorded_with: Setup, setup: Setup, *, deflector: str | None = None, dispersion: float = 1.0
 ) -> float:
     """Return the displacement in px of one experiment over that in px of another.
 

@@ -138,10 +138,7 @@ class ProtonSetup(BeamSetup):
     )
     other_fields: ClassVar = {
         "electric field": MainField(
-            "path_integrated_e",
-            "Path-integrated electric field",
-            "|∫E dz|",
-            ("∫Ey dz", "∫Ex dz"),
+            "path_integrated_e", "Path-integrated electric field", "|∫E dz|", ("∫Ey dz", "∫Ex dz")
         )
     }
 
@@ -155,8 +152,7 @@ class ProtonSetup(BeamSetup):
         le=_MAX_ENERGY_MEV,
     )
     species: Species = Field(
-        default="proton",
-        description="Particle species; electrons are deflected the opposite way.",
+        default="proton", description="Particle species; electrons are deflected the opposite way."
     )
 
     @model_validator(mode="after")

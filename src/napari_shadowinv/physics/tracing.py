@@ -23,13 +23,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import distance_transform_edt
 
 from napari_shadowinv import __version__
-from napari_shadowinv._system.arrays import (
-    PLANE,
-    as_numbers,
-    block_sums,
-    check_finite,
-    plain_array,
-)
+from napari_shadowinv._system.arrays import PLANE, as_numbers, block_sums, check_finite, plain_array
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model
@@ -158,12 +152,7 @@ class TracedImage:
         peaks += [f"∫E dz {field_e:.3g} V"] if field_e else []
         thin = self.thin_screen_error
         facts = [
-            Fact(
-                "landed",
-                noun.capitalize(),
-                counts,
-                Level.DOUBTFUL if self.lost else Level.SOUND,
-            ),
+            Fact("landed", noun.capitalize(), counts, Level.DOUBTFUL if self.lost else Level.SOUND),
             Fact("peak", "Peak", ", ".join(peaks) or "no field across the beam"),
             Fact(
                 "thin_screen_error",
