@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.analysis._field_samples import Evaluation, SampledField, sampled_fields
 from napari_shadowinv.analysis.frame import FieldFrame, field_unit
 from napari_shadowinv.analysis.kinds import product_from_dict, product_from_text
-from napari_shadowinv.analysis.product import FieldNoise, Product, Variable
+from napari_shadowinv.analysis.product import FieldNoise, Product, Values
 from napari_shadowinv.analysis.result import ProductResult
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level, caution_facts
@@ -90,7 +91,11 @@ def analyse(
     >>> profile["magnitude"].value.shape, profile.variables["magnitude"].unit
     ((31,), 'pixel')
     """
-    listed = _checked_products(products)
+    is_list = isinstance(products, Sequence) and not isinstance(products, str)
+    numbered = enumerate(products if is_list else [products], 1)
+    listed = [_checked_product(each, number) for number, each in numbered]
+    if not listed:
+        raise InputError("got no product, expected at least one")
     if not isinstance(samples, int | np.integer) or isinstance(samples, bool):
         raise InputError(f"samples is {samples!r}, expected a whole number")
     if samples < _MIN_SAMPLES:
@@ -113,14 +118,6 @@ def analyse(
         rng = np.random.default_rng(seed)
         results += task.results(evaluation, rng, names[len(results) :], headline)
     return results
-
-
-def _checked_products(products: Any) -> list[Product]:
-    is_list = isinstance(products, Sequence) and not isinstance(products, str)
-    listed = list(products) if is_list else [products]
-    if not listed:
-        raise InputError("got no product, expected at least one")
-    return [_checked_product(each, number) for number, each in enumerate(listed, 1)]
 
 
 def _checked_product(product: Any, number: int) -> Product:
@@ -160,34 +157,34 @@ class _Task:
 
     field: SampledField
     products: list[Product]
-    _layout: list[tuple[int, str, tuple[int, ...]]] = dataclasses.field(default_factory=list)
+    _shapes: list[dict[str, tuple[int, ...]]] = dataclasses.field(default_factory=list)
 
     def choose(self, noise: FieldNoise | None) -> Any:
         """Choose what follows from the noise, and return the function that measures everything."""
         frame, potential = self.field.frame, self.field.potential
         self.products = [each.adapt(potential, noise, frame) for each in self.products]
         values = self._values(potential, self.field.displacement)
-        self._layout = [(place, name, value.shape) for place, name, value in values]
+        self._shapes = [{name: value.shape for name, value in each.items()} for each in values]
         return self.measure
 
-    def _values(
-        self, potential: FloatArray, displacement: FloatArray
-    ) -> list[tuple[int, str, FloatArray]]:
+    def _values(self, potential: FloatArray, displacement: FloatArray) -> list[Values]:
+        measured = (
+            each.measure(potential, displacement, self.field.frame) for each in self.products
+        )
         return [
-            (place, name, np.asarray(value, dtype=np.float64))
-            for place, product in enumerate(self.products)
-            for name, value in product.measure(potential, displacement, self.field.frame).items()
+            {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
+            for values in measured
         ]
 
     def measure(self, potential: FloatArray, displacement: FloatArray) -> FloatArray:
         """Return all numbers of all products as one vector."""
         values = self._values(potential, displacement)
-        return np.concatenate([value.ravel() for _, _, value in values])
+        return np.concatenate([value.ravel() for each in values for value in each.values()])
 
     def results(
         self, evaluation: Evaluation, rng: np.random.Generator, names: Sequence[str], headline: Fact
-    ) -> list[ProductResult]:
-        """Return the results, with systematic errors of random sign added to the samples."""
+    ) -> Iterator[ProductResult]:
+        """Yield the results, with systematic errors of random sign added to the samples."""
         systematic = {**evaluation.systematic, **self._by_energy(evaluation.value)}
         if len(evaluation.samples):
             systematic |= self._by_readout(evaluation.value) | self._by_product()
@@ -195,33 +192,26 @@ class _Task:
         for error in systematic.values():
             for sample, strength in zip(samples, _standard_numbers(rng, len(samples)), strict=True):
                 sample += strength * error
-        quantities: list[dict[str, Quantity]] = [{} for _ in self.products]
-        causes = [list(evaluation.causes) for _ in self.products]
+        doubts = [headline, *caution_facts(evaluation.cautions)]
         start = 0
-        for place, name, shape in self._layout:
-            part = slice(start, start + int(np.prod(shape)))
-            start = part.stop
-            for cause, error in systematic.items():
-                if len(samples) and error[part].any() and cause not in causes[place]:
-                    causes[place].append(cause)
-            value, scatter = evaluation.value[part], samples[:, part]
-            if self.products[place].subtracts_noise and len(scatter):
-                scatter = scatter + (value - scatter.mean(axis=0))
-            quantities[place][name] = Quantity(
-                value.reshape(shape),
-                scatter.reshape(len(samples), *shape),
-                name in self.products[place].maxima,
-            )
-        frame = self.field.frame
-        doubts = caution_facts(evaluation.cautions)
-        return [
-            _result(product, name, quantity, frame, list_of_causes, [headline, *doubts])
-            for product, name, quantity, list_of_causes in zip(
-                self.products, names, quantities, causes, strict=False
-            )
-        ]
+        for product, name, shapes in zip(self.products, names, self._shapes, strict=False):
+            quantities: dict[str, Quantity] = {}
+            causes = list(evaluation.causes)
+            for variable, shape in shapes.items():
+                part = slice(start, start + math.prod(shape))
+                start = part.stop
+                for cause, error in systematic.items():
+                    if len(samples) and error[part].any() and cause not in causes:
+                        causes.append(cause)
+                value, scatter = evaluation.value[part], samples[:, part]
+                if product.subtracts_noise and len(scatter):
+                    scatter = scatter + (value - scatter.mean(axis=0))
+                scatter = scatter.reshape(len(samples), *shape)
+                is_maximum = variable in product.maxima
+                quantities[variable] = Quantity(value.reshape(shape), scatter, is_maximum)
+            yield _result(product, name, quantities, self.field.frame, causes, doubts)
 
-    def _by_energy(self, value: FloatArray) -> dict[str, FloatArray]:
+    def _by_energy(self, value: FloatArray) -> Values:
         """Return the errors by the energy of the beam, which scales fields in SI units."""
         frame, share = self.field.frame, self.field.instrument.energy
         if not share or frame.setup is None or frame.unit.field == "displacement":
@@ -230,22 +220,21 @@ class _Task:
         scaled = self.measure(factor * self.field.potential, factor * self.field.displacement)
         return {f"{frame.setup.beam_quantity().noun}, {100 * share:.2g} %": scaled - value}
 
-    def _by_readout(self, value: FloatArray) -> dict[str, FloatArray]:
+    def _by_readout(self, value: FloatArray) -> Values:
         """Return the errors by means over pixels, and by central differences of the read-out."""
         finer = finer_field(self.field.potential, self.field.displacement)
         return {"pixels": self.measure(*finer) - value}
 
-    def _by_product(self) -> dict[str, FloatArray]:
+    def _by_product(self) -> Values:
         """Return the errors by the products' own methods."""
-        errors = [
-            product.systematic(self.field.potential, self.field.displacement, self.field.frame)
-            for product in self.products
-        ]
+        field = self.field.potential, self.field.displacement, self.field.frame
+        errors = [product.systematic(*field) for product in self.products]
         if not any(errors):
             return {}
         parts = [
-            np.broadcast_to(errors[place].get(name, 0.0), shape).ravel()
-            for place, name, shape in self._layout
+            np.broadcast_to(errors_of_product.get(name, 0.0), shape).ravel()
+            for errors_of_product, shapes in zip(errors, self._shapes, strict=True)
+            for name, shape in shapes.items()
         ]
         return {"smoothing": np.concatenate(parts)}
 
@@ -266,25 +255,17 @@ def _result(
     causes: Sequence[str],
     doubts: Sequence[Fact],
 ) -> ProductResult:
-    variables: dict[str, Variable] = product.variables(frame)
+    variables = product.variables(frame)
     quantities = product.refine(quantities)
     for constant, values in product.constants(frame).items():
         array = np.asarray(values, dtype=np.float64)
         quantities[constant] = Quantity(array, np.zeros((0, *array.shape)))
+    text, level = "none: the errors of this field are not known", Level.DOUBTFUL
     if causes:
         count = max(len(quantity.samples) for quantity in quantities.values())
-        text = f"68 and 95 %, by {', '.join(causes)}; {count} samples"
-        bands = Fact("bands", "Bands", text)
-    else:
-        bands = Fact(
-            "bands", "Bands", "none: the errors of this field are not known", Level.DOUBTFUL
-        )
-    facts = (
-        *product.facts(quantities, frame),
-        *caution_facts(product.cautions(quantities, frame)),
-        *doubts,
-        bands,
-    )
+        text, level = f"68 and 95 %, by {', '.join(causes)}; {count} samples", Level.SOUND
+    cautions = caution_facts(product.cautions(quantities, frame))
+    bands = Fact("bands", "Bands", text, level)
     return ProductResult(
         name=name,
         product=product,
@@ -293,7 +274,7 @@ def _result(
         quantities={each: quantities[each] for each in variables},
         variables=variables,
         coordinates=product.coordinates(frame),
-        facts=facts,
+        facts=(*product.facts(quantities, frame), *cautions, *doubts, bands),
         limits=(*product.remarks(frame), *frame.limits),
         causes=tuple(causes),
     )

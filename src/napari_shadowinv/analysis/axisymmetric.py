@@ -33,6 +33,7 @@ from napari_shadowinv.analysis.product import (
     Coordinate,
     FieldNoise,
     Product,
+    Values,
     Variable,
     mask_cautions,
 )
@@ -346,9 +347,7 @@ class AxisymmetricProfile(Product):
         """Return whether there are profiles of several slices, as a plane."""
         return len(self._slices(frame)) > 1
 
-    def measure(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         _, displacement = frame.at_points(potential, displacement)
         right_rows, left_rows = self._rows(displacement, frame)
         right_side, left_side = (self._by_slice(rows, frame) for rows in (right_rows, left_rows))
@@ -395,7 +394,7 @@ class AxisymmetricProfile(Product):
             return float(setup.field_in_si(_N, unit_plane)[0]) / pixel
         return -float(setup.potential(unit_plane)[0]) / pixel
 
-    def _profiles(self, profile: FloatArray, frame: FieldFrame) -> dict[str, FloatArray]:
+    def _profiles(self, profile: FloatArray, frame: FieldFrame) -> Values:
         first, *further = self._names(frame)
         change = self._scale(frame) * profile
         values = {first: change}
@@ -415,7 +414,7 @@ class AxisymmetricProfile(Product):
 
     def systematic(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    ) -> Values:
         """Return the changes by one more smoothing, by the image's edge and by the axis' error."""
         matrix, inverse = self._operators(frame)
         right_side, left_side = self._sides(displacement, frame)
@@ -554,9 +553,7 @@ class AzimuthalProfile(Product):
         radii = frame.length(1.0) * self._radii(frame)
         return {"radius": Coordinate(radii, frame.length_unit, "Distance from the axis")}
 
-    def measure(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         radii = self._radii(frame)
         angles = 2 * np.pi * np.arange(max(int(6 * radii[-1]), 16)) / max(int(6 * radii[-1]), 16)
         sine, cosine = np.sin(angles), np.cos(angles)

@@ -11,7 +11,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis._derivatives import first_derivative, second_derivative
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.maps import MIN_SPACINGS, ORDER, Smoothed, smooth
-from napari_shadowinv.analysis.product import Variable
+from napari_shadowinv.analysis.product import Values, Variable
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.inversion.error_bars import Quantity
@@ -63,23 +63,19 @@ class Contrast(Smoothed):
             "compression": Variable((), "1", "Largest compression of the beam, 1 where rays cross"),
         }
 
-    def measure(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         return self._measure(potential, frame, ORDER)
 
     def systematic(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    ) -> Values:
         finer = self._measure(potential, frame, ORDER + 1)
         return {
             name: finer[name] - value
             for name, value in self._measure(potential, frame, ORDER).items()
         }
 
-    def _measure(
-        self, potential: FloatArray, frame: FieldFrame, order: int
-    ) -> dict[str, FloatArray]:
+    def _measure(self, potential: FloatArray, frame: FieldFrame, order: int) -> Values:
         plane = smooth(potential, self.smoothing or 0.0, order)
         crossed = first_derivative(first_derivative(plane, 0), 1)[2:-2, 2:-2]
         inner = np.s_[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX]

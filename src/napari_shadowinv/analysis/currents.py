@@ -18,7 +18,7 @@ from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.lines import Path, path_field
 from napari_shadowinv.analysis.outlines import Outlined
 from napari_shadowinv.analysis.paths import edge_midpoints, interpolate_cubic
-from napari_shadowinv.analysis.product import Product, Variable, mask_cautions
+from napari_shadowinv.analysis.product import Product, Values, Variable, mask_cautions
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.error_bars import Quantity
@@ -54,9 +54,7 @@ class Flux(Product):
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
         return {"flux": Variable((), "Wb", "Magnetic flux across the line")}
 
-    def measure(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         start, end = interpolate_cubic(potential, np.array([self.path[0], self.path[-1]]))
         # A displacement along the line belongs to a field across it.
         return {"flux": np.asarray((start - end) * unit_field(frame)[0] * frame.pixel)}
@@ -77,9 +75,7 @@ class _Enclosed(Outlined):
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
         return {self.name(): Variable((), self.unit, self.long_name)}
 
-    def measure(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         points, sides = edge_midpoints(self.outline, _STEP_PX)
         down, right = (interpolate_cubic(plane, points) for plane in displacement)
         # From x to y around the outline, outwards is to the left of the direction.

@@ -28,7 +28,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.paths import interpolate_cubic
 from napari_shadowinv.analysis.power_spectra import window_weights
-from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Product, Variable
+from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Product, Values, Variable
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact
@@ -142,9 +142,7 @@ class Filaments(Product):
         lags = frame.length(1.0) * self._lags(frame)
         return {"lag": Coordinate(lags, frame.length_unit, "Lag")}
 
-    def measure(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         potential, displacement = frame.at_points(potential, displacement)
         weights = window_weights(frame.mask, _TAPER)
         across = self._across(displacement, weights)

@@ -16,7 +16,7 @@ from napari_shadowinv.analysis.paths import (
     sample_path,
     sample_strip,
 )
-from napari_shadowinv.analysis.product import Coordinate, Product, Variable, mask_cautions
+from napari_shadowinv.analysis.product import Coordinate, Product, Values, Variable, mask_cautions
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import number_field
@@ -100,9 +100,7 @@ class LineProfile(Product):
         values = frame.length(1.0) * self._distance
         return {"distance": Coordinate(values, frame.length_unit, "Distance along the line")}
 
-    def measure(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         field = frame.field(potential, displacement)
         if not frame.is_vector:
             return {"value": self._mean_across(field, frame)}
@@ -127,7 +125,7 @@ class LineProfile(Product):
         samples = np.minimum(samples, 2 * magnitude.value)
         return quantities | {"magnitude": Quantity(magnitude.value, samples)}
 
-    def constants(self, frame: FieldFrame) -> dict[str, FloatArray]:
+    def constants(self, frame: FieldFrame) -> Values:
         if frame.image is None:
             return {}
         return {"intensity": self._mean_across(np.asarray(frame.image, dtype=np.float64), frame)}

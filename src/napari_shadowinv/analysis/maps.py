@@ -30,6 +30,7 @@ from napari_shadowinv.analysis.product import (
     Coordinate,
     FieldNoise,
     Product,
+    Values,
     Variable,
     at_peak,
     quantity_text,
@@ -168,14 +169,12 @@ class _SourceMap(Smoothed):
         """Return the density or curvature by a Laplacian of the potential of 1."""
         raise NotImplementedError
 
-    def measure(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         return {self.variable: self._per_curvature(frame) * self.sources(potential)}
 
     def systematic(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    ) -> Values:
         # The next order of the kernel shows what this one takes away.
         lost = self.sources(potential, ORDER + 1) - self.sources(potential)
         return {self.variable: self._per_curvature(frame) * lost}

@@ -23,6 +23,9 @@ from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.units import PIXEL, display_unit, prefix_for
 from napari_shadowinv.preprocessing.steps import Choice
 
+Values = dict[str, FloatArray]
+"""Values, or errors of values, by the names of a product's variables."""
+
 BANDS = 0.68, 0.95
 """Shares of probability of the bands that files, tables and figures have."""
 
@@ -144,9 +147,7 @@ class Product(Choice):
         """Return the places along the axes of the variables, by the names of the axes."""
         return {}
 
-    def measure(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         """Compute the product of a field in SI units.
 
         It must not change its arguments: several threads call it at once, for many samples.
@@ -161,13 +162,13 @@ class Product(Choice):
         """
         raise NotImplementedError
 
-    def constants(self, frame: FieldFrame) -> dict[str, FloatArray]:
+    def constants(self, frame: FieldFrame) -> Values:
         """Return variables that do not depend on the field, such as the recorded intensity."""
         return {}
 
     def systematic(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    ) -> Values:
         """Return likely errors by the product's own method, such as its smoothing.
 
         They widen the bands of the variables that they name.

@@ -10,7 +10,7 @@ import numpy as np
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.outlines import Outlined
-from napari_shadowinv.analysis.product import Variable, mask_cautions
+from napari_shadowinv.analysis.product import Values, Variable, mask_cautions
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.error_bars import Quantity
@@ -60,9 +60,7 @@ class Region(Outlined):
             variables["intensity"] = Variable((), "1", "Intensity of the image, mean")
         return variables
 
-    def measure(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         inside = self.pixels_inside(frame)
         field = frame.field(potential, displacement)[..., inside]
         values = np.hypot(*field) if frame.is_vector else field
@@ -81,7 +79,7 @@ class Region(Outlined):
             numbers |= {"mean_y": field[0].mean(), "mean_x": field[1].mean()}
         return {name: np.asarray(number) for name, number in numbers.items()}
 
-    def constants(self, frame: FieldFrame) -> dict[str, FloatArray]:
+    def constants(self, frame: FieldFrame) -> Values:
         if frame.image is None:
             return {}
         return {"intensity": np.asarray(np.nanmean(frame.image[self.pixels_inside(frame)]))}

@@ -43,7 +43,7 @@ from napari_shadowinv.analysis.power_spectra import (
     ring_spectrum,
     window_weights,
 )
-from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Product, Variable
+from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Product, Values, Variable
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level
@@ -351,13 +351,11 @@ class TurbulenceSpectrum(Product):
         unit = "rad/m" if frame.setup is not None else f"rad/{PIXEL}"
         return {"k": Coordinate(k / frame.pixel, unit, "Wavenumber k = 2π / wavelength")}
 
-    def measure(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         spectrum = ring_spectrum(potential, window_weights(frame.mask, self.taper))
         return self._measure(spectrum, frame)
 
-    def _measure(self, spectrum: RingSpectrum, frame: FieldFrame) -> dict[str, FloatArray]:
+    def _measure(self, spectrum: RingSpectrum, frame: FieldFrame) -> Values:
         rings = self._range(spectrum)
         k, width = spectrum.k / frame.pixel, spectrum.width / frame.pixel
         power = self._in_si(spectrum, self._corrected(spectrum), frame)
@@ -390,7 +388,7 @@ class TurbulenceSpectrum(Product):
             )
         return values
 
-    def constants(self, frame: FieldFrame) -> dict[str, FloatArray]:
+    def constants(self, frame: FieldFrame) -> Values:
         spectrum = self._empty(frame)
         constants = {}
         if self.noise_power:
@@ -405,7 +403,7 @@ class TurbulenceSpectrum(Product):
 
     def systematic(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> dict[str, FloatArray]:
+    ) -> Values:
         """Return the errors by the finite number of structures in the window, and the response."""
         weights = window_weights(frame.mask, self.taper)
         spectrum = ring_spectrum(potential, weights)
