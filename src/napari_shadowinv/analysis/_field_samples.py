@@ -89,8 +89,7 @@ class StoredSamples(SampledField):
         measure = choose(FieldNoise(pilot))
         value = measure(self.potential, self.displacement)
         count = min(samples, len(self.changes))
-        check_samples(count, value.size)
-        scatter = np.empty((count, value.size), sample_type(value.size))
+        scatter = np.empty((count, value.size), sample_type(count, value.size))
         for index, change in enumerate(self.changes[:count]):
             report("samples", index, count)
             moved = self.displacement + displacement_from_potential(change)
@@ -119,8 +118,7 @@ class ResampledInversion(SampledField):
             spacing = (inversion.image.size / number_of_inner_sites(inversion)) ** 0.5
             measures.append(choose(FieldNoise(changes, spacing, Reporter(**callbacks))))
             size = measures[0](self.potential, self.displacement).size
-            check_samples(samples, size)
-            kind = sample_type(size)
+            kind = sample_type(samples, size)
             return {"all": lambda *field: measures[0](*field).astype(kind, copy=False)}
 
         scatter = uncertainty(
@@ -223,15 +221,12 @@ def has_measured_source(inversion: Inversion) -> bool:
     return errors is None or errors.beam is None or errors.beam_basis not in ("assumed", "outside")
 
 
-def check_samples(count: int, size: int) -> None:
-    """Refuse more numbers than fit in memory."""
-    each = 4 * np.dtype(sample_type(size)).itemsize  # with copies of them
-    check_memory((count, size), each, "the samples of these products")
-
-
-def sample_type(size: int) -> type[Any]:
-    """Return the type of samples of some numbers: single precision for maps."""
-    return np.float32 if size > _MANY_NUMBERS else np.float64
+def sample_type(count: int, size: int) -> type[Any]:
+    """Return the type of samples, single precision for maps; refuse more than fit in memory."""
+    kind = np.float32 if size > _MANY_NUMBERS else np.float64
+    bytes_of_number = 4 * np.dtype(kind).itemsize  # with copies of it
+    check_memory((count, size), bytes_of_number, "the samples of these products")
+    return kind
 
 
 def sampled_fields(

@@ -199,12 +199,7 @@ class AxisymmetricProfile(Product):
                 f"the axis comes within {most:.3g} px of the edge of the image, expected "
                 f"{_MIN_RADIUS_PX} px or more on both sides: shorten or move it"
             )
-        if self.radius is not None and self.radius > most + 0.5:
-            raise InputError(
-                f"radius is {self.radius:g} px, expected at most {most:.1f} px: the distance of "
-                "the axis from the edge of the image"
-            )
-        return int(most if self.radius is None else min(self.radius, most))
+        return _chosen_radius(self.radius, most, "axis")
 
     def _component(self, displacement: FloatArray, axis: Axis, frame: FieldFrame) -> FloatArray:
         """Return the deflection across the axis in px, or the axial magnetic field in T m."""
@@ -534,12 +529,7 @@ class AzimuthalProfile(Product):
                 f"the centre is {most:.3g} px from the edge of the image, expected at least "
                 f"{_MIN_RADIUS_PX} px"
             )
-        if self.radius is not None and self.radius > most + 0.5:
-            raise InputError(
-                f"radius is {self.radius:g} px, expected at most {most:.1f} px: the distance of "
-                "the centre from the edge of the image"
-            )
-        return np.arange(float(int(most if self.radius is None else min(self.radius, most))) + 1.0)
+        return np.arange(_chosen_radius(self.radius, most, "centre") + 1.0)
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
         dims = ("radius",)
@@ -575,6 +565,16 @@ class AzimuthalProfile(Product):
         return (
             "A positive current flows along the beam, and its field runs clockwise in the image.",
         )
+
+
+def _chosen_radius(radius: float | None, most: float, middle: str) -> int:
+    """Return the radius in px, by default the distance of the axis or centre from the edge."""
+    if radius is not None and radius > most + 0.5:
+        raise InputError(
+            f"radius is {radius:g} px, expected at most {most:.1f} px: the distance of the "
+            f"{middle} from the edge of the image"
+        )
+    return int(most if radius is None else min(radius, most))
 
 
 def _is_index(frame: FieldFrame) -> bool:

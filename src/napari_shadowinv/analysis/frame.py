@@ -14,12 +14,14 @@ import numpy as np
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.beam import SIField
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.units import PIXEL
 
 # Error of rods whose rays nearly cross, and their length over the distance to the source, by
 # `benchmarks/tracing.py length`.
 _THIN_SCREEN_ERRORS = (0.015, 0.1), (0.032, 0.2)
+_DISPLACEMENT = SIField("displacement", PIXEL, "Displacement", is_vector=True)
 
 
 @dataclass(frozen=True)
@@ -144,21 +146,20 @@ class FieldFrame:
         return si_unit_of(self.unit.field)
 
     @cached_property
+    def _si_field(self) -> SIField:
+        """The setup's field in the unit; the displacement in pixels if there is none."""
+        fields = () if self.setup is None else self.setup.si_fields
+        return next((field for field in fields if field.name == self.unit.field), _DISPLACEMENT)
+
+    @property
     def long_name(self) -> str:
         """The field in words, such as "Path-integrated magnetic field"."""
-        if self.unit.field == "displacement" or self.setup is None:
-            return "Displacement"
-        (field,) = (each for each in self.setup.si_fields if each.name == self.unit.field)
-        return field.long_name.partition(",")[0]
+        return self._si_field.long_name.partition(",")[0]
 
-    @cached_property
+    @property
     def is_vector(self) -> bool:
         """Whether the field has components, as line-integrated densities have not."""
-        if self.unit.field == "displacement" or self.setup is None:
-            return True
-        return any(
-            field.is_vector for field in self.setup.si_fields if field.name == self.unit.field
-        )
+        return self._si_field.is_vector
 
     def field(self, potential: FloatArray, displacement: FloatArray) -> FloatArray:
         """Return the field in SI units.
@@ -175,7 +176,7 @@ class FieldFrame:
         ndarray, shape (2, H, W), or (H, W) if it is no vector
             Of a vector the components along y and x.
         """
-        if self.unit.field == "displacement" or self.setup is None:
+        if self._si_field is _DISPLACEMENT or self.setup is None:
             return displacement
         return self.setup.field_in_si(
             self.unit.field, displacement if self.is_vector else potential
@@ -188,21 +189,6 @@ class FieldFrame:
         if not self.is_pixel_mean:
             return potential, displacement
         return finer_field(potential, displacement)
-
-    def require_field(self, product: str, *fields: str) -> None:
-        """Refuse a product of other fields than this one, with an `InputError`."""
-        if self.unit.field in fields:
-            return
-        units = ", ".join(unit.symbol for unit in FIELD_UNITS.values() if unit.field in fields)
-        if self.setup is None:
-            raise InputError(
-                f"{product} needs the setup of the experiment, and the result has none: give it to "
-                "the inversion"
-            )
-        raise InputError(
-            f"{product} is not defined for a field in {self.unit.symbol}: choose one of {units} as "
-            "the unit"
-        )
 
     @cached_property
     def limits(self) -> tuple[str, ...]:

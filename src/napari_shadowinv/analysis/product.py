@@ -16,8 +16,9 @@ from pydantic import Field
 
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import AnyArray, FloatArray
-from napari_shadowinv.analysis.frame import FieldFrame
+from napari_shadowinv.analysis.frame import FIELD_UNITS, FieldFrame
 from napari_shadowinv.cautions import Caution
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.units import PIXEL, display_unit, prefix_for
@@ -119,8 +120,18 @@ class Product(Choice):
 
     def check(self, frame: FieldFrame) -> None:
         """Raise an `InputError` if the product cannot be measured in a frame."""
-        if self.fields:
-            frame.require_field(self.title, *self.fields)
+        if self.is_defined_for(frame.unit.field):
+            return
+        if frame.setup is None:
+            raise InputError(
+                f"{self.title} needs the setup of the experiment, and the result has none: give it "
+                "to the inversion"
+            )
+        units = ", ".join(unit.symbol for unit in FIELD_UNITS.values() if unit.field in self.fields)
+        raise InputError(
+            f"{self.title} is not defined for a field in {frame.unit.symbol}: choose one of "
+            f"{units} as the unit"
+        )
 
     def is_defined_for(self, field: str) -> bool:
         """Return whether it can be computed from a field, such as "path_integrated_b"."""
