@@ -184,16 +184,13 @@ class AxisymmetricProfile(Product):
             frame.check_points(np.array(self.axis), "the axis")
             self._radius_px(frame)
 
-    def _axis(self, frame: FieldFrame) -> Axis:
-        if self.axis is not None:
-            return Axis(*self.axis)
-        height, width = frame.shape
-        if self.direction == "vertical":
-            return Axis((0.0, (width - 1) / 2), (height - 1.0, (width - 1) / 2))
-        return Axis(((height - 1) / 2, width - 1.0), ((height - 1) / 2, 0.0))
+    @property
+    def _axis(self) -> Axis:
+        assert self.axis is not None  # by `adapt`
+        return Axis(*self.axis)
 
     def _radius_px(self, frame: FieldFrame) -> int:
-        most = self._axis(frame).max_radius(frame.shape)
+        most = self._axis.max_radius(frame.shape)
         if most < _MIN_RADIUS_PX:
             raise InputError(
                 f"the axis comes within {most:.3g} px of the edge of the image, expected "
@@ -213,10 +210,10 @@ class AxisymmetricProfile(Product):
     ) -> tuple[FloatArray, FloatArray]:
         """Return both sides of the object, (slices, radius), averaged over each slice."""
         right_rows, left_rows = self._rows(displacement, frame, shift)
-        return self._by_slice(right_rows, frame), self._by_slice(left_rows, frame)
+        return self._by_slice(right_rows), self._by_slice(left_rows)
 
-    def _by_slice(self, rows: FloatArray, frame: FieldFrame) -> FloatArray:
-        edges = self._slices(frame)
+    def _by_slice(self, rows: FloatArray) -> FloatArray:
+        edges = self._slices
         widths = np.diff([*edges, len(rows)])
         return np.asarray(np.add.reduceat(rows, edges, axis=0) / widths[:, None])
 
@@ -224,7 +221,7 @@ class AxisymmetricProfile(Product):
         self, displacement: FloatArray, frame: FieldFrame, shift: float = 0.0
     ) -> tuple[FloatArray, FloatArray]:
         """Return both sides of the object at each place along the axis, (places, radius)."""
-        axis = self._axis(frame)
+        axis = self._axis
         if shift:
             start, end = (np.array(end) + shift * axis.across for end in (axis.start, axis.end))
             axis = Axis((float(start[0]), float(start[1])), (float(end[0]), float(end[1])))
@@ -241,7 +238,7 @@ class AxisymmetricProfile(Product):
         largest = float(sizes.max())
         if sizes.min() >= (1 - _NOTABLE_CHANGE) * largest:
             return 0.0
-        axis, last = self._axis(frame), np.array(frame.shape) - 1.0
+        axis, last = self._axis, np.array(frame.shape) - 1.0
         at_edge = [
             float(size) / largest
             for point, size in ((axis.start, sizes[0]), (axis.end, sizes[-1]))
@@ -249,9 +246,10 @@ class AxisymmetricProfile(Product):
         ]
         return max(at_edge, default=0.0)
 
-    def _slices(self, frame: FieldFrame) -> list[int]:
-        """Return the first place of each slice along the axis."""
-        count = len(self._axis(frame).places())
+    @property
+    def _slices(self) -> list[int]:
+        """First place of each slice along the axis."""
+        count = len(self._axis.places())
         number = max(round(count / self.slice_width), 1) if self.slice_width else 1
         return [int(place) for place in np.unique(np.linspace(0, count, number + 1)[:-1].round())]
 
@@ -281,7 +279,7 @@ class AxisymmetricProfile(Product):
         return product
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
-        dims = ("along", "radius") if self._has_slices(frame) else ("radius",)
+        dims = ("along", "radius") if self._has_slices else ("radius",)
         variables = {
             name: Variable(dims, unit, long_name)
             for name, (unit, long_name) in self._names(frame).items()
@@ -325,8 +323,8 @@ class AxisymmetricProfile(Product):
         return names
 
     def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
-        count = len(self._axis(frame).places())
-        edges = np.array([*self._slices(frame), count])
+        count = len(self._axis.places())
+        edges = np.array([*self._slices, count])
         middles = (edges[:-1] + edges[1:] - 1) / 2
         unit = frame.length_unit
         radii = np.arange(float(self._radius_px(frame)))
@@ -334,23 +332,24 @@ class AxisymmetricProfile(Product):
             "along": Coordinate(frame.length(1.0) * middles, unit, "Distance along the axis"),
             "radius": Coordinate(frame.length(1.0) * radii, unit, "Distance from the axis"),
         }
-        if not self._has_slices(frame):
+        if not self._has_slices:
             del coordinates["along"]
         return coordinates
 
-    def _has_slices(self, frame: FieldFrame) -> bool:
-        """Return whether there are profiles of several slices, as a plane."""
-        return len(self._slices(frame)) > 1
+    @property
+    def _has_slices(self) -> bool:
+        """Whether there are profiles of several slices, as a plane."""
+        return len(self._slices) > 1
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         _, displacement = frame.at_points(potential, displacement)
         right_rows, left_rows = self._rows(displacement, frame)
-        right_side, left_side = (self._by_slice(rows, frame) for rows in (right_rows, left_rows))
+        right_side, left_side = (self._by_slice(rows) for rows in (right_rows, left_rows))
         _, inverse = self._operators(frame)
         values = self._profiles((right_side + left_side) / 2 @ inverse.T, frame)
         scale = self._scale(frame)
         values["half_difference"] = scale * (right_side - left_side) @ inverse.T
-        if not self._has_slices(frame):
+        if not self._has_slices:
             values = {name: profiles[0] for name, profiles in values.items()}
         values["asymmetry"] = np.asarray(asymmetry(right_side, left_side))
         mean = np.abs((right_side + left_side) / 2)
@@ -427,7 +426,7 @@ class AxisymmetricProfile(Product):
             for name, error in errors.items():
                 change = np.abs(moved[0][name] + moved[1][name] - 2 * values[name]) / 2
                 errors[name] = np.hypot(error, change)
-        if not self._has_slices(frame):
+        if not self._has_slices:
             errors = {name: error[0] for name, error in errors.items()}
         return errors
 
@@ -442,7 +441,7 @@ class AxisymmetricProfile(Product):
         ]
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
-        axis, radius = self._axis(frame), self._radius_px(frame)
+        axis, radius = self._axis, self._radius_px(frame)
         points = axis.points(axis.places(), np.arange(-radius + 1.0, radius)).reshape(-1, 2)
         cautions = mask_cautions(points, frame, "the object")
         edge, halves, ends = (
@@ -471,18 +470,14 @@ class AxisymmetricProfile(Product):
         return [*cautions, *_length_cautions(np.abs(profile), frame)]
 
     def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
+        (y0, x0), (y1, x1) = self._axis.start, self._axis.end
+        error = "" if self.axis_error is None else f", position ± {self.axis_error:.2g} px"
         remarks = [
             "The profile assumes rotational symmetry about the axis, and no change beyond the "
-            "radius; an inclination of the axis towards the beam is not seen."
+            "radius; an inclination of the axis towards the beam is not seen.",
+            f"The axis runs from y = {y0:.1f}, x = {x0:.1f} to y = {y1:.1f}, x = {x1:.1f} px"
+            f"{error}.",
         ]
-        if self.axis is not None:
-            axis = self._axis(frame)
-            (y0, x0), (y1, x1) = axis.start, axis.end
-            error = "" if self.axis_error is None else f", position ± {self.axis_error:.2g} px"
-            remarks.append(
-                f"The axis runs from y = {y0:.1f}, x = {x0:.1f} to y = {y1:.1f}, x = {x1:.1f} px"
-                f"{error}."
-            )
         if self.ambient_temperature is not None:
             remarks.append(
                 "Density and temperature assume one Gladstone-Dale constant and one molar mass "

@@ -70,10 +70,8 @@ class Contrast(Smoothed):
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
     ) -> Values:
         finer = self._measure(potential, frame, ORDER + 1)
-        return {
-            name: finer[name] - value
-            for name, value in self._measure(potential, frame, ORDER).items()
-        }
+        values = self._measure(potential, frame, ORDER)
+        return {name: finer[name] - value for name, value in values.items()}
 
     def _measure(self, potential: FloatArray, frame: FieldFrame, order: int) -> Values:
         plane = smooth(potential, self.smoothing or 0.0, order)
@@ -100,9 +98,8 @@ class Contrast(Smoothed):
         compression = float(quantities["compression"].value)
         if self.object_length is not None and frame.setup is not None:
             # Inside the object a ray moves by its angle times the length.
-            angle = float(
-                frame.setup.deflection_angle(float(quantities["displacement"].value) / frame.pixel)
-            )
+            pixels = float(quantities["displacement"].value) / frame.pixel
+            angle = float(frame.setup.deflection_angle(pixels))
             if angle * self.object_length > float(quantities["scale"].value):
                 return "diffusive"
         if compression >= _CROSSED or frame.has_crossed_rays:

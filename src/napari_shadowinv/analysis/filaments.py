@@ -112,13 +112,6 @@ class Filaments(Product):
         angle = _direction(displacement, window_weights(frame.mask, _TAPER))
         return self.model_copy(update={"angle": angle})
 
-    def _across(self, displacement: FloatArray, weights: FloatArray) -> FloatArray:
-        """Return the unit vector (y, x) across the filaments."""
-        radians = math.radians(
-            _direction(displacement, weights) if self.angle is None else self.angle
-        )
-        return np.array([math.cos(radians), -math.sin(radians)])
-
     def _lags(self, frame: FieldFrame) -> FloatArray:
         most = int(_MIN_LAG_SHARE * min(frame.shape)) - 1
         return np.arange(0.0, most, _STEP_PX)
@@ -145,7 +138,9 @@ class Filaments(Product):
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         potential, displacement = frame.at_points(potential, displacement)
         weights = window_weights(frame.mask, _TAPER)
-        across = self._across(displacement, weights)
+        assert self.angle is not None  # by `adapt`
+        radians = math.radians(self.angle)
+        across = np.array([math.cos(radians), -math.sin(radians)])
         component = np.tensordot(across, displacement, axes=1)
         plane = field_autocorrelation(component, weights)
         lags = self._lags(frame)

@@ -86,7 +86,7 @@ def chosen_width(plane: FloatArray, noise: FloatArray, spacing: float) -> float:
     widths = [least, *(width for width in _WIDTHS_PX if least < width <= most)]
 
     def risk(width: float) -> float:
-        gain = _gain(plane.shape, width) if width else np.ones(plane.shape)
+        gain = _gain(plane.shape, width)
         return float(((1 - gain) ** 2 * square + 2 * gain * by_noise).sum())
 
     return float(min(widths, key=risk))
@@ -180,12 +180,13 @@ class _SourceMap(Smoothed):
         return {self.variable: self._per_curvature(frame) * lost}
 
     def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
-        name = self.variable
-        text = quantity_text(at_peak(inside(quantities[name], frame)), self.unit, frame)
+        name, density = self.variable, quantities[self.variable]
+        used = Quantity(density.value[frame.mask], density.samples[:, frame.mask])
+        text = quantity_text(at_peak(used), self.unit, frame)
         return [
             Fact(name, f"Largest {name}", text, short=text),
             Fact("smoothing", "Smoothing", self.smoothing_text(frame)),
-            *self._linear_facts(quantities[name], frame),
+            *self._linear_facts(density, frame),
         ]
 
     def _linear_facts(self, density: Quantity, frame: FieldFrame) -> list[Fact]:
@@ -204,11 +205,6 @@ class _SourceMap(Smoothed):
             "(r.m.s.); for deflections as weak as these they are nearly the same"
         )
         return [Fact("linear", "Linear limit", text)]
-
-
-def inside(quantity: Quantity, frame: FieldFrame) -> Quantity:
-    """Return the values of a map at the pixels that were used, shape (n,)."""
-    return Quantity(quantity.value[frame.mask], quantity.samples[:, frame.mask])
 
 
 class CurrentDensity(_SourceMap):

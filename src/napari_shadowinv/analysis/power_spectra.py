@@ -105,11 +105,6 @@ class RingSpectrum:
         """Width of a ring in rad/px."""
         return float(self.k[0])
 
-    @property
-    def density(self) -> FloatArray:
-        """Ring-averaged spectrum P/2πk, px² for each (rad/px)²."""
-        return np.asarray(self.power / (2 * np.pi * self.k))
-
 
 def ring_spectrum(potential: FloatArray, weights: FloatArray) -> RingSpectrum:
     """Return the spectrum of the displacement d = -∇φ in a window.

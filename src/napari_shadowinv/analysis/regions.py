@@ -38,7 +38,7 @@ class Region(Outlined):
             )
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
-        unit, name = frame.si_unit, frame.long_name
+        unit, length, name = frame.si_unit, frame.length_unit, frame.long_name
         of_what = f"{name}, magnitude" if frame.is_vector else name
         variables = {
             "mean": Variable((), unit, f"{of_what}, mean"),
@@ -51,9 +51,7 @@ class Region(Outlined):
                 for axis in "yx"
             }
         variables |= {
-            f"centroid_{axis}": Variable(
-                (), frame.length_unit, f"Centroid of the magnitude, {axis}"
-            )
+            f"centroid_{axis}": Variable((), length, f"Centroid of the magnitude, {axis}")
             for axis in "yx"
         }
         if frame.image is not None:

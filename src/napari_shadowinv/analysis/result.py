@@ -329,21 +329,13 @@ def _rows(result: ProductResult, name: str, statistics: Sequence[str]) -> Iterat
     factor, unit = result.scale_of(name)
     values = np.atleast_1d(result.quantities[name].value)
     numbers = result.statistics(name)
-    columns = [
-        np.atleast_1d(numbers[each]) if each in numbers else np.full(values.shape, np.nan)
-        for each in statistics
-    ]
-    dims = result.variables[name].dims
-    coordinate = result.coordinates[dims[0]] if dims else None
-    for row, value in enumerate(values):
-        place = "" if coordinate is None else f"{coordinate.values[row]:.9g}"
-        place_unit = "" if coordinate is None else display_unit(coordinate.unit)
-        yield [
-            result.name,
-            name,
-            place,
-            place_unit,
-            f"{factor * value:.9g}",
-            unit,
-            *("" if np.isnan(column[row]) else f"{factor * column[row]:.9g}" for column in columns),
-        ]
+    unknown = np.full(values.shape, np.nan)
+    columns = [np.atleast_1d(numbers.get(each, unknown)) for each in statistics]
+    places, place_unit = [""] * len(values), ""
+    for axis in result.variables[name].dims:
+        coordinate = result.coordinates[axis]
+        places = [f"{place:.9g}" for place in coordinate.values]
+        place_unit = display_unit(coordinate.unit)
+    for place, value, *row in zip(places, values, *columns, strict=True):
+        cells = ("" if np.isnan(number) else f"{factor * number:.9g}" for number in row)
+        yield [result.name, name, place, place_unit, f"{factor * value:.9g}", unit, *cells]
