@@ -83,8 +83,7 @@ def sample_strip(
     across = np.stack([along_x, -along_y], axis=1)
     count = min(max(int(np.ceil(width / step - 1e-9)), 1), _MAX_SAMPLES)
     offsets = width * ((np.arange(count) + 0.5) / count - 0.5)
-    rows: FloatArray = points + offsets[:, None, None] * across
-    return rows
+    return np.asarray(points + offsets[:, None, None] * across)
 
 
 def interpolate(
@@ -174,8 +173,7 @@ def path_directions(vertices: ArrayLike, distance: FloatArray) -> FloatArray:
         np.searchsorted(cumulative_length, distance, side="right") - 1, 0, len(edges) - 1
     )
     lengths = np.maximum(np.hypot(*edges.T), np.finfo(float).tiny)
-    directions: FloatArray = (edges / lengths[:, None])[edge]
-    return directions
+    return np.asarray((edges / lengths[:, None])[edge])
 
 
 def edge_midpoints(outline: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:

@@ -269,14 +269,7 @@ def corrected(quantity: Quantity) -> FloatArray:
 def quantity_text(quantity: Quantity, unit: str, frame: FieldFrame) -> str:
     """Return a number, corrected for a bias by noise, with its bands in words; "none" for NaN.
 
-    Parameters
-    ----------
-    quantity : Quantity
-        Of a single number.
-    unit : str
-        Of its values.
-    frame : FieldFrame
-        Has the unit that a field is shown in.
+    Its values are in the unit; those of a field are shown in the unit of the frame.
     """
     value = float(corrected(quantity))
     if np.isnan(value):

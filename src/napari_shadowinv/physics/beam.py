@@ -50,19 +50,10 @@ def takes_prefixes(unit: str) -> bool:
 
 
 def number_in_unit(text: str, unit: str) -> float:
-    """Read a number with a unit, exact to the last digit.
+    """Read a number with a unit, such as ``"1.3 mm"``, exact to the last digit.
 
-    Parameters
-    ----------
-    text : str
-        Such as ``"1.3 mm"``.
-    unit : str
-        Unit of the answer that `takes_prefixes`, such as "m" or "MeV".
-
-    Raises
-    ------
-    ValueError
-        If the text is no number, or its unit does not measure the same.
+    The unit of the answer `takes_prefixes`, such as "m" or "MeV". A `ValueError` is raised if the
+    text is no number, or its unit does not measure the same.
     """
     base = next(base for base in _BASES if unit.endswith(base))
     match = _QUANTITY.fullmatch(text.strip())
@@ -330,19 +321,16 @@ class BeamSetup(CheckedModel):
     @property
     def beam_value(self) -> float:
         """Value of the quantity that differs between images of one object."""
-        value: float = getattr(self, self.beam_field)
-        return value
+        return float(getattr(self, self.beam_field))
 
     def sensitivity_to_beam(self, name: str) -> float:
         """Return the relative change of one of `si_fields` by a relative change of `beam_field`."""
+        factors = 1 - _BEAM_STEP, 1 + _BEAM_STEP
+        setups = (self.model_copy(update={self.beam_field: f * self.beam_value}) for f in factors)
         low, high = (
-            math.log(np.abs(setup.field_in_si(name, np.ones((2, 1, 1)))).max())
-            for setup in (self._with_beam(1 - _BEAM_STEP), self._with_beam(1 + _BEAM_STEP))
+            math.log(np.abs(setup.field_in_si(name, np.ones((2, 1, 1)))).max()) for setup in setups
         )
-        return (high - low) / math.log((1 + _BEAM_STEP) / (1 - _BEAM_STEP))
-
-    def _with_beam(self, factor: float) -> Self:
-        return self.model_copy(update={self.beam_field: factor * self.beam_value})
+        return (high - low) / math.log(factors[1] / factors[0])
 
     @classmethod
     def deflector_titles(cls) -> tuple[str, ...]:

@@ -257,8 +257,7 @@ def unit_factor(symbol: str, text: str, name: str) -> float:
 
 
 def _squared(array: Any) -> FloatArray:
-    total: FloatArray = sum(np.square(component, dtype=np.float64) for component in array)
-    return total
+    return np.asarray(sum(np.square(component, dtype=np.float64) for component in array))
 
 
 def _checked_field(array: ArrayLike, name: str) -> AnyArray:
@@ -359,8 +358,7 @@ def _component(dataset: Any, name: str, places: Sequence[tuple[float, float, Flo
         raise InputError(f"{name} has values of type {values.dtype}, expected real numbers")
     factor = unit_factor(name[0].upper(), _unit_text(variable.attrs), name)
     flips = tuple(slice(None, None, -1 if at[0] > at[-1] else 1) for _, _, at in places)
-    scaled = values[flips] if factor == 1.0 else values[flips] * np.float64(factor)
-    return scaled
+    return values[flips] if factor == 1.0 else values[flips] * np.float64(factor)
 
 
 def _unit_text(attributes: Mapping[Any, Any]) -> str:

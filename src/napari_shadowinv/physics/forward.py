@@ -502,6 +502,16 @@ def usable_threads(threads: int | None) -> int:
     return available_threads(threads)
 
 
+def checked_shape(shape: tuple[int, int], name: str = "the image") -> tuple[int, int]:
+    """Return height and width of an image, or raise an `InputError`."""
+    if len(tuple(shape)) != 2 or min(shape) < MIN_SIDE_PX:
+        raise InputError(
+            f"{name} has shape {tuple(shape)}: expected (height, width), at least {MIN_SIDE_PX} "
+            "pixels each way"
+        )
+    return int(shape[0]), int(shape[1])
+
+
 def checked_displacement(displacement: ArrayLike) -> FloatArray:
     """Return a displacement as floats, or raise an `InputError` if a spline cannot be fitted."""
     plain = plain_array(displacement, "displacement", VECTOR, unit=PIXELS)

@@ -25,7 +25,7 @@ from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.field_grid import FieldGrid, field_grid
-from napari_shadowinv.physics.forward import MIN_SIDE_PX, usable_threads
+from napari_shadowinv.physics.forward import checked_shape, usable_threads
 from napari_shadowinv.physics.particle_push import (
     TRAPPED,
     UNTOUCHED,
@@ -142,21 +142,8 @@ def line_integrals(
 ) -> FloatArray:
     """Integrate a field over z along the straight rays from the source through the pixels' centres.
 
-    Parameters
-    ----------
-    field, setup, shape, threads
-        As for `trace`.
-
-    Returns
-    -------
-    ndarray, shape (4, H, W)
-        ∫B_y dz and ∫B_x dz in T m, ∫E_y dz and ∫E_x dz in V; exact for a field that is trilinear
-        between the nodes.
-
-    Raises
-    ------
-    InputError
-        As `trace`.
+    The arguments, and errors, are those of `trace`. The planes, shape (4, H, W), are ∫B_y dz and
+    ∫B_x dz in T m, ∫E_y dz and ∫E_x dz in V; exact for a field that is trilinear between the nodes.
     """
     grid = field_grid(field)
     check_particles(setup)
@@ -168,8 +155,7 @@ def line_integrals(
         integrate_rays,
         len(rays),
         usable_threads(threads),
-        _interleave(grid),
-        *_nodes(grid),
+        *_interleave(grid),
         rays,
         integrals,
         smallest=_SMALLEST_RANGE,
@@ -195,12 +181,10 @@ class Flight:
         self.grid, self.setup, self.shape, self.options = grid, setup, shape, options
         self.threads, self.report = threads, report
         self.field = _interleave(grid)
-        self.origin, self.spacing = _nodes(grid)
         particle = setup.particle
         self.rest_energy = particle.mass * _LIGHT_SPEED**2 / _JOULES_PER_MEV
         self.charge = particle.charge / (particle.mass * _LIGHT_SPEED)
         self.peaks = np.array([grid.peak("magnetic"), grid.peak("electric") / _LIGHT_SPEED])
-        self.longest = options.step * float(self.spacing.min())
         diagonal = math.hypot(*((n - 1) * d for n, d in zip(grid.shape, grid.spacing, strict=True)))
         self.max_path = _MAX_PATH * diagonal
         self._check_strength(setup.energy)
@@ -223,8 +207,7 @@ class Flight:
     def momenta(self, energy: FloatArray) -> FloatArray:
         """Momentum over m c of kinetic energies in MeV."""
         ratio = energy / self.rest_energy
-        momenta: FloatArray = np.sqrt(ratio * (ratio + 2))
-        return momenta
+        return np.asarray(np.sqrt(ratio * (ratio + 2)))
 
     def push(
         self,
@@ -233,57 +216,19 @@ class Flight:
         energy: FloatArray | None = None,
         start: FloatArray | None = None,
     ) -> TracedParticles:
-        """Trace particles; aims in px, energies in MeV, points of the source in m."""
-        count = aim.shape[1]
-        energies = np.full(count, self.setup.energy) if energy is None else energy
+        """Trace particles to the detector; aims in px, energies in MeV, starts in m."""
+        energies = np.full(aim.shape[1], self.setup.energy) if energy is None else energy
         particles = straight_rays(self.setup, self.shape, aim, start)
         particles[:, 3:] *= self.momenta(energies)[:, None]
         straight = particles.copy()
-        status, steps = np.zeros(count, np.int8), np.zeros(count, np.int32)
-        for first in range(0, count, PARTICLES_PER_BLOCK):
-            self.report(stage, first, count)
-            block = slice(first, min(first + PARTICLES_PER_BLOCK, count))
-            in_ranges(
-                push_particles,
-                block.stop - first,
-                self.threads,
-                self.field,
-                self.origin,
-                self.spacing,
-                particles[block],
-                status[block],
-                steps[block],
-                self.charge,
-                self.longest,
-                self.options.max_turn,
-                self.peaks,
-                self.max_path,
-                smallest=_SMALLEST_RANGE,
-            )
-        # Without the object the landing point is the aim, moved by the source's own size.
-        shift: FloatArray | float = 0.0
-        if start is not None and not self.setup.is_collimated:
-            ratio = self.setup.object_image_distance / self.setup.source_object_distance
-            shift = start * ratio / self.setup.pixel_sizes[1]
-        return self._arrivals(aim, aim - shift, energies, straight, particles, status, steps)
-
-    def _arrivals(
-        self,
-        aim: FloatArray,
-        free_landing: FloatArray,
-        energies: FloatArray,
-        straight: FloatArray,
-        particles: FloatArray,
-        status: AnyArray,
-        steps: AnyArray,
-    ) -> TracedParticles:
-        """Fly particles from the grid to the detector, and compare with a flight without field."""
+        status, steps = self._push_through_grid(particles, stage)
         if not np.isfinite(particles).all():
             bad = int((~np.isfinite(particles)).any(axis=1).sum())
             raise InputError(
                 f"{bad} particles left the range of floating-point numbers: check the unit of the "
                 "field and the energy"
             )
+        # They are compared with a flight without field.
         distance = self.setup.object_image_distance
         lost = (status == TRAPPED) | (particles[:, 5] <= 0)
         lost |= particles[:, 2] > distance
@@ -300,9 +245,14 @@ class Flight:
         displacement[:, status == UNTOUCHED] = 0.0
         deflection[:, status == UNTOUCHED] = 0.0
         displacement[:, lost] = deflection[:, lost] = np.nan
-        start, end = ((state[:, 3:] ** 2).sum(axis=1) for state in (straight, particles))
-        gammas = np.sqrt(1 + start), np.sqrt(1 + end)
-        change = (end - start) / (gammas[0] + gammas[1]) * self.rest_energy
+        squares, last_squares = ((state[:, 3:] ** 2).sum(axis=1) for state in (straight, particles))
+        gammas = np.sqrt(1 + squares), np.sqrt(1 + last_squares)
+        change = (last_squares - squares) / (gammas[0] + gammas[1]) * self.rest_energy
+        # Without the object the landing point is the aim, moved by the source's own size.
+        shift: FloatArray | float = 0.0
+        if start is not None and not self.setup.is_collimated:
+            ratio = self.setup.object_image_distance / self.setup.source_object_distance
+            shift = start * ratio / self.setup.pixel_sizes[1]
         return TracedParticles(
             aim=aim,
             displacement=displacement,
@@ -310,9 +260,25 @@ class Flight:
             energy=energies,
             energy_change=np.where(status == UNTOUCHED, 0.0, change),
             lost=lost,
-            landing=free_landing + displacement,
+            landing=aim - shift + displacement,
             steps=steps,
         )
+
+    def _push_through_grid(self, particles: FloatArray, stage: str) -> tuple[AnyArray, AnyArray]:
+        """Move particles to where they leave the grid; return their status and their steps."""
+        count = len(particles)
+        status, steps = np.zeros(count, np.int8), np.zeros(count, np.int32)
+        longest = self.options.step * min(self.grid.spacing)
+        limits = self.charge, longest, self.options.max_turn, self.peaks, self.max_path
+        for first in range(0, count, PARTICLES_PER_BLOCK):
+            self.report(stage, first, count)
+            block = slice(first, first + PARTICLES_PER_BLOCK)
+            moved = particles[block], status[block], steps[block]
+            arguments = *self.field, *moved, *limits
+            in_ranges(
+                push_particles, len(moved[0]), self.threads, *arguments, smallest=_SMALLEST_RANGE
+            )
+        return status, steps
 
 
 def straight_rays(
@@ -331,8 +297,8 @@ def straight_rays(
     return rays
 
 
-def _interleave(grid: FieldGrid) -> AnyArray:
-    """Return the field as the kernels take it, shape (Y, X, Z, 3) or (Y, X, Z, 6)."""
+def _interleave(grid: FieldGrid) -> tuple[AnyArray, FloatArray, FloatArray]:
+    """Return the field as the kernels take it, its first node and the spacing of x, y, z in m."""
     depth, height, width = grid.shape
     parts = [grid.magnetic] if grid.electric is None else [grid.magnetic, grid.electric]
     field = np.zeros((height, width, depth, 3 * len(parts)), np.float32)
@@ -341,13 +307,8 @@ def _interleave(grid: FieldGrid) -> AnyArray:
             continue
         for component in range(3):  # from (z, y, x) to (x, y, z)
             field[..., 3 * part + component] = np.asarray(array)[2 - component].transpose(1, 2, 0)
-    return field
-
-
-def _nodes(grid: FieldGrid) -> tuple[FloatArray, FloatArray]:
-    """Return the place of the first node and the spacing along x, y, z in m."""
     origin = np.array([low for low, _ in grid.extent[::-1]])
-    return origin, np.array(grid.spacing[::-1])
+    return field, origin, np.array(grid.spacing[::-1])
 
 
 def _check_place(grid: FieldGrid, setup: ProtonSetup) -> None:
@@ -384,13 +345,3 @@ def check_particles(setup: Any) -> ProtonSetup:
             "with energy, distances and pixel size, to trace them through a 3-D field"
         )
     return setup
-
-
-def checked_shape(shape: Shape) -> Shape:
-    """Return height and width of an image, or raise an `InputError`."""
-    if len(tuple(shape)) != 2 or min(shape) < MIN_SIDE_PX:
-        raise InputError(
-            f"the image has shape {tuple(shape)}: expected (height, width), at least {MIN_SIDE_PX} "
-            "pixels each way"
-        )
-    return int(shape[0]), int(shape[1])

@@ -75,8 +75,7 @@ def push_particles(
     inv_x, inv_y, inv_z = 1.0 / spacing[0], 1.0 / spacing[1], 1.0 / spacing[2]
     is_electric = field.shape[3] > 3
     light_speed = 299792458.0
-    max_b, max_e = charge * peaks[0], charge * peaks[1]
-    max_b, max_e = abs(max_b), abs(max_e)
+    max_b, max_e = abs(charge * peaks[0]), abs(charge * peaks[1])
     for p in range(first, last):
         ux, uy, uz = particles[p, 3], particles[p, 4], particles[p, 5]
         u = math.sqrt(ux * ux + uy * uy + uz * uz)

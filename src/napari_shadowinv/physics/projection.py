@@ -34,7 +34,12 @@ from scipy.interpolate import make_interp_spline
 from napari_shadowinv._system.arrays import plain_array
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.forward import MIN_SIDE_PX, checked_displacement, synthetic_image
+from napari_shadowinv.physics.forward import (
+    MIN_SIDE_PX,
+    checked_displacement,
+    checked_shape,
+    synthetic_image,
+)
 from napari_shadowinv.physics.setup import Setup, deflector_titles
 
 # Share of a pixel by which rounding may put an image's edge beyond the other's.
@@ -243,19 +248,14 @@ def _covered_shape(old: tuple[int, int], ratio: float) -> tuple[int, int]:
 def _checked_shape(
     shape: tuple[int, int], old: tuple[int, int], ratio: float, setup: Setup
 ) -> tuple[int, int]:
-    if len(shape) != 2 or min(shape) < MIN_SIDE_PX:
-        raise InputError(
-            f"the other image has shape {tuple(shape)}: expected (height, width), at least "
-            f"{MIN_SIDE_PX} pixels each way"
-        )
-    most = _covered_shape(old, ratio)
+    size, most = checked_shape(shape, "the other image"), _covered_shape(old, ratio)
     if shape[0] > most[0] or shape[1] > most[1]:
         raise InputError(
             f"the other image has shape {tuple(shape)} with pixels of "
             f"{setup.object_pixel_size * 1e6:.4g} µm at the object, but the field is known only "
             f"on {most} of them: crop the source or reduce the shape to that"
         )
-    return int(shape[0]), int(shape[1])
+    return size
 
 
 def _resample(field: FloatArray, shape: tuple[int, int], ratio: float) -> FloatArray:

@@ -1,15 +1,12 @@
 """The experiment's geometry and probe, and the fields that follow from a displacement.
 
 - describe an experiment: `ProtonSetup`, `OpticalSetup`; any of them: `Setup`, by kind `SETUPS`
-- how a kind of setup is described: `BeamSetup`, `SIField`, `MainField`, `Deflector`,
-  `BeamQuantity`; of all kinds: `deflector_titles`, `beam_quantities`; of some setups:
-  `beam_values`
+- causes of deflections and quantities of beams, of all kinds: `deflector_titles`,
+  `beam_quantities`; of some setups: `beam_values`
 - get it back from a file's content: `setup_from_dict`; with larger pixels: `bin_setup`
 - convert pixels to SI and back: methods of `BeamSetup`; path-integrated fields: of `ProtonSetup`;
   line integrals of the refractive index or the density: of `OpticalSetup`
-- whether its numbers are plausible: `setup_warnings`, `deflection_warnings`; for people to
-  check: `geometry_text`, `field_of_view_text`
-- the gradient of a potential in pixels: `displacement_from_potential`
+- the base class of all kinds, and whether numbers are plausible: `napari_shadowinv.physics.beam`
 - the same object in another experiment: `napari_shadowinv.physics.projection`
 
 Conversions take an array_like of any shape and return an ndarray of float64 of the same
@@ -368,15 +365,13 @@ class OpticalSetup(BeamSetup):
     def angle_ratio(self, recorded_with: Any, deflector: str) -> float:
         if deflector == "refractive index":
             return 1.0
-        ratio: float = recorded_with.critical_density / self.critical_density
-        return ratio
+        return float(recorded_with.critical_density / self.critical_density)
 
     @property
     def critical_density(self) -> float:
         """Electron density n_c = ε₀ m ω² / e² in m⁻³ beyond which the light does not travel."""
         frequency = 2 * math.pi * constants.c / self.wavelength
-        density: float = constants.epsilon_0 * constants.m_e * frequency**2 / constants.e**2
-        return density
+        return float(constants.epsilon_0 * constants.m_e * frequency**2 / constants.e**2)
 
     def line_integrated_log_index(self, phi: ArrayLike) -> FloatArray:
         """Refractive index along the beam, ∫ln η dz = -Φ in m, from φ in px² (Eq. 2a)."""

@@ -8,7 +8,7 @@ The command makes flags of them, so this module does not import numba.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -103,20 +103,13 @@ class GridView(CheckedModel):
         return turned.centred() if self.centre else turned
 
 
+def _side(name: str) -> Any:
+    description = f"{name} of the traced image in px."
+    return Field(default=200, ge=4, le=20_000, title=f"{name} (px)", description=description)
+
+
 class SizedView(GridView):
     """Direction from which a grid is seen, and the size of its image."""
 
-    height: int = Field(
-        default=200,
-        ge=4,
-        le=20_000,
-        title="Height (px)",
-        description="Height of the traced image in px.",
-    )
-    width: int = Field(
-        default=200,
-        ge=4,
-        le=20_000,
-        title="Width (px)",
-        description="Width of the traced image in px.",
-    )
+    height: int = _side("Height")
+    width: int = _side("Width")

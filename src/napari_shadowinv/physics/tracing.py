@@ -2,8 +2,6 @@
 
 - the image of a field on a grid: `trace`, with `TraceOptions`; the answer is a `TracedImage`
 - displacements alone: `traced_displacement`
-- particles with chosen starting points: `trace_particles`; they are `TracedParticles`
-- the exact line integrals of a grid along straight rays: `line_integrals`
 
 Nothing is assumed of the object: it may be thick, its fields may bend the particles inside it and
 change their energy. So a traced image checks what the inversion and the fit make of it, which
@@ -31,14 +29,13 @@ from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.physics.field_grid import FieldGrid, field_grid
-from napari_shadowinv.physics.forward import synthetic_image, usable_threads
+from napari_shadowinv.physics.forward import checked_shape, synthetic_image, usable_threads
 from napari_shadowinv.physics.particle_flight import (
     PARTICLES_PER_BLOCK,
     Flight,
     Shape,
     TracedParticles,
     check_particles,
-    checked_shape,
     image_range,
     line_integrals,
     pixel_centres,
@@ -296,30 +293,27 @@ def trace(
     lines = line_integrals(grid, setup, shape, threads=threads)
     reach = _reach(flight, straight.displacement)
     if options.output == "counts":
-        image, source, tally, particles = _count(
-            flight, reach, profile, _energies(flight, spectrum), seed
-        )
+        exposure = _count(flight, reach, profile, _energies(flight, spectrum), seed)
     else:
-        image, source, tally = _fluence(flight, reach, profile, threads)
-        particles = None
+        exposure = _fluence(flight, reach, profile, threads)
     return TracedImage(
-        image=image,
-        source=source,
+        image=exposure.image,
+        source=exposure.source,
         displacement=straight.displacement.reshape(plane),
         deflection=straight.deflection.reshape(plane),
         path_integrated_b=lines[:2],
         path_integrated_e=lines[2:],
-        launched=tally.launched,
-        landed=tally.landed,
-        outside=tally.launched - tally.landed - tally.lost,
-        lost=tally.lost,
+        launched=exposure.launched,
+        landed=exposure.landed,
+        outside=exposure.launched - exposure.landed - exposure.lost,
+        lost=exposure.lost,
         setup=setup,
         options=options,
         seed=seed,
         length=grid.length,
         edge_share=grid.edge_share,
-        steps=int(straight.steps.sum()) + tally.steps,
-        particles=particles,
+        steps=int(straight.steps.sum()) + exposure.steps,
+        particles=exposure.particles,
     )
 
 
@@ -355,20 +349,23 @@ def traced_displacement(
     return np.asarray(rays.displacement.reshape(2, *size))
 
 
-@dataclass(frozen=True)
-class _Tally:
-    """Numbers of particles that were launched, landed in the image, or were lost; their steps."""
+@dataclass(frozen=True, eq=False)
+class _Exposure:
+    """An image, the beam without object, and numbers of particles; with the particles if kept."""
 
+    image: FloatArray
+    source: FloatArray
     launched: int
     landed: int
     lost: int
     steps: int
+    particles: TracedParticles | None = None
 
 
 def _fluence(
     flight: Flight, reach: tuple[IntArray, IntArray], profile: Profile | None, threads: int | None
-) -> tuple[FloatArray, FloatArray, _Tally]:
-    """Return the image of regular rays, the beam without object, and the numbers of rays."""
+) -> _Exposure:
+    """Return the exposure by regular rays."""
     fine = math.isqrt(flight.options.rays_per_pixel - 1) + 1
     first, last = reach
     size = tuple((last - first) * fine)
@@ -388,8 +385,8 @@ def _fluence(
         image = synthetic_image(displacement, flux, rays_per_pixel=4, threads=threads)
     source = _beam(flight, profile, *image_range(flight.shape), 1)
     inside = _is_inside(rays.landing, flight.shape)
-    tally = _Tally(lost.size, int(inside.sum()), int(lost.sum()), int(rays.steps.sum()))
-    return block_sums(image, fine)[cut], source, tally
+    numbers = lost.size, int(inside.sum()), int(lost.sum()), int(rays.steps.sum())
+    return _Exposure(block_sums(image, fine)[cut], source, *numbers)
 
 
 def _count(
@@ -398,8 +395,8 @@ def _count(
     profile: Profile | None,
     energies: Callable[[np.random.Generator, int], FloatArray],
     seed: int,
-) -> tuple[FloatArray, FloatArray, _Tally, TracedParticles | None]:
-    """Return the image of random particles, the expected beam, numbers, and the particles."""
+) -> _Exposure:
+    """Return the exposure by random particles."""
     first, last = reach
     options = flight.options
     beam = _beam(flight, profile, first, last, 1)
@@ -436,7 +433,7 @@ def _count(
         arrays = zip(*(vars(batch).values() for batch in batches), strict=True)
         all_particles = TracedParticles(*(np.concatenate(parts, axis=-1) for parts in arrays))
     counts = image.reshape(flight.shape).astype(np.float64)
-    return counts, source * scale, _Tally(total, landed, lost, steps), all_particles
+    return _Exposure(counts, source * scale, total, landed, lost, steps, all_particles)
 
 
 def _is_inside(landing: FloatArray, shape: Shape) -> AnyArray:
