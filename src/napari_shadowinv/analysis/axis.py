@@ -25,13 +25,7 @@ _MIN_PLACES = 200  # along a long axis while it is sought: neighbours share thei
 
 @dataclass(frozen=True)
 class Axis:
-    """A straight axis in the image plane.
-
-    Attributes
-    ----------
-    start, end : tuple of float
-        Its ends (y, x) in px.
-    """
+    """A straight axis in the image plane, with its ends (y, x) in px."""
 
     start: tuple[float, float]
     end: tuple[float, float]

@@ -8,7 +8,7 @@ particles. An azimuthal magnetic field is seen along its axis only.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import ClassVar, Literal, Self
 
@@ -440,34 +440,34 @@ class AxisymmetricProfile(Product):
             for fact in super().facts(quantities, frame)
         ]
 
-    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
+    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> Iterator[Caution]:
         axis, radius = self._axis, self._radius_px(frame)
         points = axis.points(axis.places(), np.arange(-radius + 1.0, radius)).reshape(-1, 2)
-        cautions = mask_cautions(points, frame, "the object")
+        yield from mask_cautions(points, frame, "the object")
         edge, halves, ends = (
             float(quantities[name].value) for name in ("edge", "asymmetry", "ends")
         )
         if ends > _NOTABLE_END:
-            text = (
+            yield Caution(
+                "cut-object",
                 f"the object leaves the image along its axis, where its deflection is {ends:.0%} "
                 "of the largest: the closed edge of an inversion distorts the profile near it; use "
-                "a larger image, or a free boundary"
+                "a larger image, or a free boundary",
             )
-            cautions.append(Caution("cut-object", text))
         if edge > _NOTABLE_EDGE:
-            text = (
+            yield Caution(
+                "cut-object",
                 f"the deflection at the edge is {edge:.0%} of the largest: the object does not end "
-                "inside the radius, which shifts and bends the profile; use a wider image"
+                "inside the radius, which shifts and bends the profile; use a wider image",
             )
-            cautions.append(Caution("cut-object", text))
         if halves > _NOTABLE_ASYMMETRY:
-            text = (
+            yield Caution(
+                "misfit",
                 f"the halves of the object differ by {halves:.0%} (r.m.s.): it is not symmetric "
-                "about this axis, and the profile is that of the mean of the halves"
+                "about this axis, and the profile is that of the mean of the halves",
             )
-            cautions.append(Caution("misfit", text))
         profile = np.atleast_2d(quantities[next(iter(self._names(frame)))].value)
-        return [*cautions, *_length_cautions(np.abs(profile), frame)]
+        yield from _length_cautions(np.abs(profile), frame)
 
     def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
         (y0, x0), (y1, x1) = self._axis.start, self._axis.end

@@ -17,7 +17,7 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -173,28 +173,26 @@ class Filaments(Product):
     def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
         return [fact for fact in super().facts(quantities, frame) if fact.key not in self.curves]
 
-    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
-        cautions = []
+    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> Iterator[Caution]:
         if not np.isfinite(quantities["radius"].value):
-            text = (
+            yield Caution(
+                "cut-object",
                 "the autocorrelation does not fall to zero within 40 % of the image: the "
-                "structures are too large for it, and have no size here"
+                "structures are too large for it, and have no size here",
             )
-            cautions.append(Caution("cut-object", text))
         elif float(quantities["elongation"].value) < _MIN_ELONGATION:
-            text = (
+            yield Caution(
+                "misfit",
                 f"structures are only {float(quantities['elongation'].value):.2g} times as long as "
-                "wide: they are blobs rather than filaments, and their direction means nothing"
+                "wide: they are blobs rather than filaments, and their direction means nothing",
             )
-            cautions.append(Caution("misfit", text))
         spacing, radius = (float(quantities[name].value) for name in ("spacing", "radius"))
         if abs(math.sqrt(2) * radius / spacing - _WAVE_ZERO) < _WAVE_MARGIN:
-            text = (
+            yield Caution(
+                "accuracy",
                 "the filaments nearly merge into a wave, whose first zero does not depend on their "
-                "size: the radius is a lower limit"
+                "size: the radius is a lower limit",
             )
-            cautions.append(Caution("accuracy", text))
-        return cautions
 
     def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
         return (

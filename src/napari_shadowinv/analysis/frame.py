@@ -26,21 +26,11 @@ _DISPLACEMENT = SIField("displacement", PIXEL, "Displacement", is_vector=True)
 
 @dataclass(frozen=True)
 class FieldUnit:
-    """Unit in which a field is shown.
+    """Unit in which a field is shown."""
 
-    Attributes
-    ----------
-    symbol : str
-        As people write it, such as "MG µm".
-    size : float
-        In the SI unit of the field.
-    field : str
-        Variable of the field, such as "path_integrated_b"; one of the setup's `si_fields`.
-    """
-
-    symbol: str
-    size: float
-    field: str
+    symbol: str  # as people write it, such as "MG µm"
+    size: float  # in the SI unit of the field
+    field: str  # its variable, such as "path_integrated_b"; one of the setup's `si_fields`
 
 
 _B, _E = "path_integrated_b", "path_integrated_e"

@@ -30,21 +30,12 @@ _CIRCLE_CORNERS = 720
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Values along a line, with their name and unit.
-
-    Attributes
-    ----------
-    name, unit : str
-    values : ndarray, shape (n,)
-        NaN where the line is outside the image.
-    averaging : str
-        The averaging across the line in words; empty for values on the line.
-    """
+    """Values along a line, with their name and unit."""
 
     name: str
     unit: str
-    values: FloatArray
-    averaging: str = ""
+    values: FloatArray  # (n,); NaN where the line is outside the image
+    averaging: str = ""  # across the line, in words; empty for values on the line
 
 
 def sample_path(vertices: ArrayLike, step: float) -> tuple[FloatArray, FloatArray]:

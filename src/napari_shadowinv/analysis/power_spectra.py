@@ -75,21 +75,11 @@ def _rise(share: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class RingSpectrum:
-    """Power of the displacement in rings of wavenumbers.
+    """Power of the displacement in rings of wavenumbers, shape (n,) each."""
 
-    Attributes
-    ----------
-    k : ndarray, shape (n,)
-        Wavenumbers of the rings, rad/px, multiples of their width.
-    power : ndarray, shape (n,)
-        Ring-summed spectrum P, px² for each rad/px.
-    modes : ndarray, shape (n,)
-        Number of independent modes in each ring: fewer than grid modes because of the window.
-    """
-
-    k: FloatArray
-    power: FloatArray
-    modes: FloatArray
+    k: FloatArray  # wavenumbers of the rings, rad/px, multiples of their width
+    power: FloatArray  # ring-summed spectrum P, px² for each rad/px
+    modes: FloatArray  # independent ones in each ring: fewer than of the grid, by the window
 
     @property
     def width(self) -> float:
@@ -189,21 +179,11 @@ def random_displacement(
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Spectrum of an inversion relative to the field's, in the rings of a spectrum.
+    """Spectrum of an inversion relative to the field's, in the rings of a spectrum."""
 
-    Attributes
-    ----------
-    ratio : ndarray, shape (n,)
-        Retrieved over true power.
-    spread : ndarray, shape (n,)
-        Standard error of its logarithm, from the scatter of the phantoms; 0 of one phantom.
-    contrast : float
-        R.m.s. divergence of the displacement of the phantoms.
-    """
-
-    ratio: FloatArray
-    spread: FloatArray
-    contrast: float
+    ratio: FloatArray  # (n,); retrieved over true power
+    spread: FloatArray  # (n,); its logarithm's standard error, by the phantoms' scatter; 0 of one
+    contrast: float  # r.m.s. divergence of the displacement of the phantoms
 
 
 def measure_response(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -208,9 +208,9 @@ class Product(Choice):
             facts.append(Fact(name, f"{title[:1].upper()}{title[1:]}", text, short=text))
         return facts
 
-    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
+    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> Iterable[Caution]:
         """Return reasons to doubt the product."""
-        return []
+        return ()
 
     def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
         """Return how the product has to be read, in sentences."""

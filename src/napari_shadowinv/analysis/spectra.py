@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -476,23 +476,21 @@ class TurbulenceSpectrum(Product):
             facts.append(Fact("range", "Trusted range", "none", Level.DOUBTFUL))
         return facts
 
-    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
-        cautions = []
+    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> Iterator[Caution]:
         contrast = float(quantities["contrast"].value)
         if contrast > _MAX_CONTRAST and self.resolution:
-            text = (
+            yield Caution(
+                "folds",
                 f"the contrast is {contrast:.2g}, above {_MAX_CONTRAST:g}: rays cross so often "
                 "that the spectrum of one image is too weak, and its slope wrong; fit several "
-                "images"
+                "images",
             )
-            cautions.append(Caution("folds", text))
         if self.resolution and not self.response:
-            text = (
+            yield Caution(
+                "accuracy",
                 "the loss of small structures by the inversion is not corrected, which makes a "
-                "spectrum too steep; choose one phantom or more"
+                "spectrum too steep; choose one phantom or more",
             )
-            cautions.append(Caution("accuracy", text))
-        return cautions
 
     def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
         remarks = [
