@@ -469,21 +469,22 @@ class AxisymmetricProfile(Product):
         profile = np.atleast_2d(quantities[next(iter(self._names(frame)))].value)
         yield from _length_cautions(np.abs(profile), frame)
 
-    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
+    def remarks(self, frame: FieldFrame) -> Iterator[str]:
+        yield (
+            "The profile assumes rotational symmetry about the axis, and no change beyond the "
+            "radius; an inclination of the axis towards the beam is not seen."
+        )
         (y0, x0), (y1, x1) = self._axis.start, self._axis.end
         error = "" if self.axis_error is None else f", position ± {self.axis_error:.2g} px"
-        remarks = [
-            "The profile assumes rotational symmetry about the axis, and no change beyond the "
-            "radius; an inclination of the axis towards the beam is not seen.",
+        yield (
             f"The axis runs from y = {y0:.1f}, x = {x0:.1f} to y = {y1:.1f}, x = {x1:.1f} px"
-            f"{error}.",
-        ]
+            f"{error}."
+        )
         if self.ambient_temperature is not None:
-            remarks.append(
+            yield (
                 "Density and temperature assume one Gladstone-Dale constant and one molar mass "
                 "everywhere; those of burnt gas differ from those of air by several per cent."
             )
-        return tuple(remarks)
 
 
 class AzimuthalProfile(Product):
@@ -614,19 +615,18 @@ def _axis_offset(right_side: FloatArray, left_side: FloatArray) -> float:
     return -float(np.sum((right_side - left_side) * slope)) / (2 * size) if size > 0 else 0.0
 
 
-def _length_cautions(profile: FloatArray, frame: FieldFrame) -> list[Caution]:
+def _length_cautions(profile: FloatArray, frame: FieldFrame) -> Iterator[Caution]:
     """Warn of an object that is not thin against its distance from a point source."""
     setup = frame.setup
     if setup is None or setup.is_collimated:
-        return []
+        return
     strong = np.flatnonzero((profile > _PROFILE_END * profile.max()).any(axis=0))
     length = 2 * frame.length(float(strong.max()) if len(strong) else 0.0)
     share = length / setup.source_object_distance
-    if share <= _NOTABLE_LENGTH:
-        return []
-    text = (
-        f"the object is {length_text(length)} long along the beam, {share:.0%} of its distance "
-        "from the source: rays are not parallel inside it and magnify its front more than its "
-        "back, which the Abel inversion does not allow for"
-    )
-    return [Caution("setup", text)]
+    if share > _NOTABLE_LENGTH:
+        yield Caution(
+            "setup",
+            f"the object is {length_text(length)} long along the beam, {share:.0%} of its distance "
+            "from the source: rays are not parallel inside it and magnify its front more than its "
+            "back, which the Abel inversion does not allow for",
+        )

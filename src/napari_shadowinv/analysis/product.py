@@ -196,23 +196,21 @@ class Product(Choice):
         """
         return quantities
 
-    def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
+    def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> Iterable[Fact]:
         """Return the product in words. Default: each number, and the peak of each array."""
-        facts = []
         for name, variable in self.variables(frame).items():
             quantity = quantities[name]
             title = variable.title or name.replace("_", " ")
             if variable.dims:
                 quantity, title = at_peak(quantity), f"largest {title}"
             text = quantity_text(quantity, variable.unit, frame)
-            facts.append(Fact(name, f"{title[:1].upper()}{title[1:]}", text, short=text))
-        return facts
+            yield Fact(name, f"{title[:1].upper()}{title[1:]}", text, short=text)
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> Iterable[Caution]:
         """Return reasons to doubt the product."""
         return ()
 
-    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
+    def remarks(self, frame: FieldFrame) -> Iterable[str]:
         """Return how the product has to be read, in sentences."""
         return ()
 

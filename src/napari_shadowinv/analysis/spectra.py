@@ -463,18 +463,17 @@ class TurbulenceSpectrum(Product):
             power = power / np.interp(window.k, spectrum.k, self.response)
         return np.asarray(power)
 
-    def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
+    def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> Iterator[Fact]:
         arrays = {name for name, each in self.variables(frame).items() if each.dims}
-        facts = [fact for fact in super().facts(quantities, frame) if fact.key not in arrays]
+        yield from (fact for fact in super().facts(quantities, frame) if fact.key not in arrays)
         rings = np.flatnonzero(quantities["trusted"].value)
         k = self.coordinates(frame)["k"]
         if len(rings):
             text_of = "{:.3g} px".format if frame.setup is None else length_text
             low, high = (text_of(float(length)) for length in 2 * np.pi / k.values[rings[[-1, 0]]])
-            facts.append(Fact("range", "Trusted range", f"wavelengths of {low} to {high}"))
+            yield Fact("range", "Trusted range", f"wavelengths of {low} to {high}")
         else:
-            facts.append(Fact("range", "Trusted range", "none", Level.DOUBTFUL))
-        return facts
+            yield Fact("range", "Trusted range", "none", Level.DOUBTFUL)
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> Iterator[Caution]:
         contrast = float(quantities["contrast"].value)
@@ -492,22 +491,21 @@ class TurbulenceSpectrum(Product):
                 "spectrum too steep; choose one phantom or more",
             )
 
-    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
-        remarks = [
+    def remarks(self, frame: FieldFrame) -> Iterator[str]:
+        yield (
             "P(k) is summed over rings, so that its integral over k is the mean square; the "
             "density is averaged over rings, and its slope is less by one."
-        ]
+        )
         if self.path_length is not None:
-            remarks.append(
+            yield (
                 f"E(k) assumes isotropic, homogeneous turbulence over a path of "
                 f"{1e3 * self.path_length:.4g} mm, much longer than its correlation length; the "
                 "r.m.s. field is that of the trusted range."
             )
-        remarks.append(
+        yield (
             "Bands of slope and r.m.s. field hold the scatter between parts of the image, as the "
             "window has a finite number of structures."
         )
-        return tuple(remarks)
 
 
 def _longest_run(rings: BoolArray) -> BoolArray:
