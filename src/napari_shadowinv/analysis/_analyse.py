@@ -187,7 +187,10 @@ class _Task:
         """Yield the results, with systematic errors of random sign added to the samples."""
         systematic = {**evaluation.systematic, **self._by_energy(evaluation.value)}
         if len(evaluation.samples):
-            systematic |= self._by_readout(evaluation.value) | self._by_product()
+            # Means over pixels, and central differences of the read-out
+            finer = finer_field(self.field.potential, self.field.displacement)
+            systematic["pixels"] = self.measure(*finer) - evaluation.value
+            systematic |= self._by_product()
         samples = evaluation.samples
         for error in systematic.values():
             for sample, strength in zip(samples, _standard_numbers(rng, len(samples)), strict=True):
@@ -219,11 +222,6 @@ class _Task:
         factor = 1.0 + share * abs(frame.setup.sensitivity_to_beam(frame.unit.field))
         scaled = self.measure(factor * self.field.potential, factor * self.field.displacement)
         return {f"{frame.setup.beam_quantity().noun}, {100 * share:.2g} %": scaled - value}
-
-    def _by_readout(self, value: FloatArray) -> Values:
-        """Return the errors by means over pixels, and by central differences of the read-out."""
-        finer = finer_field(self.field.potential, self.field.displacement)
-        return {"pixels": self.measure(*finer) - value}
 
     def _by_product(self) -> Values:
         """Return the errors by the products' own methods."""

@@ -59,10 +59,7 @@ def deflection_matrix(count: int, offset: float = FIRST_OFFSET) -> FloatArray:
     >>> bool(abs(deflection - exact).max() < 0.005)
     True
     """
-    y, radii = _grid(count, offset)
-    # ∫ dr / √(r² - y²) = arcosh(r / y), zero at r = y
-    ratio = np.divide(radii, y, out=np.ones((count, count + 1)), where=y > 0)
-    integral = np.arccosh(np.maximum(ratio, 1.0))
+    y, _, integral = _grid(count, offset)
     pieces = -2 * y * np.diff(integral, axis=1)
     matrix = np.zeros((count, count + 1))
     matrix[:, 1:] += pieces
@@ -75,12 +72,11 @@ def projection_matrix(count: int, offset: float = 0.0) -> FloatArray:
 
     Times f the matrix gives F, in units of f times px; see `deflection_matrix`.
     """
-    y, radii = _grid(count, offset)
+    y, radii, integral = _grid(count, offset)
     root = np.sqrt(np.maximum(radii**2 - y**2, 0.0))
-    ratio = np.divide(radii, y, out=np.ones((count, count + 1)), where=y > 0)
     # ∫ r dr / √(r² - y²) and ∫ r² dr / √(r² - y²) over each piece
     first = np.diff(root, axis=1)
-    second = np.diff((radii * root + y**2 * np.arccosh(np.maximum(ratio, 1.0))) / 2, axis=1)
+    second = np.diff((radii * root + y**2 * integral) / 2, axis=1)
     matrix = np.zeros((count, count + 1))
     matrix[:, :-1] += 2 * (radii[:, 1:] * first - second)
     matrix[:, 1:] += 2 * (second - radii[:, :-1] * first)
@@ -94,7 +90,9 @@ def inverse_matrix(matrix: FloatArray, smoothing: float) -> FloatArray:
     projections, the smoothing s of 0 or more, and second differences of f, which is even at the
     axis and zero beyond R.
     """
-    bends = _second_differences(matrix.shape[1])
+    count = matrix.shape[1]
+    bends = -2.0 * np.eye(count) + np.eye(count, k=1) + np.eye(count, k=-1)
+    bends[0, 1] = 2.0
     normal = matrix.T @ matrix + smoothing * bends.T @ bends
     return np.asarray(np.linalg.solve(normal, matrix.T))
 
@@ -133,15 +131,11 @@ def operators(
     return matrix, inverse
 
 
-def _grid(count: int, offset: float) -> tuple[FloatArray, FloatArray]:
-    """Return distances (count, 1) and radii (1, count + 1) in px."""
+def _grid(count: int, offset: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return distances y (count, 1) and radii r (1, count + 1) in px, and ∫ dr / √(r² - y²)."""
     if count < _MIN_RADII:
         raise InputError(f"the radius is {count} px, expected at least {_MIN_RADII} px")
-    return offset + np.arange(float(count))[:, None], np.arange(count + 1.0)[None, :]
-
-
-def _second_differences(count: int) -> FloatArray:
-    """Return second differences of a profile that is even at 0 and zero from `count` on."""
-    bends = -2.0 * np.eye(count) + np.eye(count, k=1) + np.eye(count, k=-1)
-    bends[0, 1] = 2.0
-    return bends
+    y, radii = offset + np.arange(float(count))[:, None], np.arange(count + 1.0)[None, :]
+    ratio = np.divide(radii, y, out=np.ones((count, count + 1)), where=y > 0)
+    # The integral is arcosh(r / y), zero at r = y.
+    return y, radii, np.arccosh(np.maximum(ratio, 1.0))

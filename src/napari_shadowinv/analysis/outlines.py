@@ -92,17 +92,12 @@ class Outlined(Product):
             corners = corners[::-1]
         return np.vstack([corners, corners[:1]])
 
-    @property
-    def span(self) -> FloatArray:
-        """Smallest and largest (y, x) of the outline, shape (2, 2)."""
-        if self.center is not None and self.radius is not None:
-            center = np.array(self.center)
-            return np.stack([center - self.radius, center + self.radius])
-        return np.stack([self.outline.min(axis=0), self.outline.max(axis=0)])
-
     def check(self, frame: FieldFrame) -> None:
         super().check(frame)
-        frame.check_points(self.span, "the outline")
+        ends = np.stack([self.outline.min(axis=0), self.outline.max(axis=0)])
+        if self.center is not None and self.radius is not None:
+            ends = np.array(self.center) + np.array([[-self.radius], [self.radius]])
+        frame.check_points(ends, "the outline")
 
     def pixels_inside(self, frame: FieldFrame) -> BoolArray:
         """Return the pixels whose centres are inside, shape (H, W)."""

@@ -389,10 +389,10 @@ class TurbulenceSpectrum(Product):
         return values
 
     def constants(self, frame: FieldFrame) -> Values:
-        spectrum = self._empty(frame)
         constants = {}
         if self.noise_power:
-            constants["noise"] = self._in_si(spectrum, np.array(self.noise_power), frame)
+            noise_power = np.array(self.noise_power)
+            constants["noise"] = self._in_si(self._empty(frame), noise_power, frame)
         if self.response:
             constants["ratio"] = np.array(self.response)
         return constants
@@ -411,15 +411,14 @@ class TurbulenceSpectrum(Product):
         share = 1 / np.sqrt(spectrum.modes)
         if self.response_spread:
             share = np.hypot(share, np.array(self.response_spread))
-        errors = {name: np.abs(values[name]) * share for name in ("power", "density")}
+        of_rings = (name for name in ("power", "density", "energy") if name in values)
+        errors: Values = {name: np.abs(values[name]) * share for name in of_rings}
         power = values["power"][rings]
         for name, order in (("rms", 0), ("rms_field", 1), ("rms_by_correlation", 0)):
             if name in values and power.sum() > 0:
                 part = spectrum.k[rings] ** order * power
                 relative = np.linalg.norm(part * share[rings]) / part.sum() / 2
                 errors[name] = np.abs(values[name]) * relative
-        if "energy" in values:
-            errors["energy"] = np.abs(values["energy"]) * share
         if self.slope:
             error = np.asarray(self._slope_error(potential, spectrum, frame))
             errors |= {"slope": error, "slope_power": error}

@@ -479,24 +479,22 @@ def deflection_warnings(setup: BeamSetup, displacement: FloatArray) -> tuple[Cau
         In px of the object plane.
     """
     largest = float(np.nanmax(np.hypot(*displacement), initial=0.0))
-    angle = float(setup.deflection_angle(largest))
+    angle, main = float(setup.deflection_angle(largest)), setup.main_field.name
+    text = ""
     if angle > _MAX_DEFLECTION_RAD:
         text = (
             f"setup: the largest deflection is {angle:.3g} rad, and small angles (below "
             f"{_MAX_DEFLECTION_RAD:g}) are assumed: the field in SI units is not reliable; check "
             "the distances, the pixel size and their units"
         )
-        return (Caution("setup", text),)
-    main = setup.main_field.name
-    if main == "path_integrated_b":
+    elif main == "path_integrated_b":
         field = float(np.abs(setup.field_in_si(main, np.array([largest, 0.0]))).max())
         if field > _MAX_FIELD_T_M:
             text = (
                 f"setup: the path-integrated field reaches {field:.3g} T m, far more than any "
                 "laboratory plasma has: check the energy (MeV), the distances and the pixel size"
             )
-            return (Caution("setup", text),)
-    return ()
+    return (Caution("setup", text),) if text else ()
 
 
 def _pixel_doubts(setup: BeamSetup) -> Iterator[str]:

@@ -27,7 +27,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -223,8 +223,7 @@ class ProtonSetup(BeamSetup):
     def _rigidity(self, unit: FieldUnit) -> float:
         """Magnetic field, integrated along the beam, that deflects by 1 rad: p / q."""
         if unit not in _TESLA_METRES:
-            units = ", ".join(get_args(FieldUnit))
-            raise InputError(f"unit is {unit!r}: it must be one of {units}")
+            raise InputError(f"unit is {unit!r}: it must be one of {', '.join(_TESLA_METRES)}")
         return self.momentum / self.particle.charge / _TESLA_METRES[unit]
 
     @property
@@ -496,13 +495,14 @@ def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> Setup:
             f"{where}: received a {type(mapping).__name__}, expected a table of keys and values"
         )
     kind = mapping.get("kind")
-    if kind is None:
-        raise InputError(f"{where}: 'kind' is missing, {_expected_kind()}")
-    if not isinstance(kind, str) or kind not in SETUPS:
-        raise InputError(
-            f"{where}: 'kind' is {kind!r}, {_expected_kind()}{_suggest_kind(str(kind))}"
-        )
-    return validate(SETUPS[kind], mapping, where)
+    if isinstance(kind, str) and kind in SETUPS:
+        return validate(SETUPS[kind], mapping, where)
+    received = "is missing" if kind is None else f"is {kind!r}"
+    other_kinds = " or ".join(repr(name) for name in SETUPS if name != "proton")
+    raise InputError(
+        f"{where}: 'kind' {received}, it must be 'proton' (any charged particles, named by "
+        f"'species': {', '.join(SPECIES)}) or {other_kinds}{_suggest_kind(kind)}"
+    )
 
 
 def bin_setup(setup: Setup, factor: int) -> Setup:
@@ -514,17 +514,9 @@ def bin_setup(setup: Setup, factor: int) -> Setup:
     return type(setup)(**values)
 
 
-def _expected_kind() -> str:
-    other_kinds = [repr(kind) for kind in SETUPS if kind != "proton"]
-    return (
-        "it must be 'proton' (any charged particles, named by 'species': "
-        f"{', '.join(SPECIES)}) or {' or '.join(other_kinds)}"
-    )
-
-
-def _suggest_kind(kind: str) -> str:
+def _suggest_kind(kind: Any) -> str:
     """Suggest a kind or species for an unknown kind."""
-    match = nearest(kind, [*SETUPS, *SPECIES])
+    match = None if kind is None else nearest(str(kind), [*SETUPS, *SPECIES])
     if match is None or match in SETUPS:
         return f"; did you mean '{match}'?" if match else ""
     return f'; for this beam give kind = "proton" and species = "{match}"'
