@@ -198,13 +198,6 @@ class AxisymmetricProfile(Product):
             )
         return _chosen_radius(self.radius, most, "axis")
 
-    def _component(self, displacement: FloatArray, axis: Axis, frame: FieldFrame) -> FloatArray:
-        """Return the deflection across the axis in px, or the axial magnetic field in T m."""
-        if frame.unit.field != _B:
-            return component_across(displacement, axis)
-        field = frame.field(displacement[0], displacement)
-        return np.asarray(np.tensordot(axis.direction, field, axes=1))
-
     def _sides(
         self, displacement: FloatArray, frame: FieldFrame, shift: float = 0.0
     ) -> tuple[FloatArray, FloatArray]:
@@ -220,13 +213,20 @@ class AxisymmetricProfile(Product):
     def _rows(
         self, displacement: FloatArray, frame: FieldFrame, shift: float = 0.0
     ) -> tuple[FloatArray, FloatArray]:
-        """Return both sides of the object at each place along the axis, (places, radius)."""
+        """Return both sides of the object at each place along the axis, (places, radius).
+
+        They are deflections across the axis in px, or the axial magnetic field in T m.
+        """
         axis = self._axis
         if shift:
             start, end = (np.array(end) + shift * axis.across for end in (axis.start, axis.end))
             axis = Axis((float(start[0]), float(start[1])), (float(end[0]), float(end[1])))
-        component = self._component(displacement, axis, frame)
         is_odd = frame.unit.field != _B
+        if is_odd:
+            component = component_across(displacement, axis)
+        else:
+            field = frame.field(displacement[0], displacement)
+            component = np.asarray(np.tensordot(axis.direction, field, axes=1))
         return sample_sides(component, axis, self._radius_px(frame), is_odd=is_odd)
 
     def _end_share(self, rows: FloatArray, frame: FieldFrame) -> float:
@@ -279,14 +279,10 @@ class AxisymmetricProfile(Product):
         return product
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
-        dims = ("along", "radius") if self._has_slices else ("radius",)
-        variables = {
-            name: Variable(dims, unit, long_name)
-            for name, (unit, long_name) in self._names(frame).items()
-        }
+        variables = self._profile_variables(frame)
         first = next(iter(variables.values()))
-        variables["half_difference"] = Variable(
-            dims, first.unit, f"{first.long_name}, right half minus left half"
+        variables["half_difference"] = replace(
+            first, long_name=f"{first.long_name}, right half minus left half"
         )
         variables["asymmetry"] = Variable(
             (), "1", "Difference of the halves of the deflection, relative (r.m.s.)"
@@ -300,27 +296,29 @@ class AxisymmetricProfile(Product):
         )
         return variables
 
-    def _names(self, frame: FieldFrame) -> dict[str, tuple[str, str]]:
+    def _profile_variables(self, frame: FieldFrame) -> dict[str, Variable]:
+        dims = ("along", "radius") if self._has_slices else ("radius",)
         field = frame.unit.field
         if field == _B:
-            return {"axial_field": ("T", "Axial magnetic field")}
+            return {"axial_field": Variable(dims, "T", "Axial magnetic field")}
         if field == _E:
             return {
-                "electric_potential": ("V", "Electric potential"),
-                "radial_field": ("V/m", "Radial electric field"),
+                "electric_potential": Variable(dims, "V", "Electric potential"),
+                "radial_field": Variable(dims, "V/m", "Radial electric field"),
             }
         if field == _N:
-            return {"electron_density": ("m⁻³", "Electron density")}
+            return {"electron_density": Variable(dims, "m⁻³", "Electron density")}
         if not _is_index(frame):
-            return {"profile": (PIXEL, "Deflection potential for each pixel along the beam")}
-        names = {"refractive_index": ("1", "Change of the refractive index")}
+            long_name = "Deflection potential for each pixel along the beam"
+            return {"profile": Variable(dims, PIXEL, long_name)}
+        profiles = {"refractive_index": Variable(dims, "1", "Change of the refractive index")}
         if self.gladstone_dale is not None:
-            names["density_change"] = ("kg/m³", "Change of the density")
+            profiles["density_change"] = Variable(dims, "kg/m³", "Change of the density")
         if self.ambient_density is not None:
-            names["density"] = ("kg/m³", "Density")
+            profiles["density"] = Variable(dims, "kg/m³", "Density")
         if self.ambient_temperature is not None:
-            names["temperature"] = ("K", "Temperature at constant pressure")
-        return names
+            profiles["temperature"] = Variable(dims, "K", "Temperature at constant pressure")
+        return profiles
 
     def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
         count = len(self._axis.places())
@@ -389,7 +387,7 @@ class AxisymmetricProfile(Product):
         return -float(setup.potential(unit_plane)[0]) / pixel
 
     def _profiles(self, profile: FloatArray, frame: FieldFrame) -> Values:
-        first, *further = self._names(frame)
+        first, *further = self._profile_variables(frame)
         change = self._scale(frame) * profile
         values = {first: change}
         if "radial_field" in further:
@@ -466,7 +464,7 @@ class AxisymmetricProfile(Product):
                 f"the halves of the object differ by {halves:.0%} (r.m.s.): it is not symmetric "
                 "about this axis, and the profile is that of the mean of the halves",
             )
-        profile = np.atleast_2d(quantities[next(iter(self._names(frame)))].value)
+        profile = np.atleast_2d(quantities[next(iter(self._profile_variables(frame)))].value)
         yield from _length_cautions(np.abs(profile), frame)
 
     def remarks(self, frame: FieldFrame) -> Iterator[str]:

@@ -80,11 +80,7 @@ class _Enclosed(Outlined):
         down, right = (interpolate_cubic(plane, points) for plane in displacement)
         # From x to y around the outline, outwards is to the left of the direction.
         outward = float((right * sides[:, 0] - down * sides[:, 1]).sum())
-        return {self.name(): np.asarray(self._per_flux(frame) * outward * frame.pixel)}
-
-    def _per_flux(self, frame: FieldFrame) -> float:
-        """Return current or charge in an outline per outward flux of the displacement, 1/(px m)."""
-        raise NotImplementedError
+        return {self.name(): np.asarray(source_by_flux(frame) * outward * frame.pixel)}
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
         return mask_cautions(edge_midpoints(self.outline, _STEP_PX)[0], frame, "the outline")
@@ -103,9 +99,6 @@ class EnclosedCurrent(_Enclosed):
     long_name = "Current inside the outline, integrated along z"
     product: Literal["current"] = "current"
 
-    def _per_flux(self, frame: FieldFrame) -> float:
-        return current_factor(frame)
-
     def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
         return (
             "The current is integrated over the thickness of the object: divide by its length "
@@ -123,9 +116,6 @@ class EnclosedCharge(_Enclosed):
     long_name = "Charge inside the outline"
     product: Literal["charge"] = "charge"
 
-    def _per_flux(self, frame: FieldFrame) -> float:
-        return charge_factor(frame)
-
     def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
         return (
             "This is Gauss's law in the column behind the outline: it holds if the electric field "
@@ -140,15 +130,13 @@ def unit_field(frame: FieldFrame) -> FloatArray:
     return np.asarray(frame.field(np.zeros((1, 1)), unit)).ravel()
 
 
-def current_factor(frame: FieldFrame) -> float:
-    """Return (1/µ₀) ∮(∫B dz)·dl, in A, by an outward flux of the displacement of 1 px².
+def source_by_flux(frame: FieldFrame) -> float:
+    """Return a source of the field by an outward flux of the displacement of 1 px².
 
-    Times the pixel size in m.
+    It is (1/µ₀) ∮(∫B dz)·dl in A, or ε₀ ∮(∫E dz)·n dl in C/m, to be multiplied by the pixel size.
     """
-    # In the direction from x to y around an outline, +y follows outwards +x.
-    return float(unit_field(frame)[0] / constants.mu_0)
-
-
-def charge_factor(frame: FieldFrame) -> float:
-    """Return ε₀ ∮(∫E dz)·n dl, in C/m, by an outward flux of the displacement of 1 px²."""
-    return float(unit_field(frame)[1] * constants.epsilon_0)
+    field_y, field_x = unit_field(frame)
+    if frame.unit.field == _B:
+        # In the direction from x to y around an outline, +y follows outwards +x.
+        return float(field_y / constants.mu_0)
+    return float(field_x * constants.epsilon_0)

@@ -24,7 +24,7 @@ from scipy.fft import dctn, idctn
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis._derivatives import laplacian
-from napari_shadowinv.analysis.currents import charge_factor, current_factor
+from napari_shadowinv.analysis.currents import source_by_flux
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.product import (
     Coordinate,
@@ -161,7 +161,8 @@ class _SourceMap(Smoothed):
 
     def _per_curvature(self, frame: FieldFrame) -> float:
         """Return the density or curvature by a Laplacian of the potential of 1."""
-        raise NotImplementedError
+        # The outward flux of the displacement from a pixel is minus the Laplacian.
+        return -source_by_flux(frame) / frame.pixel
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         return {self.variable: self._per_curvature(frame) * self.sources(potential)}
@@ -215,10 +216,6 @@ class CurrentDensity(_SourceMap):
     long_name = "Current density along the beam, integrated along z"
     product: Literal["current-density"] = "current-density"
 
-    def _per_curvature(self, frame: FieldFrame) -> float:
-        # The outward flux of the displacement from a pixel is minus the Laplacian.
-        return -current_factor(frame) / frame.pixel
-
 
 class ChargeDensity(_SourceMap):
     """Map of the charge density: ∫ρ dz = ε₀ (∂E_x/∂x + ∂E_y/∂y), integrated."""
@@ -229,9 +226,6 @@ class ChargeDensity(_SourceMap):
     unit = "C/m²"
     long_name = "Charge density, integrated along z"
     product: Literal["charge-density"] = "charge-density"
-
-    def _per_curvature(self, frame: FieldFrame) -> float:
-        return -charge_factor(frame) / frame.pixel
 
 
 class PhaseCurvature(_SourceMap):

@@ -15,7 +15,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -138,14 +138,18 @@ def _half_maximum(distance: FloatArray, relative: FloatArray) -> float:
     return float(np.interp(-0.5, -relative[pair], distance[pair]))
 
 
+def csv_text(rows: Iterable[Iterable[str]]) -> str:
+    """Return rows as comma-separated values."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
 def table_text(distance: FloatArray, unit: str, profiles: Sequence[Profile]) -> str:
     """Return profiles as comma-separated columns, with units in the first row."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([f"distance ({unit})", *(_heading(profile) for profile in profiles)])
-    for row in zip(distance, *(profile.values for profile in profiles), strict=True):
-        writer.writerow([f"{value:.9g}" for value in row])
-    return text.getvalue()
+    heading = [f"distance ({unit})", *map(_heading, profiles)]
+    numbers = zip(distance, *(profile.values for profile in profiles), strict=True)
+    return csv_text([heading, *([f"{value:.9g}" for value in row] for row in numbers)])
 
 
 def _heading(profile: Profile) -> str:

@@ -256,11 +256,9 @@ def _phantom_spectra(
 ) -> tuple[RingSpectrum, RingSpectrum, float]:
     """Return the spectra of a random field and of its inversion, and its r.m.s. divergence."""
     margins = [int(np.ceil(_MARGIN * count)) for count in weights.shape]
-    shape = tuple(count + 2 * margin for count, margin in zip(weights.shape, margins, strict=True))
-    inner = tuple(
-        slice(margin, margin + count) for count, margin in zip(weights.shape, margins, strict=True)
-    )
-    potential, displacement = random_displacement(density, (shape[0], shape[1]), rng)
+    height, width = (count + 2 * m for count, m in zip(weights.shape, margins, strict=True))
+    inner = tuple(slice(margin, -margin) for margin in margins)
+    potential, displacement = random_displacement(density, (height, width), rng)
     image = synthetic_image(displacement)[inner]
     options = InversionOptions(n_sites=n_sites, noise_level=1e-3)
     source = np.ones(weights.shape)

@@ -6,9 +6,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -21,6 +19,7 @@ from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.frame import FieldUnit, field_unit, si_unit_of
 from napari_shadowinv.analysis.kinds import product_from_dict
+from napari_shadowinv.analysis.paths import csv_text
 from napari_shadowinv.analysis.product import BANDS, Coordinate, Product, Variable, has_bands
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level
@@ -314,15 +313,13 @@ def products_table(results: Sequence[ProductResult]) -> str:
     standard deviation and the ends of the bands, all in the unit of the row. Fields are in the
     unit that they are shown in.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     bands = [each for share in BANDS for each in _band_names(share)]
-    writer.writerow([*_COLUMNS, *bands])
+    rows = [[*_COLUMNS, *bands]]
     for result in results:
         for name, variable in result.variables.items():
             if len(variable.dims) <= 1:
-                writer.writerows(_rows(result, name, ("bias", "std", *bands)))
-    return text.getvalue()
+                rows += _rows(result, name, ("bias", "std", *bands))
+    return csv_text(rows)
 
 
 def _rows(result: ProductResult, name: str, statistics: Sequence[str]) -> Iterator[list[str]]:
