@@ -96,7 +96,7 @@ class Turbulence:
         unit = 2 * math.pi / self.size
         rings = (spectrum.k >= self.ends[0] * unit) & (spectrum.k <= self.ends[1] * unit)
         k, power = spectrum.k[rings], spectrum.power[rings]
-        slope, _ = fit_exponent(k, k * power, spectrum.modes[rings])
+        slope = fit_exponent(k, k * power, spectrum.modes[rings])
         return slope, self._b_rms(float(np.sum(k * power)) * spectrum.width)
 
     def designed_b_rms(self) -> float:

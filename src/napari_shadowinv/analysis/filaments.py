@@ -109,8 +109,7 @@ class Filaments(Product):
         return np.arange(0.0, most, _STEP_PX)
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
-        dims, length = ("lag",), frame.length_unit
-        unit = frame.si_unit
+        dims, length, unit = ("lag",), frame.length_unit, frame.si_unit
         return {
             "autocorrelation": Variable(dims, "1", "Autocorrelation of the field across filaments"),
             "along": Variable(dims, "1", "Autocorrelation of that component along the filaments"),

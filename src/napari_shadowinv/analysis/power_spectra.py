@@ -117,8 +117,8 @@ def ring_spectrum(potential: FloatArray, weights: FloatArray) -> RingSpectrum:
     return RingSpectrum(at, power, number / 2 * share)
 
 
-def fit_exponent(k: FloatArray, power: FloatArray, modes: FloatArray) -> tuple[float, float]:
-    """Return exponent and amplitude of a power law P = A kᵖ, by maximum likelihood.
+def fit_exponent(k: FloatArray, power: FloatArray, modes: FloatArray) -> float:
+    """Return the exponent of a power law P = A kᵖ, by maximum likelihood.
 
     The power of each mode is distributed exponentially about its mean (Whittle's likelihood), so
     that rings count by their modes, and a ring with little power does not dominate as it would in a
@@ -127,9 +127,8 @@ def fit_exponent(k: FloatArray, power: FloatArray, modes: FloatArray) -> tuple[f
     Examples
     --------
     >>> k = np.arange(1.0, 9.0)
-    >>> exponent, amplitude = fit_exponent(k, 3 * k**-2.5, np.ones(8))
-    >>> round(exponent, 3), round(amplitude, 3)
-    (-2.5, 3.0)
+    >>> round(fit_exponent(k, 3 * k**-2.5, np.ones(8)), 3)
+    -2.5
     """
     if len(k) < _MIN_RINGS:
         raise InputError(
@@ -148,8 +147,7 @@ def fit_exponent(k: FloatArray, power: FloatArray, modes: FloatArray) -> tuple[f
         method="bounded",
         options={"xatol": 1e-6},
     )
-    exponent = float(best.x)
-    return exponent, float(amplitude(exponent) * centre**-exponent)
+    return float(best.x)
 
 
 def random_displacement(

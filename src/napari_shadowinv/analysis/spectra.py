@@ -278,12 +278,9 @@ class TurbulenceSpectrum(Product):
 
     def _range(self, spectrum: RingSpectrum) -> BoolArray:
         """Return the rings of slope and r.m.s. field: trusted, and within the chosen limits."""
-        k = spectrum.k
-        if self.rings is None:
-            rings = self._trusted(spectrum)
-        else:
-            number = np.arange(1, len(k) + 1)
-            rings = (number >= self.rings[0]) & (number <= self.rings[1])
+        assert self.rings is not None  # by `adapt`
+        k, number = spectrum.k, np.arange(1, len(spectrum.k) + 1)
+        rings = (number >= self.rings[0]) & (number <= self.rings[1])
         if self.longest is not None:
             rings &= k >= 2 * np.pi / self.longest * (1 - 1e-9)
         if self.shortest is not None:
@@ -371,7 +368,7 @@ class TurbulenceSpectrum(Product):
             "correlation_length": np.asarray(correlation),
         }
         if self.slope:
-            exponent, _ = fit_exponent(k[rings], power[rings], spectrum.modes[rings])
+            exponent = fit_exponent(k[rings], power[rings], spectrum.modes[rings])
             values["slope_power"] = np.asarray(exponent)
             values["slope"] = np.asarray(exponent + 1)
         if self.path_length is not None:
@@ -444,7 +441,7 @@ class TurbulenceSpectrum(Product):
             if inside.sum() < _MIN_RINGS:
                 continue
             power = self._interpolated(window, spectrum)
-            slopes.append(fit_exponent(window.k[inside], power[inside], window.modes[inside])[0])
+            slopes.append(fit_exponent(window.k[inside], power[inside], window.modes[inside]))
             modes = float(window.modes[inside].sum())
         expected = _exponent_error(spectrum.k[rings], spectrum.modes[rings])
         if len(slopes) < _SUBWINDOWS:
