@@ -200,9 +200,9 @@ def measure_response(
     measured spectrum is too low where power is lost, it is corrected by the response of a first
     field, and again by that of a second, before the response is measured.
 
-    The spectrum is the measured one less its noise, in a window with the weights; the number of
-    phantoms is that of random fields for the response itself, at least 1. The reporter is called
-    before each random field, and raises an `InversionCancelled` if it is asked to stop.
+    The measured spectrum, less its noise, belongs to a window with the weights. The response itself
+    is a mean over one or more `phantoms`. The reporter is called before each random field, and
+    raises an `InversionCancelled` if it is asked to stop.
     """
     ratio = np.ones(len(spectrum.k))
     spread, contrast = np.zeros(len(spectrum.k)), 0.0

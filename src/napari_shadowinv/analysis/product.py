@@ -267,7 +267,7 @@ def corrected(quantity: Quantity) -> FloatArray:
 def quantity_text(quantity: Quantity, unit: str, frame: FieldFrame) -> str:
     """Return a number, corrected for a bias by noise, with its bands in words; "none" for NaN.
 
-    Its values are in the unit; those of a field are shown in the unit of the frame.
+    Its values are in `unit`; a field is shown in the unit of the frame.
     """
     value = float(corrected(quantity))
     if np.isnan(value):

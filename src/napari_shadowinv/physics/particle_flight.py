@@ -142,8 +142,8 @@ def line_integrals(
 ) -> FloatArray:
     """Integrate a field over z along the straight rays from the source through the pixels' centres.
 
-    The arguments, and errors, are those of `trace`. The planes, shape (4, H, W), are ∫B_y dz and
-    ∫B_x dz in T m, ∫E_y dz and ∫E_x dz in V; exact for a field that is trilinear between the nodes.
+    Arguments and errors are as for `trace`. The planes, shape (4, H, W), are ∫B_y dz and ∫B_x dz in
+    T m, ∫E_y dz and ∫E_x dz in V; exact for a field that is trilinear between the nodes.
     """
     grid = field_grid(field)
     check_particles(setup)
