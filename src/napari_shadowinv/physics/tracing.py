@@ -148,27 +148,20 @@ class TracedImage:
         peaks = [f"∫B dz {field_b:.3g} T m"] if field_b else []
         peaks += [f"∫E dz {field_e:.3g} V"] if field_e else []
         thin = self.thin_screen_error
+        length = 1e3 * self.length
+        thin_text = f"{thin:.2%} r.m.s. of the displacement; the grid is {length:.3g} mm long"
+        thin_level = Level.DOUBTFUL if thin > _MAX_THIN_ERROR else Level.SOUND
         facts = [
             Fact("landed", noun.capitalize(), counts, Level.DOUBTFUL if self.lost else Level.SOUND),
             Fact("peak", "Peak", ", ".join(peaks) or "no field across the beam"),
-            Fact(
-                "thin_screen_error",
-                "Thin-screen error",
-                f"{thin:.2%} r.m.s. of the displacement; the grid is {self.length * 1e3:.3g} mm "
-                "long",
-                Level.DOUBTFUL if thin > _MAX_THIN_ERROR else Level.SOUND,
-            ),
+            Fact("thin_screen_error", "Thin-screen error", thin_text, thin_level),
         ]
         if self.edge_share > _MAX_EDGE_SHARE:
-            facts.append(
-                Fact(
-                    "edge_share",
-                    "Edge of the grid",
-                    f"the field on the faces reaches {self.edge_share:.0%} of its peak: beyond "
-                    "them it is taken as zero, so the image has edges that the object has not",
-                    Level.DOUBTFUL,
-                )
+            edge_text = (
+                f"the field on the faces reaches {self.edge_share:.0%} of its peak: beyond them it "
+                "is taken as zero, so the image has edges that the object has not"
             )
+            facts.append(Fact("edge_share", "Edge of the grid", edge_text, Level.DOUBTFUL))
         return tuple(facts)
 
     def to_dataset(self) -> xarray.Dataset:
