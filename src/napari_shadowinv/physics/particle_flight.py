@@ -230,8 +230,7 @@ class Flight:
             )
         # They are compared with a flight without field.
         distance = self.setup.object_image_distance
-        lost = (status == TRAPPED) | (particles[:, 5] <= 0)
-        lost |= particles[:, 2] > distance
+        lost = (status == TRAPPED) | (particles[:, 5] <= 0) | (particles[:, 2] > distance)
         with np.errstate(divide="ignore", invalid="ignore"):
             free, landing = (
                 (state[:, 1::-1] + state[:, 4:2:-1] / state[:, 5:] * (distance - state[:, 2:3])).T

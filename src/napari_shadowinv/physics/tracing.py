@@ -431,10 +431,8 @@ def _count(
 
 def _is_inside(landing: FloatArray, shape: Shape) -> AnyArray:
     """Return whether points in px lie in the image; NaN does not."""
-    inside = np.ones(landing.shape[1], np.bool_)
-    for at, count in zip(landing, shape, strict=True):
-        inside &= (at >= -0.5) & (at < count - 0.5)
-    return inside
+    size = np.array(shape)[:, None]
+    return np.asarray(((landing >= -0.5) & (landing < size - 0.5)).all(axis=0))
 
 
 def _energies(
@@ -462,12 +460,10 @@ def _energies(
             f"energy spread is {spread:g} MeV at {centre:g} MeV: expected at most a quarter of the "
             "energy; use a spectrum"
         )
-
-    def draw(generator: np.random.Generator, count: int) -> FloatArray:
-        # Four standard deviations reach down to zero energy at most.
-        return centre + spread * np.clip(generator.standard_normal(count), -3.9, 3.9)
-
-    return draw
+    # Four standard deviations reach down to zero energy at most.
+    return lambda generator, count: (
+        centre + spread * np.clip(generator.standard_normal(count), -3.9, 3.9)
+    )
 
 
 def _draw_from(energy: FloatArray, density: FloatArray, share: FloatArray) -> FloatArray:
