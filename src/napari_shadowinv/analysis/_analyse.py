@@ -144,11 +144,10 @@ def _products_for(products: list[Product], frame: FieldFrame, n_fields: int) -> 
 def _names(products: Sequence[Product]) -> list[str]:
     """Return names for files: the label or the kind, with a number if there are several."""
     bases = [(each.label or each.name()).replace(" ", "_").replace("-", "_") for each in products]
-    names = []
-    for number, base in enumerate(bases):
-        earlier = bases[:number].count(base)
-        names.append(base if bases.count(base) == 1 else f"{base}_{earlier + 1}")
-    return names
+    return [
+        base if bases.count(base) == 1 else f"{base}_{bases[:number].count(base)}"
+        for number, base in enumerate(bases, 1)
+    ]
 
 
 @dataclass
