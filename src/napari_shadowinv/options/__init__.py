@@ -7,7 +7,6 @@ window, and is saved with each result: there is no second list of defaults.
 - unknowns of a fit and knowledge about its images: `FitChoices`
 """
 
-from napari_shadowinv.options._errors import MaxError
 from napari_shadowinv.options.beam_prior import ASSUMED_BEAM, BeamComponents, BeamPrior
 from napari_shadowinv.options.fitting import (
     KINDS_OF_NOISE,
@@ -18,7 +17,7 @@ from napari_shadowinv.options.fitting import (
     Noise,
 )
 from napari_shadowinv.options.instrument import BEAM_SOURCES, DETECTORS, Instrument
-from napari_shadowinv.options.inversion import MAX_DEFAULT_SITES, InversionOptions
+from napari_shadowinv.options.inversion import MAX_DEFAULT_SITES, InversionOptions, MaxError
 
 __all__ = [
     "ASSUMED_BEAM",

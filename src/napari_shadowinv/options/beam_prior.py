@@ -8,21 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import ConfigDict, Field, PrivateAttr
+from pydantic import Field, PrivateAttr
 
-from napari_shadowinv._system.arrays import (
-    NORMAL_MAD,
-    block_means,
-    check_finite,
-    check_plane,
-)
+from napari_shadowinv._system.arrays import NORMAL_MAD, block_means, check_finite, check_plane
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
+
+Share = Annotated[float, Field(ge=0, lt=1)]
 
 _GRID = 128  # blocks along the longer side
 _DIMMEST = 1e-2  # of the mean beam, for a relative difference
@@ -67,7 +64,7 @@ class BeamComponents:
             )
 
 
-class BeamPrior(CheckedModel):
+class BeamPrior(CheckedModel, allow_inf_nan=False):
     """Expected difference between the true beam and the source of an image.
 
     Attributes
@@ -85,11 +82,9 @@ class BeamPrior(CheckedModel):
         If a value is out of range.
     """
 
-    model_config = ConfigDict(allow_inf_nan=False)
-
-    rms: float = Field(default=0.0, ge=0, lt=1)
+    rms: Share = 0.0
     length: float = Field(default=0.25, gt=0, le=1)
-    between: float = Field(default=0.0, ge=0, lt=1)
+    between: Share = 0.0
     _components: BeamComponents | None = PrivateAttr(default=None)
 
     @property

@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import (
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    field_validator,
-    model_validator,
-)
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
-from napari_shadowinv.options._errors import MaxError
+from napari_shadowinv.options.inversion import MaxError
 from napari_shadowinv.physics.setup import deflector_titles
+
+*_FIRST_FIELDS, _LAST_FIELD = deflector_titles()
 
 MAX_STRENGTH = 1e4
 """Largest ratio of an image's displacement to the first one's."""
 
 
-def _any_of(names: Iterable[str]) -> str:
-    *most, last = names
-    return f"{', '.join(most)} or {last}"
-
-
-class FitOptions(CheckedModel):
+class FitOptions(CheckedModel, allow_inf_nan=False):
     """Choices of a fit; all have a default that suits most images.
 
     Raises
@@ -39,8 +29,6 @@ class FitOptions(CheckedModel):
     >>> FitOptions(align="shift").boundary
     'fading'
     """
-
-    model_config = ConfigDict(allow_inf_nan=False)
 
     smoothness: float | None = Field(
         default=None,
@@ -178,7 +166,7 @@ Noise = Annotated[KindOfNoise | float, BeforeValidator(_parse_noise)]
 """The noise of an image: Poisson counts, a fraction of each pixel, or a standard deviation."""
 
 
-class FitChoices(CheckedModel):
+class FitChoices(CheckedModel, allow_inf_nan=False):
     """Unknowns of a fit, and knowledge about its images.
 
     Raises
@@ -193,13 +181,11 @@ class FitChoices(CheckedModel):
     ('B', 'E')
     """
 
-    model_config = ConfigDict(allow_inf_nan=False)
-
     fields: tuple[str, ...] | None = Field(
         default=None,
         description=(
-            f"Cause of the deflection: {_any_of(deflector_titles())}. Two of them, separated by a "
-            "comma, need images at two energies. Default: B, or phase for light."
+            f"Cause of the deflection: {', '.join(_FIRST_FIELDS)} or {_LAST_FIELD}. Two of them, "
+            "separated by a comma, need images at two energies. Default: B, or phase for light."
         ),
         json_schema_extra={"metavar": "NAMES"},
     )

@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from typing import Any, Literal, Self, get_args
 
 from pydantic import (
-    ConfigDict,
     Field,
     ModelWrapValidatorHandler,
     PrivateAttr,
@@ -23,7 +22,7 @@ from pydantic import (
 )
 
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
-from napari_shadowinv.options.beam_prior import ASSUMED_BEAM, BeamComponents, BeamPrior
+from napari_shadowinv.options.beam_prior import ASSUMED_BEAM, BeamComponents, BeamPrior, Share
 
 Detector = Literal["film", "image plate", "CR-39", "scintillator", "camera"]
 BeamSource = Literal["TNSA", "implosion", "X-ray tube", "laser"]
@@ -46,7 +45,7 @@ BEAM_SOURCES: Mapping[BeamSource, Mapping[str, float]] = {
 """Numbers of an `Instrument` with a source of its beam, unless others are stated."""
 
 
-class Instrument(CheckedModel):
+class Instrument(CheckedModel, allow_inf_nan=False):
     """How well beam, detector and alignment are known, as standard deviations.
 
     What is not stated has the default of the detector or of the beam source. Without these it
@@ -68,18 +67,14 @@ class Instrument(CheckedModel):
     (0.1, 0.03, 0.1)
     """
 
-    model_config = ConfigDict(allow_inf_nan=False)
-
     # Arrays are no text: a recipe names the files of the references.
     _components: BeamComponents | None = PrivateAttr(default=None)
 
     detector: Detector | None = Field(
-        default=None,
-        description="Kind of detector, for the numbers that are not stated.",
+        default=None, description="Kind of detector, for the numbers that are not stated."
     )
     beam_source: BeamSource | None = Field(
-        default=None,
-        description="Origin of the beam, for its numbers that are not stated.",
+        default=None, description="Origin of the beam, for its numbers that are not stated."
     )
     beam_rms: float | None = Field(
         default=None,
@@ -101,37 +96,29 @@ class Instrument(CheckedModel):
             "shorter side."
         ),
     )
-    beam_between: float = Field(
+    beam_between: Share = Field(
         default=0.0,
-        ge=0,
-        lt=1,
         title="Beam between energies",
         description=(
             "Relative r.m.s. difference between the beams of two energies of one shot, over the "
             "same length."
         ),
     )
-    energy: float = Field(
+    energy: Share = Field(
         default=0.0,
-        ge=0,
-        lt=1,
         description=(
             "Relative error of the beam's energy, or of its wavelength. It scales the field in SI "
             "units, not the displacement."
         ),
     )
-    background: float = Field(
+    background: Share = Field(
         default=0.0,
-        ge=0,
-        lt=1,
         description=(
             "Stray light, fog or dark level left in image and source, as a share of the mean."
         ),
     )
-    gamma: float = Field(
+    gamma: Share = Field(
         default=0.0,
-        ge=0,
-        lt=1,
         description="Error of the exponent of the detector's response, which is 1 if linear.",
     )
     blur: float = Field(
@@ -141,10 +128,8 @@ class Instrument(CheckedModel):
         title="Blur (px)",
         description="Point spread beyond the stated one (standard deviation in px).",
     )
-    absorption: float = Field(
+    absorption: Share = Field(
         default=0.0,
-        ge=0,
-        lt=1,
         description="Relative r.m.s. variation of the transmission of the object.",
     )
     registration: float = Field(
@@ -199,9 +184,17 @@ class Instrument(CheckedModel):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _keep_components(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
-        instrument = handler(values)
-        beam = values.get("beam") if isinstance(values, dict) else None
+    def _expand_beam(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        if not isinstance(values, dict) or "beam" not in values:
+            return handler(values)
+        numbers = {name: value for name, value in values.items() if name != "beam"}
+        if twice := {f"beam_{name}" for name in BeamPrior.model_fields} & numbers.keys():
+            raise CombinationError(f"received {{beam}} and {{{min(twice)}}}, expected one of them")
+        beam = values["beam"]
+        if not isinstance(beam, BeamPrior | dict):
+            raise ValueError(f"beam is {beam!r}, expected a BeamPrior")
+        stated = beam.model_dump(exclude_unset=True) if isinstance(beam, BeamPrior) else beam
+        instrument = handler(numbers | {f"beam_{name}": value for name, value in stated.items()})
         if isinstance(beam, BeamPrior):
             instrument._components = beam.components
         return instrument
@@ -238,20 +231,6 @@ class Instrument(CheckedModel):
         return stated | {
             name: value for name, value in self.model_dump().items() if value != usual[name]
         }
-
-    @model_validator(mode="before")
-    @classmethod
-    def _expand_beam(cls, values: Any) -> Any:
-        if not isinstance(values, dict) or "beam" not in values:
-            return values
-        numbers = {name: value for name, value in values.items() if name != "beam"}
-        if twice := {f"beam_{name}" for name in BeamPrior.model_fields} & numbers.keys():
-            raise CombinationError(f"received {{beam}} and {{{min(twice)}}}, expected one of them")
-        beam = values["beam"]
-        if not isinstance(beam, BeamPrior | dict):
-            raise ValueError(f"beam is {beam!r}, expected a BeamPrior")
-        stated = beam.model_dump(exclude_unset=True) if isinstance(beam, BeamPrior) else beam
-        return numbers | {f"beam_{name}": value for name, value in stated.items()}
 
     @property
     def has_numbers(self) -> bool:

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
-from napari_shadowinv.options._errors import MaxError
+
+_Fraction = Annotated[float, Field(gt=0, lt=1)]
+MaxError = Annotated[
+    _Fraction,
+    Field(
+        title="Largest error",
+        description="Largest total error, as a share of the field (r.m.s.), of a determined field.",
+    ),
+]
+"""The largest error of a determined result, an option of inversions and fits."""
 
 _BUDGET: Any = {"panel": "Error budget (docs/uncertainty.md)"}
 
@@ -17,7 +26,7 @@ _MOVES_SITES: Any = {"moves_sites": True}
 _BOUNDARY: Any = {"panel": "Flux across the image edge (docs/boundary.md)"}
 
 
-class InversionOptions(CheckedModel):
+class InversionOptions(CheckedModel, allow_inf_nan=False):
     """Choices of an inversion; all have a default that suits most images.
 
     Raises
@@ -31,8 +40,6 @@ class InversionOptions(CheckedModel):
     0.001
     """
 
-    model_config = ConfigDict(allow_inf_nan=False)
-
     n_sites: int | None = Field(
         default=None,
         ge=4,
@@ -43,10 +50,8 @@ class InversionOptions(CheckedModel):
         ),
         json_schema_extra=_MOVES_SITES,
     )
-    accuracy: float = Field(
+    accuracy: _Fraction = Field(
         default=0.01,
-        gt=0,
-        lt=1,
         description=(
             "Target discretisation error of the displacement (relative r.m.s.). Sites are added "
             "until it is reached or falls below a fifth of the noise error; in a stack, the first "
@@ -55,20 +60,16 @@ class InversionOptions(CheckedModel):
         ),
     )
     max_error: Annotated[MaxError, Field(json_schema_extra=_BUDGET)] = 0.05
-    floor: float = Field(
+    floor: _Fraction = Field(
         default=1e-3,
-        gt=0,
-        lt=1,
         description=(
             "Minimum image intensity as a fraction of the mean: darker pixels are raised to it. "
             "This keeps the transport solvable; values below 1e-3 rarely converge."
         ),
         json_schema_extra=_MOVES_SITES,
     )
-    tolerance: float = Field(
+    tolerance: _Fraction = Field(
         default=1e-3,
-        gt=0,
-        lt=1,
         description="Convergence criterion: maximum relative flux error of any cell.",
     )
     lloyd_iterations: int = Field(
@@ -154,7 +155,6 @@ class InversionOptions(CheckedModel):
         default=None,
         ge=0.01,
         le=1e6,
-        allow_inf_nan=False,
         title="Decay length (px)",
         description=(
             "Free boundary only: distance over which the potential decays beyond the edge; use "
