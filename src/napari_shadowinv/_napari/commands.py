@@ -50,12 +50,41 @@ class _Selection:
         return self.shot.image
 
 
-@viewer_sync.notify_errors(otherwise=list)
-def invert_uniform(
-    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
-) -> list[napari.types.LayerDataTuple]:
+Work = Callable[[_Selection, ShouldStop], list[results.FullLayerData]]
+
+
+def _in_thread(
+    activity: str, usable: Callable[[Any], bool] = about.may_be_shot
+) -> Callable[[Work], Callable[..., list[Any]]]:
+    """Make work on an image a command of the menus for the selected image."""
+
+    def as_command(work: Work) -> Callable[..., list[Any]]:
+        def command(
+            layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
+        ) -> list[napari.types.LayerDataTuple]:
+            return _start(_select_image(layer, viewer, usable), work, activity, viewer)
+
+        return viewer_sync.notify_errors(otherwise=list)(command)
+
+    return as_command
+
+
+@_in_thread("Inverting")
+def invert_uniform(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
     """Invert the selected image against a uniform source, with the default options."""
-    return _start(_select_image(layer, viewer), _invert, "Inverting", viewer)
+    from napari_shadowinv._napari.jobs import InversionJob
+
+    attributes = {"source_origin": "uniform"}
+    if selection.setup_origin:
+        attributes["setup_origin"] = selection.setup_origin
+    job = InversionJob(
+        recipe=preprocessing.Recipe(source=preprocessing.UniformEstimate(), setup=selection.setup),
+        name=selection.name,
+        frame=selection.frame,
+        attributes=attributes,
+        shot=selection.shot,
+    )
+    return main_layers(job.work(lambda _: None, should_stop).layer_data)
 
 
 @viewer_sync.notify_errors(otherwise=list)
@@ -67,38 +96,39 @@ def refine(
         raise InputError("no layer is selected: select a layer of an inversion's result")
     from napari_shadowinv._napari.jobs import name_of_result, refinement
 
-    name = name_of_result(layer)
-    job = refinement(layer, layer, name, psf=0.0)
+    job = refinement(layer, layer, name_of_result(layer), psf=0.0)
     if viewer is None or not viewer_sync.in_event_loop():
         return list(job.work(lambda _: None, lambda: False).layer_data)
     open_widget(viewer, "Invert shot").refine_layer(layer)
     return []
 
 
-@viewer_sync.notify_errors(otherwise=list)
+@_in_thread("Removing hot pixels from", about.may_be_source)
 def remove_hot_pixels(
-    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
-) -> list[napari.types.LayerDataTuple]:
+    selection: _Selection, should_stop: ShouldStop
+) -> list[results.FullLayerData]:
     """Replace pixels that stand out of the noise by the median of their neighbours."""
-    selection = _select_image(layer, viewer, about.may_be_source)
-    return _start(selection, _repair, "Removing hot pixels from", viewer)
+    image, hot, dead = preprocessing.remove_hot_pixels(selection.image, should_stop=should_stop)
+    title = f"without {int((hot | dead).sum())} hot or dead pixels"
+    return [_filtered_layer(selection, image, title)]
 
 
-@viewer_sync.notify_errors(otherwise=list)
-def high_pass(
-    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
-) -> list[napari.types.LayerDataTuple]:
+@_in_thread("Filtering", about.may_be_source)
+def high_pass(selection: _Selection, _: ShouldStop) -> list[results.FullLayerData]:
     """Remove structures larger than about 0.15 of the image's shorter side; keep the mean."""
-    selection = _select_image(layer, viewer, about.may_be_source)
-    return _start(selection, _high_pass, "Filtering", viewer)
+    width = 0.15 * min(selection.image.shape)
+    image = preprocessing.high_pass(selection.image, width)
+    return [_filtered_layer(selection, image, f"high-pass σ={width:.3g} px")]
 
 
-@viewer_sync.notify_errors(otherwise=list)
-def estimate_source(
-    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
-) -> list[napari.types.LayerDataTuple]:
+@_in_thread("Estimating the source of")
+def estimate_source(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
     """Estimate the undisturbed beam as the image of least total variation near the selected one."""
-    return _start(_select_image(layer, viewer), _estimate_beam, "Estimating the source of", viewer)
+    source = preprocessing.total_variation_source(selection.image, should_stop=should_stop)
+    made_from = {"image": selection.name, "estimate": "total variation"}
+    selection = replace(selection, role=about.SOURCE)
+    title = "source by total variation"
+    return [_filtered_layer(selection, source, title, made_from=made_from)]
 
 
 @viewer_sync.notify_errors(otherwise=list)
@@ -149,8 +179,7 @@ def align_source(
     source, name = _source_for(selection, layer, viewer)
 
     def align(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
-        usable = about.usable_of(layer)
-        aligned = preprocessing.align_source(selection.image, source, usable)
+        aligned = preprocessing.align_source(selection.image, source, about.usable_of(layer))
         (y, x), (y_error, x_error) = aligned.shift, aligned.error
         shift = f"y {y:+.2f} ± {y_error:.2f}, x {x:+.2f} ± {x_error:.2f} px"
         if not aligned.is_significant:
@@ -224,9 +253,6 @@ def _select_image(
     )
 
 
-Work = Callable[[_Selection, ShouldStop], list[results.FullLayerData]]
-
-
 def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> list[Any]:
     """Do the work now, or in a thread if there is a window."""
     if viewer is None or not viewer_sync.in_event_loop():
@@ -259,42 +285,6 @@ def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> lis
     worker.returned.connect(finish)
     worker.start()
     return []
-
-
-def _invert(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
-    from napari_shadowinv._napari.jobs import InversionJob
-
-    attributes = {"source_origin": "uniform"}
-    if selection.setup_origin:
-        attributes["setup_origin"] = selection.setup_origin
-    job = InversionJob(
-        recipe=preprocessing.Recipe(source=preprocessing.UniformEstimate(), setup=selection.setup),
-        name=selection.name,
-        frame=selection.frame,
-        attributes=attributes,
-        shot=selection.shot,
-    )
-    return main_layers(job.work(lambda _: None, should_stop).layer_data)
-
-
-def _repair(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
-    image, hot, dead = preprocessing.remove_hot_pixels(selection.image, should_stop=should_stop)
-    title = f"without {int((hot | dead).sum())} hot or dead pixels"
-    return [_filtered_layer(selection, image, title)]
-
-
-def _high_pass(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
-    width = 0.15 * min(selection.image.shape)
-    image = preprocessing.high_pass(selection.image, width)
-    return [_filtered_layer(selection, image, f"high-pass σ={width:.3g} px")]
-
-
-def _estimate_beam(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
-    source = preprocessing.total_variation_source(selection.image, should_stop=should_stop)
-    made_from = {"image": selection.name, "estimate": "total variation"}
-    selection = replace(selection, role=about.SOURCE)
-    title = "source by total variation"
-    return [_filtered_layer(selection, source, title, made_from=made_from)]
 
 
 def _moved_layer(
