@@ -17,6 +17,7 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.layers import (
     FullLayerData,
+    View,
     dataset_layers,
     shared_metadata,
     significance_variables,
@@ -110,8 +111,8 @@ def _field_layers(
 
     facts = {**facts, "displacement": variables["displacement"][1]}
     deflector = deflector_titles()[fit.fields[m].name]
-    dataset = xr.Dataset(variables)
-    layer_data = dataset_layers(dataset, fit.setup, frame, title, facts, deflector=deflector)
+    view = View(xr.Dataset(variables), fit.setup, deflector=deflector)
+    layer_data = dataset_layers(view, frame, title, facts)
     for _, keywords, _ in layer_data:
         keywords["visible"] &= m == 0
     return layer_data
@@ -127,7 +128,9 @@ def _image_layers(
     percent = np.where(fit.mask, 100 * fit.residual / np.array(means)[:, None, None], np.nan)
     content = {"reprojection": (fit.reprojection, grey), "residual": (percent, None)}
     if np.ptp(fit.source[0]):
-        content = {"source": (_without_brightness(fit.source), grey), **content}
+        beams = fit.source / fit.source.mean(axis=(1, 2), keepdims=True)
+        is_common = np.abs(beams - beams[0]).max() < _MAX_BEAM_DIFFERENCE
+        content = {"source": (fit.source[:1] if is_common else fit.source, grey), **content}
     if with_images:
         content = {"image": (fit.images, grey), **content}
     layers: list[FullLayerData] = []
@@ -144,12 +147,6 @@ def _image_layers(
         }
         layers.append((data, keywords, "image"))
     return layers
-
-
-def _without_brightness(beams: FloatArray) -> FloatArray:
-    """Return the first beam only if all beams are proportional to each other."""
-    normalised = beams / beams.mean(axis=(1, 2), keepdims=True)
-    return beams[:1] if np.abs(normalised - normalised[0]).max() < _MAX_BEAM_DIFFERENCE else beams
 
 
 def _full_size(displacement: FloatArray, shape: tuple[int, ...]) -> FloatArray:

@@ -121,11 +121,10 @@ def matrix_of(values: Any) -> Matrix:
 
 
 def _with_shots(matrix: Matrix, stacked: bool) -> FloatArray:
-    """Extend a matrix of the axes y and x by an unchanged first axis of shots."""
-    if not stacked:
-        return np.array(matrix)
-    extended = np.eye(len(matrix) + 1)
-    extended[1:, 1:] = matrix
+    """Extend a matrix of the axes y and x by an unchanged first axis of shots, if stacked."""
+    first = int(stacked)
+    extended = np.eye(first + len(matrix))
+    extended[first:, first:] = matrix
     return extended
 
 
@@ -154,7 +153,7 @@ class Kind:
     colormap: str = ""
     type: str = "image"
     visible: bool = False
-    main: bool = False  # shown by default; the others by *More layers*
+    main: bool = False  # shown by default, as visible ones are; the others by *More layers*
     shown_of: Literal["shot", "stack", "both"] = "both"
 
 
@@ -167,7 +166,7 @@ KINDS = (
     Kind("potential", "potential", "potential ({unit})", colormap="potential"),
     Kind("field y", "displacement", "{symbol} ({unit})", colormap="signed"),
     Kind("field x", "displacement", "{symbol} ({unit})", colormap="signed"),
-    Kind("field", "displacement", "{symbol} ({unit})", colormap="field", visible=True, main=True),
+    Kind("field", "displacement", "{symbol} ({unit})", colormap="field", visible=True),
     Kind(
         "uncertainty",
         "displacement_uncertainty",
@@ -180,19 +179,11 @@ KINDS = (
     Kind("structures", "structures", "structures above 2 σ", "1", type="labels", shown_of="shot"),
     Kind("caustic", "caustic", "caustics", type="labels", main=True),
     Kind("field arrows", "displacement", "{arrows}", type="vectors", shown_of="shot"),
-    Kind(
-        "arrows",
-        "displacement",
-        "displacement arrows",
-        "px",
-        type="vectors",
-        visible=True,
-        main=True,
-    ),
+    Kind("arrows", "displacement", "displacement arrows", "px", type="vectors", visible=True),
     Kind("sites", "sites", "sites{share}", colormap="field", type="points", shown_of="shot"),
     Kind("cells", "sites", "power cells", type="shapes", main=True, shown_of="shot"),
 )
-_MAIN_ROLES = {kind.role for kind in KINDS if kind.main}
+_MAIN_ROLES = {kind.role for kind in KINDS if kind.main or kind.visible}
 MASKED_ROLES = {"reprojection", "residual", "potential", "field y", "field x", "field"}
 MASKED_ROLES |= {"uncertainty", "significance"}
 

@@ -158,13 +158,11 @@ def field_layers(
     result: Result[RetrievedField], frame: Frame, name: str = ""
 ) -> list[FullLayerData]:
     """Describe the layers of a field without images."""
-    dataset = result.content.dataset
-    field = dataset[[variable for variable in _FIELD_VARIABLES if variable in dataset]]
-    content = result.content
-    field = field.assign(
+    content, dataset = result.content, result.content.dataset
+    field = dataset[[variable for variable in _FIELD_VARIABLES if variable in dataset]].assign(
         significance_variables(content.displacement, content.pixel_errors, content.structures)
     )
-    return dataset_layers(field, result.setup, frame, name, shared_metadata(result, name))
+    return dataset_layers(View(field, result.setup), frame, name, shared_metadata(result, name))
 
 
 def significance_variables(
@@ -194,20 +192,12 @@ def result_layers(
     content = result.content
     dataset = xr.Dataset(
         {name: (dims, getattr(content, name)) for name, (dims, _, _) in VARIABLES.items()}
-    )
-    dataset = dataset.assign(
-        significance_variables(content.displacement, content.pixel_errors, content.structures)
-    )
-    diagram = power_cells(content) if cells else None
-    layer_data = dataset_layers(
-        dataset,
-        result.setup,
-        frame,
-        name,
-        shared_metadata(result, name),
-        cells=diagram,
-        suffix=trust_label(content),
-    )
+    ).assign(significance_variables(content.displacement, content.pixel_errors, content.structures))
+    level, verdict = content.headline.level, content.verdict
+    doubt = level if verdict is Verdict.DETERMINED or level is Level.FAILED else verdict
+    suffix = "" if level is Level.SOUND else f"({doubt})"
+    view = View(dataset, result.setup, cells=power_cells(content) if cells else None)
+    layer_data = dataset_layers(view, frame, name, shared_metadata(result, name), suffix)
     for _, keywords, _ in layer_data:
         if role_of(keywords) == "image":
             # With beam and mask, the image can be inverted again.
@@ -216,43 +206,23 @@ def result_layers(
     return layer_data
 
 
-def trust_label(inversion: Inversion) -> str:
-    """Return the verdict, or the doubt, as a suffix of layers' names; empty for a sound result."""
-    level, verdict = inversion.headline.level, inversion.verdict
-    if level is Level.SOUND:
-        return ""
-    return f"({level if verdict is Verdict.DETERMINED or level is Level.FAILED else verdict})"
-
-
 def dataset_layers(
-    dataset: xarray.Dataset,
-    setup: Setup | None,
-    frame: Frame,
-    name: str,
-    facts: Mapping[str, Any],
-    shot: int | None = None,
-    cells: Cells | None = None,
-    deflector: str | None = None,
-    suffix: str = "",
+    view: View, frame: Frame, name: str, facts: Mapping[str, Any], suffix: str = ""
 ) -> list[FullLayerData]:
-    """Describe the layers of a result, or of a stack with units and contrast of one `shot`.
-
-    All names end with `suffix`.
-    """
-    view = _View(dataset, setup, shot, cells, deflector)
+    """Describe the layers of a result or of a stack; all names end with `suffix`."""
     layers = []
     for kind in KINDS:
         if not view.has(kind):
             continue
         data, words, look = _CONTENTS[kind.type](view, kind)
         if kind.role in MASKED_ROLES and view.masked is not None:
-            data = _where(view.masked, np.nan, data)
-        unit = words.get("unit", kind.unit)
+            # On lazy arrays, numpy's functions are dask's.
+            data = np.where(view.masked, np.nan, data)
         keywords = {
             "name": f"{layer_name(kind.title.format(**words), name)} {suffix}".rstrip(),
-            "metadata": metadata_for(kind.role, unit, setup, **facts),
+            "metadata": metadata_for(kind.role, words.get("unit", kind.unit), view.setup, **facts),
             "visible": kind.visible,
-            **frame.keywords(stacked=shot is not None),
+            **frame.keywords(stacked=view.shot is not None),
             **look,
         }
         layers.append((data, keywords, kind.type))
@@ -260,13 +230,13 @@ def dataset_layers(
 
 
 @dataclass
-class _View:
+class View:
     """A result, or a stack with the units and contrast of one shot."""
 
     dataset: xarray.Dataset
     setup: Setup | None
-    shot: int | None
-    cells: Cells | None
+    shot: int | None = None
+    cells: Cells | None = None
     deflector: str | None = None
 
     def has(self, kind: Kind) -> bool:
@@ -304,8 +274,7 @@ class _View:
         """Pixels with data in the shot."""
         if self.masked is None:
             return np.ones(self.dataset["displacement"].shape[-2:], dtype=np.bool_)
-        plane = self.masked[self.shot] if self.masked.ndim == 3 else self.masked
-        return ~np.asarray(plane)
+        return ~np.asarray(self.masked[self.shot] if self.masked.ndim == 3 else self.masked)
 
     @cached_property
     def field(self) -> ShownField:
@@ -356,7 +325,7 @@ def _field_per_pixel(setup: Setup) -> FloatArray:
 Content = tuple[Any, dict[str, str], dict[str, Any]]  # data, words of the title, keywords
 
 
-def _image(view: _View, kind: Kind) -> Content:
+def _image(view: View, kind: Kind) -> Content:
     words: dict[str, str] = {}
     data = view.dataset[kind.variable].data
     if kind.role == "uncertainty":
@@ -393,12 +362,11 @@ def _image(view: _View, kind: Kind) -> Content:
     return data, words, look
 
 
-def _field(view: _View, role: str) -> tuple[Any, Limits, dict[str, str]]:
+def _field(view: View, role: str) -> tuple[Any, Limits, dict[str, str]]:
     """Return strength or a component of the field, its limits, unit and symbol."""
     field = view.field
     peak = float(view.magnitude[view.used].max())
     if role == "field":
-        # On lazy arrays, numpy's functions are dask's.
         data = view.magnitude if view.shot is None else np.hypot(*view.vectors)
         return data, (0.0, peak), {"unit": field.unit, "symbol": field.symbol}
     axis = "yx".index(role[-1])
@@ -408,16 +376,7 @@ def _field(view: _View, role: str) -> tuple[Any, Limits, dict[str, str]]:
     return view.vectors[axis], (-limit, limit), words
 
 
-def _where(condition: Any, value: float, data: Any) -> Any:
-    """Apply `numpy.where`, lazily if either array is lazy."""
-    if isinstance(condition, np.ndarray) and isinstance(data, np.ndarray):
-        return np.where(condition, value, data)
-    from dask import array
-
-    return array.where(condition, value, data)
-
-
-def _labels(view: _View, kind: Kind) -> Content:
+def _labels(view: View, kind: Kind) -> Content:
     if kind.role == "structures":
         look = {"colormap": label_colours(_STRUCTURE_COLOUR), "opacity": 1.0}
         return outline(view.dataset["structures"].data), {}, look
@@ -441,7 +400,7 @@ def label_colours(*colours: str) -> Any:
     return CyclicLabelColormap(transform_color(["transparent", *colours]))
 
 
-def _arrows(view: _View, kind: Kind) -> Content:
+def _arrows(view: View, kind: Kind) -> Content:
     """Return arrows on a grid, few enough to be distinguishable."""
     is_field = kind.role == "field arrows"
     vectors = view.field.vectors if is_field else view.plane("displacement")
@@ -483,7 +442,7 @@ def arrows_in_shot(arrows: FloatArray, shot: int) -> FloatArray:
     return stacked
 
 
-def _sites(view: _View, kind: Kind) -> Content:
+def _sites(view: View, kind: Kind) -> Content:
     sites = view.dataset["sites"].values
     step = -(-len(sites) // _MAX_SHOWN_SITES)
     features = {key: values[::step] for key, values in site_features(view.dataset).items()}
@@ -500,7 +459,7 @@ def _sites(view: _View, kind: Kind) -> Content:
     return sites[::step], {"share": "" if step == 1 else f" (1 in {step})"}, look
 
 
-def _cells(view: _View, kind: Kind) -> Content:
+def _cells(view: View, kind: Kind) -> Content:
     polygons, site_numbers = view.cells or ([], [])
     look = {
         "shape_type": "polygon",
@@ -515,7 +474,7 @@ def _cells(view: _View, kind: Kind) -> Content:
     return polygons, {}, look
 
 
-_CONTENTS: dict[str, Callable[[_View, Kind], Content]] = {
+_CONTENTS: dict[str, Callable[[View, Kind], Content]] = {
     "image": _image,
     "labels": _labels,
     "vectors": _arrows,

@@ -15,6 +15,7 @@ from napari_shadowinv._napari.events import connect
 from napari_shadowinv._napari.layer_metadata import frame_for, main_layers, metadata_of, role_of
 from napari_shadowinv._napari.layers import (
     FullLayerData,
+    View,
     arrows_in_shot,
     dataset_layers,
     sample_arrows,
@@ -53,7 +54,7 @@ def store_layers(path: Path, name: str = "", shot: int | None = None) -> list[Fu
     setup = setup_from_dataset(dataset.isel(shot=reference))
     frame = frame_for(dataset["displacement"].shape, setup)
     facts = {"store": str(path), "name": name, "shots": _shot_names(dataset)}
-    layers = dataset_layers(dataset, setup, frame, name, facts, reference)
+    layers = dataset_layers(View(dataset, setup, reference), frame, name, facts)
     if shot is None:
         _widen_contrast(layers, _finished_shots(dataset))
     return layers
@@ -118,10 +119,9 @@ def shot_rows(path: Path, index: int) -> list[tuple[str, str]]:
 
 
 def _first_done(dataset: xarray.Dataset, path: Path) -> int:
-    displacement = dataset["displacement"]
     for shot in _finished_shots(dataset):
         with suppress(FileFormatError):  # the shot is damaged
-            if np.isfinite(displacement[shot].values).all():
+            if np.isfinite(dataset["displacement"][shot].values).all():
                 return int(shot)
     raise FileFormatError(f"{path} contains no finished shot yet: wait for the first one")
 
