@@ -48,7 +48,11 @@ def pack_figure(doses: FilmDoses, *, title: str | None = None) -> Figure:
     columns = min(_COLUMNS, panels_shown)
     width, height = (_PANEL_SHARE * side for side in _panels.panel_size(shape))
     grid = Grid(-(-panels_shown // columns), columns, width, height, foot=0.1, head=0.52)
-    header = _header(doses, int(grid.figure_size[0] * _LETTERS_PER_INCH))
+    facts = [fact for fact in doses.facts if not fact.is_detail]
+    line = _panels.fact_line(fact for fact in facts if fact.level is Level.SOUND)
+    cautions = [(fact.text, ALARM_COLOUR) for fact in facts if fact.level is not Level.SOUND]
+    letters = int(grid.figure_size[0] * _LETTERS_PER_INCH)
+    header = _panels.wrapped([(line, QUIET_COLOUR), *cautions], letters)
     with _panels.new_page(grid, Scale(1.0, "px"), title, header) as (figure, panels):
         for k in range(count):
             label = doses.film_label(k)
@@ -59,14 +63,6 @@ def pack_figure(doses: FilmDoses, *, title: str | None = None) -> Figure:
         for panel in panels[panels_shown:]:
             panel.axes.remove()
     return figure
-
-
-def _header(doses: FilmDoses, letters: int) -> list[tuple[str, str]]:
-    facts = [fact for fact in doses.facts if not fact.is_detail]
-    cautions = [fact.text for fact in facts if fact.level is not Level.SOUND]
-    line = _panels.fact_line(fact for fact in facts if fact.level is Level.SOUND)
-    sentences = [(line, QUIET_COLOUR), *((text, ALARM_COLOUR) for text in cautions)]
-    return _panels.wrapped(sentences, letters)
 
 
 def _draw_dose(panel: Panel, dose: FloatArray, usable: BoolArray, title: str) -> None:

@@ -60,9 +60,8 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
     upright = count > _MAX_ROWS
     columns = count if upright else len(kinds)
     rows = len(kinds) if upright else count
-    fields = [_field_in_units(fit, field) for field in fit.fields]
     sentences = [_panels.headline_sentence(fit.headline)]
-    grid, header, heading = _page(shape, rows + len(fields), columns, sentences, title)
+    grid, header, heading = _page(shape, rows + len(fit.fields), columns, sentences, title)
     facts = fit.facts_with_names(())
     of_images = [fact for fact in facts if fact.key.startswith("image_")]
     letters = int(grid.figure_size[0] * _LETTERS_PER_INCH)
@@ -73,9 +72,8 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
             for j, kind in enumerate(kinds):
                 place = j * columns + k if upright else k * columns + j
                 _draw_image(panels[place], fit, k, kind, of_images[k])
-        for m, (field, error) in enumerate(fields):
-            row = panels[(rows + m) * columns : (rows + m + 1) * columns]
-            _draw_fitted(row, fit, fit.fields[m], field, error)
+        for m, field in enumerate(fit.fields, start=rows):
+            _draw_fitted(panels[m * columns : (m + 1) * columns], fit, field)
     return figure
 
 
@@ -84,16 +82,6 @@ def _kinds(fit: Fit) -> tuple[str, ...]:
     is_uniform = bool((np.abs(fit.source / levels - 1) < _UNIFORM_TOLERANCE).all())
     usual = ("Image", "Re-projection", "Residual")
     return usual if is_uniform else ("Beam", *usual)
-
-
-def _field_in_units(fit: Fit, field: FittedField) -> tuple[ShownField, ShownField | None]:
-    """Return a field and its standard deviation, each in a handy unit."""
-    deflector = deflector_titles()[field.name]
-    (in_units,) = shown_fields([field.displacement], fit.setup, deflector, mask=fit.used)
-    if field.uncertainty is None:
-        return in_units, None
-    (error,) = shown_fields([field.uncertainty], fit.setup, deflector, mask=fit.used)
-    return in_units, error
 
 
 def _draw_image(panel: Panel, fit: Fit, k: int, kind: str, fact: Fact) -> None:
@@ -110,28 +98,24 @@ def _draw_image(panel: Panel, fit: Fit, k: int, kind: str, fact: Fact) -> None:
     panel.draw_intensity(hidden, title, intensity_limits(scale[k] / mean))
 
 
-def _draw_fitted(
-    panels: list[Panel],
-    fit: Fit,
-    field: FittedField,
-    in_units: ShownField,
-    error: ShownField | None,
-) -> None:
+def _draw_fitted(panels: list[Panel], fit: Fit, field: FittedField) -> None:
     """Fill a row of panels with a field; the potential comes first if there is room for it."""
+    deflector = deflector_titles()[field.name]
+    (in_units,) = shown_fields([field.displacement], fit.setup, deflector, mask=fit.used)
     title = in_units.name if len(fit.fields) == 1 else f"{field.name}: {in_units.symbol}"
     contents = ["potential", "field", "error", "cuts"]
-    if error is None:
+    if field.uncertainty is None:
         contents.remove("error")
     contents = contents[-len(panels) :]
     for panel, content in zip(panels, contents, strict=False):
         if content == "potential":
-            potential = np.where(fit.used, field.potential, np.nan)
-            panel.draw_potential(potential, fit.setup)
+            panel.draw_potential(np.where(fit.used, field.potential, np.nan), fit.setup)
         elif content == "field":
             panel.draw_field(in_units, title)
             panel.hatch_insignificant(fit.structures(field))
             panel.outline_caustics(_crossed_rays(fit))
-        elif content == "error" and error is not None:
+        elif content == "error" and field.uncertainty is not None:
+            (error,) = shown_fields([field.uncertainty], fit.setup, deflector, mask=fit.used)
             limits = 0.0, error.largest or 1.0
             label = f"σ of {in_units.symbol} ({error.unit})"
             panel.show(error.magnitude, "Standard deviation", label, "cividis", limits)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -30,10 +30,6 @@ _CUT_COLOURS = ("#1f9bff", "#18b368")
 _REFERENCE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 2.4, "alpha": 0.45}
 _CAUSTIC_DENSITY = 0.15  # level of the outline of a caustic
 LINE_IN = 0.18  # of a header or footer
-
-
-def _label(field: ShownField) -> str:
-    return f"{field.symbol} ({field.unit})"
 
 
 ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR = "#b00020", "#1b6e3c", "0.3"
@@ -215,6 +211,22 @@ def footer_lines(facts: Iterable[Fact], headline: str, letters: int) -> list[tup
     return wrapped(paragraphs, letters)
 
 
+def shot_page(
+    shape: Sequence[int],
+    setup: Setup | None,
+    title: str | None,
+    headline: Headline,
+    facts: Iterable[Fact] = (),
+) -> AbstractContextManager[tuple[Figure, list[Panel]]]:
+    """Return a page of six panels of one shot, below its headline and above its facts."""
+    width = choose_grid(shape, panels=6).figure_size[0]
+    header = wrapped([headline_sentence(headline)], int(width * 12))
+    footer = footer_lines(facts, headline.text, int(width * 14))
+    grid = choose_grid(shape, panels=6, foot=0.12 + 0.18 * len(footer), title=bool(title))
+    grid = replace(grid, head=0.52 if title else 0.22, foot=0.12)
+    return new_page(grid, image_scale(shape, setup), title, header, footer)
+
+
 @dataclass(frozen=True)
 class Panel:
     """Axes with room for a colour bar on their right."""
@@ -284,8 +296,7 @@ class Panel:
         limits = (float(np.nanmin(plane)), float(np.nanmax(plane)))
         self.show(plane, "Deflection potential", f"Potential ({unit})", "viridis", limits)
         if limits[1] > limits[0]:
-            levels = np.linspace(*limits, 9)[1:-1]
-            self.contour(plane, levels, "black", linewidths=0.5, alpha=0.45)
+            self.contour(plane, np.linspace(*limits, 9)[1:-1], "black", linewidths=0.5, alpha=0.45)
 
     def draw_differences(self, plane: FloatArray, title: str, label: str, largest: float) -> None:
         """Show differences in red and blue, up to `largest`."""
@@ -304,7 +315,7 @@ class Panel:
     def draw_vectors(self, field: ShownField, title: str, largest: float) -> None:
         """Show a field, with arrows where it is strong enough to have a direction."""
         everywhere = field.magnitude
-        self.show(everywhere, title, _label(field), "inferno", (0.0, largest))
+        self.show(everywhere, title, f"{field.symbol} ({field.unit})", "inferno", (0.0, largest))
         height, width = everywhere.shape
         step = max(1, round(np.sqrt(height * width) / 14))
         rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
@@ -316,24 +327,11 @@ class Panel:
         pixel = self.scale.pixel
         # A square root keeps weak arrows long enough to see where they point.
         length = 0.8 * step * pixel * np.sqrt(share)
-        direction = field.vectors[:, rows, columns] / everywhere[rows, columns]
-        self.axes.quiver(
-            columns * pixel,
-            rows * pixel,
-            direction[1] * length,
-            direction[0] * length,
-            angles="xy",
-            scale_units="xy",
-            scale=1.0,
-            pivot="mid",
-            color="white",
-            alpha=0.7,
-            units="inches",
-            width=0.011,
-            headwidth=4,
-            headlength=4.5,
-            headaxislength=4,
-        )
+        dy, dx = field.vectors[:, rows, columns] / everywhere[rows, columns] * length
+        size: Any = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "units": "inches"}
+        head: Any = {"width": 0.011, "headwidth": 4, "headlength": 4.5, "headaxislength": 4}
+        style: Any = {"pivot": "mid", "color": "white", "alpha": 0.7}
+        self.axes.quiver(columns * pixel, rows * pixel, dx, dy, **size, **head, **style)
 
     def hatch_insignificant(self, structures: Structures | None) -> None:
         """Hatch the pixels outside structures thinly, and say so in the lower left corner."""
@@ -388,7 +386,7 @@ class Panel:
         axes = self.axes
         axes.set_title(title)
         axes.set_xlabel(f"Position ({self.scale.unit})")
-        axes.set_ylabel(_label(field))
+        axes.set_ylabel(f"{field.symbol} ({field.unit})")
         axes.grid(alpha=0.25, linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
         axes.margins(x=0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,14 +38,8 @@ def plan_figure(plan: ExperimentPlan) -> Figure:
     """
     setup = plan.setups[0] if plan.setups else None
     true, retrieved = shown_fields([plan.truth, plan.retrieved], setup)
-    width = _panels.choose_grid(plan.shape, panels=6).figure_size[0]
-    header = _panels.wrapped([_panels.headline_sentence(plan.headline)], int(width * 12))
-    grid = _panels.choose_grid(plan.shape, panels=6, foot=0.12, title=True)
-    grid = replace(grid, head=0.52)
-    scale = _panels.image_scale(plan.shape, setup)
-    with _panels.new_page(grid, scale, plan.title, header) as (figure, panels):
-        mean = plan.options.counts
-        image = plan.images[0] / mean
+    with _panels.shot_page(plan.shape, setup, plan.title, plan.headline) as (figure, panels):
+        image = plan.images[0] / plan.options.counts
         panels[0].draw_intensity(image, "First draw", intensity_limits(image))
         _panels.draw_side_by_side(
             panels[1:4], {"object": true, "retrieved in the first draw": retrieved}

@@ -91,8 +91,7 @@ def _draw(axes: Axes, result: ProductResult, names: Sequence[str]) -> None:
     if "intensity" in result.variables:
         beside = axes.twinx()
         places, _ = result.shown_places("intensity")
-        values = result.quantities["intensity"].value
-        beside.plot(places, values, color="0.6", linewidth=0.8)
+        beside.plot(places, result.quantities["intensity"].value, color="0.6", linewidth=0.8)
         beside.set_ylabel("image", color="0.5")
         beside.margins(x=0)
 
@@ -163,5 +162,4 @@ def _draw_map(axes: Axes, result: ProductResult, name: str) -> None:
     down, right = ("y", "x") if dims == PLANE else (result.coordinates[d].long_name for d in dims)
     axes.set_xlabel(f"{right} ({letter})")
     axes.set_ylabel(f"{down} ({letter})")
-    unit = f"{prefix}{result.variables[name].unit}"
-    axes.figure.colorbar(image, ax=axes, label=unit)
+    axes.figure.colorbar(image, ax=axes, label=f"{prefix}{result.variables[name].unit}")

@@ -56,15 +56,8 @@ def report_figure(
     setup = inversion.setup if setup is None else setup
     shape = inversion.potential.shape
     (field,) = shown_fields([inversion.displacement], setup, mask=inversion.mask)
-    width = _panels.choose_grid(shape, panels=6).figure_size[0]
-    headline = inversion.headline_in(setup)
-    header = _panels.wrapped([_panels.headline_sentence(headline)], int(width * 12))
-    facts = inversion.facts_in(setup)
-    footer = _panels.footer_lines(facts, headline.text, int(width * 14))
-    grid = _panels.choose_grid(shape, panels=6, foot=0.12 + 0.18 * len(footer), title=bool(title))
-    grid = replace(grid, head=0.52 if title else 0.22, foot=0.12)
-    scale = _panels.image_scale(shape, setup)
-    with _panels.new_page(grid, scale, title, header, footer) as (figure, panels):
+    headline, facts = inversion.headline_in(setup), inversion.facts_in(setup)
+    with _panels.shot_page(shape, setup, title, headline, facts) as (figure, panels):
         mean = float(inversion.source.mean())
         limits = intensity_limits(inversion.image / mean)
 
