@@ -47,7 +47,7 @@ CAUTION_CODES: Mapping[str, str] = MappingProxyType(
         "film-range": "a film is darker than its calibration covers",
         "film-alignment": "the alignment of the films is uncertain",
         "film-side": "the side from which the films are seen is not known",
-        # sentences of files written before codes existed
+        # codes of later versions
         "other": "other warnings",
     }
 )
@@ -87,11 +87,9 @@ class Caution:
 
     @classmethod
     def from_json(cls, content: Any) -> Caution:
-        """Rebuild a caution from a result file, where older versions wrote the text alone."""
+        """Rebuild a caution from a result file, perhaps with a code of a later version."""
         if isinstance(content, cls):
             return content
-        if isinstance(content, str):
-            return cls("other", content)
         code = content["code"] if content["code"] in CAUTION_CODES else "other"
         return cls(code, content["text"])
 

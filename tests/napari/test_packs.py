@@ -101,7 +101,8 @@ def test_saved_layers_are_the_whole_pack_again(
 def test_warnings_are_told_when_a_pack_is_opened(
     viewer: ViewerModel, pack_doses: Any, tmp_path: Path, messages: list[str]
 ) -> None:
-    warned = pack_doses.to_dataset(attributes={"warnings": '["film 2 is too dark"]'})
+    dark = '[{"code": "film-range", "text": "film 2 is too dark"}]'
+    warned = pack_doses.to_dataset(attributes={"warnings": dark})
     opened(viewer, write(tmp_path / "dark.shadowinv", warned))
     assert messages == ["dark.shadowinv: film 2 is too dark"]
 
