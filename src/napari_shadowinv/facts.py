@@ -25,9 +25,8 @@ class ResultKind(StrEnum):
     INVERSION = "shadowinv result"
     FIT = "shadowinv fit"
     FILM_DOSES = "shadowinv film pack"
-    FIELD = (
-        "shadowinv field"  # without images: of a shot of a store, of pradformat, of another program
-    )
+    # Without images: of a shot of a store, of pradformat, of another program.
+    FIELD = "shadowinv field"
 
     @classmethod
     def of(cls, attributes: Mapping[Any, Any]) -> ResultKind:

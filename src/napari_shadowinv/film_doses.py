@@ -243,8 +243,7 @@ class FilmDoses:
             history["scan_pixel_size"] = self.pixel_size
         if self.setups:
             coordinates["time_of_flight"] = ("layer", self.times_of_flight, {"units": "s"})
-            setups = [setup.model_dump(mode="json") for setup in self.setups]
-            history["setups"] = json.dumps(setups)
+            history["setups"] = json.dumps([setup.model_dump(mode="json") for setup in self.setups])
         return xr.Dataset(variables, coordinates, history | dict(attributes or {}))
 
     @classmethod

@@ -153,18 +153,16 @@ class FitProgress:
         if stage != self._stage:
             self._stage, self._steps = stage, 0
         self._steps += 1
-        self._done = max(self._done, self._share())
+        stages = list(self._weights)
+        index = stages.index(stage)
+        before = sum(self._weights[earlier] for earlier in stages[:index])
+        within = 1 - math.exp(-2 * self._steps / self._expected[stage])
+        share = (before + within * self._weights[stage]) / sum(self._weights.values())
+        self._done = max(self._done, share)
         words = {"starts": f"starts ({name})", "full size": self._last_stage}
-        number = list(self._weights).index(stage) + 1
-        message = f"stage {number} of {len(self._weights)}, {words.get(stage, stage)}"
+        message = f"stage {index + 1} of {len(stages)}, {words.get(stage, stage)}"
         done = int(_BAR_LENGTH * self._done)
         return Progress(progress.stage, done, _BAR_LENGTH, message, self._objective)
-
-    def _share(self) -> float:
-        stages = list(self._weights)
-        before = sum(self._weights[stage] for stage in stages[: stages.index(self._stage)])
-        within = 1 - math.exp(-2 * self._steps / self._expected[self._stage])
-        return (before + within * self._weights[self._stage]) / sum(self._weights.values())
 
 
 def estimate_fit_time(
@@ -241,7 +239,6 @@ class InversionJob(ImageJob):
     def run(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
     ) -> Inversion:
-        """Invert the shot."""
         source = None if self.source is None else load_radiograph(self.source, "the source")
         return run(
             self.recipe,
@@ -309,17 +306,11 @@ class FitJob(ImageJob):
         return estimate_fit_time(self.shape, len(self.names), fields, source, choices.options)
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
-        """Fit the images."""
-
-        def update(progress: Progress) -> None:
-            on_progress(self.progress.update(progress))
-
-        fit = self.compute(update, should_stop)
+        fit = self.compute(lambda state: on_progress(self.progress.update(state)), should_stop)
         PACE.learn(self.time_estimate, sum(fit.report.seconds.values()))
         return fit
 
     def layers(self, content: Fit) -> list[FullLayerData]:
-        """Describe the layers of the fit."""
         result = Result(content, content.setup, dict(self.attributes))
         return fit_layers(result, self.frame, self.name)
 
@@ -351,7 +342,6 @@ class Refinement(FitJob):
         return self.inversion.image.shape
 
     def compute(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
-        """Fit, starting from the inversion."""
         return run_refinement(
             self.inversion,
             self.setup,
@@ -374,20 +364,15 @@ def refinement(layer: Any, image: Any, name: str, psf: float) -> Refinement:
             "the field"
         )
     inversion, setup = result.content, result.setup
-    choices = refinement_choices(inversion, setup, psf)
-    inputs = [
-        ("Start", f"the inversion of '{name}'"),
-        ("Point spread", f"σ {psf:g} px" if psf else "none"),
-    ]
-    attributes = {"start_origin": f"the inversion of '{name}'"}
+    start = f"the inversion of '{name}'"
     return Refinement(
-        recipe=Recipe(fit=choices),
+        recipe=Recipe(fit=refinement_choices(inversion, setup, psf)),
         shots=(),
         names=(name,),
         name=f"{name} refined",
         frame=frame_of(layer),
-        inputs=inputs,
-        attributes=attributes,
+        inputs=[("Start", start), ("Point spread", f"σ {psf:g} px" if psf else "none")],
+        attributes={"start_origin": start},
         image=image,
         inversion=inversion,
         setup=setup,

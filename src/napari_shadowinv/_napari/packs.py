@@ -93,12 +93,16 @@ def pack_layers(
     }
     layers = []
     for kind in KINDS:
-        data: AnyArray = getattr(doses, kind.variable)
-        look: dict[str, Any] = {}
-        if kind.type == "labels":
-            data, look = _labels(doses.usable, by_hand)
         metadata: dict[str, Any] = {**films, **facts, "result": result, "main": True}
-        if kind.type == "image":
+        data: AnyArray
+        look: dict[str, Any]
+        if kind.type == "labels":
+            data = np.where(doses.usable, 0, EXCLUDED).astype(np.uint8)
+            if by_hand is not None:
+                data[by_hand] = BY_HAND
+            look = {"colormap": label_colours("#5dff5d", "#00c8ff"), "opacity": 0.5}
+        else:
+            data = getattr(doses, kind.variable)
             limits = [_limits(film, used) for film, used in zip(data, doses.usable, strict=True)]
             metadata["limits"] = limits
             look = {"colormap": colour_map(kind.colormap), "contrast_limits": limits[plane]}
@@ -173,13 +177,6 @@ def painted_by_hand(labels: AnyArray, doses: FilmDoses) -> BoolArray:
     return np.asarray((labels == BY_HAND) | (doses.usable & (labels > 0)))
 
 
-def _labels(usable: BoolArray, by_hand: BoolArray | None) -> tuple[AnyArray, dict[str, Any]]:
-    labels = np.where(usable, 0, EXCLUDED).astype(np.uint8)
-    if by_hand is not None:
-        labels[by_hand] = BY_HAND
-    return labels, {"colormap": label_colours("#5dff5d", "#00c8ff"), "opacity": 0.5}
-
-
 def _limits(plane: AnyArray, used: BoolArray) -> Limits:
     """Return the contrast limits of a film from its usable pixels."""
     if not used.any():
@@ -221,7 +218,6 @@ class PackJob(Job):
             raise
 
     def layers(self, content: EvaluatedPack) -> list[FullLayerData]:
-        """Describe the layers of the pack."""
         doses = content.doses
         return pack_layers(
             Result(doses, doses.setup),
@@ -242,7 +238,10 @@ class PackJob(Job):
             changes["corners"] = self._file("corners.csv")
             write_corners(changes["corners"], dict(self.corners))
             if by_hand is not None:
-                by_hand = _resize(by_hand, self._shape(changes["corners"]))
+                assert self.scales is not None
+                films = read_corners(changes["corners"])
+                sides = [upright(films[n])[2] / self.scales[int(n) - 1] for n in films]
+                by_hand = _resize(by_hand, common_shape(sides))
         if by_hand is not None and by_hand.any():
             layers = list(self.pack.layers)
             for k in np.flatnonzero(by_hand.any(axis=(1, 2))):
@@ -259,12 +258,6 @@ class PackJob(Job):
                 layers[k] = layers[k].model_copy(update={"mask": file})
             changes["layers"] = tuple(layers)
         return self.pack.model_copy(update=changes), by_hand
-
-    def _shape(self, corners: Path) -> tuple[int, int]:
-        """Return the shape of the upright films with the new corners."""
-        assert self.scales is not None
-        films = read_corners(corners)
-        return common_shape([upright(films[n])[2] / self.scales[int(n) - 1] for n in films])
 
     def _file(self, name: str) -> Path:
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -297,5 +290,4 @@ def copy_edits(doses: FilmDoses, scratch: Path, path: Path) -> FilmDoses:
     pack = doses.pack
     layers = tuple(layer.model_copy(update={"mask": copy(layer.mask)}) for layer in pack.layers)
     saved_pack = pack.model_copy(update={"corners": copy(pack.corners), "layers": layers})
-    provenance = doses.provenance.model_copy(update={"pack": saved_pack})
-    return replace(doses, provenance=provenance)
+    return replace(doses, provenance=doses.provenance.model_copy(update={"pack": saved_pack}))

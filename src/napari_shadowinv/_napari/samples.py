@@ -86,12 +86,8 @@ def wakefield_run() -> list[FullLayerData]:
     return [shot_layer(stack, "wakefield run", setup, limits, setup_origin=origin)]
 
 
-def _no_layer() -> list[FullLayerData]:
-    """Return an image without channels: napari adds no layer, where it refuses an empty list."""
-    return [(np.empty((0, 1, 1)), {"channel_axis": 0}, "image")]
-
-
-@notify_errors(otherwise=_no_layer)
+# For an image without channels napari adds no layer; it refuses an empty list.
+@notify_errors(otherwise=lambda: [(np.empty((0, 1, 1)), {"channel_axis": 0}, "image")])
 def burner() -> list[FullLayerData]:
     """Shadowgram of an alcohol burner's plume with its reference beam, downloaded once."""
     reference, frame = (io.read_radiograph(path) for path in fetch_burner())

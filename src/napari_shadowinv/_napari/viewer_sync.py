@@ -178,7 +178,9 @@ def _place_new_images(viewer: Any) -> None:
 def _place_on_result(layer: Any, fields: list[Any]) -> None:
     from napari.utils.notifications import show_info, show_warning
 
-    same_size = [field for field in fields if field.data.shape[-2:] == _size(layer)]
+    data = layer.data[0] if layer.multiscale else layer.data
+    shape = data.shape[:-1] if layer.rgb else data.shape
+    same_size = [field for field in fields if field.data.shape[-2:] == tuple(shape[-2:])]
     if not same_size:
         unit = f"{fields[-1].units[-1]:~P}"
         show_warning(
@@ -202,12 +204,6 @@ def _is_bare_image(layer: Any) -> bool:
         return False
     is_plugin_layer = role_of(layer) is not None and layer.source.path is None
     return not is_plugin_layer and frame_of(layer) == Frame()
-
-
-def _size(layer: Any) -> tuple[int, ...]:
-    data = layer.data[0] if layer.multiscale else layer.data
-    shape = data.shape[:-1] if layer.rgb else data.shape
-    return tuple(shape[-2:])
 
 
 @dataclass
