@@ -255,8 +255,7 @@ class FilmDoses:
         InputError
             If a variable or attribute is missing or damaged.
         """
-        names = (*_VARIABLES, "energy", *_BANDS)
-        missing = [name for name in names if name not in dataset]
+        missing = [name for name in (*_VARIABLES, "energy", *_BANDS) if name not in dataset]
         if missing:
             raise InputError(
                 f"dataset has no {', '.join(map(repr, missing))}: expected the result of a film "

@@ -1,6 +1,6 @@
 """Commands of the menus *Layers > Measure*, *Filter*, *Transform* and *Register*.
 
-They work on the selected image or shown shot; `open_widgets` has those that only open a widget.
+They work on the selected image or shown shot, or open a widget for it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from napari_shadowinv._napari import layers as results
 from napari_shadowinv._napari import viewer_sync
 from napari_shadowinv._napari.events import without_proxy
 from napari_shadowinv._napari.layer_metadata import Frame, frame_of, main_layers
-from napari_shadowinv._napari.open_widgets import open_widget
 from napari_shadowinv._napari.preferences import use_preferred_threads
 from napari_shadowinv._napari.shots import radiograph_of, shot_layer
 from napari_shadowinv._system.progress import ShouldStop
@@ -99,7 +98,7 @@ def refine(
     job = refinement(layer, layer, name_of_result(layer), psf=0.0)
     if viewer is None or not viewer_sync.in_event_loop():
         return list(job.work(lambda _: None, lambda: False).layer_data)
-    open_widget(viewer, "Invert shot").refine_layer(layer)
+    _open_widget(viewer, "Invert shot").refine_layer(layer)
     return []
 
 
@@ -189,6 +188,54 @@ def align_source(
         return [_filtered_layer(moved, aligned.source, f"moved by {shift}", made_from=made_from)]
 
     return _start(selection, align, "Aligning the source with", viewer)
+
+
+@viewer_sync.notify_errors(otherwise=lambda: None)
+def plot_along_line(
+    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
+) -> None:
+    """Plot the selected image along a line, in *Analyse*."""
+    _open_widget(viewer, "Analyse").plot_layer(without_proxy(layer))
+
+
+@viewer_sync.notify_errors(otherwise=lambda: None)
+def measure_products(
+    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
+) -> None:
+    """Measure products of the result that the selected layer belongs to, in *Analyse*."""
+    _open_widget(viewer, "Analyse").measure_layer(without_proxy(layer))
+
+
+@viewer_sync.notify_errors(otherwise=lambda: None)
+def predict_image(
+    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
+) -> None:
+    """Predict the image of the selected field or potential, in *Forward model*."""
+    _open_widget(viewer, "Forward model").start_from(without_proxy(layer))
+
+
+@viewer_sync.notify_errors(otherwise=lambda: None)
+def watch_folder(viewer: napari.Viewer | None = None) -> None:
+    """Choose a folder whose shots are inverted as they arrive, in *Invert stack*."""
+    _open_widget(viewer, "Invert stack").choose_folder()
+
+
+@viewer_sync.notify_errors(otherwise=lambda: None)
+def edit_setup(
+    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
+) -> None:
+    """Enter the setup of the selected image."""
+    window = _window_of(viewer)
+    from napari_shadowinv._napari.widgets.image_setup import ImageSetup
+
+    title = "Setup of an image"
+    widget = window.dock_widgets.get(title)
+    if widget is None:
+        widget = ImageSetup(without_proxy(viewer))
+        window.add_dock_widget(widget, name=title, area="right")
+    else:
+        without_proxy(widget).come_to_front()
+    widget.choose(without_proxy(layer))
 
 
 def _source_for(selection: _Selection, layer: Any, viewer: Any) -> tuple[FloatArray, str]:
@@ -316,3 +363,23 @@ def _filtered_layer(
         setup_origin=selection.setup_origin or None,
         **metadata,
     )
+
+
+def _open_widget(viewer: Any, name: str) -> Any:
+    """Open one of the plugin's widgets, or bring it to the front, and return it."""
+    window = _window_of(viewer)
+    # napari's menus know the plugin by another name, under which it would be opened twice.
+    for title, widget in window.dock_widgets.items():
+        if title.startswith(f"{name} ("):
+            widget = without_proxy(widget)
+            widget.come_to_front()
+            return widget
+    _, widget = window.add_plugin_dock_widget("napari-shadowinv", name)
+    return widget
+
+
+def _window_of(viewer: Any) -> Any:
+    window = getattr(viewer, "window", None)
+    if window is None:
+        raise InputError("there is no window: choose this in a menu of napari")
+    return window

@@ -57,7 +57,6 @@ _PLACEMENT = ("scale", "translate", "units")
 _TRANSFORM = ("rotate", "shear", "affine")
 _SAVED_KEYWORDS: dict[str, tuple[str, ...]] = {
     "image": ("colormap", "contrast_limits", "gamma", "interpolation2d"),
-    "labels": (),
     "points": ("face_colormap", "face_contrast_limits"),
     "vectors": ("length", "edge_width", "vector_style"),
     "shapes": ("edge_width",),
@@ -93,7 +92,7 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]
     shape = dataset.sizes["y"], dataset.sizes["x"]
     places = {key: placement.get(key) for key in _PLACEMENT}
     frame = frame_for(shape, setup, **places, pixel_size=dataset.attrs.get("scan_pixel_size"))
-    if all(name in placement for name in _TRANSFORM):  # not in files of older versions
+    if all(name in placement for name in _TRANSFORM):  # not in those of a script
         frame = replace(
             frame,
             rotate=matrix_of(np.array(placement["rotate"])[-2:, -2:]),

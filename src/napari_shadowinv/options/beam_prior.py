@@ -163,14 +163,10 @@ class BeamPrior(CheckedModel, allow_inf_nan=False):
         patterns = scale[:, None] * shapes[clear] / np.sqrt(np.maximum(weights.ravel(), 1e-300))
         patterns = np.where(bright, patterns.reshape(-1, *level.shape), 0.0)
         size = (mean.shape[0], mean.shape[1])
-        components = BeamComponents(
-            patterns[:0] if share == 1 else patterns,
-            block,
-            size,
-            rms * np.sqrt(share),
-            "references",
-            mean,
-        )
+        if share == 1:
+            patterns = patterns[:0]
+        rest = rms * np.sqrt(share)
+        components = BeamComponents(patterns, block, size, rest, "references", mean)
         length = _length(ratios, bright, noise) * block / min(size)
         numbers = {"rms": rms, "length": float(np.clip(length, 1 / min(size), 1)), **numbers}
         return cls(**numbers).with_components(components)

@@ -175,8 +175,7 @@ def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figur
     grid, header, heading = _page(shape, rows, columns, sentences, title)
     scale = _panels.image_scale(shape, setups[0] if setups else None)
     text = "Each image as predicted by a fit of the others, without those that are not explained."
-    footer = [(text, QUIET_COLOUR)]
-    with _panels.new_page(grid, scale, heading, header, footer) as (figure, panels):
+    with _panels.new_page(grid, scale, heading, header, [(text, QUIET_COLOUR)]) as (figure, panels):
         for k in range(count):
             row, column = k % rows, k // rows
             first = row * columns + column * _PANELS_PER_IMAGE
@@ -219,8 +218,7 @@ def windows_figure(windows: FitWindows, *, title: str | None = None) -> Figure:
     scale = _panels.image_scale(shape, windows.setup)
     text = "All fields on one colour scale"
     text += ", at the strength of the image displaced most." if windows.setup is None else "."
-    footer = [(text, QUIET_COLOUR)]
-    with _panels.new_page(grid, scale, heading, header, footer) as (figure, panels):
+    with _panels.new_page(grid, scale, heading, header, [(text, QUIET_COLOUR)]) as (figure, panels):
         for m, field in enumerate(windows.fits[0].fields):
             block = panels[m * rows * columns : (m + 1) * rows * columns]
             in_units = shown_fields(

@@ -150,15 +150,9 @@ def _draw_map(axes: Axes, result: ProductResult, name: str) -> None:
         scale, letter = prefix_for(float(columns[-1]))
         letter = f"{letter}m"
     half = scale * (columns[1] - columns[0]) / 2
-    image = axes.imshow(
-        factor * values,
-        cmap="RdBu_r",
-        vmin=-factor * limit,
-        vmax=factor * limit,
-        extent=(
-            -half, scale * columns[-1] + half, scale * rows[-1] + half, -half,
-        ),
-    )  # fmt: skip
+    extent = (-half, scale * columns[-1] + half, scale * rows[-1] + half, -half)
+    limits: Any = {"vmin": -factor * limit, "vmax": factor * limit}
+    image = axes.imshow(factor * values, cmap="RdBu_r", extent=extent, **limits)
     down, right = ("y", "x") if dims == PLANE else (result.coordinates[d].long_name for d in dims)
     axes.set_xlabel(f"{right} ({letter})")
     axes.set_ylabel(f"{down} ({letter})")
