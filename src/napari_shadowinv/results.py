@@ -32,13 +32,9 @@ def result_from_dataset(dataset: xarray.Dataset) -> AnyResult:
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.inversion.result import RetrievedField
 
-    classes: dict[ResultKind, type[AnyResult]] = {
-        ResultKind.INVERSION: Inversion,
-        ResultKind.FIT: Fit,
-        ResultKind.FILM_DOSES: FilmDoses,
-        ResultKind.FIELD: RetrievedField,
-    }
-    return classes[ResultKind.of(dataset.attrs)].from_dataset(dataset)
+    kind = ResultKind.of(dataset.attrs)
+    classes: tuple[type[AnyResult], ...] = (Inversion, Fit, FilmDoses, RetrievedField)
+    return next(each for each in classes if each.kind is kind).from_dataset(dataset)
 
 
 def unpack_result(result: Any) -> tuple[AnyResult, Setup | None]:

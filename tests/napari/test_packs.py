@@ -14,7 +14,13 @@ from napari.layers import Layer
 
 from napari_shadowinv import read, write
 from napari_shadowinv._napari import packs
-from napari_shadowinv._napari.layer_metadata import metadata_of, role_of, setup_of, usable_of
+from napari_shadowinv._napari.layer_metadata import (
+    frame_for,
+    metadata_of,
+    role_of,
+    setup_of,
+    usable_of,
+)
 from napari_shadowinv._napari.viewer_sync import connect_viewer
 
 PLUGIN = "napari-shadowinv"
@@ -125,7 +131,7 @@ def test_a_spectrum_is_the_mean_of_usable_pixels(pack_doses: Any) -> None:
 def test_images_for_a_fit_know_setup_energy_and_usable_pixels(pack_doses: Any) -> None:
     lost = deepcopy(pack_doses)
     lost.usable[1] = False
-    frame = packs.pack_frame(lost)
+    frame = frame_for(lost.dose.shape, lost.setup)
     layers = [Layer.create(*layer_data) for layer_data in packs.film_layers(lost, frame, "trio")]
     first, _, last = (f"{energy:.3g} MeV" for energy in pack_doses.energies)
     assert [layer.name for layer in layers] == [f"film 1, {first}", f"film 3, {last}"]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from inspect import ismethod
 from typing import Any
 
@@ -64,22 +65,17 @@ def connect_layers(layers: Any, names: str | Sequence[str], callback: Callback) 
     The callback gets the layer. Methods are held weakly.
     """
     get_callback = _reference(callback)
-    undo: list[Disconnect] = []
+    connections = ExitStack()
 
     def watch(layer: Any) -> None:
         function = get_callback()
         if function is not None:
-            undo.append(connect(layer, names, function))
+            connections.callback(connect(layer, names, function))
 
     for layer in layers:
         watch(layer)
-    undo.append(connect(layers, "inserted", watch))
-
-    def disconnect() -> None:
-        for disconnect_signals in undo:
-            disconnect_signals()
-
-    return disconnect
+    connections.callback(connect(layers, "inserted", watch))
+    return connections.close
 
 
 def without_proxy(model: Any) -> Any:

@@ -7,14 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from napari_shadowinv._napari.layer_metadata import (
-    KINDS,
-    Frame,
-    Result,
-    layer_name,
-    metadata_for,
-    role_of,
-)
+from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.layer_metadata import Frame, Result, layer_name, metadata_for, role_of
 from napari_shadowinv._napari.layers import (
     FullLayerData,
     View,
@@ -34,7 +28,7 @@ if TYPE_CHECKING:
 
 # Of alternative solutions only these are shown.
 _ALTERNATIVE_ROLES = ("field", "arrows")
-_KINDS = {kind.role: kind for kind in KINDS if kind.shown_of != "stack"}
+_KINDS = {kind.role: kind for kind in about.KINDS if kind.shown_of != "stack"}
 _MAX_BEAM_DIFFERENCE = 1e-6  # relative to the mean
 
 

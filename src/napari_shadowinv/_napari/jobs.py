@@ -13,17 +13,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.fit_layers import fit_layers
-from napari_shadowinv._napari.layer_metadata import (
-    KEY,
-    SOURCE,
-    Frame,
-    Result,
-    frame_of,
-    metadata_of,
-    result_of,
-    role_of,
-)
+from napari_shadowinv._napari.layer_metadata import KEY, Frame, Result, frame_of, result_of, role_of
 from napari_shadowinv._napari.layers import FullLayerData, result_layers
 from napari_shadowinv._napari.shots import load_radiograph
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
@@ -257,7 +249,7 @@ class InversionJob(ImageJob):
         layer_data = result_layers(result, self.frame, name)
         mask = self.shot.source_mask
         for _, keywords, _ in layer_data:
-            if role_of(keywords) == SOURCE and mask is not None:
+            if role_of(keywords) == about.SOURCE and mask is not None:
                 masked = Radiograph(mask.astype(float), source_mask=mask)
                 keywords["metadata"][KEY]["source_mask"] = self.recipe.move(masked).source_mask
         if self.preview:
@@ -381,4 +373,4 @@ def refinement(layer: Any, image: Any, name: str, psf: float) -> Refinement:
 
 def name_of_result(layer: Any) -> str:
     """Return the name of the result that a layer belongs to, or else the layer's name."""
-    return str(metadata_of(layer).get("name") or layer.name)
+    return str(about.metadata_of(layer).get("name") or layer.name)

@@ -10,19 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv._napari.layer_metadata import (
-    KEY,
-    KINDS,
-    MASKED_ROLES,
-    Frame,
-    Kind,
-    Result,
-    frame_for,
-    layer_name,
-    main_layers,
-    metadata_for,
-    role_of,
-)
+from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.layer_metadata import Frame, Kind, Result, frame_for, role_of
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import connect_viewer, show_scale_bar
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
@@ -132,7 +121,7 @@ def add_inversion(
     ['|d| (px) – blank (too uncertain)', 'displacement arrows – blank (too uncertain)']
     """
     layer_data = inversion_layers(inversion, setup, name=name, **keywords)
-    return add_layers(viewer, layer_data if all_layers else main_layers(layer_data))
+    return add_layers(viewer, layer_data if all_layers else about.main_layers(layer_data))
 
 
 def add_layers(
@@ -202,7 +191,7 @@ def result_layers(
         if role_of(keywords) == "image":
             # With beam and mask, the image can be inverted again.
             usable = None if content.mask.all() else content.mask
-            keywords["metadata"][KEY] |= {"source": content.source, "usable": usable}
+            keywords["metadata"][about.KEY] |= {"source": content.source, "usable": usable}
     return layer_data
 
 
@@ -211,16 +200,17 @@ def dataset_layers(
 ) -> list[FullLayerData]:
     """Describe the layers of a result or of a stack; all names end with `suffix`."""
     layers = []
-    for kind in KINDS:
+    for kind in about.KINDS:
         if not view.has(kind):
             continue
         data, words, look = _CONTENTS[kind.type](view, kind)
-        if kind.role in MASKED_ROLES and view.masked is not None:
+        if kind.role in about.MASKED_ROLES and view.masked is not None:
             # On lazy arrays, numpy's functions are dask's.
             data = np.where(view.masked, np.nan, data)
+        unit = words.get("unit", kind.unit)
         keywords = {
-            "name": f"{layer_name(kind.title.format(**words), name)} {suffix}".rstrip(),
-            "metadata": metadata_for(kind.role, words.get("unit", kind.unit), view.setup, **facts),
+            "name": f"{about.layer_name(kind.title.format(**words), name)} {suffix}".rstrip(),
+            "metadata": about.metadata_for(kind.role, unit, view.setup, **facts),
             "visible": kind.visible,
             **frame.keywords(stacked=view.shot is not None),
             **look,

@@ -17,15 +17,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Job
-from napari_shadowinv._napari.layer_metadata import (
-    CAME_WITH,
-    Frame,
-    Kind,
-    Result,
-    frame_for,
-    metadata_for,
-)
+from napari_shadowinv._napari.layer_metadata import Frame, Kind, Result, frame_for, metadata_for
 from napari_shadowinv._napari.layers import FullLayerData, Limits, label_colours
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.shots import shot_layer
@@ -135,7 +129,7 @@ def film_layers(doses: FilmDoses, frame: Frame, name: str) -> list[FullLayerData
             doses.setups[k] if doses.setups else None,
             _limits(image, used),
             frame=frame,
-            setup_origin=f"{CAME_WITH} {name}" if doses.setups else None,
+            setup_origin=f"{about.CAME_WITH} {name}" if doses.setups else None,
             usable=used,
             part=str(k + 1),
             energies=[float(doses.energies[k])],
@@ -144,11 +138,6 @@ def film_layers(doses: FilmDoses, frame: Frame, name: str) -> list[FullLayerData
         layer[1]["visible"] = not layers
         layers.append(layer)
     return layers
-
-
-def pack_frame(doses: FilmDoses) -> Frame:
-    """Return the frame with pixels of the object plane, or of the first scan without a setup."""
-    return frame_for(doses.fluence.shape, doses.setup, pixel_size=doses.pixel_size)
 
 
 def spectrum_in(doses: FilmDoses, region: BoolArray | None = None) -> Spectrum:
@@ -221,7 +210,7 @@ class PackJob(Job):
         doses = content.doses
         return pack_layers(
             Result(doses, doses.setup),
-            pack_frame(doses),
+            frame_for(doses.dose.shape, doses.setup, pixel_size=doses.pixel_size),
             self.name,
             by_hand=content.by_hand,
             plane=self.plane,

@@ -14,21 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.fit_layers import fit_layers
-from napari_shadowinv._napari.layer_metadata import (
-    SHOT,
-    SOURCE,
-    Frame,
-    Result,
-    frame_for,
-    frame_of,
-    layer_key,
-    main_layers,
-    matrix_of,
-    metadata_of,
-    result_of,
-    role_of,
-)
+from napari_shadowinv._napari.layer_metadata import Frame, Result, frame_for, frame_of, main_layers
 from napari_shadowinv._napari.layers import FullLayerData, field_layers, result_layers
 from napari_shadowinv._napari.packs import pack_layers
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -95,13 +83,13 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]
     if all(name in placement for name in _TRANSFORM):  # not in those of a script
         frame = replace(
             frame,
-            rotate=matrix_of(np.array(placement["rotate"])[-2:, -2:]),
+            rotate=about.matrix_of(np.array(placement["rotate"])[-2:, -2:]),
             shear=float(placement["shear"][-1]),
-            affine=matrix_of(np.array(placement["affine"])[-3:, -3:]),
+            affine=about.matrix_of(np.array(placement["affine"])[-3:, -3:]),
         )
     layers = layers_of_result(result, frame, name, cells="cells" in looks)
     return [
-        (data, keywords | looks.get(layer_key(keywords), {}), kind)
+        (data, keywords | looks.get(about.layer_key(keywords), {}), kind)
         for data, keywords, kind in main_layers(layers, also={*looks, "image"})
     ]
 
@@ -113,7 +101,7 @@ def missing_layers(viewer: Any, layer: Any) -> list[FullLayerData]:
     """
     from napari_shadowinv._napari.stores import store_layers
 
-    facts = metadata_of(layer)
+    facts = about.metadata_of(layer)
     result, store = facts.get("result"), facts.get("store")
     if result is not None:
         layer_data = layers_of_result(result, frame_of(layer), str(facts.get("name", "")))
@@ -128,10 +116,11 @@ def missing_layers(viewer: Any, layer: Any) -> list[FullLayerData]:
     present = [
         layer
         for layer in viewer.layers
-        if metadata_of(layer).get("result") is result and metadata_of(layer).get("store") == store
+        if about.metadata_of(layer).get("result") is result
+        and about.metadata_of(layer).get("store") == store
     ]
-    keys = {layer_key(layer) for layer in present} | _shown_inputs(viewer, result)
-    missing = [entry for entry in layer_data if layer_key(entry[1]) not in keys]
+    keys = {about.layer_key(layer) for layer in present} | _shown_inputs(viewer, result)
+    missing = [entry for entry in layer_data if about.layer_key(entry[1]) not in keys]
     for _, keywords, _ in missing:
         keywords["visible"] = False
     return missing
@@ -145,12 +134,12 @@ def _shown_inputs(viewer: Any, result: Result[AnyResult] | None) -> set[str]:
         return set()
     planes: Any = getattr(content, "images", getattr(content, "image", None))
     shape = () if planes is None else tuple(planes.shape[-2:])
-    inputs = {SHOT: "image", SOURCE: "source", None: "image"}
+    inputs = {about.SHOT: "image", about.SOURCE: "source", None: "image"}
     return {
-        inputs[role_of(layer)]
+        inputs[about.role_of(layer)]
         for layer in viewer.layers
         if type(layer).__name__ == "Image"
-        and role_of(layer) in inputs
+        and about.role_of(layer) in inputs
         and tuple(layer.data.shape) == shape
     }
 
@@ -158,15 +147,15 @@ def _shown_inputs(viewer: Any, result: Result[AnyResult] | None) -> set[str]:
 def dataset_of_layers(layers: Sequence[FullLayerData], result: Result[AnyResult]) -> xarray.Dataset:
     """Return the dataset of a result with its layers' appearance and painted caustics."""
     content = result.content
-    looks = {layer_key(keywords): _look(keywords, kind) for _, keywords, kind in layers}
-    name = next((metadata_of(keywords).get("name") for _, keywords, _ in layers), None)
+    looks = {about.layer_key(keywords): _look(keywords, kind) for _, keywords, kind in layers}
+    name = next((about.metadata_of(keywords).get("name") for _, keywords, _ in layers), None)
     attributes = {**result.attributes, _LOOKS: json.dumps(looks, default=_plain)}
     if name is not None:
         attributes[_NAME] = name
     if not isinstance(content, Inversion):
         return content.to_dataset(attributes=attributes)
     for data, keywords, _ in layers:
-        if role_of(keywords) == "caustic":
+        if about.role_of(keywords) == "caustic":
             content = replace(content, caustic=np.asarray(data) > 0)
     return content.to_dataset(result.setup, attributes=attributes)
 
@@ -236,10 +225,10 @@ def _common_result(
     layers: Sequence[FullLayerData],
 ) -> tuple[list[FullLayerData], Result[AnyResult]]:
     results = {
-        id(result): result for layer in layers if (result := result_of(layer[1])) is not None
+        id(result): result for layer in layers if (result := about.result_of(layer[1])) is not None
     }
     if len(results) > 1:
-        names = [_name(layer) for layer in layers if result_of(layer[1]) is not None]
+        names = [_name(layer) for layer in layers if about.result_of(layer[1]) is not None]
         raise InputError(
             f"the layers belong to {len(results)} results ({_quote_names(names)}): select layers "
             "of one result and save the selected layers"
@@ -250,16 +239,16 @@ def _common_result(
             "expected at least one layer of an inversion; save other layers as images"
         )
     (common,) = results.values()
-    return [layer for layer in layers if result_of(layer[1]) is common], common
+    return [layer for layer in layers if about.result_of(layer[1]) is common], common
 
 
 def _warn_of_changes(layers: Sequence[FullLayerData], result: Result[AnyResult]) -> None:
     """Warn about layers whose data differ from the file."""
     images = [layer for layer in layers if layer[2] == "image"]
-    originals = {layer_key(layer[1]): layer[0] for layer in layers_of_result(result, Frame())}
+    originals = {about.layer_key(layer[1]): layer[0] for layer in layers_of_result(result, Frame())}
     changed = []
     for layer in images:
-        original: Any = originals.get(layer_key(layer[1]))
+        original: Any = originals.get(about.layer_key(layer[1]))
         if layer[0] is not original and not np.array_equal(layer[0], original, equal_nan=True):
             changed.append(_name(layer))
     if changed:

@@ -71,8 +71,7 @@ def two_energies() -> list[FullLayerData]:
     layers = []
     for seed, (setup, level) in enumerate(zip(setups, _FILMS.values(), strict=True)):
         # Fields displace in inverse proportion to the momentum.
-        displacement = truth * first.momentum / setup.momentum
-        image = _counts_image(displacement, level * beam, seed)
+        image = _counts_image(truth * first.momentum / setup.momentum, level * beam, seed)
         layers += radiograph_layers(Radiograph(image, setup=setup), f"{setup.energy:g} MeV")
     return layers
 

@@ -12,17 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv import io
-from napari_shadowinv._napari.layer_metadata import (
-    CAME_WITH,
-    MASK,
-    SHOT,
-    SOURCE,
-    Frame,
-    frame_for,
-    metadata_for,
-    metadata_of,
-    role_of,
-)
+from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.layer_metadata import Frame, frame_for, metadata_for, metadata_of
 from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import show_caution
@@ -47,14 +38,14 @@ def radiograph_layers(shot: Radiograph, name: str = "") -> list[FullLayerData]:
     facts = _facts(shot, f"the sample '{name}'" if shot.path is None else shot.path.name)
     if shot.source is not None:
         data, keywords, kind = shot_layer(
-            shot.source, f"{name} source", shot.setup, limits, SOURCE, frame=frame, **facts
+            shot.source, f"{name} source", shot.setup, limits, about.SOURCE, frame=frame, **facts
         )
         layers.append((data, {**keywords, "visible": False}, kind))
     if shot.mask is not None:
         keywords = {
             "name": f"{name} mask",
             "visible": False,
-            "metadata": metadata_for(MASK, "", shot.setup, **facts),
+            "metadata": metadata_for(about.MASK, "", shot.setup, **facts),
             **frame.keywords(stacked=False),
         }
         layers.append(((~shot.mask).astype(np.uint8), keywords, "labels"))
@@ -69,7 +60,7 @@ def shot_layer(
     name: str,
     setup: Setup | None,
     limits: tuple[float, float],
-    role: str | None = SHOT,
+    role: str | None = about.SHOT,
     *,
     frame: Frame | None = None,
     unit: str = "intensity",
@@ -91,7 +82,7 @@ def shot_layer(
 def _facts(shot: Radiograph, origin: str) -> dict[str, Any]:
     """Return the metadata of a file for its layers."""
     return {
-        "setup_origin": None if shot.setup is None else f"{CAME_WITH} {origin}",
+        "setup_origin": None if shot.setup is None else f"{about.CAME_WITH} {origin}",
         "file": dict(shot.metadata) or None,
         "warnings": list(shot.warnings) or None,
         "path": None if shot.path is None else str(shot.path),
@@ -125,7 +116,7 @@ def source_of_shot(
 ) -> Radiograph:
     """Return a layer's image as the source of a shot, without the file of another shot."""
     beam = radiograph_of(layer, image, plane)
-    if role_of(layer) != SOURCE or beam.path == shot.path:
+    if about.role_of(layer) != about.SOURCE or beam.path == shot.path:
         return beam
     # It came with another shot, whose file contains more than the source.
     return replace(beam, path=None, metadata={})

@@ -56,7 +56,10 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
         A figure with an Agg canvas; write it with `save_figure`.
     """
     count, *shape = fit.images.shape
-    kinds = _kinds(fit)
+    levels = fit.source.mean(axis=(1, 2), keepdims=True)
+    kinds = ["Image", "Re-projection", "Residual"]
+    if (np.abs(fit.source / levels - 1) >= _UNIFORM_TOLERANCE).any():
+        kinds.insert(0, "Beam")
     upright = count > _MAX_ROWS
     columns = count if upright else len(kinds)
     rows = len(kinds) if upright else count
@@ -75,13 +78,6 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
         for m, field in enumerate(fit.fields, start=rows):
             _draw_fitted(panels[m * columns : (m + 1) * columns], fit, field)
     return figure
-
-
-def _kinds(fit: Fit) -> tuple[str, ...]:
-    levels = fit.source.mean(axis=(1, 2), keepdims=True)
-    is_uniform = bool((np.abs(fit.source / levels - 1) < _UNIFORM_TOLERANCE).all())
-    usual = ("Image", "Re-projection", "Residual")
-    return usual if is_uniform else ("Beam", *usual)
 
 
 def _draw_image(panel: Panel, fit: Fit, k: int, kind: str, fact: Fact) -> None:

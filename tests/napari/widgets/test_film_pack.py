@@ -18,9 +18,9 @@ from qtpy.QtWidgets import QFileDialog
 
 from napari_shadowinv import read, write
 from napari_shadowinv._napari import packs
-from napari_shadowinv._napari.layer_metadata import role_of, setup_of, usable_of
+from napari_shadowinv._napari.layer_metadata import Frame, role_of, setup_of, usable_of
 from napari_shadowinv._napari.layers import add_layers
-from napari_shadowinv._napari.packs import BY_HAND, film_layers, pack_frame
+from napari_shadowinv._napari.packs import BY_HAND, film_layers
 from napari_shadowinv._napari.widgets.film_pack import FilmPack, NewPackDialog
 from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
@@ -319,7 +319,7 @@ def test_without_a_setup_films_know_how_strongly_they_are_displaced(
     viewer: ViewerModel, pack_doses: Any, qtbot: Any
 ) -> None:
     bare = replace(pack_doses, setups=())
-    add_layers(viewer, film_layers(bare, pack_frame(bare), "trio"))
+    add_layers(viewer, film_layers(bare, Frame(), "trio"))
     fit = FitImages(viewer)
     qtbot.addWidget(fit)
     fit.source.set_kind("unknown")
