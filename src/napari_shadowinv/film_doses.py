@@ -132,11 +132,6 @@ class FilmDoses:
         return np.asarray(magnifications / magnifications[0])
 
     @property
-    def has_data(self) -> BoolArray:
-        """Whether each film has usable pixels, shape (n,)."""
-        return np.asarray(self.usable.any(axis=(1, 2)))
-
-    @property
     def headline(self) -> Headline:
         """Warnings, number of films and their energies in one line."""
         texts = in_headline(self.cautions)
@@ -157,8 +152,9 @@ class FilmDoses:
             Fact("pixels", "Pixels", ", ".join(pixels)),
             Fact("seen_from", "Seen from", self.pack.seen_from_text),
         ]
-        if not self.has_data.all():
-            numbers = ", ".join(map(str, np.flatnonzero(~self.has_data) + 1))
+        excluded = np.flatnonzero(~self.usable.any(axis=(1, 2))) + 1
+        if excluded.size:
+            numbers = ", ".join(map(str, excluded))
             facts.append(Fact("excluded", "Excluded", f"film {numbers}"))
         for number, cells in enumerate(self.film_texts(), 1):
             text = ", ".join(
@@ -177,7 +173,7 @@ class FilmDoses:
         """Return number, energy and time of flight of a film in words."""
         cells = self._film_text(index)
         parts = [cells[name] for name in ("energy", "flight") if name in cells]
-        if not self.has_data[index]:
+        if not self.usable[index].any():
             parts.append("excluded")
         return f"film {index + 1}: {', '.join(parts)}"
 
@@ -193,7 +189,7 @@ class FilmDoses:
                 f"{1e12 * time:.3g} ps" if time < _MIN_TIME_IN_NS else f"{1e9 * time:.3g} ns"
             )
         usable = self.usable[k]
-        if not self.has_data[k]:
+        if not usable.any():
             return {**cells, "median dose": "", "usable": "0%", "shift": ""}
         dy, dx = self.shifts[k]
         return {

@@ -21,10 +21,8 @@ from napari_shadowinv.io.formats import PRADFORMAT, RADIOGRAPH_SUFFIXES, RESULT,
 if TYPE_CHECKING:
     from napari_shadowinv._napari.layers import FullLayerData
 
-ReaderFunction = Callable[[str | Sequence[str]], "list[Any]"]
 
-
-def get_reader(path: str | Sequence[str]) -> ReaderFunction | None:
+def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[Any]] | None:
     """Return the reader of a file, folder, pattern with ``*`` or list of files, or None."""
     if not isinstance(path, str):
         return read_paths if path and all(_is_image_name(Path(item)) for item in path) else None
