@@ -230,9 +230,8 @@ class View:
     deflector: str | None = None
 
     def has(self, kind: Kind) -> bool:
-        if kind.shown_of == ("shot" if self.shot is not None else "stack"):
-            return False
-        if not self.along_shots(kind.variable):
+        other = "shot" if self.shot is not None else "stack"
+        if kind.shown_of == other or not self.along_shots(kind.variable):
             return False
         if kind.role == "field arrows":
             return bool(self.field.arrows)

@@ -58,7 +58,7 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
     count, *shape = fit.images.shape
     levels = fit.source.mean(axis=(1, 2), keepdims=True)
     kinds = ["Image", "Re-projection", "Residual"]
-    if (np.abs(fit.source / levels - 1) >= _UNIFORM_TOLERANCE).any():
+    if not (np.abs(fit.source / levels - 1) < _UNIFORM_TOLERANCE).all():
         kinds.insert(0, "Beam")
     upright = count > _MAX_ROWS
     columns = count if upright else len(kinds)
