@@ -85,7 +85,7 @@ def test_the_next_forecast_follows_the_last_fit() -> None:
     pace = Pace()
     text = estimate.text(pace)
     assert text.startswith("3 images of 1000 × 1000 px, 2 fields: about 80 s, up to 5 min")
-    pace.learn(estimate, 3 * estimate.seconds)
+    pace.factor = 3.0
     assert "about 4 min, based on the last fit" in estimate.text(pace)
     single = estimate_fit_time((200, 200), 1, 1, "unknown", FitOptions())
     assert single.text(Pace()).startswith("one image of 200 × 200 px, unknown beam: about ")

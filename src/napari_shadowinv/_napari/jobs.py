@@ -63,15 +63,11 @@ def duration_in_words(seconds: float) -> str:
     return f"{seconds / _HOUR_S:.1f} h"
 
 
+@dataclass
 class Pace:
-    """Time of fits on this machine relative to the reference, from the last fit."""
+    """Time of the last fit on this machine relative to its estimate."""
 
-    def __init__(self) -> None:
-        self.factor: float | None = None
-
-    def learn(self, estimate: TimeEstimate, seconds: float) -> None:
-        """Update the factor from the measured time of a fit."""
-        self.factor = seconds / estimate.seconds
+    factor: float | None = None
 
 
 @dataclass(frozen=True)
@@ -299,7 +295,7 @@ class FitJob(ImageJob):
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
         fit = self.compute(lambda state: on_progress(self.progress.update(state)), should_stop)
-        PACE.learn(self.time_estimate, sum(fit.report.seconds.values()))
+        PACE.factor = sum(fit.report.seconds.values()) / self.time_estimate.seconds
         return fit
 
     def layers(self, content: Fit) -> list[FullLayerData]:
