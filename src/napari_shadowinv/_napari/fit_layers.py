@@ -122,6 +122,7 @@ def _image_layers(
     percent = np.where(fit.mask, 100 * fit.residual / np.array(means)[:, None, None], np.nan)
     content = {"reprojection": (fit.reprojection, grey), "residual": (percent, None)}
     if np.ptp(fit.source[0]):
+        # One plane unless the beams differ in more than their brightness.
         beams = fit.source / fit.source.mean(axis=(1, 2), keepdims=True)
         is_common = np.abs(beams - beams[0]).max() < _MAX_BEAM_DIFFERENCE
         content = {"source": (fit.source[:1] if is_common else fit.source, grey), **content}
