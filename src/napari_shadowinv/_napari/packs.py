@@ -88,13 +88,11 @@ def pack_layers(
     layers = []
     for kind in KINDS:
         metadata: dict[str, Any] = {**films, **facts, "result": result, "main": True}
-        data: AnyArray
-        look: dict[str, Any]
         if kind.type == "labels":
-            data = np.where(doses.usable, 0, EXCLUDED).astype(np.uint8)
+            data: AnyArray = np.where(doses.usable, 0, EXCLUDED).astype(np.uint8)
             if by_hand is not None:
                 data[by_hand] = BY_HAND
-            look = {"colormap": label_colours("#5dff5d", "#00c8ff"), "opacity": 0.5}
+            look: dict[str, Any] = {"colormap": label_colours("#5dff5d", "#00c8ff"), "opacity": 0.5}
         else:
             data = getattr(doses, kind.variable)
             limits = [_limits(film, used) for film, used in zip(data, doses.usable, strict=True)]

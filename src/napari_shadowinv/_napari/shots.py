@@ -106,7 +106,7 @@ def radiograph_of(layer: Any, image: Any, plane: int | None = None) -> Radiograp
     if plane is not None and len(paths) == len(layer.data):
         return replace(shot, path=Path(paths[plane]))
     # A plane split off a stack keeps the path of the first file.
-    if layer.ndim != 2 or len(metadata.get("paths", ())) > 1 or path is None:
+    if layer.ndim != 2 or len(paths) > 1 or path is None:
         return shot
     return replace(shot, path=Path(path), metadata=metadata.get("file") or {})
 
