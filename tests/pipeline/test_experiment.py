@@ -18,7 +18,6 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics.phantom_models import BlobRecipe, FourToroidsRecipe, ToroidRecipe
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup, toroid
 from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment, sweep_experiment
@@ -37,7 +36,7 @@ from napari_shadowinv.pipeline.experiment_result import (
     Spread,
     table_text,
 )
-from napari_shadowinv.pipeline.experiment_shots import Beam, Detector, ShotSimulator
+from napari_shadowinv.pipeline.experiment_shots import ExperimentInputs, ShotSimulator
 
 SETUP = paper_setup()
 SLOWER = SETUP.model_copy(update={"energy": 6.0})
@@ -55,9 +54,11 @@ def simulator(
 ) -> ShotSimulator:
     recipe = ToroidRecipe(peak=30, radius=12e-6)
     target = target or object_of_phantom(recipe, SETUP, (64, 64))
-    prior = BeamPrior(rms=instrument.beam_rms or 0.0, length=instrument.beam_length)
-    beam = Beam(counts, structure, structure > 0, 1e12, prior)
-    return ShotSimulator(target, [SETUP], (64, 64), beam, Detector((psf,), instrument), seed)
+    options = ExperimentOptions(counts=counts, psf=psf, seed=seed)
+    if structure:
+        changes = {"reference": "recorded", "reference_counts": 1e12, "beam_structure": structure}
+        options = options.model_copy(update=changes)
+    return ShotSimulator(ExperimentInputs(target, (SETUP,), (64, 64), instrument, options))
 
 
 def image_of(instrument: Instrument = EXACT, number: int = 0, **choices) -> NDArray[np.float64]:

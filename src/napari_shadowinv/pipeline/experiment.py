@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +27,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Fit, FitShot, fit
 from napari_shadowinv.fitting.compilation import ensure_compiled as ensure_fit_compiled
-from napari_shadowinv.fitting.shots import NearField, point_spread
+from napari_shadowinv.fitting.shots import NearField
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.budget import Errors
 from napari_shadowinv.inversion.compilation import ensure_compiled as ensure_inversion_compiled
@@ -45,8 +45,7 @@ from napari_shadowinv.pipeline.experiment_result import (
     percent,
 )
 from napari_shadowinv.pipeline.experiment_shots import (
-    Beam,
-    Detector,
+    ExperimentInputs,
     ShotSimulator,
     SimulatedShots,
 )
@@ -235,43 +234,9 @@ def _shifted(on_progress: OnProgress, number: int, count: int) -> OnProgress:
     return report
 
 
-@dataclass(frozen=True)
-class _Inputs:
-    """Checked inputs of a plan."""
-
-    object: PlannedObject
-    setups: tuple[Setup | None, ...]
-    shape: tuple[int, int]
-    instrument: Instrument
-    options: ExperimentOptions
-
-    @property
-    def is_fit(self) -> bool:
-        if self.options.method == "automatic":
-            return len(self.setups) > 1
-        return self.options.method == "fit"
-
-    @property
-    def fitted_instrument(self) -> Instrument:
-        """The instrument with the beam that is assumed, which a fit takes as exact otherwise."""
-        instrument = self.instrument
-        if instrument.beam_rms is not None or self.options.is_recorded:
-            return instrument
-        return Instrument(
-            **{**instrument.stated, "beam_rms": instrument.beam_of(measured=False).rms}
-        )
-
-    @property
-    def psf(self) -> tuple[float, ...]:
-        """Known point spread of each image, px."""
-        options = self.options
-        if options.psf is not None or self.setups == (None,):
-            return (options.psf or 0.0,) * len(self.setups)
-        lengths = options.source_size or 0.0, options.resolution or 0.0
-        return tuple(point_spread(setup, *lengths) for setup in self.setups if setup is not None)
-
-
-def _checked_inputs(object: Any, setups: Any, shape: Any, instrument: Any, options: Any) -> _Inputs:
+def _checked_inputs(
+    object: Any, setups: Any, shape: Any, instrument: Any, options: Any
+) -> ExperimentInputs:
     options = as_model(ExperimentOptions, options, "options")
     instrument = as_model(Instrument, instrument, "instrument")
     check_instance(object, (PlannedObject, PhantomRecipe), "object")
@@ -291,12 +256,12 @@ def _checked_inputs(object: Any, setups: Any, shape: Any, instrument: Any, optio
     size = int(size[0]), int(size[1])
     if is_phantom:
         object = object_of_phantom(object, listed[0], size)
-    inputs = _Inputs(object, listed, size, instrument, options)
+    inputs = ExperimentInputs(object, listed, size, instrument, options)
     _refuse_unsuitable(inputs)
     return inputs
 
 
-def _refuse_unsuitable(inputs: _Inputs) -> None:
+def _refuse_unsuitable(inputs: ExperimentInputs) -> None:
     options, instrument, setups = inputs.options, inputs.instrument, inputs.setups
     if options.method == "inversion" and len(setups) > 1:
         raise InputError(
@@ -324,14 +289,14 @@ def _refuse_unsuitable(inputs: _Inputs) -> None:
             "received a noise correlation, but simulated pixels have independent noise: leave it "
             "out"
         )
-    if instrument.beam_of(measured=options.is_recorded).components is not None:
+    if inputs.beam.components is not None:
         raise InputError(
             "received a beam with components of references, which is not simulated: state its "
             "r.m.s. and its length"
         )
 
 
-def _with_value(inputs: _Inputs, quantity: str, value: float) -> _Inputs:
+def _with_value(inputs: ExperimentInputs, quantity: str, value: float) -> ExperimentInputs:
     """Return inputs with another value of a quantity."""
     owner, name = SWEPT[quantity].owner, _FIELDS.get(quantity, quantity)
     if owner == "options":
@@ -362,11 +327,11 @@ def _with_value(inputs: _Inputs, quantity: str, value: float) -> _Inputs:
     return changed
 
 
-def _plan(inputs: _Inputs, report: Reporter) -> ExperimentPlan:
+def _plan(inputs: ExperimentInputs, report: Reporter) -> ExperimentPlan:
     start = time.perf_counter()
     options = inputs.options
     report("draws", 0, options.draws)
-    simulator = _simulator(inputs)
+    simulator = ShotSimulator(inputs)
     if float(np.abs(simulator.truth).max()) < _MIN_DISPLACEMENT_PX:
         raise InputError(
             "the object displaces rays by nothing in this experiment: check its strength, the "
@@ -381,7 +346,7 @@ def _plan(inputs: _Inputs, report: Reporter) -> ExperimentPlan:
 
     def draw_all(numbers: range, near: Fit | None) -> Iterator[_Retrieved]:
         def compute(number: int) -> _Retrieved:
-            return retrieve(inputs, simulator, number, near, report.should_stop)
+            return retrieve(simulator, number, near, report.should_stop)
 
         with ThreadPoolExecutor(available_threads(options.threads)) as pool:
             tasks = [pool.submit(compute, number) for number in numbers]
@@ -420,19 +385,6 @@ def _tally(shots: Sequence[PlannedShot]) -> str:
     return f"error made {error}, determined {determined} of {len(shots)}"
 
 
-def _simulator(inputs: _Inputs) -> ShotSimulator:
-    options, instrument = inputs.options, inputs.instrument
-    beam = Beam(
-        counts=options.counts,
-        structure=options.beam_structure,
-        is_recorded=options.is_recorded,
-        reference_counts=options.reference_counts or options.counts,
-        prior=instrument.beam_of(measured=options.is_recorded),
-    )
-    detector = Detector(inputs.psf, instrument)
-    return ShotSimulator(inputs.object, inputs.setups, inputs.shape, beam, detector, options.seed)
-
-
 class _Retrieved(NamedTuple):
     """The outcome of a draw, with its images and the displacement that was retrieved."""
 
@@ -443,13 +395,12 @@ class _Retrieved(NamedTuple):
 
 
 def _inverted(
-    inputs: _Inputs,
     simulator: ShotSimulator,
     number: int,
     near: Fit | None,
     should_stop: ShouldStop | None,
 ) -> _Retrieved:
-    shots = simulator.draw(number)
+    inputs, shots = simulator.inputs, simulator.draw(number)
     options, (setup,) = inputs.options, inputs.setups
     # An inversion does not correct the known point spread: it adds to the unknown one.
     blur = float(np.hypot(inputs.instrument.blur, inputs.psf[0]))
@@ -474,13 +425,12 @@ def _inverted(
 
 
 def _fitted(
-    inputs: _Inputs,
     simulator: ShotSimulator,
     number: int,
     near: Fit | None,
     should_stop: ShouldStop | None,
 ) -> _Retrieved:
-    shots = simulator.draw(number)
+    inputs, shots = simulator.inputs, simulator.draw(number)
     options, setups = inputs.options, inputs.setups
     images = [
         FitShot(image, setup=setup, psf=psf, measured=options.is_recorded)
@@ -520,7 +470,7 @@ def _fitted(
     return _Retrieved(shot, shots.images, displacement, result)
 
 
-def _fields_of(inputs: _Inputs) -> tuple[str, ...]:
+def _fields_of(inputs: ExperimentInputs) -> tuple[str, ...]:
     """Return the key of the cause of the deflection."""
     setup = inputs.setups[0]
     cause = inputs.object.cause(setup)
@@ -556,7 +506,7 @@ def _parts_of(errors: Errors) -> dict[str, float]:
     return parts
 
 
-def _fit_errors(result: Fit, inputs: _Inputs) -> tuple[dict[str, float], float, Verdict]:
+def _fit_errors(result: Fit, inputs: ExperimentInputs) -> tuple[dict[str, float], float, Verdict]:
     """Return the parts of a fit's error, the total, and the verdict, with the energy's error."""
     report = result.report
     if np.isnan(report.uncertainty):
@@ -574,10 +524,9 @@ def _fit_errors(result: Fit, inputs: _Inputs) -> tuple[dict[str, float], float, 
     return parts, total, verdict
 
 
-def _scales_of(result: Fit, inputs: _Inputs) -> dict[str, float]:
+def _scales_of(result: Fit, inputs: ExperimentInputs) -> dict[str, float]:
     """Return standard deviations of the instrument's numbers over those that were stated."""
-    instrument = inputs.instrument
-    beam = instrument.beam_of(measured=inputs.options.is_recorded)
+    instrument, beam = inputs.instrument, inputs.beam
     stated = {
         "beam": beam.rms,
         "beam_between": beam.between,

@@ -1,5 +1,7 @@
 """Simulated shots of a planned experiment: `ShotSimulator`, which draws `SimulatedShots`.
 
+- the object and the stated quality of the experiment: `ExperimentInputs`
+
 The chain from the beam to the counts has its own imperfections, drawn from the stated instrument;
 none of it uses the models by which inversions and fits judge them. Rays start at nine samples a
 pixel, and each sample is cut into nine tiles; light that enters from beyond the edge is in it.
@@ -12,7 +14,6 @@ one is changed.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,10 +21,12 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.shots import point_spread
 from napari_shadowinv.options import BeamPrior, Instrument
 from napari_shadowinv.physics.projection import displacement_ratio
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline.experiment_object import Grid, PlannedObject
+from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 
 _FINER = 3  # samples along a side of a pixel
 _NEGLIGIBLE = 1e-12  # of the largest variance
@@ -52,36 +55,42 @@ _STREAMS = (
 
 
 @dataclass(frozen=True)
-class Beam:
-    """The beam of an experiment.
+class ExperimentInputs:
+    """Checked inputs of a plan; a setup of None stands for one image in pixels."""
 
-    Attributes
-    ----------
-    counts : float
-        Mean counts a pixel without the object.
-    structure : float
-        Relative r.m.s. of the structure that a reference records.
-    is_recorded : bool
-        Whether a reference is recorded.
-    reference_counts : float
-        Mean counts a pixel of the reference.
-    prior : BeamPrior
-        Of the difference of beam and reference, or of the beam and a uniform one.
-    """
-
-    counts: float
-    structure: float
-    is_recorded: bool
-    reference_counts: float
-    prior: BeamPrior
-
-
-@dataclass(frozen=True)
-class Detector:
-    """The stated point spread of each image (standard deviations in px), and the instrument."""
-
-    psf: tuple[float, ...]
+    object: PlannedObject
+    setups: tuple[Setup | None, ...]
+    shape: tuple[int, int]
     instrument: Instrument
+    options: ExperimentOptions
+
+    @property
+    def is_fit(self) -> bool:
+        """Whether the images are fitted, not inverted."""
+        if self.options.method == "automatic":
+            return len(self.setups) > 1
+        return self.options.method == "fit"
+
+    @property
+    def beam(self) -> BeamPrior:
+        """Expected difference of beam and reference, or of the beam and a uniform one."""
+        return self.instrument.beam_of(measured=self.options.is_recorded)
+
+    @property
+    def fitted_instrument(self) -> Instrument:
+        """The instrument with the beam that is assumed, which a fit takes as exact otherwise."""
+        if self.instrument.beam_rms is not None or self.options.is_recorded:
+            return self.instrument
+        return Instrument(**{**self.instrument.stated, "beam_rms": self.beam.rms})
+
+    @property
+    def psf(self) -> tuple[float, ...]:
+        """Known point spread of each image, px."""
+        options = self.options
+        if options.psf is not None or self.setups == (None,):
+            return (options.psf or 0.0,) * len(self.setups)
+        lengths = options.source_size or 0.0, options.resolution or 0.0
+        return tuple(point_spread(setup, *lengths) for setup in self.setups if setup is not None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,47 +118,33 @@ class ShotSimulator:
 
     Parameters
     ----------
-    object : PlannedObject
-        The object.
-    setups : sequence of Setup, or of None
-        The experiment of each image; None for one image in pixels.
-    shape : tuple of int
-        Height and width in px.
-    beam, detector
-        Stated quality of the experiment.
-    seed : int
-        Of all random choices.
+    inputs : ExperimentInputs
+        The object, and the stated quality of the experiment.
     """
 
-    def __init__(
-        self,
-        object: PlannedObject,
-        setups: Sequence[Setup | None],
-        shape: tuple[int, int],
-        beam: Beam,
-        detector: Detector,
-        seed: int,
-    ) -> None:
-        self._object, self._setups, self._beam, self._detector = object, setups, beam, detector
-        self._seed = seed
+    def __init__(self, inputs: ExperimentInputs) -> None:
+        self.inputs = inputs
+        self._object, self._setups, self._beam = inputs.object, inputs.setups, inputs.beam
         self._roots_by_length: dict[float, list[tuple[FloatArray, float]]] = {}
-        coarse = [object.displacement(setup, Grid(shape)) for setup in setups]
+        shape = inputs.shape
+        coarse = [self._object.displacement(setup, Grid(shape)) for setup in self._setups]
         reach = max(float(np.abs(moved).max()) for moved in coarse)
         margin = min(math.ceil(reach) + _BEYOND_PX, max(shape) // 2)
         self._grid = Grid(shape, _FINER, margin)
-        self._nominal = [object.displacement(setup, self._grid) for setup in setups]
+        self._nominal = [self._object.displacement(setup, self._grid) for setup in self._setups]
         self.truth = coarse[0]
 
     def draw(self, number: int) -> SimulatedShots:
         """Return the shots of a draw; the same number gives the same shots."""
+        inputs, options, grid = self.inputs, self.inputs.options, self._grid
+        instrument, beam = inputs.instrument, self._beam
         streams = {
-            name: np.random.default_rng([self._seed, number, stream])
+            name: np.random.default_rng([options.seed, number, stream])
             for stream, name in enumerate(_STREAMS)
         }
-        beam, grid, instrument = self._beam, self._grid, self._detector.instrument
         scale = self._energy_factor(streams["energy"])
-        structure = 1 + self._wave(streams["structure"], beam.structure)
-        common = structure * (1 + self._wave(streams["beam"], beam.prior.rms))
+        structure = 1 + self._wave(streams["structure"], options.beam_structure)
+        common = structure * (1 + self._wave(streams["beam"], beam.rms))
         common = common * (1 + self._absorption(streams["absorption"]))
         open_share = self._open_share
         admixture = instrument.other_field * streams["other_field"].normal()
@@ -157,7 +152,7 @@ class ShotSimulator:
         exponent = max(1 + instrument.gamma * streams["gamma"].normal(), _LEAST_EXPONENT)
 
         def counts(flux: FloatArray, image: int, mean: float, noise: str) -> FloatArray:
-            blur = math.hypot(self._detector.psf[image], width)
+            blur = math.hypot(inputs.psf[image], width)
             flux = gaussian_filter(flux, blur, mode="nearest")
             level = instrument.background * streams["background"].normal()
             recorded = np.maximum(grid.inner(flux), 0) ** exponent + level
@@ -165,7 +160,7 @@ class ShotSimulator:
 
         images = []
         for image, setup in enumerate(self._setups):
-            between = beam.prior.between if image else 0.0
+            between = beam.between if image else 0.0
             light = common * (1 + self._wave(streams["between"], between))
             light = np.maximum(light, _DIMMEST) * open_share
             displacement = self._nominal[image] * (
@@ -174,15 +169,15 @@ class ShotSimulator:
             if image:
                 displacement = self._misaligned(displacement, streams["alignment"])
             flux = self._object.image(light, displacement, grid)
-            images.append(counts(flux, image, beam.counts, "counts"))
+            images.append(counts(flux, image, options.counts, "counts"))
         source, noise = None, 0.0
-        if beam.is_recorded:
+        if options.is_recorded:
             reference = self._moved(structure * open_share, streams["registration"])
-            counted = counts(reference, 0, beam.reference_counts, "reference")
-            source, noise = counted / beam.reference_counts, 1 / beam.reference_counts
-            source, noise = beam.counts * source, beam.counts * noise
+            level = options.reference_counts or options.counts
+            counted = counts(reference, 0, level, "reference")
+            source, noise = options.counts * (counted / level), options.counts * (1 / level)
         elif self._object.shadow is not None:
-            source = beam.counts * grid.inner(grid.in_pixels(open_share))
+            source = options.counts * grid.inner(grid.in_pixels(open_share))
         return SimulatedShots(np.stack(images), source, noise)
 
     @cached_property
@@ -193,7 +188,7 @@ class ShotSimulator:
 
     def _energy_factor(self, rng: np.random.Generator):  # type: ignore[no-untyped-def]
         """Return the displacement of an image over that at its stated energy."""
-        error = 1 + self._detector.instrument.energy * rng.normal()
+        error = 1 + self.inputs.instrument.energy * rng.normal()
         error = max(error, _DIMMEST)
 
         def factor(setup: Setup | None) -> float:
@@ -222,7 +217,7 @@ class ShotSimulator:
         if not rms:
             return np.zeros(self._grid.sizes)
         if length is None:
-            length = self._beam.prior.length * min(self._grid.shape)
+            length = self._beam.length * min(self._grid.shape)
         (along_y, mean_y), (along_x, mean_x) = self._roots(length)
         field = along_y @ rng.normal(size=(along_y.shape[1], along_x.shape[1])) @ along_x.T
         # The mean over the image takes a share of the variance.
@@ -250,7 +245,7 @@ class ShotSimulator:
 
     def _absorption(self, rng: np.random.Generator) -> FloatArray:
         """Smooth noise of the object's size inside the object."""
-        rms = self._detector.instrument.absorption
+        rms = self.inputs.instrument.absorption
         if not rms:
             return np.zeros(self._grid.sizes)
         size = np.hypot(*self._nominal[0])
@@ -262,13 +257,13 @@ class ShotSimulator:
 
     def _misaligned(self, displacement: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Displacement onto a detector that is shifted, turned and scaled by random numbers."""
-        if not self._detector.instrument.registration:
+        if not self.inputs.instrument.registration:
             return displacement
         return displacement + self._motion(displacement + self._grid.places(), rng)
 
     def _moved(self, reference: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Reference in pixels, out of register with the image."""
-        if not self._detector.instrument.registration:
+        if not self.inputs.instrument.registration:
             return self._grid.in_pixels(reference)
         places = self._grid.places()
         moved = places + self._motion(places, rng)
@@ -281,5 +276,5 @@ class ShotSimulator:
         height, width = self._grid.shape
         corner = np.hypot(height, width) / 2
         y, x = (places[0] - (height - 1) / 2) / corner, (places[1] - (width - 1) / 2) / corner
-        down, right, turn, scale = self._detector.instrument.registration * rng.normal(size=4)
+        down, right, turn, scale = self.inputs.instrument.registration * rng.normal(size=4)
         return np.stack([down + turn * x + scale * y, right - turn * y + scale * x])
