@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import ProtonSetup, Setup
     from napari_shadowinv.physics.tracing import TracedImage
-    from napari_shadowinv.pipeline.rerun import Rerun, RerunInputs
 
     Fields = Mapping[str, FloatArray]
 
@@ -197,6 +196,7 @@ def rerun(
 
     With the same files and version, the result is identical bit for bit.
     """
+    from napari_shadowinv.cli import _fit_result
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, suffixes_for
     from napari_shadowinv.pipeline.rerun import collect_rerun
 
@@ -205,15 +205,31 @@ def rerun(
     suffixes = suffixes_for(ResultKind.INVERSION)
     _inputs.check_outputs({again_out: suffixes, figure: FIGURE_SUFFIXES}, overwrite)
     inputs = collect_rerun(result, image, source=source, other_folders=other_folders)
-    check_rerun(inputs, result, again_out, figure, overwrite)
+    _inputs.check_outputs({again_out: suffixes_for(inputs.kind)}, overwrite)
+    figures = _fit_result.static_figures(figure, **inputs.checks)
+    _inputs.check_outputs(dict.fromkeys(figures, FIGURE_SUFFIXES), overwrite)
+    _inputs.protect([again_out, figure, *figures], [result, *inputs.files])
     warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in inputs.shots)
     with work_callbacks(quiet) as callbacks:
         again = inputs.run(**callbacks)
     names = [str(file) for file in inputs.files[: len(inputs.shots)]] or [str(result)]
     _inputs.write_result(again.content, names, again_out, figure, overwrite, again.checks)
+    content: Any = again.content
     if not quiet:
-        say(rerun_table(again, names, [again_out, figure]))
-    exit_unless_sound(again, again_out)
+        rows = [
+            *[("file", name) for name in names],
+            *[("changed", text) for text in again.changes or ("nothing",)],
+            ("difference", again.difference),
+            headline_row(content.headline),
+            *fact_rows(content.facts),
+            *written_rows([again_out, figure]),
+        ]
+        say(two_columns("Rerun", rows))
+    _fit_result.exit_unless_static(again.checks, again_out)
+    if content.kind is ResultKind.INVERSION:
+        exit_unless_converged(content.report, again_out)
+    elif content.kind is ResultKind.FIT:
+        _fit_result.exit_unless_determined(content, again_out)
 
 
 FORWARD_EPILOG = """
@@ -366,13 +382,16 @@ def demo(
     flags = {} if n_sites is None else {"n_sites": n_sites}
     chosen = _inputs.recipe_from(flags, None, None, clip_negative=True)
     make_folder(out)
+    from napari_shadowinv.physics.beam import displacement_from_potential
     from napari_shadowinv.physics.phantoms import paper_setup
+    from napari_shadowinv.physics.poisson import poisson_invert
     from napari_shadowinv.preprocessing import Radiograph
 
     setup = paper_setup()
     image, truth = simulate_shot(setup, dm, noise)
     inversion = invert_shot(chosen.model_copy(update={"setup": setup}), Radiograph(image))
-    fields = fields_to_compare(image, truth, inversion)
+    poisson = displacement_from_potential(poisson_invert(image))
+    fields = {"True": truth, "Retrieved": inversion.displacement, "Poisson": poisson}
     written = write_demo(out, f"toroid_{dm:g}", inversion, setup, fields)
     say(demo_table(inversion, setup, fields, written))
     exit_unless_converged(inversion.report, written[0])
@@ -389,15 +408,6 @@ def simulate_shot(setup: ProtonSetup, dm: float, noise: float) -> tuple[FloatArr
     image = synthetic_image(truth)
     grain = np.random.default_rng(0).normal(size=image.shape)
     return image + noise * image.mean() * grain, truth
-
-
-def fields_to_compare(image: FloatArray, truth: FloatArray, inversion: Inversion) -> Fields:
-    """Return three displacements: the truth, the inversion, and a linear inversion."""
-    from napari_shadowinv.physics.beam import displacement_from_potential
-    from napari_shadowinv.physics.poisson import poisson_invert
-
-    poisson = displacement_from_potential(poisson_invert(image))
-    return {"True": truth, "Retrieved": inversion.displacement, "Poisson": poisson}
 
 
 def write_demo(
@@ -603,43 +613,3 @@ def predict_image(
         f"From {setup_text(recorded_with)} to {setup_text(target)}, assuming that only a {name} "
         "deflects the beam"
     )
-
-
-def check_rerun(
-    inputs: RerunInputs, result: Path, out: Path, figure: Path, overwrite: bool
-) -> None:
-    """Refuse, before any work, outputs that cannot be written or would replace an input."""
-    from napari_shadowinv.cli._fit_result import static_figures
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, suffixes_for
-
-    _inputs.check_outputs({out: suffixes_for(inputs.kind)}, overwrite)
-    figures = static_figures(figure, left_out=inputs.has_left_out, window=inputs.window)
-    _inputs.check_outputs(dict.fromkeys(figures, FIGURE_SUFFIXES), overwrite)
-    _inputs.protect([out, figure, *figures], [result, *inputs.files])
-
-
-def rerun_table(again: Rerun, names: Sequence[str], written: list[Path]) -> Table:
-    """Build the table of a repeated result: the changes since the first one, and its facts."""
-    rows = [
-        *[("file", name) for name in names],
-        *[("changed", text) for text in again.changes or ("nothing",)],
-        ("difference", again.difference),
-        headline_row(again.content.headline),
-        *fact_rows(again.content.facts),
-        *written_rows(written),
-    ]
-    return two_columns("Rerun", rows)
-
-
-def exit_unless_sound(again: Rerun, out: Path) -> None:
-    """Exit with an error code if an inversion did not converge or a fit is not determined."""
-    from napari_shadowinv.cli._fit_result import exit_unless_determined, exit_unless_static
-
-    exit_unless_static(again.checks, out)
-    exits: dict[ResultKind, Callable[[Any, Path], None]] = {
-        ResultKind.INVERSION: lambda inversion, out: exit_unless_converged(inversion.report, out),
-        ResultKind.FIT: exit_unless_determined,
-    }
-    exit_unless = exits.get(again.content.kind)
-    if exit_unless is not None:
-        exit_unless(again.content, out)

@@ -111,15 +111,11 @@ class RerunInputs:
         return ResultKind.from_noun(self.provenance.kind)
 
     @property
-    def has_left_out(self) -> bool:
-        """Whether the first result has the images of a fit left out one by one."""
-        return "left_out_chi2" in self.dataset
-
-    @property
-    def window(self) -> int | None:
-        """Number of images in a window of a fit; None if it has no windows."""
+    def checks(self) -> dict[str, Any]:
+        """Keywords of `run_checks` for the checks of a fit that the first result has."""
         numbers = self.dataset.get(f"{PREFIX}image_number")
-        return None if numbers is None else int(numbers.sizes["member"])
+        window = None if numbers is None else int(numbers.sizes["member"])
+        return {"left_out": "left_out_chi2" in self.dataset, "window": window}
 
     def run(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
@@ -169,14 +165,7 @@ class RerunInputs:
             setup = self.provenance.image.setup
             return run_refinement(inversion, setup, choices, **callbacks), StaticChecks()
         fit = run_fit(self.recipe, self.shots, **callbacks)
-        checks = run_checks(
-            self.recipe,
-            self.shots,
-            fit,
-            left_out=self.has_left_out,
-            window=self.window,
-            **callbacks,
-        )
+        checks = run_checks(self.recipe, self.shots, fit, **self.checks, **callbacks)
         assert fit.provenance is not None
         provenance = self._with_masks(fit.provenance)
         if self.provenance.fiducial_rows is not None:
