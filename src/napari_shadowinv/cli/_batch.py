@@ -1,6 +1,6 @@
 """Output of the commands for many shots.
 
-- progress and summary of `shadowinv batch`: `run_batch`; of `shadowinv merge`: `run_merge`
+- progress and summary of `shadowinv batch`: `run_batch`; the rows of a summary: `summary_rows`
 - a line for each shot of `shadowinv watch`, and a summary: `run_watch`
 - the tables of `shadowinv status`: `status_tables`
 """
@@ -97,7 +97,8 @@ def run_batch(
     if run.part is None:
         _check_store(out, resume, run.overwrite)
     try:
-        with _ProgressBar(quiet) as bar:
+        bar = _ProgressBar(quiet)
+        with bar.bars:
             run_stack(
                 shots[0] if len(shots) == 1 else shots,
                 out,
@@ -115,7 +116,7 @@ def run_batch(
         raise typer.Exit(cancel_exit_code()) from None
     store = _store_of(run, out)
     if not quiet:
-        say(two_columns("Batch", _summary_rows(store, *_run_rows(run, bar.status))))
+        say(two_columns("Batch", summary_rows(store, *_run_rows(run, bar.status))))
     exit_unless_reliable(store)
 
 
@@ -134,17 +135,6 @@ def _run_rows(run: RunOptions, status: RunStatus | None) -> Rows:
         text = f"{status.ended} shots in {status.seconds:.1f} s, {_rate_text(status)}"
     shard = [] if run.shard is None else [("shard", f"{run.shard}; merge the store after the last")]
     return [("this run", text), *shard]
-
-
-def run_merge(store: Path, quiet: bool) -> None:
-    """Complete a store that was written in shards, and print a summary."""
-    from napari_shadowinv.stack import merge_stack
-
-    merge_stack(store)
-    merged = StackStore(store)
-    if not quiet:
-        say(two_columns("Merge", _summary_rows(merged)))
-    exit_unless_reliable(merged)
 
 
 def exit_unless_reliable(store: StackStore) -> None:
@@ -211,27 +201,20 @@ class _ProgressBar:
         self._console = Console(stderr=True)
         self._quiet = quiet
         hidden = quiet or not self._console.is_terminal
-        self._bars = progress.Progress(
+        self.bars = progress.Progress(
             *progress_columns(), console=self._console, disable=hidden, expand=True
         )
         fields: dict[str, Any] = {"rate": "", "remaining": "", "failed": "", "last": ""}
-        self._task = self._bars.add_task("starting", total=None, **fields)
+        self._task = self.bars.add_task("starting", total=None, **fields)
         self.status: RunStatus | None = None
-
-    def __enter__(self) -> _ProgressBar:
-        self._bars.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bars.stop()
 
     def update(self, status: RunStatus) -> None:
         if status.stage:
-            self._bars.update(self._task, description=status.stage)
+            self.bars.update(self._task, description=status.stage)
             return
         self.status, outcome = status, status.outcome
         last = "" if outcome is None else f"{status.name}, {outcome.seconds:.1f} s"
-        self._bars.update(
+        self.bars.update(
             self._task,
             description=status.engine,
             total=status.total,
@@ -254,7 +237,8 @@ def _counts_text(store: StackStore) -> str:
     return ", ".join(f"{counts[name]} {name}" for name in names)
 
 
-def _summary_rows(store: StackStore, *run: tuple[str, str]) -> Rows:
+def summary_rows(store: StackStore, *run: tuple[str, str]) -> Rows:
+    """Describe the shots of a store after a run."""
     return [
         ("shots", _counts_text(store)),
         *run,

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from napari_shadowinv.cli import _flags, _inputs
-from napari_shadowinv.cli._summary import two_columns, written_rows
+from napari_shadowinv.cli._summary import fact_rows, two_columns, written_rows
 from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups, work_callbacks
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.io.formats import IMAGE_TITLES
@@ -111,7 +111,7 @@ def fit(
     """
     from napari_shadowinv.cli import _fit_result
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, suffixes_for
-    from napari_shadowinv.pipeline import write_recipe
+    from napari_shadowinv.pipeline import run_fit, write_recipe
     from napari_shadowinv.pipeline.fit_run import read_row_images
     from napari_shadowinv.pipeline.shot_table import shot_rows
     from napari_shadowinv.pipeline.static_checks import run_checks
@@ -149,7 +149,8 @@ def fit(
     if compare:
         result_fit = _fit_result.compare_fields(chosen, shots, quiet, written=flags.get("fields"))
     else:
-        result_fit = _fit_result.fit_images(chosen, shots, quiet)
+        with work_callbacks(quiet) as callbacks:
+            result_fit = run_fit(chosen, shots, **callbacks)
     with work_callbacks(quiet) as callbacks:
         named = [replace(shot, name=name) for shot, name in zip(shots, short, strict=True)]
         static = run_checks(chosen, named, result_fit, **checks, **callbacks)
@@ -159,8 +160,9 @@ def fit(
         (common,) = setups if len(setups) == 1 else (None,)
         write_recipe(save_recipe, chosen.model_copy(update={"setup": common}), overwrite=overwrite)
     if not quiet:
-        for table in _fit_result.check_tables(static):
-            say(table)
+        for title, check in (("Left out", static.left_out), ("Windows", static.windows)):
+            if check is not None:
+                say(two_columns(title, fact_rows(check.facts)))
         say(two_columns("Fit", [*_fit_result.fit_rows(result_fit, names), *written_rows(outputs)]))
     _fit_result.exit_unless_static(static, result)
     _fit_result.exit_unless_determined(result_fit, result)

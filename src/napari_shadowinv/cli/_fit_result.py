@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -14,7 +14,6 @@ from napari_shadowinv.cli._summary import (
     options_text,
     setup_text,
     size_text,
-    two_columns,
 )
 from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
@@ -34,14 +33,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.pipeline.static_checks import StaticChecks
     from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.provenance import Provenance
-
-
-def fit_images(recipe: Recipe, shots: Sequence[FitShot], quiet: bool) -> Fit:
-    """Fit fields to images, with a bar for each stage."""
-    from napari_shadowinv.pipeline import run_fit
-
-    with work_callbacks(quiet) as callbacks:
-        return run_fit(recipe, shots, **callbacks)
 
 
 def compare_fields(
@@ -191,16 +182,6 @@ def check_figures(checks: StaticChecks, report: Path, title: str) -> dict[Path, 
     if checks.windows is not None:
         figures[windows] = windows_figure(checks.windows, title=title)
     return figures
-
-
-def check_tables(checks: StaticChecks) -> list[Table]:
-    """Return a table for each check."""
-    results: dict[str, Any] = {"Left out": checks.left_out, "Windows": checks.windows}
-    return [
-        two_columns(title, fact_rows(result.facts))
-        for title, result in results.items()
-        if result is not None
-    ]
 
 
 def exit_unless_static(checks: StaticChecks, out: Path) -> None:

@@ -16,7 +16,9 @@ from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._summary import (
     fact_rows,
     headline_row,
+    provenance_rows,
     setup_text,
+    size_text,
     two_columns,
     written_rows,
 )
@@ -128,7 +130,6 @@ def invert(
     Writes potential, displacement, re-projection, residual and all options to one file,
     and a figure next to it.
     """
-    from napari_shadowinv.cli._summary import summary
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, suffixes_for
     from napari_shadowinv.pipeline import write_recipe
     from napari_shadowinv.pipeline.files import read_part
@@ -160,7 +161,15 @@ def invert(
     if save_recipe is not None:
         write_recipe(save_recipe, chosen, overwrite=overwrite)
     if not quiet:
-        say(summary(inversion, shot, outputs))
+        rows = [
+            headline_row(inversion.headline),
+            ("image", f"{shot.path}, {size_text(inversion.image)}"),
+            *provenance_rows(inversion.provenance),
+            ("setup", setup_text(inversion.setup, shot, inversion.image.shape)),
+            *fact_rows(inversion.facts),
+            *written_rows(outputs),
+        ]
+        say(two_columns("Inversion", rows))
     exit_unless_converged(inversion.report, result)
 
 
@@ -282,8 +291,7 @@ def forward(
     Without --source, the result's own source is used if the setup is the same; otherwise
     the source is uniform.
     """
-    from napari_shadowinv.cli._summary import size_text
-    from napari_shadowinv.io import is_field_grid, read_radiograph, write
+    from napari_shadowinv.io import is_field_grid, read_radiograph, replacing, write
     from napari_shadowinv.io.formats import IMAGE_WRITERS, TIFF
     from napari_shadowinv.pipeline.files import setup_from
 
@@ -304,7 +312,10 @@ def forward(
                 "field, which needs only --setup: leave them out"
             )
         traced = trace_field(field, target, beam, variable, flags, seed, quiet)
-        write_traced(traced, path, truth, overwrite)
+        write(path, traced.image, setup=traced.setup, overwrite=overwrite)
+        if truth is not None:
+            with replacing(truth, overwrite) as temporary:
+                traced.to_dataset().to_netcdf(temporary, engine="h5netcdf")
         if not quiet:
             rows = [
                 ("setup", setup_text(traced.setup, shape=traced.image.shape)),
@@ -485,16 +496,6 @@ def trace_field(
             seed=seed,
             **callbacks,
         )
-
-
-def write_traced(traced: TracedImage, path: Path, truth: Path | None, overwrite: bool) -> None:
-    """Write a traced image, and the truth about it as NetCDF."""
-    from napari_shadowinv.io import replacing, write
-
-    write(path, traced.image, setup=traced.setup, overwrite=overwrite)
-    if truth is not None:
-        with replacing(truth, overwrite) as temporary:
-            traced.to_dataset().to_netcdf(temporary, engine="h5netcdf")
 
 
 @dataclass(frozen=True)

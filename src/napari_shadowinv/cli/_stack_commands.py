@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from napari_shadowinv.cli import _flags, _inputs
+from napari_shadowinv.cli._summary import two_columns
 from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 
@@ -139,9 +140,15 @@ def batch(
 @notify_errors
 def merge(store: _flags.StoreFolder, quiet: _flags.Quiet = False) -> None:
     """Complete a store that batch --shard has written, when all shards have ended."""
-    from napari_shadowinv.cli._batch import run_merge
+    from napari_shadowinv.cli._batch import exit_unless_reliable, summary_rows
+    from napari_shadowinv.io.store import StackStore
+    from napari_shadowinv.stack import merge_stack
 
-    run_merge(store, quiet)
+    merge_stack(store)
+    merged = StackStore(store)
+    if not quiet:
+        say(two_columns("Merge", summary_rows(merged)))
+    exit_unless_reliable(merged)
 
 
 @notify_errors

@@ -1,4 +1,4 @@
-"""Tables that the commands print: `summary` of an inversion, and rows of other tables."""
+"""Tables that the commands print, and their rows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv._typing import AnyArray
     from napari_shadowinv.facts import Fact, Headline
-    from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Radiograph
     from napari_shadowinv.provenance import Provenance
@@ -42,19 +41,6 @@ def two_columns(title: str, rows: Rows) -> Table:
 def headline_row(headline: Headline) -> tuple[str, str]:
     """Return the headline of a result; the name of the row is the level of trust."""
     return (headline.level.value, headline.text)
-
-
-def summary(inversion: Inversion, shot: Radiograph, written: list[Path]) -> Table:
-    """Build the table of an inversion: its headline, its input, its quality and its files."""
-    rows = [
-        headline_row(inversion.headline),
-        ("image", f"{shot.path}, {size_text(inversion.image)}"),
-        *provenance_rows(inversion.provenance),
-        ("setup", setup_text(inversion.setup, shot, inversion.image.shape)),
-        *fact_rows(inversion.facts),
-        *written_rows(written),
-    ]
-    return two_columns("Inversion", rows)
 
 
 def provenance_rows(provenance: Provenance | None) -> Rows:
