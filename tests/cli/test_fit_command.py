@@ -291,7 +291,7 @@ def test_every_option_of_a_fit_has_a_flag() -> None:
     for name in FitOptions.model_fields:
         assert f"--{name.replace('_', '-')}" in text
     flags = {"bin": 2, "ambiguous": True, "beam_modes": 4}
-    recipe = fit_recipe_of(flags, Recipe(), {})
+    recipe = fit_recipe_of(flags, Recipe())
     options = FitOptions(ambiguous=True, beam_modes=4)
     assert recipe == Recipe(steps=(Bin(factor=2),), fit=FitChoices(options=options))
 

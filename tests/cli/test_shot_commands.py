@@ -102,7 +102,7 @@ def prepared(
     image: str, source: str | None = None, mask: str | None = None, **flags: Any
 ) -> Radiograph:
     """Return a shot and its source after the steps that flags ask for."""
-    recipe = recipe_of(flags, Recipe(mask=None if mask is None else Path(mask)), {})
+    recipe = recipe_of(flags, Recipe(mask=None if mask is None else Path(mask)))
     return collect_inputs(recipe, image, source=source).prepare()
 
 
@@ -918,8 +918,6 @@ def test_mistakes_in_a_recipe_are_named(
     ):
         (folder / "recipe.toml").write_text(text)
         refused("invert", shot, "--recipe", "recipe.toml", names=names)
-    (folder / "options.toml").write_text("[prepare]\nhot_pixels = 6\n")
-    refused("invert", shot, "--options", "options.toml", names=("[prepare]", "--recipe"))
 
 
 def test_a_saved_recipe_gives_the_same_result(folder: Path, shot: Path) -> None:

@@ -46,7 +46,7 @@ def test_a_stated_zero_survives_a_recipe_file(tmp_path):
 
 def test_flags_replace_the_detector_of_a_recipe():
     base = Recipe(instrument=Instrument.of("film", blur=2))
-    flagged = recipe_of({"detector": "CR-39", "gamma": 0.2}, base, {})
+    flagged = recipe_of({"detector": "CR-39", "gamma": 0.2}, base)
     assert flagged.instrument == Instrument.of("CR-39", blur=2, gamma=0.2)
 
 

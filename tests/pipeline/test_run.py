@@ -221,7 +221,7 @@ def test_every_parameter_has_a_flag() -> None:
     for name in [*InversionOptions.model_fields, *Instrument.model_fields]:
         assert name in flags
         flags.discard(name)
-    flagged = recipe_of({"gamma": 0.1}, Recipe(instrument=Instrument(blur=2)), {})
+    flagged = recipe_of({"gamma": 0.1}, Recipe(instrument=Instrument(blur=2)))
     assert flagged.instrument == Instrument(blur=2, gamma=0.1)
     for step in (changed(model) for model in STEPS.values()):
         assert isinstance(step, Step)
@@ -230,12 +230,12 @@ def test_every_parameter_has_a_flag() -> None:
             for name, v in step.values().items()
         }
         assert values.keys() <= flags
-        assert recipe_of(values, Recipe(), {}).steps == (step,)
+        assert recipe_of(values, Recipe()).steps == (step,)
         flags -= values.keys()
     for source in (changed(model) for model in ESTIMATES.values()):
         values = {f"source_{name}": value for name, value in source.values().items()}
         assert values.keys() <= flags
-        assert recipe_of({"source_from": source.name(), **values}, Recipe(), {}).source == source
+        assert recipe_of({"source_from": source.name(), **values}, Recipe()).source == source
     assert {name for name in flags if not name.startswith("source_")} == set()
 
 

@@ -114,9 +114,13 @@ def run_batch(
         flag = " with --resume" if run.part is None else ""
         say_on_stderr(f"Cancelled: {counts}. Repeat the command{flag} to continue.")
         raise typer.Exit(cancel_exit_code()) from None
-    store = _store_of(run, out)
+    store, status = _store_of(run, out), bar.status
+    text = "nothing to do"
+    if status is not None and status.ended:
+        text = f"{status.ended} shots in {status.seconds:.1f} s, {_rate_text(status)}"
+    shard = [] if run.shard is None else [("shard", f"{run.shard}; merge the store after the last")]
     if not quiet:
-        say(two_columns("Batch", summary_rows(store, *_run_rows(run, bar.status))))
+        say(two_columns("Batch", summary_rows(store, ("this run", text), *shard)))
     exit_unless_reliable(store)
 
 
@@ -126,15 +130,6 @@ def _store_of(run: RunOptions, out: Path) -> StackStore:
 
     store = StackStore(out)
     return StackStore(out, numbers=numbers_of(run, len(store.names)))
-
-
-def _run_rows(run: RunOptions, status: RunStatus | None) -> Rows:
-    """Describe the run that has ended."""
-    text = "nothing to do"
-    if status is not None and status.ended:
-        text = f"{status.ended} shots in {status.seconds:.1f} s, {_rate_text(status)}"
-    shard = [] if run.shard is None else [("shard", f"{run.shard}; merge the store after the last")]
-    return [("this run", text), *shard]
 
 
 def exit_unless_reliable(store: StackStore) -> None:

@@ -502,12 +502,10 @@ takes_trace = partial(_with_flags, additions=_TRACE_FLAGS)
 takes_plan = partial(_with_flags, additions=_PLAN_FLAGS)
 
 
-def recipe_of(
-    flags: Mapping[str, Any], base: Recipe, options: Mapping[str, Any], where: str = "options"
-) -> Recipe:
-    """Override a recipe with an options file, named `where`, and with flags."""
+def recipe_of(flags: Mapping[str, Any], base: Recipe, options: Path | None = None) -> Recipe:
+    """Override a recipe with an options file and with flags."""
     before = base.options.model_dump(exclude_unset=True)
-    inversion_options = choices_of(InversionOptions, flags, before, options, where)
+    inversion_options = choices_of(InversionOptions, flags, before, options)
     if "margin" in flags and inversion_options.boundary != "free":
         raise InputError("received --margin: it needs --boundary free")
     changes = {
@@ -519,20 +517,16 @@ def recipe_of(
     return base.model_copy(update=changes)
 
 
-def fit_recipe_of(
-    flags: Mapping[str, Any], base: Recipe, options: Mapping[str, Any], where: str = "options"
-) -> Recipe:
-    """Override a recipe with an options file, named `where`, and with flags of a fit."""
+def fit_recipe_of(flags: Mapping[str, Any], base: Recipe, options: Path | None = None) -> Recipe:
+    """Override a recipe with an options file and with flags of a fit."""
     before = base.fit or FitChoices()
     stated = before.options.model_dump(exclude_unset=True)
-    fit_options = choices_of(FitOptions, flags, stated, options, where)
+    fit_options = choices_of(FitOptions, flags, stated, options)
     changes = {name: flags[name] for name in FitChoices.model_fields if name in flags}
     values = before.model_dump(exclude_none=True, exclude={"options"})
-    in_metres = ("source_size", "resolution")
     # A point spread in px replaces one in m, and the other way round.
-    replaced = (
-        in_metres if "psf" in changes else ("psf",) if changes.keys() & set(in_metres) else ()
-    )
+    in_metres = {"source_size", "resolution"}
+    replaced = in_metres if "psf" in changes else {"psf"} if changes.keys() & in_metres else set()
     values = {name: value for name, value in values.items() if name not in replaced}
     choices = validate(
         FitChoices, {**values, **changes, "options": fit_options}, "", flag_names(FitChoices)
@@ -549,13 +543,15 @@ def choices_of(
     model: type[Model],
     flags: Mapping[str, Any],
     before: Mapping[str, Any] = MappingProxyType({}),
-    content: Mapping[str, Any] = MappingProxyType({}),
-    where: str = "",
+    file: Path | None = None,
 ) -> Model:
-    """Override the values of a model with the content of the file `where`, and with flags."""
+    """Override the values of a model with a file of them, and with flags."""
+    from napari_shadowinv.io import read_toml
+
+    content = {} if file is None else read_toml(file)
     chosen = {name: flags[name] for name in model.model_fields if name in flags}
     of_file = content.keys() - chosen.keys()
-    names = flag_names(model) | {name: f"'{name}' in {where}" for name in of_file}
+    names = flag_names(model) | {name: f"'{name}' in {file}" for name in of_file}
     return validate(model, {**before, **content, **chosen}, "", names)
 
 

@@ -68,16 +68,6 @@ def protect_files_of(recipe: Recipe, outputs: list[Path]) -> None:
     protect(outputs, [recipe.mask, recipe.source_mask, source])
 
 
-def save_recipe(path: Path, recipe: Recipe, inputs: list[Path | None], overwrite: bool) -> None:
-    """Write a recipe, but not over an input."""
-    from napari_shadowinv.pipeline import write_recipe
-
-    check_outputs({path: (".toml",)}, overwrite)
-    protect([path], inputs)
-    protect_files_of(recipe, [path])
-    write_recipe(path, recipe, overwrite=overwrite)
-
-
 def protect_store(store: Path, output: Path) -> None:
     """Refuse to write into a store that is read."""
     if resolved_path(output).is_relative_to(resolved_path(store)):
@@ -135,18 +125,14 @@ def recipe_from(
 ) -> Recipe:
     """Read a recipe, and override it with an options file and flags."""
     from napari_shadowinv.cli._flags import recipe_of
-    from napari_shadowinv.preprocessing import MeasuredSource
+    from napari_shadowinv.pipeline import read_recipe
+    from napari_shadowinv.preprocessing import MeasuredSource, Recipe
 
-    base, content, where = _recipe_and_options(recipe, options)
-    if "prepare" in content:
-        raise InputError(
-            f"{options} has a table [prepare], which recipes replace: write steps and source "
-            "into a file for --recipe (--save-recipe shows how)"
-        )
     if clip_negative:
         flags = {"negative": "clip", **flags}
     files = {"mask": mask, "source_mask": source_mask}
-    chosen = recipe_of(flags, base, content, where)
+    base = Recipe() if recipe is None else read_recipe(recipe)
+    chosen = recipe_of(flags, base, options)
     chosen = chosen.model_copy(update={name: file for name, file in files.items() if file})
     if source is None and source_variable is None:
         return chosen
@@ -156,18 +142,6 @@ def recipe_from(
         )
     measured = MeasuredSource(file=source, variable=source_variable)
     return chosen.model_copy(update={"source": measured})
-
-
-def _recipe_and_options(
-    recipe: Path | None, options: Path | None
-) -> tuple[Recipe, dict[str, Any], str]:
-    """Read the files of a recipe and of options, and name the latter."""
-    from napari_shadowinv.io import read_toml
-    from napari_shadowinv.pipeline import read_recipe
-    from napari_shadowinv.preprocessing import Recipe
-
-    base = Recipe() if recipe is None else read_recipe(recipe)
-    return (base, {}, "options") if options is None else (base, read_toml(options), str(options))
 
 
 def fit_recipe_from(
@@ -181,16 +155,17 @@ def fit_recipe_from(
 ) -> Recipe:
     """Read the recipe of a fit, and override it with an options file and flags."""
     from napari_shadowinv.cli._flags import fit_recipe_of
-    from napari_shadowinv.preprocessing import MeasuredSource
+    from napari_shadowinv.pipeline import read_recipe
+    from napari_shadowinv.preprocessing import MeasuredSource, Recipe
 
-    base, content, where = _recipe_and_options(recipe, options)
+    base = Recipe() if recipe is None else read_recipe(recipe)
     choices = {} if brightness is None else {"brightness": brightness}
     changes: dict[str, Any] = {} if mask is None else {"mask": mask}
     if source is not None:
         is_unknown = source == "unknown"
         choices["beam"] = "unknown" if is_unknown else "known"
         changes["source"] = None if is_unknown else MeasuredSource(file=Path(source))
-    return fit_recipe_of({**flags, **choices}, base, content, where).model_copy(update=changes)
+    return fit_recipe_of({**flags, **choices}, base, options).model_copy(update=changes)
 
 
 def fit_recipe(

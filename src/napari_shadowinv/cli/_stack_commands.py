@@ -97,7 +97,7 @@ def _stack_inputs(
 ) -> dict[str, Any]:
     """Return the inputs of `batch` and `watch`, and save their recipe."""
     from napari_shadowinv.cli._batch import shot_reader
-    from napari_shadowinv.pipeline.files import setup_from
+    from napari_shadowinv.pipeline.files import setup_from, write_recipe
 
     files: dict[str, Any] = {"source": source, "mask": mask, "source_mask": source_mask}
     chosen = _inputs.recipe_from(flags, recipe, options, clip_negative=clip_negative, **files)
@@ -106,7 +106,10 @@ def _stack_inputs(
     if setup is not None:
         chosen = chosen.model_copy(update={"setup": setup_from(setup)})
     if save_recipe is not None:
-        _inputs.save_recipe(save_recipe, chosen, [recipe, setup, options], run.overwrite)
+        _inputs.check_outputs({save_recipe: (".toml",)}, run.overwrite)
+        _inputs.protect([save_recipe], [recipe, setup, options])
+        _inputs.protect_files_of(chosen, [save_recipe])
+        write_recipe(save_recipe, chosen, overwrite=run.overwrite)
     if not quiet:
         warn_of_setups([(chosen.setup, None)])
     return {"recipe": chosen, "reader": shot_reader(channel, variable), "quiet": quiet}
