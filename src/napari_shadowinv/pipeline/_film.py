@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,6 +24,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.film import (
     Calibration,
     Pack,
+    PackLayer,
     Poses,
     Response,
     burnt_edges,
@@ -59,15 +59,20 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """The film of layer `number`: its scan the right way round, corners and calibration."""
+    """The film of layer `number`: its scan the right way round, corners and calibration.
+
+    Its image is larger by `scale` than that of the first film.
+    """
 
     number: int
+    layer: PackLayer
     scan: Scan
     corners: FloatArray
     calibration: Calibration
     background: FloatArray
     mask: BoolArray | None
     fiducials: dict[str, FloatArray]
+    scale: float = 1.0
 
     @property
     def name(self) -> str:
@@ -127,10 +132,10 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
             for mark in fiducials.get(number, [])
         }
         scan, corners = to_scan_frame(scan, corners, *turn)
-        return Film(number, scan, corners, calibration, background, mask, marks)
+        return Film(number, layer, scan, corners, calibration, background, mask, marks)
 
     films = in_parallel(film, used)
-    _check_distinct(pack, films)
+    _check_distinct(films)
     return films
 
 
@@ -179,11 +184,11 @@ def _check_on_scan(marks: Sequence[_Fiducial], scan: Scan, table: Path | None) -
             )
 
 
-def _check_distinct(pack: Pack, films: list[Film]) -> None:
+def _check_distinct(films: list[Film]) -> None:
     """Raise an `InputError` if two layers have the same scan of a single film."""
     by_checksum: dict[str, Film] = {}
     for film in films:
-        file = pack.layers[film.number - 1].file
+        file = film.layer.file
         first = by_checksum.setdefault(film.scan.checksum, film) if file is not None else film
         if first is not film:
             raise InputError(
@@ -325,31 +330,38 @@ def run_film(
     report = Reporter(on_progress, should_stop)
     response = Response.of(pack)
     peaks = np.array([band.peak for band in response.bands])
-    films = read_films(pack, report)
-    pixel = _pixel_size(pack, [film.scan for film in films])
+    scanned = read_films(pack, report)
+    pixel = _pixel_size(pack, [film.scan for film in scanned])
     geometry = pack.setups(peaks, pixel)
     magnifications = np.array([setup.magnification for setup in geometry] or np.ones(len(peaks)))
     scales = magnifications / magnifications[0]
-    shape = _common_shape(films, scales)
+    films = [replace(film, scale=scales[film.number - 1]) for film in scanned]
+    shape = _common_shape(films)
 
     def doses_of(film: Film) -> _Doses:
         report("dose", film.number - 1, len(pack.layers), film.name)
-        return _film_doses(film, shape, scales[film.number - 1], pack.rim)
+        return _film_doses(film, shape, pack.rim)
 
-    by_layer = partial(_by_layer, films, len(pack.layers))
+    def by_layer(values: Sequence[AnyArray] | AnyArray, excluded: Any = np.nan) -> AnyArray:
+        """Return values of the films by layer, with `excluded` for those without a film."""
+        layers: AnyArray = np.full((len(pack.layers), *np.shape(values[0])), excluded)
+        for film, value in zip(films, values, strict=True):
+            layers[film.number - 1] = value
+        return layers
+
     corners = by_layer([_corners_on_scan(film, pack) for film in films])
     # Marks through the pack lie behind each other, the image content lies on rays.
     marked = any(film.fiducials for film in films)
     if not marked:
-        films = _scale_about_axis(films, pack, scales)
+        films = _scale_about_axis(films, pack)
     edges = in_parallel(doses_of, films)
-    poses = _align_films(films, edges, pack, scales, report)
+    poses = _align_films(films, edges, pack, report)
     aligned = [
-        replace(film, corners=move_corners(film.corners, shift, turn, scales[film.number - 1]))
+        replace(film, corners=move_corners(film.corners, shift, turn, film.scale))
         for film, shift, turn in zip(films, poses.shifts, poses.turns, strict=True)
     ]
     if marked:
-        aligned = _scale_about_axis(aligned, pack, scales)
+        aligned = _scale_about_axis(aligned, pack)
     pairs = zip(films, aligned, strict=True)
     moved = any((film.corners != shifted.corners).any() for film, shifted in pairs)
     doses = in_parallel(doses_of, aligned) if moved else edges
@@ -387,30 +399,29 @@ def run_film(
 
 
 def _corners_on_scan(film: Film, pack: Pack) -> FloatArray:
-    layer = pack.layers[film.number - 1]
-    return to_scan_frame(film.scan, film.corners, layer.turned, pack.is_mirrored(layer))[1]
+    turn = film.layer.turned, pack.is_mirrored(film.layer)
+    return to_scan_frame(film.scan, film.corners, *turn)[1]
 
 
 def _scans(pack: Pack, films: list[Film]) -> tuple[ImageOrigin, ...]:
     """Return the origin of each film's scan."""
     origins = []
     for film in films:
-        file = pack.layers[film.number - 1].file or pack.scan
+        file = film.layer.file or pack.scan
         name = "" if file is None else text_of(file.name)
         origins.append(ImageOrigin(file=name, sha256=film.scan.checksum))
     return tuple(origins)
 
 
-def _scale_about_axis(films: list[Film], pack: Pack, scales: FloatArray) -> list[Film]:
+def _scale_about_axis(films: list[Film], pack: Pack) -> list[Film]:
     """Move the corners of the films so that they are scaled about the axis."""
     if pack.axis is None:
         return films
     away = np.array(pack.axis) - (upright(films[0].corners)[2] - 1) / 2
     moved = []
     for film in films:
-        scale = scales[film.number - 1]
-        shift = (1 - scale) / scale * away
-        moved.append(replace(film, corners=move_corners(film.corners, shift, 0.0, scale)))
+        shift = (1 - film.scale) / film.scale * away
+        moved.append(replace(film, corners=move_corners(film.corners, shift, 0.0, film.scale)))
     return moved
 
 
@@ -433,8 +444,8 @@ def _pixel_size(pack: Pack, scans: list[Scan]) -> float | None:
     return sizes[0]
 
 
-def _common_shape(films: list[Film], scales: FloatArray) -> tuple[int, int]:
-    sizes = np.array([upright(film.corners)[2] / scales[film.number - 1] for film in films])
+def _common_shape(films: list[Film]) -> tuple[int, int]:
+    sizes = np.array([upright(film.corners)[2] / film.scale for film in films])
     usual = np.median(sizes, axis=0)
     for film, size in zip(films, sizes, strict=True):
         if (np.abs(size / usual - 1) > _MAX_SIZE_DEVIATION).any():
@@ -445,8 +456,8 @@ def _common_shape(films: list[Film], scales: FloatArray) -> tuple[int, int]:
     return common_shape(sizes)
 
 
-def _film_doses(film: Film, shape: tuple[int, int], scale: float, rim: int) -> _Doses:
-    values = straighten_film(film.scan.pixels, film.corners, shape=shape, scale=scale)
+def _film_doses(film: Film, shape: tuple[int, int], rim: int) -> _Doses:
+    values = straighten_film(film.scan.pixels, film.corners, shape=shape, scale=film.scale)
     combined = combined_dose(values, film.calibration, background=film.background)
     usable = usable_pixels(values, film.calibration, background=film.background, rim=rim)
     usable &= ~burnt_edges(combined.dose)
@@ -480,13 +491,7 @@ def _cut_groups(films: list[Film], kinds: Sequence[str]) -> list[tuple[object, .
     return [(kind, *map(int, group)) for kind, group in zip(kinds, groups, strict=True)]
 
 
-def _align_films(
-    films: list[Film],
-    doses: list[_Doses],
-    pack: Pack,
-    scales: FloatArray,
-    report: Reporter,
-) -> Poses:
+def _align_films(films: list[Film], doses: list[_Doses], pack: Pack, report: Reporter) -> Poses:
     usable = np.array([film_doses.usable for film_doses in doses])
     logarithms = np.log(np.array([film_doses.dose for film_doses in doses]))
     check_orientation(logarithms, usable, [film.name for film in films])
@@ -494,23 +499,13 @@ def _align_films(
         return poses_by_fiducials(
             [film.fiducials for film in films],
             [film.corners for film in films],
-            [scales[film.number - 1] for film in films],
+            [film.scale for film in films],
             [film.name for film in films],
         )
     if pack.align == "images":
-        kinds = [pack.layers[film.number - 1].film for film in films]
+        kinds = [film.layer.film for film in films]
         return register(logarithms, usable, kinds=_cut_groups(films, kinds), report=report)
     return Poses.by_edges(len(films))
-
-
-def _by_layer(
-    films: list[Film], count: int, values: Sequence[AnyArray] | AnyArray, excluded: Any = np.nan
-) -> AnyArray:
-    """Return values of the films by layer, with `excluded` for those without a film."""
-    layers: AnyArray = np.full((count, *np.shape(values[0])), excluded)
-    for film, value in zip(films, values, strict=True):
-        layers[film.number - 1] = value
-    return layers
 
 
 def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) -> list[Caution]:
