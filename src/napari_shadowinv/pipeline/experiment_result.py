@@ -247,7 +247,10 @@ class ExperimentPlan:
         if name == "noise":
             counts = 2 * self.options.counts
             return f"twice the counts ({counts:,.4g} a pixel)", math.sqrt(0.5)
-        size = self._stated(name)
+        if name == "beam":
+            size = self.instrument.beam_of(measured=self.options.is_recorded).rms
+        else:
+            size = float(getattr(self.instrument, name, 0.0) or 0.0)
         if not size:
             return None
         power = 2.0 if name == "blur" else 1.0
@@ -258,12 +261,6 @@ class ExperimentPlan:
         unit, digits = ("", 1.0) if name == "gamma" else (unit, digits)
         better, before = (f"{digits * x:.2g} {unit}".rstrip() for x in (size / 2, size))
         return f"{self._title(name)} known to {better} instead of {before}", factor
-
-    def _stated(self, name: str) -> float:
-        """Standard deviation of a number of the instrument."""
-        if name == "beam":
-            return self.instrument.beam_of(measured=self.options.is_recorded).rms
-        return float(getattr(self.instrument, name, 0.0) or 0.0)
 
     def _scale(self, name: str) -> float:
         scales = [shot.scales[name] for shot in self.shots if name in shot.scales]

@@ -166,8 +166,9 @@ class ShotSimulator:
             displacement = self._nominal[image] * (
                 scale(setup) + admixture * self._other_ratio(setup)
             )
-            if image:
-                displacement = self._misaligned(displacement, streams["alignment"])
+            if image and instrument.registration:  # onto a misaligned detector
+                landing = displacement + grid.places()
+                displacement = displacement + self._motion(landing, streams["alignment"])
             flux = self._object.image(light, displacement, grid)
             images.append(counts(flux, image, options.counts, "counts"))
         source, noise = None, 0.0
@@ -254,12 +255,6 @@ class ShotSimulator:
         inside = self._inner_samples(depth) > _EDGE
         radius = math.sqrt(inside.sum() / np.pi) / self._grid.factor
         return np.asarray(self._wave(rng, rms, max(radius, 1.0)) / (1 + np.exp(-steep)))
-
-    def _misaligned(self, displacement: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Displacement onto a detector that is shifted, turned and scaled by random numbers."""
-        if not self.inputs.instrument.registration:
-            return displacement
-        return displacement + self._motion(displacement + self._grid.places(), rng)
 
     def _moved(self, reference: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Reference in pixels, out of register with the image."""

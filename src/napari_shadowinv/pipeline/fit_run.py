@@ -94,9 +94,14 @@ def run_refinement(
         on_progress=on_progress,
         should_stop=should_stop,
     )
-    if inversion.provenance is None:
+    before = inversion.provenance
+    if before is None:
         return result
-    return replace(result, provenance=_provenance(inversion.provenance, setup, choices))
+    changes = {"setup": None, "instrument": Instrument(), "fit": choices}
+    recipe = before.recipe.model_copy(update=changes)
+    origin = before.image.model_copy(update={"mask": None, "source_mask": None, "setup": setup})
+    provenance = Provenance(kind="fit", recipe=recipe, images=(origin,), start=before)
+    return replace(result, provenance=provenance)
 
 
 def _instrument(inversion: Inversion) -> Instrument:
@@ -115,13 +120,6 @@ def refinement_choices(inversion: Inversion, setup: Setup | None, psf: float = 0
     boundary = "free" if inversion.options.boundary == "free" else "fading"
     options = FitOptions(boundary=boundary, seed=inversion.options.seed)
     return FitChoices(fields=(field,), psf=psf, options=options)
-
-
-def _provenance(start: Provenance, setup: Setup | None, choices: FitChoices) -> Provenance:
-    changes = {"setup": None, "instrument": Instrument(), "fit": choices}
-    recipe = start.recipe.model_copy(update=changes)
-    image = start.image.model_copy(update={"mask": None, "source_mask": None, "setup": setup})
-    return Provenance(kind="fit", recipe=recipe, images=(image,), start=start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,7 +306,11 @@ def collect_fit_inputs(
     choices = recipe.fit or FitChoices()
     check_fit(recipe)
     names = tuple(_shot_name(image, k) for k, image in enumerate(recorded))
-    unknown = _beam_is_unknown(choices, recorded, names)
+    by_default = choices.beam == "unknown"
+    flags = [
+        image.beam_unknown or (by_default and image.source is None) or None for image in recorded
+    ]
+    unknown = common_values(names, flags, "unknown source") is not None
     collected = [
         _collect_image(recipe, image, name, unknown=unknown)
         for image, name in zip(recorded, names, strict=True)
@@ -329,9 +331,11 @@ def collect_fit_inputs(
     source = recipe.estimate
     cleared = {"source": source, "mask": None, "source_mask": None, "setup": None, "fit": resolved}
     table, origin = _read_fiducials(value_of_first(recorded, "fiducials"))
+    if recipe.dark_file is not None:  # by its name only; the images have its checksum
+        recipe = recipe.with_dark_file(Path(text_of(recipe.dark_file.name)))
     provenance = Provenance(
         kind="fit",
-        recipe=_without_folder(recipe).model_copy(update=cleared),
+        recipe=recipe.model_copy(update=cleared),
         **_image_origins(recorded, collected, ready),
         fiducials=origin,
         fiducial_rows=None if table is None else table.tolist(),
@@ -359,13 +363,6 @@ def _shot_name(shot: FitShot, k: int) -> str:
     image = shot.image
     path = image.path if isinstance(image, Radiograph) else image
     return str(path) if isinstance(path, (str, Path)) else f"image {k + 1}"
-
-
-def _beam_is_unknown(choices: FitChoices, shots: Sequence[FitShot], names: Sequence[str]) -> bool:
-    """Return whether the beam is fitted, by choice of all images or of the recipe."""
-    by_default = choices.beam == "unknown"
-    flags = [shot.beam_unknown or (by_default and shot.source is None) or None for shot in shots]
-    return common_values(names, flags, "unknown source") is not None
 
 
 def _collect_image(recipe: Recipe, shot: FitShot, name: str, *, unknown: bool) -> Inputs:
@@ -433,12 +430,6 @@ def _read_fiducials(fiducials: ArrayLike | Path | None) -> tuple[FloatArray | No
         origin = Origin(file=text_of(fiducials.name), sha256=sha256(fiducials))
         return np.array(fiducials_from(fiducials)), origin
     return np.array(fiducials, dtype=np.float64), Origin()
-
-
-def _without_folder(recipe: Recipe) -> Recipe:
-    """Return the recipe with the name of its dark frame only; the images have its checksum."""
-    dark = recipe.dark_file
-    return recipe if dark is None else recipe.with_dark_file(Path(text_of(dark.name)))
 
 
 def _image_origins(

@@ -510,7 +510,9 @@ def _difference(before: xarray.Dataset, after: xarray.Dataset) -> str:
             pairs[name] = old, new
     if not pairs:
         return IDENTICAL
-    return _describe_pairs(pairs) + _verdict_change(before.attrs, after.attrs)
+    verdict = before.attrs.get("verdict")  # a shot of a stack has none in its attributes
+    is_changed = verdict not in (None, after.attrs.get("verdict"))
+    return _describe_pairs(pairs) + (f"; the verdict was '{verdict}'" if is_changed else "")
 
 
 def _describe_pairs(pairs: Mapping[str, tuple[Any, Any]]) -> str:
@@ -522,8 +524,3 @@ def _describe_pairs(pairs: Mapping[str, tuple[Any, Any]]) -> str:
     if displacements:
         return f"displacement differs by up to {max(displacements):.2g} px"
     return f"{', '.join(pairs)} differ{'s' * (len(pairs) == 1)}"
-
-
-def _verdict_change(before: Mapping[Any, Any], after: Mapping[Any, Any]) -> str:
-    verdict = before.get("verdict")  # a shot of a stack has none in its attributes
-    return f"; the verdict was '{verdict}'" if verdict not in (None, after.get("verdict")) else ""
