@@ -159,10 +159,7 @@ def _products(texts: list[str], file: Path | None) -> list[Product]:
 
 
 def _write(
-    results: list[ProductResult],
-    dataset: Any,
-    paths: dict[str, Path | None],
-    overwrite: bool,
+    results: list[ProductResult], dataset: Any, paths: dict[str, Path | None], overwrite: bool
 ) -> None:
     """Write all files, or none."""
     from napari_shadowinv.analysis import add_products, products_table

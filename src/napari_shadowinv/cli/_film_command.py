@@ -60,13 +60,12 @@ def film(
     pack: Annotated[Path | None, typer.Argument(help=HELP["pack"], show_default=False)] = None,
     layers: Annotated[Path | None, typer.Option(help=HELP["layers"])] = None,
     layers_format: Annotated[
-        LayersFormat,
-        typer.Option(metavar="tiff|pradformat", help="Format of the layers' images."),
+        LayersFormat, typer.Option(metavar="tiff|pradformat", help="Format of the layers' images.")
     ] = "tiff",
     corners: Annotated[Path | None, typer.Option("--save-corners", help=HELP["corners"])] = None,
     out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
     figure: _flags.Figure = None,
-    new: Annotated[Path | None, typer.Option("--new", help=HELP["new"])] = None,
+    new: Annotated[Path | None, typer.Option(help=HELP["new"])] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
 ) -> None:
@@ -79,7 +78,7 @@ def film(
 
     from napari_shadowinv.film import write_corners
     from napari_shadowinv.io import replacing
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, SITES, suffixes_for
+    from napari_shadowinv.io.formats import SITES
     from napari_shadowinv.pipeline import read_pack, run_film, write_layers
     from napari_shadowinv.pipeline.film_files import LAYERS_TABLE
 
@@ -91,11 +90,8 @@ def film(
             "received no pack file: name one, or write one for a folder of scans with --new"
         )
     result, figure = _inputs.result_and_figure(pack, out, figure)
-    suffixes: dict[Path | None, tuple[str, ...]] = {
-        result: suffixes_for(ResultKind.FILM_DOSES),
-        figure: FIGURE_SUFFIXES,
-        corners: SITES.suffixes,
-    }
+    suffixes = _inputs.result_suffixes(ResultKind.FILM_DOSES, result, figure)
+    suffixes[corners] = SITES.suffixes
     if layers is not None and (table := layers / LAYERS_TABLE).exists():
         suffixes[table] = SITES.suffixes
     outputs = _inputs.check_outputs(suffixes, overwrite)

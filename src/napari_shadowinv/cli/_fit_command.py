@@ -12,7 +12,7 @@ from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._summary import fact_rows, two_columns, written_rows
 from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups, work_callbacks
 from napari_shadowinv.facts import ResultKind
-from napari_shadowinv.io.formats import IMAGE_TITLES
+from napari_shadowinv.io.formats import IMAGE_TITLES, RESULT
 
 # Help of arguments, where it is longer than a line.
 HELP = {
@@ -74,27 +74,21 @@ def fit(
     strengths: Annotated[
         str | None, typer.Option(metavar="NUMBER,NUMBER,…", help=HELP["strengths"])
     ] = None,
-    setup: Annotated[Path | None, typer.Option("--setup", help=HELP["setup"])] = None,
-    source: Annotated[
-        str | None, typer.Option("--source", metavar="PATH|unknown", help=HELP["source"])
-    ] = None,
+    setup: Annotated[Path | None, typer.Option(help=HELP["setup"])] = None,
+    source: Annotated[str | None, typer.Option(metavar="PATH|unknown", help=HELP["source"])] = None,
     brightness: Annotated[
         str | None, typer.Option(metavar="known|free|NUMBERS", help=HELP["brightness"])
     ] = None,
-    mask: Annotated[Path | None, typer.Option("--mask", help=HELP["mask"])] = None,
+    mask: Annotated[Path | None, typer.Option(help=HELP["mask"])] = None,
     fiducials: Annotated[Path | None, typer.Option(help=HELP["fiducials"])] = None,
     compare: Annotated[bool, typer.Option("--compare", help=HELP["compare"])] = False,
     leave_one_out: Annotated[
         bool, typer.Option("--leave-one-out", help=HELP["leave_one_out"])
     ] = False,
-    energy_window: Annotated[
-        int | None, typer.Option("--energy-window", help=HELP["energy_window"])
-    ] = None,
+    energy_window: Annotated[int | None, typer.Option(help=HELP["energy_window"])] = None,
     recipe: _flags.RecipeFile = None,
     save_recipe: _flags.SaveRecipe = None,
-    options: Annotated[
-        Path | None, typer.Option("--options", help="TOML file with options of the fit.")
-    ] = None,
+    options: Annotated[Path | None, typer.Option(help="TOML file with options of the fit.")] = None,
     channel: _flags.Channel = None,
     variable: _flags.Variable = None,
     out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
@@ -110,7 +104,6 @@ def fit(
     bars, re-projections, residuals and a verdict to one file, and a figure next to it.
     """
     from napari_shadowinv.cli import _fit_result
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, suffixes_for
     from napari_shadowinv.pipeline import run_fit, write_recipe
     from napari_shadowinv.pipeline.fit_run import read_row_images
     from napari_shadowinv.pipeline.shot_table import shot_rows
@@ -127,12 +120,8 @@ def fit(
     checks: dict[str, Any] = {"left_out": leave_one_out, "window": energy_window}
     _fit_result.check_requests(len(rows), **checks, fiducials=fiducials, result=result)
     figures = [figure, *_fit_result.static_figures(figure, **checks)]
-    suffixes: dict[Path | None, tuple[str, ...]] = {
-        result: suffixes_for(ResultKind.FIT),
-        **dict.fromkeys(figures, FIGURE_SUFFIXES),
-        save_recipe: (".toml",),
-    }
-    outputs = _inputs.check_outputs(suffixes, overwrite)
+    suffixes = _inputs.result_suffixes(ResultKind.FIT, result, *figures)
+    outputs = _inputs.check_outputs({**suffixes, save_recipe: (".toml",)}, overwrite)
     row_files = [file for row in rows for file in row.files.values()]
     _inputs.protect(outputs, [*images, fiducials, options, recipe, *row_files])
     chosen = _inputs.fit_recipe_from(

@@ -8,19 +8,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from napari_shadowinv.cli._summary import (
-    Rows,
-    fact_rows,
-    options_text,
-    setup_text,
-    size_text,
-)
-from napari_shadowinv.cli._terminal import (
-    EXIT_NOT_CONVERGED,
-    say,
-    say_on_stderr,
-    work_callbacks,
-)
+from napari_shadowinv.cli._summary import Rows, fact_rows, options_text, setup_text, size_text
+from napari_shadowinv.cli._terminal import EXIT_NOT_CONVERGED, say, say_on_stderr, work_callbacks
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import RESULT
 
@@ -36,11 +25,7 @@ if TYPE_CHECKING:
 
 
 def compare_fields(
-    recipe: Recipe,
-    shots: Sequence[FitShot],
-    quiet: bool,
-    *,
-    written: str | None,
+    recipe: Recipe, shots: Sequence[FitShot], quiet: bool, *, written: str | None
 ) -> Fit:
     """Fit several choices of fields and print how likely each is; return the one to write."""
     from napari_shadowinv.pipeline import run_comparison

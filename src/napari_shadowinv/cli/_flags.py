@@ -242,35 +242,24 @@ ImageFile = Annotated[
 StoreFolder = Annotated[
     Path, Argument(help="name.shadowinv.zarr, from shadowinv batch.", show_default=False)
 ]
-SourceFile = Annotated[
-    Path | None, Option("--source", help="Image of the undisturbed beam. Default: uniform.")
-]
-MaskFile = Annotated[
-    Path | None, Option("--mask", help="Image of the same size, 0 at unusable pixels.")
-]
+SourceFile = Annotated[Path | None, Option(help="Image of the undisturbed beam. Default: uniform.")]
+MaskFile = Annotated[Path | None, Option(help="Image of the same size, 0 at unusable pixels.")]
 RecipeFile = Annotated[
-    Path | None,
-    Option(
-        "--recipe",
-        help="TOML file with all steps, files and options; flags override it.",
-    ),
+    Path | None, Option(help="TOML file with all steps, files and options; flags override it.")
 ]
 SaveRecipe = Annotated[
-    Path | None,
-    Option("--save-recipe", help="Write all steps, files and options to a TOML file for --recipe."),
+    Path | None, Option(help="Write all steps, files and options to a TOML file for --recipe.")
 ]
 SetupFile = Annotated[
-    Path | None,
-    Option("--setup", help="TOML file with the experimental geometry, for results in SI units."),
+    Path | None, Option(help="TOML file with the experimental geometry, for results in SI units.")
 ]
-OptionsFile = Annotated[Path | None, Option("--options", help="TOML file with inversion options.")]
+OptionsFile = Annotated[Path | None, Option(help="TOML file with inversion options.")]
 Channel = Annotated[
     str | None, Option(help="Channel of a colour image: red, green, blue, mean or an index from 0.")
 ]
 Variable = Annotated[
     str | None,
     Option(
-        "--variable",
         metavar="NAME",
         help="Name of the array in an HDF5 file, or in a MATLAB file with several images; for a "
         "CR-39 scan, the tracks to count, such as 'diameter=4:12 contrast=:40 bin=300'.",
@@ -287,8 +276,7 @@ SourceVariable = Annotated[
 ChosenShots = Annotated[
     str | None,
     Option(
-        "--shots",
-        help="Shots to use, counted from 0: 3, 3:20, ::10 or 1,4,9. Default: all finished shots.",
+        help="Shots to use, counted from 0: 3, 3:20, ::10 or 1,4,9. Default: all finished shots."
     ),
 ]
 ClipNegative = Annotated[

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io.formats import PNG, PRADFORMAT, RESULT
+from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, PRADFORMAT, RESULT, suffixes_for
 
 if TYPE_CHECKING:
+    from napari_shadowinv.facts import ResultKind
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.pipeline.static_checks import StaticChecks
     from napari_shadowinv.preprocessing import Radiograph, Recipe
@@ -40,6 +41,13 @@ def figure_beside(result: Path) -> Path:
     if not result.name:
         raise InputError(f"{result} is a folder: expected the name of a file; add it to --out")
     return result.with_suffix(PNG.suffix)
+
+
+def result_suffixes(
+    kind: ResultKind, result: Path, *figures: Path
+) -> dict[Path | None, tuple[str, ...]]:
+    """Return the endings that the files of a result and its figures may have."""
+    return {result: suffixes_for(kind), **dict.fromkeys(figures, FIGURE_SUFFIXES)}
 
 
 def check_outputs(outputs: Mapping[Path | None, tuple[str, ...]], overwrite: bool) -> list[Path]:

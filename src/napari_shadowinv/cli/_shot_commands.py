@@ -36,14 +36,11 @@ from napari_shadowinv.options import InversionOptions
 
 if TYPE_CHECKING:
     import xarray
-    from rich.table import Table
 
     from napari_shadowinv._typing import AnyArray, FloatArray
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import ProtonSetup, Setup
     from napari_shadowinv.physics.tracing import TracedImage
-
-    Fields = Mapping[str, FloatArray]
 
 # Help of arguments, where it is longer than a line.
 HELP = {
@@ -130,17 +127,11 @@ def invert(
     Writes potential, displacement, re-projection, residual and all options to one file,
     and a figure next to it.
     """
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, suffixes_for
-    from napari_shadowinv.pipeline import write_recipe
-    from napari_shadowinv.pipeline.files import read_part
+    from napari_shadowinv.pipeline.files import read_part, write_recipe
 
     result, figure = _inputs.result_and_figure(image, out, figure)
-    suffixes = {
-        result: suffixes_for(ResultKind.INVERSION),
-        figure: FIGURE_SUFFIXES,
-        save_recipe: (".toml",),
-    }
-    outputs = _inputs.check_outputs(suffixes, overwrite)
+    suffixes = _inputs.result_suffixes(ResultKind.INVERSION, result, figure)
+    outputs = _inputs.check_outputs({**suffixes, save_recipe: (".toml",)}, overwrite)
     _inputs.protect(outputs, [image, recipe, setup, options])
     chosen = _inputs.recipe_from(
         flags,
@@ -182,7 +173,7 @@ def rerun(
         list[Path] | None, typer.Argument(help=HELP["image"], show_default=False)
     ] = None,
     source: Annotated[
-        Path | None, typer.Option("--source", help="The measured source, if it has moved.")
+        Path | None, typer.Option(help="The measured source, if it has moved.")
     ] = None,
     out: Annotated[
         Path | None,
@@ -194,8 +185,7 @@ def rerun(
     other_folders: Annotated[
         bool,
         typer.Option(
-            "--other-folders",
-            help="Also read the files in other folders that the result names.",
+            "--other-folders", help="Also read the files in other folders that the result names."
         ),
     ] = False,
     overwrite: _flags.Overwrite = False,
@@ -206,17 +196,16 @@ def rerun(
     With the same files and version, the result is identical bit for bit.
     """
     from napari_shadowinv.cli import _fit_result
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, suffixes_for
     from napari_shadowinv.pipeline.rerun import collect_rerun
 
     target = out or Path(f"{result.stem}_again{result.suffix}")
     again_out, figure = _inputs.result_and_figure(result, target, figure)
-    suffixes = suffixes_for(ResultKind.INVERSION)
-    _inputs.check_outputs({again_out: suffixes, figure: FIGURE_SUFFIXES}, overwrite)
+    suffixes = _inputs.result_suffixes(ResultKind.INVERSION, again_out, figure)
+    _inputs.check_outputs(suffixes, overwrite)
     inputs = collect_rerun(result, image, source=source, other_folders=other_folders)
-    _inputs.check_outputs({again_out: suffixes_for(inputs.kind)}, overwrite)
     figures = _fit_result.static_figures(figure, **inputs.checks)
-    _inputs.check_outputs(dict.fromkeys(figures, FIGURE_SUFFIXES), overwrite)
+    suffixes = _inputs.result_suffixes(inputs.kind, again_out, *figures)
+    _inputs.check_outputs(suffixes, overwrite)
     _inputs.protect([again_out, figure, *figures], [result, *inputs.files])
     warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in inputs.shots)
     with work_callbacks(quiet) as callbacks:
@@ -269,7 +258,7 @@ grid's x = y = z = 0, in its middle.
 def forward(
     field: Annotated[Path, typer.Argument(help=HELP["field"], show_default=False)],
     source: _flags.SourceFile = None,
-    setup: Annotated[Path | None, typer.Option("--setup", help=HELP["setup"])] = None,
+    setup: Annotated[Path | None, typer.Option(help=HELP["setup"])] = None,
     recorded_with: Annotated[Path | None, typer.Option(help=HELP["recorded_with"])] = None,
     deflector: Annotated[str | None, typer.Option(metavar="WHAT", help=HELP["deflector"])] = None,
     dispersion: Annotated[float, typer.Option(help=HELP["dispersion"])] = 1.0,
@@ -393,45 +382,50 @@ def demo(
     flags = {} if n_sites is None else {"n_sites": n_sites}
     chosen = _inputs.recipe_from(flags, None, None, clip_negative=True)
     make_folder(out)
+    import numpy as np
+
     from napari_shadowinv.physics.beam import displacement_from_potential
-    from napari_shadowinv.physics.phantoms import paper_setup
+    from napari_shadowinv.physics.forward import synthetic_image
+    from napari_shadowinv.physics.phantoms import paper_setup, toroid
     from napari_shadowinv.physics.poisson import poisson_invert
     from napari_shadowinv.preprocessing import Radiograph
 
     setup = paper_setup()
-    image, truth = simulate_shot(setup, dm, noise)
-    inversion = invert_shot(chosen.model_copy(update={"setup": setup}), Radiograph(image))
-    poisson = displacement_from_potential(poisson_invert(image))
-    fields = {"True": truth, "Retrieved": inversion.displacement, "Poisson": poisson}
-    written = write_demo(out, f"toroid_{dm:g}", inversion, setup, fields)
-    say(demo_table(inversion, setup, fields, written))
-    exit_unless_converged(inversion.report, written[0])
-
-
-def simulate_shot(setup: ProtonSetup, dm: float, noise: float) -> tuple[FloatArray, FloatArray]:
-    """Return an image with noise, and its true displacement."""
-    import numpy as np
-
-    from napari_shadowinv.physics.forward import synthetic_image
-    from napari_shadowinv.physics.phantoms import toroid
-
     truth = toroid((200, 200), setup, peak=dm, sigma=30e-6).displacement
     image = synthetic_image(truth)
     grain = np.random.default_rng(0).normal(size=image.shape)
-    return image + noise * image.mean() * grain, truth
+    image = image + noise * image.mean() * grain
+    inversion = invert_shot(chosen.model_copy(update={"setup": setup}), Radiograph(image))
+    poisson = displacement_from_potential(poisson_invert(image))
+    fields = {"True": truth, "Retrieved": inversion.displacement, "Poisson": poisson}
+    errors = {name: _error_text(fields[name], truth) for name in ("Retrieved", "Poisson")}
+    written = write_demo(out, f"toroid_{dm:g}", inversion, setup, fields, errors)
+    rows = [
+        headline_row(inversion.headline_in(setup)),
+        ("setup", setup_text(setup, shape=image.shape)),
+        *fact_rows(inversion.facts_in(setup)),
+        ("error", errors["Retrieved"]),
+        ("error of Poisson", errors["Poisson"]),
+        *written_rows(written),
+    ]
+    say(two_columns("Demo", rows))
+    exit_unless_converged(inversion.report, written[0])
 
 
 def write_demo(
-    folder: Path, name: str, inversion: Inversion, setup: ProtonSetup, fields: Fields
+    folder: Path,
+    name: str,
+    inversion: Inversion,
+    setup: ProtonSetup,
+    fields: Mapping[str, FloatArray],
+    errors: Mapping[str, str],
 ) -> list[Path]:
     """Write the result, its figure, and the fields side by side."""
     from napari_shadowinv.io import write
     from napari_shadowinv.io.formats import PNG, RESULT
     from napari_shadowinv.plotting import comparison_figure, report_figure, save_figure
 
-    caption = "Errors: " + "; ".join(
-        f"{name} {_errors_text(fields, name)}" for name in ("Retrieved", "Poisson")
-    )
+    caption = "Errors: " + "; ".join(f"{field} {error}" for field, error in errors.items())
     comparison = comparison_figure(fields, setup, title="True and retrieved", caption=caption)
     report = report_figure(inversion, setup, title=f"Demo {name}")
     return [
@@ -441,25 +435,9 @@ def write_demo(
     ]
 
 
-def demo_table(
-    inversion: Inversion, setup: ProtonSetup, fields: Fields, written: list[Path]
-) -> Table:
-    """Build the table of a demo: the quality of the inversion and its true error."""
-    rows = [
-        headline_row(inversion.headline_in(setup)),
-        ("setup", setup_text(setup, shape=inversion.image.shape)),
-        *fact_rows(inversion.facts_in(setup)),
-        ("error", _errors_text(fields, "Retrieved")),
-        ("error of Poisson", _errors_text(fields, "Poisson")),
-        *written_rows(written),
-    ]
-    return two_columns("Demo", rows)
-
-
-def _errors_text(fields: Fields, name: str) -> str:
+def _error_text(estimate: FloatArray, truth: FloatArray) -> str:
     import numpy as np
 
-    truth, estimate = fields["True"], fields[name]
     true_peak, peak = (float(np.hypot(*field).max()) for field in (truth, estimate))
     if not true_peak:
         return f"peak {peak:.3g} px where the truth is zero"

@@ -79,7 +79,7 @@ by Ctrl-C while files were waiting.
 
 
 def _stack_inputs(
-    source: Annotated[Path | None, typer.Option("--source", help=HELP["source"])] = None,
+    source: Annotated[Path | None, typer.Option(help=HELP["source"])] = None,
     mask: _flags.MaskFile = None,
     source_mask: _flags.SourceMask = None,
     recipe: _flags.RecipeFile = None,
@@ -118,10 +118,7 @@ def _stack_inputs(
 @notify_errors
 @_flags.takes_run(RunOptions, _stack_inputs)
 def batch(
-    shots: Annotated[
-        list[str],
-        typer.Argument(help=HELP["shots"], show_default=False),
-    ],
+    shots: Annotated[list[str], typer.Argument(help=HELP["shots"], show_default=False)],
     out: Annotated[Path, typer.Option(help="Output store: name.shadowinv.zarr.")],
     scheduler: Annotated[str | None, typer.Option(help=HELP["scheduler"])] = None,
     resume: Annotated[
@@ -216,8 +213,7 @@ def export(
     ],
     shots: _flags.ChosenShots = None,
     variables: Annotated[
-        str,
-        typer.Option(help="For tiff and ome-zarr: variables to export, separated by commas."),
+        str, typer.Option(help="For tiff and ome-zarr: variables to export, separated by commas.")
     ] = "potential",
     out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
     overwrite: _flags.Overwrite = False,
@@ -248,8 +244,7 @@ def movie(
     limits: Annotated[
         tuple[float, float] | None,
         typer.Option(
-            metavar="MIN MAX",
-            help="Limits of the colour scale. Default: the range over all shots.",
+            metavar="MIN MAX", help="Limits of the colour scale. Default: the range over all shots."
         ),
     ] = None,
     overwrite: _flags.Overwrite = False,

@@ -73,9 +73,7 @@ def written_rows(paths: Iterable[Path]) -> Rows:
 
 
 def setup_text(
-    setup: Setup | None,
-    shot: Radiograph | None = None,
-    shape: tuple[int, ...] | None = None,
+    setup: Setup | None, shot: Radiograph | None = None, shape: tuple[int, ...] | None = None
 ) -> str:
     """Describe the setup in a line, or name the values that are missing for SI units."""
     if setup is not None:

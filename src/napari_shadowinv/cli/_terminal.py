@@ -80,10 +80,7 @@ def say_on_stderr(text: str, style: str = "bold red") -> None:
 
 
 def invert_shot(
-    recipe: Recipe,
-    shot: Radiograph,
-    source: Radiograph | None = None,
-    quiet: bool = False,
+    recipe: Recipe, shot: Radiograph, source: Radiograph | None = None, quiet: bool = False
 ) -> Inversion:
     """Apply a recipe to a shot; errors name the file."""
     from napari_shadowinv.pipeline import run
