@@ -142,7 +142,7 @@ class ShotSimulator:
             name: np.random.default_rng([options.seed, number, stream])
             for stream, name in enumerate(_STREAMS)
         }
-        scale = self._energy_factor(streams["energy"])
+        energy = max(1 + instrument.energy * streams["energy"].normal(), _DIMMEST)
         structure = 1 + self._wave(streams["structure"], options.beam_structure)
         common = structure * (1 + self._wave(streams["beam"], beam.rms))
         common = common * (1 + self._absorption(streams["absorption"]))
@@ -163,9 +163,8 @@ class ShotSimulator:
             between = beam.between if image else 0.0
             light = common * (1 + self._wave(streams["between"], between))
             light = np.maximum(light, _DIMMEST) * open_share
-            displacement = self._nominal[image] * (
-                scale(setup) + admixture * self._other_ratio(setup)
-            )
+            scale = self._energy_factor(setup, energy) + admixture * self._other_ratio(setup)
+            displacement = self._nominal[image] * scale
             if image and instrument.registration:  # onto a misaligned detector
                 landing = displacement + grid.places()
                 displacement = displacement + self._motion(landing, streams["alignment"])
@@ -187,18 +186,12 @@ class ShotSimulator:
         passed = self._object.transmission(self._setups[0], self._grid)
         return np.ones(self._grid.sizes) if passed is None else passed
 
-    def _energy_factor(self, rng: np.random.Generator):  # type: ignore[no-untyped-def]
-        """Return the displacement of an image over that at its stated energy."""
-        error = 1 + self.inputs.instrument.energy * rng.normal()
-        error = max(error, _DIMMEST)
-
-        def factor(setup: Setup | None) -> float:
-            if setup is None:
-                return 1.0
-            true = setup.model_copy(update={setup.beam_field: error * setup.beam_value})
-            return displacement_ratio(setup, true, deflector=self._object.cause(setup))
-
-        return factor
+    def _energy_factor(self, setup: Setup | None, energy: float) -> float:
+        """Displacement of an image at a multiple of its stated energy, over that at the latter."""
+        if setup is None:
+            return 1.0
+        true = setup.model_copy(update={setup.beam_field: energy * setup.beam_value})
+        return displacement_ratio(setup, true, deflector=self._object.cause(setup))
 
     def _other_ratio(self, setup: Setup | None) -> float:
         """Displacement by the other field over that by the object's, relative to image 1."""
