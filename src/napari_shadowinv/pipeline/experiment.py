@@ -395,10 +395,7 @@ class _Retrieved(NamedTuple):
 
 
 def _inverted(
-    simulator: ShotSimulator,
-    number: int,
-    near: Fit | None,
-    should_stop: ShouldStop | None,
+    simulator: ShotSimulator, number: int, near: Fit | None, should_stop: ShouldStop | None
 ) -> _Retrieved:
     inputs, shots = simulator.inputs, simulator.draw(number)
     options, (setup,) = inputs.options, inputs.setups
@@ -425,10 +422,7 @@ def _inverted(
 
 
 def _fitted(
-    simulator: ShotSimulator,
-    number: int,
-    near: Fit | None,
-    should_stop: ShouldStop | None,
+    simulator: ShotSimulator, number: int, near: Fit | None, should_stop: ShouldStop | None
 ) -> _Retrieved:
     inputs, shots = simulator.inputs, simulator.draw(number)
     options, setups = inputs.options, inputs.setups
@@ -449,9 +443,7 @@ def _fitted(
         noise=noise,
         instrument=inputs.fitted_instrument,
         options=FitOptions(
-            samples=_ERROR_SAMPLES if near is None else 0,
-            max_error=options.max_error,
-            threads=1,
+            samples=_ERROR_SAMPLES if near is None else 0, max_error=options.max_error, threads=1
         ),
         should_stop=should_stop,
     )

@@ -157,9 +157,7 @@ class NewPack(BaseModel):
 
 
 def draft_pack(
-    folder: Path,
-    facts: NewPack | None = None,
-    layers: Sequence[Mapping[str, Any]] | None = None,
+    folder: Path, facts: NewPack | None = None, layers: Sequence[Mapping[str, Any]] | None = None
 ) -> dict[str, Any]:
     """Return the entries of a pack file for the scans of a folder, or for `layers` of them.
 

@@ -211,10 +211,7 @@ class FitInputs:
     def run(self, on_progress: OnProgress | None, should_stop: ShouldStop | None) -> Fit:
         """Fit the fields to the images."""
         result = fit(
-            **self.keywords,
-            fields=self.fields,
-            on_progress=on_progress,
-            should_stop=should_stop,
+            **self.keywords, fields=self.fields, on_progress=on_progress, should_stop=should_stop
         )
         return self.with_provenance(result)
 
@@ -294,10 +291,7 @@ def run_comparison(
 
 
 def collect_fit_inputs(
-    recipe: Recipe,
-    shots: Sequence[FitShot | Shot],
-    *,
-    should_stop: ShouldStop | None = None,
+    recipe: Recipe, shots: Sequence[FitShot | Shot], *, should_stop: ShouldStop | None = None
 ) -> FitInputs:
     """Collect the inputs of a fit: read files, apply the steps, and fill in defaults."""
     recorded = tuple(entry if isinstance(entry, FitShot) else FitShot(entry) for entry in shots)

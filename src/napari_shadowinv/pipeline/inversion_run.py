@@ -416,12 +416,7 @@ def collect_inputs(
     elif isinstance(kind, MeasuredSource):
         kind = MeasuredSource()
     resolved = recipe.model_copy(
-        update={
-            "source": kind,
-            "mask": None,
-            "source_mask": None,
-            "setup": setup,
-        }
+        update={"source": kind, "mask": None, "source_mask": None, "setup": setup}
     )
     dark = _dark_frame(recipe, radiograph)
     if dark is not None:
