@@ -30,7 +30,6 @@ HELP = {
     "shots": "Shots of a store, such as 3:20. Default: all finished ones.",
     "times": "Time between two shots of the store in s, or a list for the shots used, such as "
     "0,1e-9,3e-9. Default: shots are numbered.",
-    "csv": "Table of all numbers with their bands.",
     "figure": "Figure of the products: .png, .pdf or .svg.",
     "out": "Copy of the result with the products, .shadowinv.",
 }
@@ -73,7 +72,7 @@ def analyse(
     setup: _flags.SetupFile = None,
     shots: Annotated[str | None, typer.Option(help=HELP["shots"])] = None,
     times: Annotated[str | None, typer.Option(help=HELP["times"])] = None,
-    csv: Annotated[Path | None, typer.Option(help=HELP["csv"])] = None,
+    csv: Annotated[Path | None, typer.Option(help="Table of all numbers with their bands.")] = None,
     figure: Annotated[Path | None, typer.Option(help=HELP["figure"])] = None,
     out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
     overwrite: _flags.Overwrite = False,
@@ -83,9 +82,9 @@ def analyse(
 
     Bands hold the noise of the image, the discretisation and what was stated of the instrument.
     """
+    from napari_shadowinv.analysis import add_products, analyse_shots, products_table
     from napari_shadowinv.analysis import analyse as measure
-    from napari_shadowinv.analysis import analyse_shots
-    from napari_shadowinv.io import read_dataset
+    from napari_shadowinv.io import read_dataset, replacing, write
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, SITES
     from napari_shadowinv.io.store import is_stack
     from napari_shadowinv.io.store_shots import open_shots
@@ -119,7 +118,18 @@ def analyse(
             results = [each.result for each in series]
         else:
             results = measure(dataset, chosen, samples=samples, **common)
-    _write(results, dataset, {"csv": csv, "figure": figure, "out": out}, overwrite)
+    from napari_shadowinv.plotting import products_figure
+    from napari_shadowinv.plotting.figures import DOTS_PER_INCH
+
+    with ExitStack() as stack:  # all files, or none
+        if csv is not None:
+            temporary = stack.enter_context(replacing(csv, overwrite))
+            temporary.write_text(products_table(results), encoding="utf-8")
+        if figure is not None:
+            temporary = stack.enter_context(replacing(figure, overwrite))
+            products_figure(results).savefig(temporary, dpi=DOTS_PER_INCH)
+        if out is not None:
+            write(out, add_products(dataset, results), overwrite=overwrite)
     if not quiet:
         for table in _tables(results):
             say(table)
@@ -156,26 +166,6 @@ def _products(texts: list[str], file: Path | None) -> list[Product]:
         names = ", ".join(PRODUCTS)
         raise InputError(f"received no product, expected at least one: {names}")
     return listed
-
-
-def _write(
-    results: list[ProductResult], dataset: Any, paths: dict[str, Path | None], overwrite: bool
-) -> None:
-    """Write all files, or none."""
-    from napari_shadowinv.analysis import add_products, products_table
-    from napari_shadowinv.io import replacing, write
-    from napari_shadowinv.plotting import products_figure
-    from napari_shadowinv.plotting.figures import DOTS_PER_INCH
-
-    with ExitStack() as stack:
-        if (path := paths["csv"]) is not None:
-            temporary = stack.enter_context(replacing(path, overwrite))
-            temporary.write_text(products_table(results), encoding="utf-8")
-        if (path := paths["figure"]) is not None:
-            temporary = stack.enter_context(replacing(path, overwrite))
-            products_figure(results).savefig(temporary, dpi=DOTS_PER_INCH)
-        if (path := paths["out"]) is not None:
-            write(path, add_products(dataset, results), overwrite=overwrite)
 
 
 def _tables(results: list[ProductResult]) -> list[Any]:

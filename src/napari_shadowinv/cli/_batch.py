@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -51,8 +50,6 @@ from napari_shadowinv.io.store import (
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from napari_shadowinv.fitting import Fit
-    from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.io.store_columns import Column as StoreColumn
     from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
     from napari_shadowinv.preprocessing import Recipe
@@ -143,15 +140,6 @@ def exit_unless_reliable(store: StackStore) -> None:
     reports = zip(statuses, store.reports(), strict=True)
     if not all(_is_reliable(report) for status, report in reports if status == DONE):
         raise typer.Exit(EXIT_NOT_CONVERGED)
-
-
-def shot_reader(channel: str | None, variable: str | None) -> Callable[..., ArrayLike]:
-    """Return the reader of the shots' files."""
-    from napari_shadowinv.stack import read_shot
-
-    # A reader is part of a store's identity: only a variable that is there names itself.
-    named: dict[str, Any] = {} if variable is None else {"variable": variable}
-    return functools.partial(read_shot, channel=channel, **named)
 
 
 def _is_reliable(report: Mapping[str, Any]) -> bool:
@@ -372,7 +360,11 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
     store = StackStore(path, every_byte=verify)
     rows = store_rows(store, trouble=not every)
     if verify:
-        rows.append(("checksums", _checksums_text(store)))
+        count = len(store.damage.shots) + len(store.damage.files)
+        text = f"{count} do not match" if count else "all files match"
+        if not store.has_checksums:
+            text = "none: the store was written by an earlier version, so damage cannot be detected"
+        rows.append(("checksums", text))
     tables = [two_columns(str(path), rows)]
     is_damaged = bool(store.damage.shots or store.damage.files)
     if not every:
@@ -413,13 +405,6 @@ def _notes(store: StackStore) -> Iterator[tuple[int, str]]:
             continue
         cautions = map(Caution.from_json, report.get("warnings", ()))
         yield from ((index, caution.text) for caution in cautions)
-
-
-def _checksums_text(store: StackStore) -> str:
-    if not store.has_checksums:
-        return "none: the store was written by an earlier version, so damage cannot be detected"
-    count = len(store.damage.shots) + len(store.damage.files)
-    return f"{count} do not match" if count else "all files match"
 
 
 def store_rows(store: StackStore, *, trouble: bool = True) -> Rows:
@@ -491,13 +476,17 @@ class _WatchPrinter:
         if outcome.reason:
             self._print(self.err, f"failed: {name}: {outcome.reason}", "red")
             return
-        assert status.result is not None
-        summary, doubts = _shot_summary(status.result)
-        summary = f"  {summary}  {outcome.seconds:.2f} s{waiting}{doubts}"
+        result = status.result
+        assert result is not None
+        summary = "  ".join(fact.short for fact in result.facts if fact.short)
+        summary = f"  {summary}  {outcome.seconds:.2f} s{waiting}"
+        # Any other verdict implies its warnings.
+        if result.verdict == _DETERMINED and (count := len(result.cautions)):
+            summary += f", {count} warning{'s' if count > 1 else ''}"
         name = _shorten_name(name, _LINE_COLUMNS - len(summary))
-        is_sound = status.result.headline.level is Level.SOUND
+        is_sound = result.headline.level is Level.SOUND
         self._print(self.out, f"{name}{summary}", "" if is_sound else "yellow")
-        for warning in status.result.cautions:
+        for warning in result.cautions:
             if warning.code not in self.warned:
                 self.warned.add(warning.code)
                 self._print(self.err, f"warning: {status.name}: {warning.text}", "yellow")
@@ -510,13 +499,6 @@ def _shorten_name(name: str, columns: int) -> str:
     """Cut the start of a long name; its end identifies the file."""
     columns = max(columns, _MIN_NAME_COLUMNS)
     return name if len(name) <= columns else f"…{name[1 - columns :]}"
-
-
-def _shot_summary(result: Inversion | Fit) -> tuple[str, str]:
-    """Return the facts of a shot in a few words, and warnings that its verdict does not imply."""
-    count = len(result.cautions) if result.verdict == _DETERMINED else 0
-    doubts = f", {count} warning{'s' if count > 1 else ''}" if count else ""
-    return "  ".join(fact.short for fact in result.facts if fact.short), doubts
 
 
 def run_watch(

@@ -80,10 +80,24 @@ def film(
     from napari_shadowinv.io import replacing
     from napari_shadowinv.io.formats import SITES
     from napari_shadowinv.pipeline import read_pack, run_film, write_layers
-    from napari_shadowinv.pipeline.film_files import LAYERS_TABLE
+    from napari_shadowinv.pipeline.film_files import (
+        LAYERS_TABLE,
+        draft_pack,
+        missing_entries,
+        write_new_pack,
+    )
 
     if new is not None:
-        _write_new(new, pack, overwrite)
+        if pack is not None:
+            raise InputError(
+                f"received --new, which writes a pack file, and the pack file {pack}: use one of "
+                "them"
+            )
+        entries = draft_pack(new)
+        rows = [("layers", str(len(entries["layers"])))]
+        rows += [("to complete", text) for text in missing_entries(entries)]
+        written = [write_new_pack(new, entries, overwrite=overwrite)]
+        say(two_columns("New pack", [*rows, *written_rows(written)]))
         return
     if pack is None:
         raise InputError(
@@ -116,21 +130,6 @@ def film(
         say(film_table(doses))
         facts = [fact for fact in doses.facts if not fact.is_detail]
         say(two_columns("Film pack", [*fact_rows(facts), *written_rows(written)]))
-
-
-def _write_new(folder: Path, pack: Path | None, overwrite: bool) -> None:
-    """Write a pack file for a folder of scans, and list the entries to complete."""
-    from napari_shadowinv.pipeline.film_files import draft_pack, missing_entries, write_new_pack
-
-    if pack is not None:
-        raise InputError(
-            f"received --new, which writes a pack file, and the pack file {pack}: use one of them"
-        )
-    entries = draft_pack(folder)
-    rows = [("layers", str(len(entries["layers"])))]
-    rows += [("to complete", text) for text in missing_entries(entries)]
-    path = write_new_pack(folder, entries, overwrite=overwrite)
-    say(two_columns("New pack", [*rows, ("written", str(path))]))
 
 
 def film_table(doses: FilmDoses) -> Table:

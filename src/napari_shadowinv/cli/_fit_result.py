@@ -15,7 +15,6 @@ from napari_shadowinv.io.formats import RESULT
 
 if TYPE_CHECKING:
     import xarray
-    from matplotlib.figure import Figure
     from rich.table import Table
 
     from napari_shadowinv.fitting import Fit, FitShot
@@ -154,19 +153,6 @@ def static_figures(report: Path, *, left_out: bool, window: int | None) -> list[
         for name, is_requested in requests.items()
         if is_requested
     ]
-
-
-def check_figures(checks: StaticChecks, report: Path, title: str) -> dict[Path, Figure]:
-    """Return the figures of the checks by file."""
-    from napari_shadowinv.plotting import left_out_figure, windows_figure
-
-    left_out, windows = static_figures(report, left_out=True, window=1)
-    figures = {}
-    if checks.left_out is not None:
-        figures[left_out] = left_out_figure(checks.left_out, title=title)
-    if checks.windows is not None:
-        figures[windows] = windows_figure(checks.windows, title=title)
-    return figures
 
 
 def exit_unless_static(checks: StaticChecks, out: Path) -> None:

@@ -102,17 +102,21 @@ def write_result(
     checks: StaticChecks | None = None,
 ) -> None:
     """Write a result and its figures, all or none; the names of its files are the title."""
-    from napari_shadowinv.cli._fit_result import check_figures
+    from napari_shadowinv.cli._fit_result import static_figures
     from napari_shadowinv.io import replacing, write
     from napari_shadowinv.io.files import text_of
-    from napari_shadowinv.plotting import result_figure
+    from napari_shadowinv.plotting import left_out_figure, result_figure, windows_figure
     from napari_shadowinv.plotting.figures import DOTS_PER_INCH
 
     title = ", ".join(text_of(Path(name).name) for name in names)
     dataset, figures = result.to_dataset(), {figure: result_figure(result, title=title)}
     if checks is not None:
         dataset = checks.add_to(dataset)
-        figures |= check_figures(checks, figure, title)
+        left_out, windows = static_figures(figure, left_out=True, window=1)
+        if checks.left_out is not None:
+            figures[left_out] = left_out_figure(checks.left_out, title=title)
+        if checks.windows is not None:
+            figures[windows] = windows_figure(checks.windows, title=title)
     with ExitStack() as stack:
         for path, page in figures.items():
             temporary = stack.enter_context(replacing(path, overwrite))
@@ -193,17 +197,6 @@ def fit_recipe(
             "fit in the recipe's section [fit.options]"
         )
     return recipe.model_copy(update={"fit": recipe.fit or FitChoices()})
-
-
-def source_from(recipe: Recipe, image: Path, channel: str | None) -> Radiograph | None:
-    """Read the measured source that a recipe names, from its file or else the image's."""
-    from napari_shadowinv.pipeline.files import read_part
-    from napari_shadowinv.preprocessing import MeasuredSource
-
-    measured = recipe.source
-    if not isinstance(measured, MeasuredSource) or measured == MeasuredSource():
-        return None
-    return read_part(measured.file or image, channel, measured.variable)
 
 
 def setup_for(path: Path | None, shot: Radiograph, recipe: Recipe) -> Setup | None:

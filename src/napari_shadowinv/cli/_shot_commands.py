@@ -38,14 +38,15 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv._typing import AnyArray, FloatArray
-    from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.physics.setup import ProtonSetup, Setup
+    from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.physics.tracing import TracedImage
 
 # Help of arguments, where it is longer than a line.
 HELP = {
     "image": "The image, if it has moved or changed; for a fit, all images in their order. "
     "Default: the files named in the result, in its folder or the current one.",
+    "repeated": "Result file. Default: the result's name with _again, in the current folder.",
+    "others": "Also read the files in other folders that the result names.",
     "field": ".shadowinv or pradformat result, or NPY, MATLAB or HDF5 (with --variable) "
     "containing a displacement (2, H, W) in px or a potential (H, W) in px²; or a 3-D field of a "
     "simulation (openPMD, NetCDF).",
@@ -59,6 +60,7 @@ HELP = {
     "magnetic-field, electric-field, plasma or refractive-index.",
     "dispersion": "For a refractive index: ratio of ln η at the new wavelength to ln η at the old "
     "one.",
+    "system": "Print the versions and the system instead, for a bug report.",
     "predicted_image": "Image file: .tif (float32), .npy or .png (16 bits, scaled to its maximum). "
     "Default: the field's name with _image.tif, in the current folder.",
 }
@@ -128,6 +130,7 @@ def invert(
     and a figure next to it.
     """
     from napari_shadowinv.pipeline.files import read_part, write_recipe
+    from napari_shadowinv.preprocessing import MeasuredSource
 
     result, figure = _inputs.result_and_figure(image, out, figure)
     suffixes = _inputs.result_suffixes(ResultKind.INVERSION, result, figure)
@@ -147,7 +150,11 @@ def invert(
     shot = read_part(image, channel, variable)
     chosen = chosen.model_copy(update={"setup": _inputs.setup_for(setup, shot, chosen)})
     _inputs.check_setup(result, chosen.setup)
-    inversion = invert_shot(chosen, shot, _inputs.source_from(chosen, image, channel), quiet)
+    beam, measured = None, chosen.source
+    if isinstance(measured, MeasuredSource) and measured != MeasuredSource():
+        # In its own file or in the image's; the channel is that of both.
+        beam = read_part(measured.file or image, channel, measured.variable)
+    inversion = invert_shot(chosen, shot, beam, quiet)
     _inputs.write_result(inversion, [str(image)], result, figure, overwrite)
     if save_recipe is not None:
         write_recipe(save_recipe, chosen, overwrite=overwrite)
@@ -175,19 +182,9 @@ def rerun(
     source: Annotated[
         Path | None, typer.Option(help="The measured source, if it has moved.")
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Result file. Default: the result's name with _again, in the current folder."
-        ),
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help=HELP["repeated"])] = None,
     figure: _flags.Figure = None,
-    other_folders: Annotated[
-        bool,
-        typer.Option(
-            "--other-folders", help="Also read the files in other folders that the result names."
-        ),
-    ] = False,
+    other_folders: Annotated[bool, typer.Option("--other-folders", help=HELP["others"])] = False,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.QuietInversion = False,
 ) -> None:
@@ -322,7 +319,21 @@ def forward(
     beam = content.source if original == target else None
     if source is not None:
         beam = read_radiograph(source, channel=channel, variable=source_variable).image
-    image, note = predict_image(content.displacement, beam, original, target, deflector, dispersion)
+    from napari_shadowinv.physics.forward import synthetic_image
+    from napari_shadowinv.physics.projection import default_deflector, project
+
+    note = ""
+    if original is None or target is None or original == target:
+        image = synthetic_image(content.displacement, beam)
+    else:
+        # Names of two words have a hyphen on the command line.
+        name = deflector.replace("-", " ") if deflector else default_deflector(original, target)
+        assumed: dict[str, Any] = {"deflector": name, "dispersion": dispersion, "source": beam}
+        image = project(content.displacement, original, target, **assumed)
+        note = (
+            f"From {setup_text(original)} to {setup_text(target)}, assuming that only a {name} "
+            "deflects the beam"
+        )
     write(path, image, setup=target, overwrite=overwrite)
     if not quiet:
         inside = image.sum() / (image.size if beam is None else beam.sum())
@@ -337,12 +348,7 @@ def info(
         Path | None, typer.Argument(help="An image or a result.", show_default=False)
     ] = None,
     variable: _flags.Variable = None,
-    system: Annotated[
-        bool,
-        typer.Option(
-            "--system", help="Print the versions and the system instead, for a bug report."
-        ),
-    ] = False,
+    system: Annotated[bool, typer.Option("--system", help=HELP["system"])] = False,
 ) -> None:
     """Describe a file and its contents."""
     from napari_shadowinv.cli import _info
@@ -384,10 +390,13 @@ def demo(
     make_folder(out)
     import numpy as np
 
+    from napari_shadowinv.io import write
+    from napari_shadowinv.io.formats import PNG, RESULT
     from napari_shadowinv.physics.beam import displacement_from_potential
     from napari_shadowinv.physics.forward import synthetic_image
     from napari_shadowinv.physics.phantoms import paper_setup, toroid
     from napari_shadowinv.physics.poisson import poisson_invert
+    from napari_shadowinv.plotting import comparison_figure, report_figure, save_figure
     from napari_shadowinv.preprocessing import Radiograph
 
     setup = paper_setup()
@@ -399,7 +408,15 @@ def demo(
     poisson = displacement_from_potential(poisson_invert(image))
     fields = {"True": truth, "Retrieved": inversion.displacement, "Poisson": poisson}
     errors = {name: _error_text(fields[name], truth) for name in ("Retrieved", "Poisson")}
-    written = write_demo(out, f"toroid_{dm:g}", inversion, setup, fields, errors)
+    caption = "Errors: " + "; ".join(f"{field} {error}" for field, error in errors.items())
+    comparison = comparison_figure(fields, setup, title="True and retrieved", caption=caption)
+    name = f"toroid_{dm:g}"
+    report = report_figure(inversion, setup, title=f"Demo {name}")
+    written = [
+        write(out / f"{name}{RESULT.suffix}", inversion, setup=setup, overwrite=True),
+        save_figure(out / f"{name}{PNG.suffix}", report, overwrite=True),
+        save_figure(out / f"{name}_comparison{PNG.suffix}", comparison, overwrite=True),
+    ]
     rows = [
         headline_row(inversion.headline_in(setup)),
         ("setup", setup_text(setup, shape=image.shape)),
@@ -410,29 +427,6 @@ def demo(
     ]
     say(two_columns("Demo", rows))
     exit_unless_converged(inversion.report, written[0])
-
-
-def write_demo(
-    folder: Path,
-    name: str,
-    inversion: Inversion,
-    setup: ProtonSetup,
-    fields: Mapping[str, FloatArray],
-    errors: Mapping[str, str],
-) -> list[Path]:
-    """Write the result, its figure, and the fields side by side."""
-    from napari_shadowinv.io import write
-    from napari_shadowinv.io.formats import PNG, RESULT
-    from napari_shadowinv.plotting import comparison_figure, report_figure, save_figure
-
-    caption = "Errors: " + "; ".join(f"{field} {error}" for field, error in errors.items())
-    comparison = comparison_figure(fields, setup, title="True and retrieved", caption=caption)
-    report = report_figure(inversion, setup, title=f"Demo {name}")
-    return [
-        write(folder / f"{name}{RESULT.suffix}", inversion, setup=setup, overwrite=True),
-        save_figure(folder / f"{name}{PNG.suffix}", report, overwrite=True),
-        save_figure(folder / f"{name}_comparison{PNG.suffix}", comparison, overwrite=True),
-    ]
 
 
 def _error_text(estimate: FloatArray, truth: FloatArray) -> str:
@@ -566,29 +560,3 @@ def choose_setups(
             "with --setup, and for a field in px also --recorded-with"
         )
     return original, target
-
-
-def predict_image(
-    displacement: FloatArray,
-    source: FloatArray | None,
-    recorded_with: Setup | None,
-    target: Setup | None,
-    deflector: str | None,
-    dispersion: float,
-) -> tuple[FloatArray, str]:
-    """Return the image, and a sentence with the assumptions."""
-    from napari_shadowinv.physics.forward import synthetic_image
-    from napari_shadowinv.physics.projection import default_deflector, project
-
-    if recorded_with is None or target is None or recorded_with == target:
-        return synthetic_image(displacement, source), ""
-    # Names of two words have a hyphen on the command line.
-    name = deflector and deflector.replace("-", " ")
-    name = name or default_deflector(recorded_with, target)
-    image = project(
-        displacement, recorded_with, target, deflector=name, dispersion=dispersion, source=source
-    )
-    return image, (
-        f"From {setup_text(recorded_with)} to {setup_text(target)}, assuming that only a {name} "
-        "deflects the beam"
-    )

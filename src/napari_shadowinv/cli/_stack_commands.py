@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,6 +29,10 @@ HELP = {
     "[fit]; table rows with the same shot are images of one object.",
     "table": "Table with a row for each shot: CSV with the column 'shot' or 'number', or HDF5 as "
     "file.h5::/entry/shots.",
+    "verify": "Read all files and compare their checksums; exit code 1 if any is damaged.",
+    "variables": "For tiff and ome-zarr: variables to export, separated by commas.",
+    "variable": "Variable to show; for vectors, the magnitude. Default: the potential.",
+    "limits": "Limits of the colour scale. Default: the range over all shots.",
     "out": "Output folder, or file for csv. Default: the store's name, in the current folder.",
 }
 BATCH_EPILOG = """
@@ -96,7 +101,6 @@ def _stack_inputs(
     flags: dict[str, Any],
 ) -> dict[str, Any]:
     """Return the inputs of `batch` and `watch`, and save their recipe."""
-    from napari_shadowinv.cli._batch import shot_reader
     from napari_shadowinv.pipeline.files import setup_from, write_recipe
 
     files: dict[str, Any] = {"source": source, "mask": mask, "source_mask": source_mask}
@@ -112,7 +116,12 @@ def _stack_inputs(
         write_recipe(save_recipe, chosen, overwrite=run.overwrite)
     if not quiet:
         warn_of_setups([(chosen.setup, None)])
-    return {"recipe": chosen, "reader": shot_reader(channel, variable), "quiet": quiet}
+    from napari_shadowinv.stack import read_shot
+
+    # A reader is part of a store's identity: only a variable that is there names itself.
+    named: dict[str, Any] = {} if variable is None else {"variable": variable}
+    reader = partial(read_shot, channel=channel, **named)
+    return {"recipe": chosen, "reader": reader, "quiet": quiet}
 
 
 @notify_errors
@@ -172,13 +181,7 @@ def watch(
 def status(
     store: _flags.StoreFolder,
     every: Annotated[bool, typer.Option("--all", help="Show one line per shot.")] = False,
-    verify: Annotated[
-        bool,
-        typer.Option(
-            "--verify",
-            help="Read all files and compare their checksums; exit code 1 if any is damaged.",
-        ),
-    ] = False,
+    verify: Annotated[bool, typer.Option("--verify", help=HELP["verify"])] = False,
 ) -> None:
     """Show which shots of a store are done, pending, failed or damaged, and why."""
     from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, status_tables
@@ -212,9 +215,7 @@ def export(
         str, typer.Option("--format", metavar="tiff|pradformat|…", help=HELP["format"])
     ],
     shots: _flags.ChosenShots = None,
-    variables: Annotated[
-        str, typer.Option(help="For tiff and ome-zarr: variables to export, separated by commas.")
-    ] = "potential",
+    variables: Annotated[str, typer.Option(help=HELP["variables"])] = "potential",
     out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
@@ -235,17 +236,11 @@ def export(
 def movie(
     store: _flags.StoreFolder,
     out: Annotated[Path, typer.Option("--out", "-o", help="Output movie: .mp4 or .gif.")],
-    variable: Annotated[
-        str | None,
-        typer.Option(help="Variable to show; for vectors, the magnitude. Default: the potential."),
-    ] = None,
+    variable: Annotated[str | None, typer.Option(help=HELP["variable"])] = None,
     shots: _flags.ChosenShots = None,
     rate: Annotated[float, typer.Option(help="Shots per second.")] = 10.0,
     limits: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            metavar="MIN MAX", help="Limits of the colour scale. Default: the range over all shots."
-        ),
+        tuple[float, float] | None, typer.Option(metavar="MIN MAX", help=HELP["limits"])
     ] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
