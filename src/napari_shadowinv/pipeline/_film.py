@@ -370,6 +370,12 @@ def run_film(
     usable = by_layer([film_doses.usable for film_doses in doses], False)
     # Per area of the first film: behind it the same protons cover more.
     dose *= scales[:, None, None] ** 2
+    origins = tuple(
+        ImageOrigin(
+            file=text_of(Path(film.layer.file or pack.scan or "").name), sha256=film.scan.checksum
+        )
+        for film in films
+    )
     spectra = unfold(
         dose,
         np.where(usable, error, np.inf),
@@ -391,7 +397,7 @@ def run_film(
         corners=corners,
         energies=spectra.energies,
         bands=np.array([(band.peak, band.low, band.high) for band in response.bands]),
-        provenance=Provenance(kind="film pack", pack=pack, images=_scans(pack, films)),
+        provenance=Provenance(kind="film pack", pack=pack, images=origins),
         cautions=tuple(_warnings(aligned, doses, poses, pack)),
         pixel_size=pixel,
         setups=pack.setups(spectra.energies, pixel),
@@ -401,16 +407,6 @@ def run_film(
 def _corners_on_scan(film: Film, pack: Pack) -> FloatArray:
     turn = film.layer.turned, pack.is_mirrored(film.layer)
     return to_scan_frame(film.scan, film.corners, *turn)[1]
-
-
-def _scans(pack: Pack, films: list[Film]) -> tuple[ImageOrigin, ...]:
-    """Return the origin of each film's scan."""
-    origins = []
-    for film in films:
-        file = film.layer.file or pack.scan
-        name = "" if file is None else text_of(file.name)
-        origins.append(ImageOrigin(file=name, sha256=film.scan.checksum))
-    return tuple(origins)
 
 
 def _scale_about_axis(films: list[Film], pack: Pack) -> list[Film]:

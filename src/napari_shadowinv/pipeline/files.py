@@ -37,7 +37,14 @@ def write_recipe(path: Path, recipe: Recipe, *, overwrite: bool = False) -> None
     """
     folder = resolved_path(Path(path).parent)
     relative = map_paths(recipe, lambda file: Path(os.path.relpath(resolved_path(file), folder)))
-    write_toml(path, _without_defaults(relative), overwrite)
+    content = relative.model_dump(exclude_none=True)
+    # Options at their defaults are left out.
+    content["instrument"] = relative.instrument.stated or ()
+    content["options"] = relative.options.model_dump(exclude_defaults=True) or ()
+    if relative.fit is not None:  # an empty section still requests a fit
+        content["fit"] = relative.fit.model_dump(exclude_defaults=True)
+    content = {name: _to_toml(value) for name, value in content.items() if value != ()}
+    write_toml(path, content, overwrite)
 
 
 def read_part(path: Path, channel: str | None = None, variable: str | None = None) -> Radiograph:
@@ -72,16 +79,6 @@ def _kind_of(entries: Mapping[str, Any]) -> str:
     """Return the first kind of setup that alone has one of the entries, empty without one."""
     kinds = (kind for kind, model in SETUPS.items() if entries.keys() & model.own_fields())
     return next(kinds, "")
-
-
-def _without_defaults(recipe: Recipe) -> dict[str, Any]:
-    """Return the content of a recipe without options at their defaults."""
-    content = recipe.model_dump(exclude_none=True)
-    content["instrument"] = recipe.instrument.stated or ()
-    content["options"] = recipe.options.model_dump(exclude_defaults=True) or ()
-    if recipe.fit is not None:  # an empty section still requests a fit
-        content["fit"] = recipe.fit.model_dump(exclude_defaults=True)
-    return {name: _to_toml(value) for name, value in content.items() if value != ()}
 
 
 def _to_toml(value: Any) -> Any:

@@ -199,14 +199,13 @@ def draft_pack(
         for part, candidates in (("calibration", calibrations), ("unexposed", unexposed)):
             if (path := _file_for_type(kind, candidates, types)) is not None:
                 films.setdefault(kind, {})[part] = path.name
-    entries: dict[str, Any] = {}
-    if facts.seen_from is not None:
-        entries["seen_from"] = facts.seen_from
-    distances = facts.model_dump(include={"source_object_distance", "object_image_distance"})
-    if None not in distances.values():
-        entries["setup"] = distances
-    elif any(value is not None for value in distances.values()):
+    entries = facts.model_dump(exclude={"film"}, exclude_none=True)
+    names = ("source_object_distance", "object_image_distance")
+    distances = {name: entries.pop(name) for name in names if name in entries}
+    if len(distances) == 1:
         raise InputError("only one of two distances is given: give both, or none")
+    if distances:
+        entries["setup"] = distances
     return {**entries, "films": films, "layers": [dict(layer) for layer in layer_entries]}
 
 
