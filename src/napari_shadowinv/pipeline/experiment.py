@@ -47,7 +47,6 @@ from napari_shadowinv.pipeline.experiment_result import (
 from napari_shadowinv.pipeline.experiment_shots import (
     ExperimentInputs,
     ShotSimulator,
-    SimulatedShots,
 )
 
 _MIN_SIDE_PX = 32
@@ -434,8 +433,9 @@ def _fitted(
         start = NearField(potential_from_displacement(simulator.truth), near.fields[0].smoothness)
         images[0] = replace(images[0], start=start)
     noise: Any = "poisson"
-    if shots.source is not None and shots.source_noise:
-        noise = _noise(shots)
+    if shots.source is not None and shots.source_noise:  # by the counts of image and reference
+        means = gaussian_filter(shots.images, (0, 1.0, 1.0))
+        noise = np.sqrt(np.maximum(means, 1.0) + shots.source * shots.source_noise)
     result = fit(
         images,
         source=shots.source,
@@ -469,13 +469,6 @@ def _fields_of(inputs: ExperimentInputs) -> tuple[str, ...]:
     if setup is None or cause is None:
         return ("B",)
     return tuple(key for key, title in deflector_titles().items() if title == cause)
-
-
-def _noise(shots: SimulatedShots) -> FloatArray:
-    """Standard deviation by the counts of image and reference in each pixel."""
-    assert shots.source is not None
-    means = gaussian_filter(shots.images, (0, 1.0, 1.0))
-    return np.asarray(np.sqrt(np.maximum(means, 1.0) + shots.source * shots.source_noise))
 
 
 def _errors_made(displacement: FloatArray, truth: FloatArray) -> tuple[float, float]:

@@ -365,9 +365,7 @@ def _collect_image(recipe: Recipe, shot: FitShot, name: str, *, unknown: bool) -
     source: Any = None if shot.beam_unknown else shot.source
     masks = {"mask": shot.mask, "source_mask": shot.source_mask}
     files = {key: Path(mask) for key, mask in masks.items() if isinstance(mask, (str, Path))}
-    arrays: Any = {
-        key: mask for key, mask in masks.items() if mask is not None and key not in files
-    }
+    arrays: Any = {key: mask for key, mask in masks.items() if key not in files}
     shot_recipe = recipe.model_copy(
         update={**files, "setup": shot.setup or recipe.setup, "fit": None}
     )

@@ -122,9 +122,6 @@ class ShotRow(CheckedModel):
         return {**entries, **{name: text_of(path.name) for name, path in self.files.items()}}
 
 
-_FIT_COLUMNS = ("strength", "psf", "noise")
-
-
 class _Fiducial(CheckedModel):
     y: float
     x: float
@@ -209,7 +206,8 @@ def rows_to_invert(table: Path | Sequence[ShotRow]) -> tuple[list[ShotRow], tupl
                 "find: name an image, or leave the cell empty"
             )
     used = list(rows.values())
-    filled = (name for name in _FIT_COLUMNS if any(getattr(row, name) is not None for row in used))
+    of_fits = ("strength", "psf", "noise")
+    filled = (name for name in of_fits if any(getattr(row, name) is not None for row in used))
     return used, tuple(filled)
 
 
