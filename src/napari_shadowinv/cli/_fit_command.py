@@ -10,7 +10,13 @@ import typer
 
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._summary import fact_rows, two_columns, written_rows
-from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups, work_callbacks
+from napari_shadowinv.cli._terminal import (
+    exit_unless_sound,
+    notify_errors,
+    say,
+    warn_of_setups,
+    work_callbacks,
+)
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.io.formats import IMAGE_TITLES, RESULT
 
@@ -153,5 +159,4 @@ def fit(
             if check is not None:
                 say(two_columns(title, fact_rows(check.facts)))
         say(two_columns("Fit", [*_fit_result.fit_rows(result_fit, names), *written_rows(outputs)]))
-    _fit_result.exit_unless_static(static, result)
-    _fit_result.exit_unless_determined(result_fit, result)
+    exit_unless_sound(result_fit, result, static)

@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
 from napari_shadowinv.cli._summary import Rows, fact_rows, options_text, setup_text, size_text
-from napari_shadowinv.cli._terminal import EXIT_NOT_CONVERGED, say, say_on_stderr, work_callbacks
+from napari_shadowinv.cli._terminal import say, work_callbacks
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import RESULT
 
@@ -18,7 +16,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from napari_shadowinv.fitting import Fit, FitShot
-    from napari_shadowinv.pipeline.static_checks import StaticChecks
     from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.provenance import Provenance
 
@@ -64,15 +61,6 @@ def comparison_table(fits: Sequence[Fit]) -> Table:
         evidence = "likeliest" if fit is fits[0] else f"{difference:+.1f}"
         table.add_row(names, chi2, evidence, fit.verdict)
     return table
-
-
-def exit_unless_determined(fit: Fit, out: Path) -> None:
-    """Exit with an error code unless the verdict is 'determined'."""
-    from napari_shadowinv.facts import Verdict
-
-    if fit.verdict is not Verdict.DETERMINED:
-        say_on_stderr(f"{fit.verdict.upper()}: {out} was written, but {fit.explanation}")
-        raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
 def fit_file_rows(dataset: xarray.Dataset) -> Rows:
@@ -153,13 +141,6 @@ def static_figures(report: Path, *, left_out: bool, window: int | None) -> list[
         for name, is_requested in requests.items()
         if is_requested
     ]
-
-
-def exit_unless_static(checks: StaticChecks, out: Path) -> None:
-    """Exit with an error code if a static field does not explain an image."""
-    if checks.left_out is not None and not checks.left_out.explained.all():
-        say_on_stderr(f"NOT STATIC: {out} was written, but {checks.left_out.explanation}")
-        raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
 def short_names(names: Sequence[str], beams: Sequence[str]) -> list[str]:

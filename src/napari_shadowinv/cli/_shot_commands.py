@@ -23,7 +23,7 @@ from napari_shadowinv.cli._summary import (
     written_rows,
 )
 from napari_shadowinv.cli._terminal import (
-    exit_unless_converged,
+    exit_unless_sound,
     invert_shot,
     notify_errors,
     say,
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 HELP = {
     "image": "The image, if it has moved or changed; for a fit, all images in their order. "
     "Default: the files named in the result, in its folder or the current one.",
-    "repeated": "Result file. Default: the result's name with _again, in the current folder.",
-    "others": "Also read the files in other folders that the result names.",
+    "rerun_out": "Result file. Default: the result's name with _again, in the current folder.",
+    "other_folders": "Also read the files in other folders that the result names.",
     "field": ".shadowinv or pradformat result, or NPY, MATLAB or HDF5 (with --variable) "
     "containing a displacement (2, H, W) in px or a potential (H, W) in px²; or a 3-D field of a "
     "simulation (openPMD, NetCDF).",
@@ -168,7 +168,7 @@ def invert(
             *written_rows(outputs),
         ]
         say(two_columns("Inversion", rows))
-    exit_unless_converged(inversion.report, result)
+    exit_unless_sound(inversion, result)
 
 
 @notify_errors
@@ -182,9 +182,11 @@ def rerun(
     source: Annotated[
         Path | None, typer.Option(help="The measured source, if it has moved.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help=HELP["repeated"])] = None,
+    out: Annotated[Path | None, typer.Option(help=HELP["rerun_out"])] = None,
     figure: _flags.Figure = None,
-    other_folders: Annotated[bool, typer.Option("--other-folders", help=HELP["others"])] = False,
+    other_folders: Annotated[
+        bool, typer.Option("--other-folders", help=HELP["other_folders"])
+    ] = False,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.QuietInversion = False,
 ) -> None:
@@ -220,11 +222,7 @@ def rerun(
             *written_rows([again_out, figure]),
         ]
         say(two_columns("Rerun", rows))
-    _fit_result.exit_unless_static(again.checks, again_out)
-    if content.kind is ResultKind.INVERSION:
-        exit_unless_converged(content.report, again_out)
-    elif content.kind is ResultKind.FIT:
-        _fit_result.exit_unless_determined(content, again_out)
+    exit_unless_sound(content, again_out, again.checks)
 
 
 FORWARD_EPILOG = """
@@ -426,7 +424,7 @@ def demo(
         *written_rows(written),
     ]
     say(two_columns("Demo", rows))
-    exit_unless_converged(inversion.report, written[0])
+    exit_unless_sound(inversion, written[0])
 
 
 def _error_text(estimate: FloatArray, truth: FloatArray) -> str:

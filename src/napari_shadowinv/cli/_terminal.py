@@ -21,6 +21,7 @@ from pydantic import ValidationError
 
 from napari_shadowinv._system.machine import ENDING_SIGNALS, handling
 from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.facts import ResultKind, Verdict
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -28,8 +29,9 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from napari_shadowinv._system.progress import OnProgress, Progress
-    from napari_shadowinv.inversion import Inversion, Report
+    from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.pipeline.static_checks import StaticChecks
     from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 EXIT_MISTAKE = 2
@@ -182,14 +184,26 @@ def notify_errors(command: Callable[P, None]) -> Callable[P, None]:
     return run
 
 
-def exit_unless_converged(report: Report, out: Path) -> None:
-    """Exit with an error code if an inversion has not converged."""
-    if not report.converged:
-        say_on_stderr(
+def exit_unless_sound(result: Any, out: Path, checks: StaticChecks | None = None) -> None:
+    """Exit with an error code if an inversion did not converge or a fit is not determined.
+
+    Also if, by the checks of a fit, a static field does not explain an image.
+    """
+    left_out = None if checks is None else checks.left_out
+    if left_out is not None and not left_out.explained.all():
+        text = f"NOT STATIC: {out} was written, but {left_out.explanation}"
+    elif result.kind is ResultKind.INVERSION and not result.report.converged:
+        report = result.report
+        text = (
             f"NOT CONVERGED: {out} was written, but its flux residual is {report.residual:.2g} "
             f"(tolerance {report.tolerance:.2g}): do not trust the field"
         )
-        raise typer.Exit(EXIT_NOT_CONVERGED)
+    elif result.kind is ResultKind.FIT and result.verdict is not Verdict.DETERMINED:
+        text = f"{result.verdict.upper()}: {out} was written, but {result.explanation}"
+    else:
+        return
+    say_on_stderr(text)
+    raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
 def is_interrupted() -> bool:
