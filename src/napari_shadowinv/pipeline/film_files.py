@@ -95,31 +95,31 @@ def write_layers(
     setups = doses.setups
     if form == "pradformat" and not setups:
         raise InputError("pradformat needs a setup: give the pack's distances, or write TIFF")
-    written, rows = [], []
+    rows = []
     for k, used in enumerate(doses.usable):
         name = f"layer_{k + 1:02d}"
         row = {"mask": f"{name}_mask{TIFF.suffix}"}
         fluence = np.where(used, doses.fluence[k], 0.0)
-        written.append(write(folder / row["mask"], used.astype(np.float32), overwrite=overwrite))
+        write(folder / row["mask"], used.astype(np.float32), overwrite=overwrite)
         if form == "pradformat":
             row["file"] = f"{name}{PRADFORMAT.suffix}"
             description = f"Film {k + 1} of a pack, fluence in protons per m² and MeV"
             with replacing(folder / row["file"], overwrite) as temporary:
                 write_radiograph(temporary, fluence, setups[k], description)
-            written.append(folder / row["file"])
         else:
             row["file"] = f"{name}{TIFF.suffix}"
-            written.append(write(folder / row["file"], fluence, overwrite=overwrite))
+            write(folder / row["file"], fluence, overwrite=overwrite)
         if setups and form == "tiff":
             row["setup"] = f"{name}.toml"
             write_toml(folder / row["setup"], setups[k].model_dump(), overwrite)
-            written.append(folder / row["setup"])
         elif not setups:
             row["energy"] = f"{doses.energies[k]:.6g}"
             row["strength"] = f"{doses.strengths[k]:.6g}"
         if not used.any():
             row["exclude"] = "yes"
         rows.append(row)
+    files = ("mask", "file", "setup")
+    written = [folder / row[key] for row in rows for key in files if key in row]
     table = folder / LAYERS_TABLE
     columns = [name for name in _COLUMNS if any(name in row for row in rows)]
     with replacing(table, overwrite) as temporary:
