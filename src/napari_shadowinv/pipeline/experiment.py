@@ -161,13 +161,10 @@ def sweep_experiment(
         )
     inputs = _checked_inputs(object, setups, shape, instrument, options)
     changed = [_with_value(inputs, quantity, value) for value in numbers]
-    plans = []
-    for number, each in enumerate(changed):
-        report = Reporter(
-            None if on_progress is None else _shifted(on_progress, number, len(changed)),
-            should_stop,
-        )
-        plans.append(_plan(each, report))
+    plans = [
+        _plan(each, Reporter(_shifted(on_progress, number, len(changed)), should_stop))
+        for number, each in enumerate(changed)
+    ]
     swept = SWEPT[quantity]
     return ExperimentSweep(quantity, swept.title, swept.unit, tuple(numbers), tuple(plans))
 
@@ -221,8 +218,10 @@ SWEPT: dict[str, Swept] = _swept()
 """Quantities that `sweep_experiment` can vary, by their keys."""
 
 
-def _shifted(on_progress: OnProgress, number: int, count: int) -> OnProgress:
+def _shifted(on_progress: OnProgress | None, number: int, count: int) -> OnProgress | None:
     """Count the shots of all values of a sweep together."""
+    if on_progress is None:
+        return None
 
     def report(progress: Progress) -> None:
         if progress.total is not None:

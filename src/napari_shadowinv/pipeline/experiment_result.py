@@ -254,17 +254,14 @@ class ExperimentPlan:
         if not size:
             return None
         power = 2.0 if name == "blur" else 1.0
-        scale = self._scale(name)
+        scales = [shot.scales[name] for shot in self.shots if name in shot.scales]
+        scale = min(float(np.median(scales)), 1.0) if scales else 1.0
         # Of a prior and data with known variances, in which the prior's becomes smaller.
         factor = 1 / math.sqrt(1 + (4.0**power - 1) * scale**2)
         unit, digits = ("px", 1.0) if name in ("blur", "registration") else ("%", 100.0)
         unit, digits = ("", 1.0) if name == "gamma" else (unit, digits)
         better, before = (f"{digits * x:.2g} {unit}".rstrip() for x in (size / 2, size))
         return f"{self._title(name)} known to {better} instead of {before}", factor
-
-    def _scale(self, name: str) -> float:
-        scales = [shot.scales[name] for shot in self.shots if name in shot.scales]
-        return min(float(np.median(scales)), 1.0) if scales else 1.0
 
     @property
     def is_determined(self) -> bool:

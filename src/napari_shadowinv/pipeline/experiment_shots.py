@@ -187,7 +187,7 @@ class ShotSimulator:
         return np.ones(self._grid.sizes) if passed is None else passed
 
     def _energy_factor(self, setup: Setup | None, energy: float) -> float:
-        """Displacement if the energy is `energy` times the stated one, over the stated displacement."""
+        """Displacement at `energy` times the stated energy, over the stated displacement."""
         if setup is None:
             return 1.0
         true = setup.model_copy(update={setup.beam_field: energy * setup.beam_value})
