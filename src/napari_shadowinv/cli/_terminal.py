@@ -190,16 +190,19 @@ def exit_unless_sound(result: Any, out: Path, checks: StaticChecks | None = None
     Also if, by the checks of a fit, a static field does not explain an image.
     """
     left_out = None if checks is None else checks.left_out
+    is_inversion = result.kind is ResultKind.INVERSION
+    # Of a fit; a film pack has none.
+    verdict: Any = None if is_inversion else getattr(result, "verdict", None)
     if left_out is not None and not left_out.explained.all():
         text = f"NOT STATIC: {out} was written, but {left_out.explanation}"
-    elif result.kind is ResultKind.INVERSION and not result.report.converged:
+    elif is_inversion and not result.report.converged:
         report = result.report
         text = (
             f"NOT CONVERGED: {out} was written, but its flux residual is {report.residual:.2g} "
             f"(tolerance {report.tolerance:.2g}): do not trust the field"
         )
-    elif result.kind is ResultKind.FIT and result.verdict is not Verdict.DETERMINED:
-        text = f"{result.verdict.upper()}: {out} was written, but {result.explanation}"
+    elif verdict not in (None, Verdict.DETERMINED):
+        text = f"{verdict.upper()}: {out} was written, but {result.explanation}"
     else:
         return
     say_on_stderr(text)
