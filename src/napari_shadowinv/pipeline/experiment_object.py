@@ -191,7 +191,7 @@ class TracedObject(PlannedObject):
     field: FieldGrid
 
     def displacement(self, setup: Setup | None, grid: Grid) -> FloatArray:
-        """As of a `PlannedObject`; refuse particles that do not reach the detector."""
+        """Trace particles; an `InputError` if the setup has none, or one misses the detector."""
         particles = check_particles(setup)
         finer = check_particles(finer_setup(particles, grid.factor))
         return traced_displacement(self.field, finer, grid.sizes) / grid.factor
