@@ -24,13 +24,7 @@ from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.inversion.variables import dataset_from_field, setup_from_dataset
-from napari_shadowinv.io.hdf5 import (
-    hdf5_in_memory,
-    list_arrays,
-    load_dataset,
-    member,
-    open_hdf5,
-)
+from napari_shadowinv.io.hdf5 import hdf5_in_memory, list_arrays, load_dataset, member, open_hdf5
 from napari_shadowinv.io.read_write import require
 from napari_shadowinv.provenance import Provenance
 

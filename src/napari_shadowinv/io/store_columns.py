@@ -84,13 +84,7 @@ def _uncertainty(fit: Any) -> float | None:
 
 # In the order of all tables.
 COLUMNS: tuple[Column, ...] = (
-    Column(
-        "seconds",
-        "seconds",
-        "Time its worker spent on the shot",
-        unit="s",
-        format=".1f",
-    ),
+    Column("seconds", "seconds", "Time its worker spent on the shot", unit="s", format=".1f"),
     Column(
         "verdict",
         "verdict",

@@ -447,10 +447,7 @@ def _find_table(shots: Any) -> Path | Sequence[ShotRow] | None:
 
 
 def _describe_table(
-    table: Path | Sequence[ShotRow],
-    recipe: Recipe,
-    reader: Reader,
-    shape: tuple[int, int] | None,
+    table: Path | Sequence[ShotRow], recipe: Recipe, reader: Reader, shape: tuple[int, int] | None
 ) -> tuple[Shots, Setup | None]:
     """Return the shots of a table, and the setup of the first image."""
     if getattr(reader, "func", reader) is not read_shot:

@@ -34,13 +34,7 @@ from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, column_val
 from napari_shadowinv.io.store_writing import GrowingStore, ShotWriter
 from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.pipeline import (
-    Cache,
-    Inputs,
-    collect_inputs,
-    run_fit,
-    run_prepared,
-)
+from napari_shadowinv.pipeline import Cache, Inputs, collect_inputs, run_fit, run_prepared
 from napari_shadowinv.pipeline.fit_run import usual_fields
 from napari_shadowinv.preprocessing import Estimate, Radiograph, Recipe, UniformEstimate
 from napari_shadowinv.stack._shots import ArrayReference, Shot, checksum

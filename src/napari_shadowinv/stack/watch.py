@@ -29,14 +29,7 @@ from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.files import sha256, text_of
-from napari_shadowinv.io.store import (
-    DONE,
-    FAILED,
-    PENDING,
-    SKIPPED,
-    StackStore,
-    check_store_path,
-)
+from napari_shadowinv.io.store import DONE, FAILED, PENDING, SKIPPED, StackStore, check_store_path
 from napari_shadowinv.io.store_writing import GrowingStore, create_store, remove_unfinished
 from napari_shadowinv.pipeline.run_options import WatchOptions
 from napari_shadowinv.stack._folder_events import Arrivals, checked_folder, observing
