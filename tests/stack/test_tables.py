@@ -349,7 +349,6 @@ def test_a_row_is_repeated_from_its_provenance(pack: Path) -> None:
         mask=None,
         source_mask=None,
         reader=read_shot,
-        warm_start=1,
     )
     images, _ = stack.shots.items[0].images.load()
     inversion = stack.task.run(images, stack.beam, workers=1)

@@ -317,18 +317,15 @@ def _processes(count: int) -> Iterator[Engine]:
         try:
             client = opened.enter_context(local_client(count))
         except (OSError, RuntimeError) as error:
+            cause: BaseException = error
+            while cause.__cause__ is not None:  # dask has wrapped it
+                cause = cause.__cause__
+            reason = str(cause).rstrip(".") or type(cause).__name__
             raise EngineError(
-                f"{name} for the shots could not be started ({_last_cause(error)}): if memory is "
-                "short use fewer workers, then run again to resume"
+                f"{name} for the shots could not be started ({reason}): if memory is short use "
+                "fewer workers, then run again to resume"
             ) from error
         yield _Cluster(client, name, count)
-
-
-def _last_cause(error: BaseException) -> str:
-    """Return the original error that dask has wrapped."""
-    while error.__cause__ is not None:
-        error = error.__cause__
-    return str(error).rstrip(".") or type(error).__name__
 
 
 def _connected(scheduler: Any, should_stop: ShouldStop | None) -> Any:

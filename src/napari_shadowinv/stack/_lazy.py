@@ -190,16 +190,7 @@ def invert_stack(
             "the recipe has a section fit, and invert_stack inverts: use run_stack to fit, or "
             "leave the section out"
         )
-    stack = describe_stack(
-        shots,
-        recipe,
-        variables=variables,
-        source=source,
-        mask=mask,
-        source_mask=source_mask,
-        reader=reader,
-        warm_start=warm_start,
-    )
+    stack = describe_stack(shots, recipe, source, mask, source_mask, reader, variables, warm_start)
     return _Graph(choose_sites(stack)).dataset()
 
 

@@ -33,7 +33,7 @@ from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.formats import format_of
 from napari_shadowinv.io.frames import split_address
 from napari_shadowinv.io.shot_columns import JOINED, ShotTable, describe_columns
-from napari_shadowinv.io.store import FORMAT, OWN_SETUPS
+from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.io.store_checksums import RECORD
 from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, Column, columns_of
 from napari_shadowinv.io.store_writing import check_column_keys
@@ -138,14 +138,6 @@ class Stack:
         return {**sizes, "site": count_sites(beam.image, self.task.recipe.options, mask=beam.mask)}
 
     @property
-    def setup_texts(self) -> dict[str, str]:
-        """Description of the setup, for the store's identity."""
-        if self.task.by_row:
-            return {OWN_SETUPS: "a row for each shot"}
-        setup = self.task.setup
-        return {OWN_SETUPS: "", "setup": "" if setup is None else setup.model_dump_json()}
-
-    @property
     def setups(self) -> list[str] | None:
         """The setup of each shot after the steps, as JSON; None unless they have their own."""
         if not self.task.by_row or self.task.setup is None:
@@ -243,13 +235,12 @@ def with_enough_sites(stack: Stack, shares: list[float]) -> Stack:
 def describe_stack(
     shots: Any,
     recipe: Recipe | None,
-    *,
-    variables: Collection[str] | None,
     source: Any,
     mask: ArrayLike | None,
     source_mask: ArrayLike | None,
     reader: Reader,
-    warm_start: int,
+    variables: Collection[str] | None,
+    warm_start: int = 1,
 ) -> Stack:
     """Describe a stack, and check everything that can be checked before a shot is read."""
     if warm_start < 1:
@@ -285,17 +276,13 @@ def describe_stack(
     if common is not None and beam is None:
         own_sources = [Shot("", ArrayReference(common))] * len(stack_shots)
     if own_sources is not None:
-        stack_shots = _with_sources(stack_shots, own_sources, by_row=task.by_row)
+        items = [
+            # A row may name its own.
+            shot if task.by_row and shot.rows[0].source else replace(shot, source=own_source)
+            for shot, own_source in zip(stack_shots.items, own_sources, strict=True)
+        ]
+        stack_shots = replace(stack_shots, items=items)
     return Stack(stack_shots, task, beam, common, reader_text(reader), warm_start)
-
-
-def _with_sources(shots: Shots, sources: Sequence[Shot], *, by_row: bool) -> Shots:
-    """Return the shots with the source of each, except rows that name their own."""
-    items = [
-        shot if by_row and shot.rows[0].source is not None else replace(shot, source=source)
-        for shot, source in zip(shots.items, sources, strict=True)
-    ]
-    return replace(shots, items=items)
 
 
 def _plan_inversion(

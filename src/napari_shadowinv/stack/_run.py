@@ -34,7 +34,10 @@ from napari_shadowinv.io.shot_columns import read_shot_table
 from napari_shadowinv.io.store import (
     DONE,
     FAILED,
+    OWN_SETUPS,
     PENDING,
+    SHARDS,
+    SHOT_FILES,
     SKIPPED,
     UNREAD,
     StackStore,
@@ -224,15 +227,9 @@ def run_stack(
     path = check_store_path(out)
     run = as_model(RunOptions, run, "run")
     stored = np.dtype(run.dtype)
+    variables = stored_variables(run.variables, recipe, mask)
     stack = describe_stack(
-        shots,
-        recipe,
-        variables=stored_variables(run.variables, recipe, mask),
-        source=source,
-        mask=mask,
-        source_mask=source_mask,
-        reader=reader,
-        warm_start=run.warm_start,
+        shots, recipe, source, mask, source_mask, reader, variables, run.warm_start
     )
     stack = replace(stack, shard=Shard.of(run.part, stack.shots, path))
     numbers = numbers_of(run, len(stack.shots))
@@ -471,7 +468,7 @@ class _Run:
             outcomes = [ShotOutcome(index, FAILED, 0.0, str(error)) for index in lost]
             for index in lost:
                 entries = self._stack.shots.items[index].entries
-                self._writer.fail(index, {"reason": str(error), **entries})
+                self._writer.write(index, {}, {"reason": str(error), **entries}, FAILED)
         if outcomes is None:
             return False
         for outcome in outcomes:
@@ -486,7 +483,7 @@ def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
     if stack.as_arrived:
         attributes |= NUMBERED_AS_ARRIVED
     if stack.shard is not None:
-        attributes |= stack.shard.attributes
+        attributes |= {SHARDS: stack.shard.count, SHOT_FILES: stack.shard.files}
     if isinstance(stack.task, InvertTask) and stack.task.sites_chosen:
         attributes[_CHOSEN_SITES] = stack.task.recipe.options.n_sites
     return Contents(stack.sizes, _variables(stack, dtype), _coordinates(stack), attributes)
@@ -530,9 +527,13 @@ def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> d
     height, width = stack.task.shape
     shot = stack.task.inputs.shot
     steps = [step.model_dump(mode="json") for step in stack.task.recipe.steps]
+    setup = "" if stack.task.setup is None else stack.task.setup.model_dump_json()
+    setups = {OWN_SETUPS: "", "setup": setup}
+    if stack.task.by_row:
+        setups = {OWN_SETUPS: "a row for each shot"}
     return {
         **stack.task.identity,
-        **stack.setup_texts,
+        **setups,
         "source_image": stack.source_text(shots),
         "mask_image": _mask_text(shot.mask) or "none",
         "steps": json.dumps(steps) if steps else "",

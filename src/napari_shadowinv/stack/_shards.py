@@ -61,11 +61,6 @@ class Shard:
                 digest.update(f"{identity}\n".encode())
         return cls(*part, digest.hexdigest())
 
-    @property
-    def attributes(self) -> dict[str, int | str]:
-        """Attributes of its store until the shards are merged."""
-        return {SHARDS: self.count, SHOT_FILES: self.files}
-
 
 def numbers_of(run: RunOptions, shots: int) -> list[int] | None:
     """Return the numbers of the shots of a run's shard, of `shots`; None for all."""

@@ -592,7 +592,7 @@ def write_shot(
     cautions = [dataclasses.asdict(caution) for caution in attempt.origin.get("warnings", ())]
     if result is None:
         failed = {"reason": attempt.failure, "seconds": attempt.seconds}
-        writer.fail(index, {**attempt.origin, **failed, "warnings": cautions})
+        writer.write(index, {}, {**attempt.origin, **failed, "warnings": cautions}, FAILED)
         return ShotOutcome(index, FAILED, attempt.seconds, attempt.failure)
     entries = task.report(result)
     warnings = {"warnings": [*entries["warnings"], *cautions]}

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from threading import Event
@@ -158,21 +157,20 @@ class Watch:
     def __init__(
         self,
         path: Path,
-        dtype: np.dtype[Any],
+        options: WatchOptions,
         stacks: StackMaker,
         arrivals: Arrivals,
-        on_progress: OnStatus | None,
+        on_progress: OnStatus,
         should_stop: ShouldStop | None,
-        latest: bool = False,
     ) -> None:
-        self._path, self._dtype, self._stacks = path, dtype, stacks
+        self._path, self._options, self._stacks = path, options, stacks
         self._arrivals, self._on_progress, self._should_stop = arrivals, on_progress, should_stop
+        self._dtype = np.dtype(options.dtype)
         self.store: GrowingStore | None = None
         # Failures before the first good shot, which creates the store or proves that it fits.
         self._early: dict[str, dict[str, Any]] = {}
         self._doubtful: set[str] = set()
         self._failures: dict[str, str] = {}
-        self._overwrite = False
         self._stack: Stack | None = None
         self._task: AnyTask | None = None  # once the number of sites is known
         self._pool = ThreadPoolExecutor(_LANES)
@@ -180,17 +178,13 @@ class Watch:
         self._running: deque[_RunningShot] = deque()
         self._lanes: list[Inversion | Fit | None] = [None] * _LANES
         self._redo: set[str] = set()
-        self._latest = latest
         self._skipped: dict[str, None] = {}  # not in the store yet, in order of arrival
         self._begun = self._ended = 0
-        self._most: int | None = None  # shots to end
         self._last = self._busy_since = time.monotonic()
         self._busy_s = 0.0
 
     def report(self, **news: Any) -> None:
         """Report the numbers of shots, and some news."""
-        if self._on_progress is None:
-            return
         early, store = len(self._early), self.store
         status = RunStatus(
             total=early + (0 if store is None else len(store)),
@@ -206,15 +200,14 @@ class Watch:
         )
         self._on_progress(replace(status, **news))
 
-    def open(self, *, overwrite: bool, redo_failed: bool) -> None:
+    def open(self) -> None:
         """Open or check the store before any shot arrives, as far as possible."""
-        self._overwrite = overwrite
         self._stack = self._stacks.before_any()
-        if overwrite or not self._path.exists():
+        if self._options.overwrite or not self._path.exists():
             return
         store = StackStore(self._path)
         check_shard(store, None)
-        again = (PENDING, SKIPPED, *([FAILED] if redo_failed else []))
+        again = (PENDING, SKIPPED, *([FAILED] if self._options.redo_failed else []))
         self._redo = {store.names[i] for i in np.flatnonzero(np.isin(store.statuses(), again))}
         for name, report in zip(store.names, store.reports(), strict=True):
             self._note_report(name, report)
@@ -222,29 +215,29 @@ class Watch:
         if self._stack is not None:
             self._use_stack(match_store(store, self._stack, self._dtype))
 
-    def run(self, idle: float | None = None, most: int | None = None) -> None:
+    def run(self) -> None:
         """Invert existing and arriving files until the watch ends."""
-        self._most = most
-        for name in () if self._latest else sorted(self._redo):
+        for name in () if self._options.latest else sorted(self._redo):
             self._arrivals.put_back(name)
         self.report()
         try:
-            while not self._is_over(idle):
+            while not self._is_over():
                 self._advance()
         except InversionCancelled:
             pass
         finally:
             self._abandoned.set()
             self._pool.shutdown(cancel_futures=True)
-            if self._latest:
+            if self._options.latest:
                 self._skip_waiting()
             if self.store is not None:
                 with suppress(OSError):  # the folder's own copy has the length
                     self.store.close()
             self.report()
 
-    def _is_over(self, idle: float | None) -> bool:
-        if (self._most is not None and self._ended >= self._most) or self._is_stopped():
+    def _is_over(self) -> bool:
+        idle, most = self._options.idle, self._options.max_shots
+        if (most is not None and self._ended >= most) or self._is_stopped():
             return True
         quiet = time.monotonic() - max(self._arrivals.last_event, self._last)
         is_quiet = self._arrivals.is_quiet and not self._running
@@ -260,7 +253,7 @@ class Watch:
             self._finish(begin_next=True)
             return
         arrived = self._arrivals.next_name(_POLL_S)
-        if arrived is not None and self._latest:
+        if arrived is not None and self._options.latest:
             *older, arrived = arrived, *self._arrivals.take_all()
             self._skip(older)
         if arrived is not None:
@@ -269,13 +262,13 @@ class Watch:
     @property
     def _is_full(self) -> bool:
         """Whether no other shot may begin now."""
-        begun, most = len(self._running), self._most
+        begun, most = len(self._running), self._options.max_shots
         return begun == _LANES or (most is not None and self._ended + begun >= most)
 
     def _begin_waiting(self, finished: str) -> None:
         """Begin the next shot, if it waits, before the finished one is written."""
         # The latest shot is numbered when it begins, and the first ones create the store.
-        if self._latest or self._task is None or self.store is None or self._is_full:
+        if self._options.latest or self._task is None or self.store is None or self._is_full:
             return
         # A file that was written again waits for its earlier version to be written to the store.
         at_work = {finished, *(shot.name for shot in self._running)}
@@ -331,7 +324,7 @@ class Watch:
         attempt.add_done_callback(lambda _: self._arrivals.wake())
         self._busy_since = self._busy_since if self._running else time.monotonic()
         self._running.append(_RunningShot(name, stamp_now, lane, attempt))
-        if self._latest and self.store is not None:
+        if self._options.latest and self.store is not None:
             # Now, as the shot must not wait for it once it is done.
             with defer_interrupts():
                 self._store_skipped(self.store, text_of(name))
@@ -454,7 +447,7 @@ class Watch:
         for early_name in list(early):
             report = early.pop(early_name)
             if early_name != name:
-                store.fail(store.append(early_name), report)
+                store.write(store.append(early_name), {}, report, FAILED)
         if self._skipped:
             self._store_skipped(store)
         index = store.append(name)
@@ -469,9 +462,8 @@ class Watch:
         items = [Shot(name, _NoImage()) for name in dict.fromkeys(names)]
         stack = replace(self._stack, shots=replace(self._stack.shots, items=items))
         created = create_store(
-            self._path, contents_of(stack, self._dtype), overwrite=self._overwrite
+            self._path, contents_of(stack, self._dtype), overwrite=self._options.overwrite
         )
-        self._overwrite = False
         self.store = GrowingStore(created, NUMBERED_AS_ARRIVED)
         return self.store
 
@@ -533,25 +525,19 @@ def watch_stack(
     watch = as_model(WatchOptions, watch, "watch")
     place = checked_folder(folder, watch.pattern)
     path = check_store_path(out)
-    describe = partial(
-        describe_stack,
-        recipe=recipe,
-        variables=stored_variables(watch.variables, recipe, mask),
-        source=source,
-        mask=mask,
-        source_mask=source_mask,
-        reader=reader,
-        warm_start=1,
-    )
+    variables = stored_variables(watch.variables, recipe, mask)
+
+    def describe(arrived: Shots) -> Stack:
+        return describe_stack(arrived, recipe, source, mask, source_mask, reader, variables)
+
     existing = not watch.skip_existing
     arrivals = Arrivals(place, watch.pattern, settle=watch.settle, existing=existing)
     stacks = StackMaker(describe, place, reader, chained=watch.warm_start)
+    on_progress = on_progress or (lambda _: None)
     with ExitStack() as opened:
         if watch.status_file is not None:
             on_progress = _with_status_file(watch.status_file, arrivals, path, on_progress, opened)
-        loop = Watch(
-            path, np.dtype(watch.dtype), stacks, arrivals, on_progress, should_stop, watch.latest
-        )
+        loop = Watch(path, watch, stacks, arrivals, on_progress, should_stop)
         try:
             ensure_compiled(
                 lambda news: loop.report(stage=f"compiling, {news.message}"), should_stop
@@ -559,29 +545,27 @@ def watch_stack(
         except InversionCancelled:
             return None
         with clear_up_when_terminated(), locked(path):
-            loop.open(overwrite=watch.overwrite, redo_failed=watch.redo_failed)
+            loop.open()
             remove_unfinished(path)
             with observing(
                 arrivals, polling=watch.polling, on_note=lambda text: loop.report(note=text)
             ):
-                loop.run(watch.idle, watch.max_shots)
+                loop.run()
         return None if loop.store is None else read_stack(path)
 
 
 def _with_status_file(
-    file: Path, arrivals: Arrivals, store: Path, on_progress: OnStatus | None, opened: ExitStack
+    file: Path, arrivals: Arrivals, store: Path, on_progress: OnStatus, opened: ExitStack
 ) -> OnStatus:
     """Return a receiver of the status that also writes it to a file until `opened` closes."""
 
     def notify(text: str) -> None:
-        if on_progress is not None:
-            on_progress(RunStatus(engine=WATCHING, note=text))
+        on_progress(RunStatus(engine=WATCHING, note=text))
 
     status_file = opened.enter_context(StatusFile(file, arrivals, store, notify))
 
     def update(status: RunStatus) -> None:
         status_file.update(status)
-        if on_progress is not None:
-            on_progress(status)
+        on_progress(status)
 
     return update
