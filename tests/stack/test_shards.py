@@ -313,7 +313,7 @@ def test_a_shard_that_survives_the_merge_cannot_write(unmerged, any_night):
     merge_stack(unmerged)
     before = file_contents(unmerged)
     with pytest.raises(StoreError, match="must not be replaced or merged during the run"):
-        writer.fail(1, {"reason": "late"})
+        writer.write(1, {}, {"reason": "late"}, FAILED)
     assert file_contents(unmerged) == before
 
 

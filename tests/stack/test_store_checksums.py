@@ -199,15 +199,6 @@ def swap_shots(store: Path, first: int, second: int) -> None:
     names[[first, second]] = names[[second, first]]
 
 
-def without_places(store: Path) -> None:
-    """Write the reports as an earlier version did."""
-    reports = zarr.open_group(store, mode="r+")["report"]
-    for index, text in enumerate(reports[:]):
-        report = json.loads(text)
-        del report["place"]
-        reports[index : index + 1] = np.array([json.dumps(report)], object)
-
-
 def test_swapped_shots_are_damaged_with_all_their_files(store):
     swap_shots(store, 1, 4)
     damage = StackStore(store).damage
@@ -227,14 +218,7 @@ def test_shot_of_another_store_is_damaged(any_night, store, tmp_path):
     assert list(StackStore(store).damage.shots) == list(range(6))
 
 
-def test_reports_without_places_are_read(store, finished):
-    without_places(store)
-    assert StackStore(store, every_byte=True).damage.shots == {}
-    np.testing.assert_array_equal(read(store).potential, read(finished).potential)
-
-
 def test_every_name_is_compared_with_its_report(store):
-    without_places(store)
     names = zarr.open_group(store, mode="r+")["name"]
     names[[2, 3]] = names[[3, 2]]
     with pytest.raises(FileFormatError, match="name/c/0 does not belong to shots 0 to 5"):
@@ -335,7 +319,7 @@ def test_shot_that_was_done_keeps_no_field(make_night, out, way):
     if way == "reopened":
         writer.reopen(1)
     else:
-        writer.fail(1, {"error": "no image"})
+        writer.write(1, {}, {"error": "no image"}, FAILED)
     arrays = writer.arrays()
     for name in ("potential", "displacement", "weights"):
         assert np.isnan(arrays[name][1]).all(), name

@@ -8,7 +8,7 @@ and the checksums of chunks that belong to no shot.
 - note them: `seal`, `reseal`, `note_shot`
 - compare them: `check_seal`, `check_chunk`, `check_content`, `find_damage`
 
-Stores without a seal, of an earlier version or copied by another program, are not checked.
+Stores without a seal, copied by another program, are not checked.
 
 `CheckedStore` checks each file of a Zarr store before it is opened: Zarr itself would wait for
 ever for a pipe behind a link, and ask for as much memory as the first bytes of a chunk name,
@@ -23,7 +23,7 @@ import math
 import os
 import struct
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property, partial
@@ -95,17 +95,16 @@ class CheckedStore(LocalStore):
         self, key: str, buffer: Buffer | None, byte_range: ByteRequest | None
     ) -> Buffer | None:
         """Return the bytes read from a chunk once they have matched its checksum."""
-        name, is_chunk, place = key.partition(_CHUNKS)
-        if buffer is not None and is_chunk and byte_range is None and self._layout is not None:
-            index = int(place.partition("/")[0])
-            check_content(self._layout, key, name, index, buffer.to_bytes())
+        is_chunk = _CHUNKS in key and byte_range is None
+        if buffer is not None and is_chunk and self._layout is not None:
+            check_content(self._layout, key, buffer.to_bytes())
         return buffer
 
     def _check(self, key: str) -> None:
         path = self.root / key
-        name, is_chunk, place = key.partition(_CHUNKS)
+        name, is_chunk, _ = key.partition(_CHUNKS)
         if is_chunk and self._layout is not None:
-            check_chunk(self._layout, key, name, int(place.partition("/")[0]))
+            check_chunk(self._layout, key)
         if path.is_dir() or not path.exists():
             return
         check_regular(path, "a file of the store")
@@ -300,13 +299,13 @@ def _has_checksums(array: Any) -> bool:
     return any(codec.to_dict()["name"] == _CODEC for codec in array.metadata.codecs)
 
 
-def fields_of(arrays: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names of the open Zarr arrays that hold a chunk of values for each shot."""
-    return tuple(
-        name
+def fields_of(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the open Zarr arrays that hold a chunk of values for each shot."""
+    return {
+        name: array
         for name, array in arrays.items()
         if is_along_shots(array) and array.chunks[0] == 1 and name not in RECORD
-    )
+    }
 
 
 def note_shot(
@@ -321,7 +320,7 @@ def note_shot(
         for name, array in arrays.items()
         if is_along_shots(array) and array.chunks[0] > 1 and name not in copied
     }
-    fields = {name: arrays[name] for name in fields_of(arrays)}
+    fields = fields_of(arrays)
     if not all(map(_has_checksums, fields.values())):
         return {}
     chunks = {
@@ -375,29 +374,35 @@ def _read_report(root: Path, index: int) -> dict[str, Any]:
     return dict(json.loads(content[8 : 8 + length] or b"{}"))
 
 
-def check_chunk(layout: Layout, key: str, name: str, index: int) -> None:
-    """Refuse a chunk of the array `name` that is lost or was exchanged.
-
-    `index` is the first of the chunk's numbers. The `FileFormatError` names the damaged shot.
-    """
+def check_chunk(layout: Layout, key: str) -> None:
+    """Refuse a chunk that is lost or was exchanged; the `FileFormatError` names a damaged shot."""
+    name, index = _name_and_index(key)
     problem = ""
     if name in layout.of_each_shot:
         problem, _ = _check_again(partial(_inspect_shot, layout, index, (name,)))
     elif name not in RECORD:
         problem = _chunk_problem(layout, key, every_byte=False)
     if problem:
-        raise _damage_error(layout, name, index, problem)
+        raise _damage_error(layout, key, problem)
 
 
-def check_content(layout: Layout, key: str, name: str, index: int, raw: bytes) -> None:
+def check_content(layout: Layout, key: str, raw: bytes) -> None:
     """Refuse a chunk, `raw`, that has changed since it was written; otherwise as `check_chunk`."""
     if not _is_intact(raw):
+        name, _ = _name_and_index(key)
         damaged = f"its {name}" if name in layout.of_each_shot else key
         problem = f"{damaged} is damaged (its content does not match its checksum)"
-        raise _damage_error(layout, name, index, problem)
+        raise _damage_error(layout, key, problem)
 
 
-def _damage_error(layout: Layout, name: str, index: int, problem: str) -> FileFormatError:
+def _name_and_index(key: str) -> tuple[str, int]:
+    """Return the array of a chunk, and the first of the chunk's numbers."""
+    name, _, place = key.partition(_CHUNKS)
+    return name, int(place.partition("/")[0])
+
+
+def _damage_error(layout: Layout, key: str, problem: str) -> FileFormatError:
+    name, index = _name_and_index(key)
     advice = "resume its run, or copy the store again"
     if name in layout.of_each_shot:
         problem = f"{_label(layout, index)}: {problem}"
@@ -422,41 +427,32 @@ def _check_again(inspect: Callable[[], tuple[str, Report]]) -> tuple[str, Report
 
 
 def _inspect_shot(
-    layout: Layout, index: int, names: tuple[str, ...], every_byte: bool = False
+    layout: Layout, index: int, names: Sequence[str], every_byte: bool = False, ended: bool = False
 ) -> tuple[str, Report]:
-    """Describe the damage to a shot that has ended, empty if there is none; return its report."""
+    """Describe the damage to a shot, if any, which perhaps must have `ended`; return its report."""
+    part = "status"
     try:
+        if ended and _read_status(layout.root, index) not in (Status.DONE, Status.FAILED):
+            return "", {}
+        part = "report"
         report = _read_report(layout.root, index)
-    except (OSError, ValueError, TypeError, struct.error) as error:
-        return f"its report is damaged ({error})", {}
-    return _shot_problem(layout, index, report, names, every_byte), report
-
-
-def _shot_problem(
-    layout: Layout, index: int, report: Report, names: tuple[str, ...], every_byte: bool
-) -> str:
-    if CHUNKS not in report:
-        try:
+        if CHUNKS not in report:
+            part = "status"
             status = _read_status(layout.root, index)
-        except OSError as error:
-            return f"its status is damaged ({error})"
-        lacks = status == Status.DONE or (status == Status.FAILED and "reason" not in report)
-        return "its report is missing" if lacks else ""
-    place = [layout.store_id, index]
-    if report.get(PLACE, place) != place:  # not in reports of earlier versions
-        return "its report was written for another shot"
-    for name in names:
-        file = layout.root / layout.key(name, index)
-        expected = report[CHUNKS].get(name)
-        try:
-            if stored_checksum(file) != expected:
+            lacks = status == Status.DONE or (status == Status.FAILED and "reason" not in report)
+            return "its report is missing" if lacks else "", report
+        if report.get(PLACE) != [layout.store_id, index]:
+            return "its report was written for another shot", report
+        for part in names:
+            file = layout.root / layout.key(part, index)
+            if stored_checksum(file) != report[CHUNKS].get(part):
                 state = "not the one that was written" if file.exists() else "missing"
-                return f"its {name} is {state}"
+                return f"its {part} is {state}", report
             if every_byte:
                 _read_chunk(file)
-        except OSError as error:
-            return f"its {name} is damaged ({error})"
-    return ""
+    except (OSError, ValueError, TypeError, struct.error) as error:
+        return f"its {part} is damaged ({error})", {}
+    return "", report
 
 
 def _chunk_problem(layout: Layout, key: str, every_byte: bool) -> str:
@@ -499,7 +495,8 @@ def find_damage(
     shots: dict[int, str] = {}
     noted: dict[int, dict[str, Any]] = {}
     for index in range(layout.shots) if numbers is None else numbers:
-        problem, report = _check_again(partial(_inspect_record, layout, index, names, every_byte))
+        inspect = partial(_inspect_shot, layout, index, names, every_byte, ended=True)
+        problem, report = _check_again(inspect)
         if problem:
             shots[index] = problem
         elif report:
@@ -537,14 +534,3 @@ def _as_comparable_text(description: Mapping[str, Any]) -> str:
     """Return a description as text, without empty entries, which are optional."""
     filled = {key: value for key, value in description.items() if value not in (None, {}, [])}
     return json.dumps(filled, sort_keys=True)
-
-
-def _inspect_record(
-    layout: Layout, index: int, names: tuple[str, ...], every_byte: bool
-) -> tuple[str, Report]:
-    try:
-        if _read_status(layout.root, index) not in (Status.DONE, Status.FAILED):
-            return "", {}
-    except OSError as error:
-        return f"its status is damaged ({error})", {}
-    return _inspect_shot(layout, index, names, every_byte)

@@ -103,10 +103,6 @@ class ShotWriter:
         attributes = store.attributes
         return cls(store.path, attributes["store_id"], len(store.names), attributes.get(SHARDS))
 
-    def fail(self, index: int, report: Mapping[str, Any]) -> None:
-        """Write why a shot failed."""
-        self.write(index, {}, report, FAILED)
-
     def write(
         self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any], status: int = DONE
     ) -> None:
@@ -120,11 +116,11 @@ class ShotWriter:
             )
         group = self.arrays()
         with _as_store_errors(self.path):
-            for name in fields_of(group):
+            for name, array in fields_of(group).items():
                 if name in arrays:
-                    group[name][index : index + 1] = np.asarray(arrays[name])[np.newaxis]
+                    array[index : index + 1] = np.asarray(arrays[name])[np.newaxis]
                 else:
-                    self._erase(group[name], index)
+                    self._erase(array, index)
             copied = [column.key for column in columns_of_store(attributes)]
             note = note_shot(self.path, self.store_id, group, index, copied)
             text = json.dumps({**report, **note})
@@ -141,12 +137,23 @@ class ShotWriter:
         group = self.arrays()
         with _as_store_errors(self.path):
             group["status"][index : index + 1] = np.int8(PENDING)
-            for name in ("report", *fields_of(group)):
-                self._erase(group[name], index)
+            for array in (group["report"], *fields_of(group).values()):
+                self._erase(array, index)
 
     def _erase(self, array: Any, index: int) -> None:
         """Remove the chunk of a shot, which is read as the fill value then."""
         chunk_file(self.path, array, index).unlink(missing_ok=True)
+
+    def write_columns(
+        self, columns: Sequence[Column], reports: Sequence[Mapping[str, Any]], shots: slice
+    ) -> None:
+        """Gather the columns of some shots from their reports, as far as the store has them."""
+        arrays = self.arrays()
+        with _as_store_errors(self.path):
+            for column in columns:
+                if column.key in arrays:
+                    values: Any = np.array([column.of(report) for report in reports], column.dtype)
+                    arrays[column.key][shots] = values
 
     def arrays(self) -> dict[str, Any]:
         return self.opened or _open_arrays(self.path, self.store_id, self.shots)
@@ -248,22 +255,7 @@ def _create_columns(store: StackStore, columns: Sequence[Column], description: s
 
 def summarise(store: StackStore) -> None:
     """Gather the columns of all shots from their reports, for those who open the store."""
-    arrays = ShotWriter.of(store).arrays()
-    _write_columns(store.path, arrays, store.columns, store.reports(), slice(None))
-
-
-def _write_columns(
-    path: Path,
-    arrays: Mapping[str, Any],
-    columns: Sequence[Column],
-    reports: Sequence[Mapping[str, Any]],
-    shots: slice,
-) -> None:
-    with _as_store_errors(path):
-        for column in columns:
-            if column.key in arrays:  # not in a store of an older version
-                values: Any = np.array([column.of(report) for report in reports], column.dtype)
-                arrays[column.key][shots] = values
+    ShotWriter.of(store).write_columns(store.columns, store.reports(), slice(None))
 
 
 @dataclass(frozen=True)
@@ -541,15 +533,10 @@ class GrowingStore:
         self._writer.reopen(index)
         self._statuses[index] = PENDING
 
-    def fail(self, index: int, report: Mapping[str, Any]) -> None:
-        """As `ShotWriter.fail`."""
-        self.write(index, {}, report, FAILED)
-
     def write(
         self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any], status: int = DONE
     ) -> None:
         """As `ShotWriter.write`; the shot's numbers are there as soon as it has its status."""
-        shot = slice(index, index + 1)
-        _write_columns(self.path, self._writer.arrays(), self._columns, [report], shot)
+        self._writer.write_columns(self._columns, [report], slice(index, index + 1))
         self._writer.write(index, arrays, report, status)
         self._statuses[index] = status
