@@ -124,24 +124,11 @@ TEXT = Format(
     unmarked="text", reader="text:read_text",
 )
 STORE = Format("store", (".shadowinv.zarr",), holds=("result",))
-# fmt: on
 
 FORMATS = (
-    TIFF,
-    PNG,
-    BMP,
-    JPEG,
-    NPY,
-    PCO,
-    MATLAB,
-    RESULT,
-    PRADFORMAT,
-    CPSA,
-    SPE,
-    TEXT,
-    SITES,
-    STORE,
+    TIFF, PNG, BMP, JPEG, NPY, PCO, MATLAB, RESULT, PRADFORMAT, CPSA, SPE, TEXT, SITES, STORE,
 )
+# fmt: on
 
 
 def _join_titles(titles: Iterable[str]) -> str:

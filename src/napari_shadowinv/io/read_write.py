@@ -15,7 +15,7 @@ import re
 import tomllib
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -385,20 +385,14 @@ def write(
     return Path(path)
 
 
-def _as_dataset(
-    result: AnyResult | Uncertainty | xarray.Dataset, setup: Setup | None
-) -> xarray.Dataset:
-    if _is_dataset(result):
-        return result
-    if setup is None:
-        return result.to_dataset()
+def _as_dataset(result: Any, setup: Setup | None) -> xarray.Dataset:
+    is_dataset = hasattr(result, "data_vars")  # without waiting for xarray's import
+    if is_dataset or setup is None:
+        dataset: xarray.Dataset = result if is_dataset else result.to_dataset()
+        return dataset
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.inversion.error_bars import Uncertainty
 
     if isinstance(result, Inversion | Uncertainty):
         return result.to_dataset(setup)
     raise InputError(f"received a setup for a {result.kind.noun}, which has its own: leave it out")
-
-
-def _is_dataset(result: Any) -> TypeGuard[xarray.Dataset]:
-    return hasattr(result, "data_vars")  # without waiting for xarray's import
