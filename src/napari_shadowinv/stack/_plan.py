@@ -103,6 +103,7 @@ class Stack:
     as_arrived: bool = False  # whether its shots are numbered as they arrive in a folder
     chained: bool = False  # whether each shot starts from an earlier one, without groups
     shard: Shard | None = None  # the part of the shots that is to be inverted
+    dtype: str = "float64"  # of fields in a store
     columns: tuple[Column, ...] = ()  # of a shot table, whose rows the shots have
 
     @property

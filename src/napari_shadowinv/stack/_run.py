@@ -226,12 +226,12 @@ def run_stack(
     """
     path = check_store_path(out)
     run = as_model(RunOptions, run, "run")
-    stored = np.dtype(run.dtype)
     variables = stored_variables(run.variables, recipe, mask)
     stack = describe_stack(
         shots, recipe, source, mask, source_mask, reader, variables, run.warm_start
     )
-    stack = replace(stack, shard=Shard.of(run.part, stack.shots, path))
+    shard = Shard.of(run.part, stack.shots, path)
+    stack = replace(stack, shard=shard, dtype=run.dtype)
     numbers = numbers_of(run, len(stack.shots))
     if run.shot_table is not None:
         stack = stack.with_table(read_shot_table(run.shot_table))
@@ -248,7 +248,7 @@ def run_stack(
         store = StackStore(path, numbers=numbers) if path.exists() and not run.overwrite else None
         arrived = False
         if store is not None:
-            stack = resume(store, stack, stored)
+            stack = resume(store, stack)
             if stack.shard is None:
                 remove_unfinished(path)
             store = reopen_damaged(store)
@@ -264,12 +264,12 @@ def run_stack(
             if store is None:
                 if stack.chooses_sites:
                     prepare("how many sites the first shots need")
-                contents = contents_of(choose_sites(stack, should_stop), stored)
+                contents = contents_of(choose_sites(stack, should_stop))
                 is_shared = stack.shard is not None
                 create_store(path, contents, overwrite=run.overwrite, shared=is_shared)
                 store = StackStore(path, numbers=numbers)
                 # It may be that of another shard.
-                stack = resume(store, stack, stored)
+                stack = resume(store, stack)
             elif arrived:
                 store = append_shots(store, stack)
             _Run(stack, store, again, on_progress, should_stop).run_on(engine)
@@ -340,49 +340,42 @@ class _Run:
     ) -> None:
         self._stack = stack
         self._store, self._writer = store, ShotWriter.of(store)
-        self._on_progress = on_progress
+        self._on_progress = on_progress or (lambda _: None)
         self._should_stop = should_stop
         statuses, reports = store.statuses(), store.reports()
         self._todo = {int(index) for index in np.flatnonzero(np.isin(statuses, again))}
-        self._done = int((statuses == DONE).sum())
-        self._doubtful = sum(
-            status == DONE and bool(report.get("warnings"))
-            for status, report in zip(statuses, reports, strict=True)
-        )
         self._failures = [
             (store.names[index], str(reports[int(index)].get("reason", "unknown")))
             for index in np.flatnonzero(statuses == FAILED)
             if index not in self._todo
         ]
-        self._total = int((statuses != UNREAD).sum())
-        self._ended = 0
+        self._status = RunStatus(
+            total=int((statuses != UNREAD).sum()),
+            done=int((statuses == DONE).sum()),
+            doubtful=sum(
+                status == DONE and bool(report.get("warnings"))
+                for status, report in zip(statuses, reports, strict=True)
+            ),
+        )
         self._began = time.monotonic()
 
     def report(self, engine: str, outcome: ShotOutcome | None = None) -> None:
-        shots = self._stack.shots
-        name = "" if outcome is None else shots.items[outcome.index].name
+        status, name = self._status, ""
         if outcome is not None:
-            self._ended += 1
-            self._done += outcome.status == DONE
-            self._doubtful += outcome.warnings > 0
+            name = self._stack.shots.items[outcome.index].name
             self._failures += [(name, outcome.reason)] if outcome.reason else []
-        if self._on_progress is None:
-            return
-        failed = len(self._failures)
-        status = RunStatus(
-            total=self._total,
-            done=self._done,
-            failed=failed,
-            doubtful=self._doubtful,
-            waiting=self._total - self._done - failed,
-            ended=self._ended,
-            seconds=time.monotonic() - self._began,
-            engine=engine,
-            name=name,
-            outcome=outcome,
-            failures=tuple(self._failures),
+            status = self._status = replace(
+                status,
+                done=status.done + (outcome.status == DONE),
+                doubtful=status.doubtful + (outcome.warnings > 0),
+                ended=status.ended + 1,
+            )
+        failed, seconds = len(self._failures), time.monotonic() - self._began
+        waiting, failures = status.total - status.done - failed, tuple(self._failures)
+        status = replace(status, failed=failed, waiting=waiting, failures=failures)
+        self._on_progress(
+            replace(status, seconds=seconds, engine=engine, name=name, outcome=outcome)
         )
-        self._on_progress(status)
 
     def run_on(self, engine: Engine) -> None:
         """Invert all pending shots, and summarise their reports unless other shards do so, too."""
@@ -400,14 +393,17 @@ class _Run:
 
     def _work_on(self, engine: Engine) -> None:
         self.report(engine.name)
-        context, beam = self._shared(engine)
+        stack = self._stack
+        # A name that no earlier run has used: dask would reuse the earlier value.
+        name = f"settings-{self._store.attributes['store_id']}-{time.time_ns()}"
+        beam = stack.beam and engine.share(stack.beam, f"beam-{stack.beam.key}")
+        context = engine.share(TaskContext(self._writer, stack.shot_task, engine.workers), name)
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         running: dict[Any, list[int]] = {}
         batches = self._batches()
-        is_file = self._stack.shots.array is None
         try:
             while True:
-                window = engine.window(files=is_file)
+                window = engine.window(files=stack.shots.array is None)
                 while len(running) < window and (batch := next(batches, None)) is not None:
                     future = self._start(engine, batch, beam, context)
                     running[future] = batch
@@ -425,14 +421,6 @@ class _Run:
             for future in running:
                 future.cancel()
             raise
-
-    def _shared(self, engine: Engine) -> tuple[Any, Any]:
-        stack = self._stack
-        context = TaskContext(self._writer, stack.shot_task, engine.workers)
-        # A name that no earlier run has used: dask would reuse the earlier value.
-        name = f"settings-{self._store.attributes['store_id']}-{time.time_ns()}"
-        beam = stack.beam and engine.share(stack.beam, f"beam-{stack.beam.key}")
-        return engine.share(context, name), beam
 
     def _batches(self) -> Iterator[list[int]]:
         """Yield the shots of a task: one, or a group in which each starts from the previous."""
@@ -477,8 +465,8 @@ class _Run:
         return True
 
 
-def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
-    identity = {name: value for name, value in _identity(stack, dtype).items() if value}
+def contents_of(stack: Stack) -> Contents:
+    identity = {name: value for name, value in _identity(stack).items() if value}
     attributes: dict[str, Any] = {**attributes_of(stack), **identity}
     if stack.as_arrived:
         attributes |= NUMBERED_AS_ARRIVED
@@ -486,7 +474,7 @@ def contents_of(stack: Stack, dtype: np.dtype[Any]) -> Contents:
         attributes |= {SHARDS: stack.shard.count, SHOT_FILES: stack.shard.files}
     if isinstance(stack.task, InvertTask) and stack.task.sites_chosen:
         attributes[_CHOSEN_SITES] = stack.task.recipe.options.n_sites
-    return Contents(stack.sizes, _variables(stack, dtype), _coordinates(stack), attributes)
+    return Contents(stack.sizes, _variables(stack), _coordinates(stack), attributes)
 
 
 def _coordinates(stack: Stack) -> dict[str, Variable]:
@@ -507,13 +495,13 @@ def _coordinates(stack: Stack) -> dict[str, Variable]:
     return coordinates
 
 
-def _variables(stack: Stack, dtype: np.dtype[Any]) -> dict[str, Variable]:
+def _variables(stack: Stack) -> dict[str, Variable]:
     variables: dict[str, Variable] = {}
     for name, (dims, labels) in stack.task.labels.items():
         if name not in stack.task.variables:
             continue
         exact = dtype_of(name).kind != "f" or "site" in dims
-        stored = dtype_of(name) if exact else dtype
+        stored = dtype_of(name) if exact else np.dtype(stack.dtype)
         if stack.beam is not None and stack.is_shared(name):
             values = np.asarray(values_of_beam(stack.beam, stack.task.recipe.options)[name])
             variables[name] = Variable(dims, stored, labels, values)
@@ -522,7 +510,7 @@ def _variables(stack: Stack, dtype: np.dtype[Any]) -> dict[str, Variable]:
     return variables
 
 
-def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> dict[str, str]:
+def _identity(stack: Stack, shots: int | None = None) -> dict[str, str]:
     """Return the attributes that must agree for a store with `shots` shots to be continued."""
     height, width = stack.task.shape
     shot = stack.task.inputs.shot
@@ -539,7 +527,7 @@ def _identity(stack: Stack, dtype: np.dtype[Any], shots: int | None = None) -> d
         "steps": json.dumps(steps) if steps else "",
         "source_mask_image": _mask_text(shot.source_mask),
         "image_size": f"{width} × {height} px",
-        "stored": f"{', '.join(stack.task.variables)} as {dtype}",
+        "stored": f"{', '.join(stack.task.variables)} as {stack.dtype}",
         "reader": stack.reader,
         "warm_start": CHAINED if stack.chained else str(stack.warm_start),
     }
@@ -549,7 +537,7 @@ def _mask_text(mask: BoolArray | None) -> str:
     return "" if mask is None else f"sha256 {checksum(mask)}"
 
 
-def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
+def resume(store: StackStore, stack: Stack) -> Stack:
     """Return the stack in the order of its store, new shots last; an `InputError` if it differs."""
     if store.attributes.get("warm_start") == CHAINED and not stack.as_arrived:
         raise InputError(
@@ -558,7 +546,7 @@ def resume(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
         )
     check_shard(store, stack.shard)
     shots = stack.shots.reordered(_order(store, stack.shots.names))
-    stack = match_store(store, replace(stack, shots=shots), dtype)
+    stack = match_store(store, replace(stack, shots=shots))
     if stack.shard is not None:
         check_shots(store, stack.shard, len(shots))
     for index in np.flatnonzero(store.statuses() == DONE):
@@ -589,11 +577,11 @@ def reopen_damaged(store: StackStore) -> StackStore:
     return store
 
 
-def match_store(store: StackStore, stack: Stack, dtype: np.dtype[Any]) -> Stack:
+def match_store(store: StackStore, stack: Stack) -> Stack:
     """Return the stack with the store's number of sites; an `InputError` if they do not match."""
     if stack.chooses_sites and _CHOSEN_SITES in store.attributes:
         stack = stack.with_sites(int(store.attributes[_CHOSEN_SITES]))
-    identity = _identity(stack, dtype, len(store.names))
+    identity = _identity(stack, len(store.names))
     for name, value in {**identity, "package_version": __version__}.items():
         before = str(store.attributes.get(name, ""))
         if before != value:

@@ -1,7 +1,6 @@
 """Watch a folder and invert each shot into a store as soon as it arrives: `watch_stack`.
 
 - the loop over files that arrive: `Watch`
-- the description of the stack from its first files: `StackMaker`
 """
 
 from __future__ import annotations
@@ -103,40 +102,6 @@ class _NoImage(ImageReference):
         raise _ShapeUnknownError
 
 
-@dataclass(frozen=True)
-class StackMaker:
-    """Describes the stack of a folder's shots."""
-
-    describe: Callable[[Shots], Stack]
-    folder: Path
-    reader: Reader
-    chained: bool  # whether each shot starts from an earlier one
-
-    def file(self, name: str) -> FileReference:
-        return FileReference(self.folder / name, self.reader)
-
-    def shot(self, name: str) -> Shot:
-        return Shot(text_of(name), self.file(name))
-
-    def before_any(self) -> Stack | None:
-        """Return the stack before a shot has arrived; None if its shape is unknown."""
-        try:
-            return self._describe([Shot("", _NoImage())])
-        except _ShapeUnknownError:
-            return None
-
-    def of(self, names: Sequence[str]) -> Stack:
-        """Return the stack of some shots, the first of which can be read."""
-        return self._describe([self.shot(name) for name in names])
-
-    def _describe(self, items: Sequence[Shot]) -> Stack:
-        stack = self.describe(Shots(items, (0, 0)))
-        # Shots start from each other only on the same sites.
-        on_same_sites = stack.beam is not None and isinstance(stack.task, InvertTask)
-        chained = self.chained and on_same_sites
-        return replace(stack, as_arrived=True, chained=chained)
-
-
 @dataclass(frozen=True, eq=False)
 class _RunningShot:
     """A shot in work, with its attempt."""
@@ -158,14 +123,14 @@ class Watch:
         self,
         path: Path,
         options: WatchOptions,
-        stacks: StackMaker,
+        describe: Callable[[Shots], Stack],
+        reader: Reader,
         arrivals: Arrivals,
         on_progress: OnStatus,
         should_stop: ShouldStop | None,
     ) -> None:
-        self._path, self._options, self._stacks = path, options, stacks
+        self._path, self._options, self._describe, self._reader = path, options, describe, reader
         self._arrivals, self._on_progress, self._should_stop = arrivals, on_progress, should_stop
-        self._dtype = np.dtype(options.dtype)
         self.store: GrowingStore | None = None
         # Failures before the first good shot, which creates the store or proves that it fits.
         self._early: dict[str, dict[str, Any]] = {}
@@ -202,7 +167,8 @@ class Watch:
 
     def open(self) -> None:
         """Open or check the store before any shot arrives, as far as possible."""
-        self._stack = self._stacks.before_any()
+        with suppress(_ShapeUnknownError):  # until a shot has arrived
+            self._stack = self._stack_of([Shot("", _NoImage())])
         if self._options.overwrite or not self._path.exists():
             return
         store = StackStore(self._path)
@@ -213,7 +179,21 @@ class Watch:
             self._note_report(name, report)
         self.store = GrowingStore(store, NUMBERED_AS_ARRIVED)
         if self._stack is not None:
-            self._use_stack(match_store(store, self._stack, self._dtype))
+            self._use_stack(match_store(store, self._stack))
+
+    def _stack_of(self, shots: Sequence[Shot]) -> Stack:
+        """Return the stack of some shots, the first of which can be read."""
+        stack = self._describe(Shots(shots, (0, 0)))
+        # Shots start from each other only on the same sites.
+        on_same_sites = stack.beam is not None and isinstance(stack.task, InvertTask)
+        chained = self._options.warm_start and on_same_sites
+        return replace(stack, as_arrived=True, chained=chained, dtype=self._options.dtype)
+
+    def _file(self, name: str) -> FileReference:
+        return FileReference(self._arrivals.folder / name, self._reader)
+
+    def _shot(self, name: str) -> Shot:
+        return Shot(text_of(name), self._file(name))
 
     def run(self) -> None:
         """Invert existing and arriving files until the watch ends."""
@@ -307,7 +287,7 @@ class Watch:
         self._skipped.pop(text_of(name), None)
         while any(name == running.name for running in self._running):
             self._finish()  # it may have changed since it was read
-        file = self._stacks.file(name)
+        file = self._file(name)
         try:
             stamp_now = stamp(file.path)
             report = self._previous_report(text_of(name))
@@ -341,7 +321,7 @@ class Watch:
         stamp_after = {**stamp_before, **attempt.origin}
         if attempt.failure:
             with suppress(OSError):
-                stamp_after = stamp(self._stacks.file(running.name).path)
+                stamp_after = stamp(self._file(running.name).path)
         if not stamp_before.items() <= stamp_after.items():
             self._arrivals.put_back(running.name)  # it was written to while it was read
             return
@@ -389,7 +369,7 @@ class Watch:
         return None if pending else store.report(name)
 
     def _submit(self, name: str, lane: int) -> Future[Attempt]:
-        shot = self._stacks.shot(name)
+        shot = self._shot(name)
         failed = self._prepare(name, shot) if self._task is None else None
         if failed is not None:
             done: Future[Attempt] = Future()
@@ -417,15 +397,15 @@ class Watch:
             if store is not None:
                 # Earlier shots are a better reference for the size of the images.
                 done = store.done_names()
-                existing = (name for name in done if self._stacks.file(name).path.exists())
+                existing = (name for name in done if self._file(name).path.exists())
                 names = [*islice(existing, MAX_TRIED_SHOTS), *names]
-            stack = self._stacks.of(names)
+            stack = self._stack_of(list(map(self._shot, names)))
             if store is not None:
-                self._use_stack(match_store(StackStore(self._path), stack, self._dtype))
+                self._use_stack(match_store(StackStore(self._path), stack))
                 return None
         if stack.chooses_sites:
             self.report(stage="how many sites the first shots need")
-            shots = self._stacks.of(names).shots
+            shots = self._stack_of(list(map(self._shot, names))).shots
             shares = needed_shares(replace(stack, shots=shots), self._should_stop)
             if not shares:
                 # It fails the same way, and a later shot decides.
@@ -461,9 +441,7 @@ class Watch:
         assert self._stack is not None
         items = [Shot(name, _NoImage()) for name in dict.fromkeys(names)]
         stack = replace(self._stack, shots=replace(self._stack.shots, items=items))
-        created = create_store(
-            self._path, contents_of(stack, self._dtype), overwrite=self._options.overwrite
-        )
+        created = create_store(self._path, contents_of(stack), overwrite=self._options.overwrite)
         self.store = GrowingStore(created, NUMBERED_AS_ARRIVED)
         return self.store
 
@@ -532,12 +510,11 @@ def watch_stack(
 
     existing = not watch.skip_existing
     arrivals = Arrivals(place, watch.pattern, settle=watch.settle, existing=existing)
-    stacks = StackMaker(describe, place, reader, chained=watch.warm_start)
     on_progress = on_progress or (lambda _: None)
     with ExitStack() as opened:
         if watch.status_file is not None:
             on_progress = _with_status_file(watch.status_file, arrivals, path, on_progress, opened)
-        loop = Watch(path, watch, stacks, arrivals, on_progress, should_stop)
+        loop = Watch(path, watch, describe, reader, arrivals, on_progress, should_stop)
         try:
             ensure_compiled(
                 lambda news: loop.report(stage=f"compiling, {news.message}"), should_stop
