@@ -132,7 +132,6 @@ def _format_number(value: float) -> str:
 
 
 def _parse_ranges(text: str) -> dict[str, Any]:
-    """Parse the ranges and the bin from a text."""
     chosen: dict[str, Any] = {}
     try:
         if not text.strip() or _WORD.sub("", text).strip():
@@ -154,7 +153,6 @@ def _parse_ranges(text: str) -> dict[str, Any]:
 
 
 def _read_scan(path: Path) -> tuple[Tracks, tuple[Caution, ...]]:
-    """Read the tracks of a scan and the warnings about them."""
     check_regular(path, "a CR-39 scan, .cpsa")
     check_size(path, _IN_MEMORY * path.stat().st_size)
     data = path.read_bytes()

@@ -203,8 +203,7 @@ class StackStore:
         """Name files with values of many shots that disagree with the shots' reports."""
         assert self._layout is not None
         columns = {column.key: column for column in self.columns}
-        for name in self._layout.of_many_shots:
-            length = self._arrays[name].chunks[0]
+        for name, length in self._layout.of_many_shots.items():
             for first in range(0, len(self.names), length):
                 end = min(first + length, len(self.names))
                 sound = [index for index in range(first, end) if index in damage.noted]
@@ -379,10 +378,8 @@ def of_each_setup(dataset: xarray.Dataset, measure: Callable[[Any], float]) -> A
 
 
 def _measure_setups(texts: AnyArray, measure: Callable[[Any], float]) -> FloatArray:
-    from napari_shadowinv.physics.setup import setup_from_dict
-
-    measures = (measure(setup_from_dict(json.loads(text))) if text else np.nan for text in texts)
-    return np.array(list(measures))
+    setups = _parse_setups(texts)
+    return np.array([np.nan if setup is None else measure(setup) for setup in setups])
 
 
 def field_in_si(dataset: xarray.Dataset, origin: str, name: str, setup: Any) -> Any:
@@ -396,11 +393,13 @@ def field_in_si(dataset: xarray.Dataset, origin: str, name: str, setup: Any) -> 
 
 
 def _field_of_block(block: AnyArray, texts: AnyArray | None, name: str, setup: Any) -> FloatArray:
+    setups = [None] * len(block) if texts is None else _parse_setups(texts)
+    # A shot that is not done yet is NaN with any setup.
+    pairs = zip(setups, block, strict=True)
+    return np.stack([(its_setup or setup).field_in_si(name, values) for its_setup, values in pairs])
+
+
+def _parse_setups(texts: AnyArray) -> list[Any]:
     from napari_shadowinv.physics.setup import setup_from_dict
 
-    setups = [setup] * len(block)
-    if texts is not None:
-        # A shot that is not done yet is NaN with any setup.
-        setups = [setup_from_dict(json.loads(text)) if text else setup for text in texts.flat]
-    pairs = zip(setups, block, strict=True)
-    return np.stack([shot_setup.field_in_si(name, values) for shot_setup, values in pairs])
+    return [setup_from_dict(json.loads(text)) if text else None for text in texts.flat]

@@ -256,19 +256,13 @@ class Layout:
         return tuple(name for name, length in lengths if length == 1 and name not in RECORD)
 
     @cached_property
-    def of_many_shots(self) -> tuple[str, ...]:
-        """Arrays with the values of many shots in one chunk."""
-        return tuple(name for name, length in self._lengths.items() if length > 1)
+    def of_many_shots(self) -> dict[str, int]:
+        """Number of shots in a chunk of each array with the values of many."""
+        return {name: length for name, length in self._lengths.items() if length > 1}
 
     def key(self, name: str, index: int) -> str:
         """Return the key of a chunk by its first number; along other axes there is one."""
         return "/".join([name, "c", str(index), *["0"] * (len(self.arrays[name]["shape"]) - 1)])
-
-    @property
-    def keys_of_many(self) -> list[str]:
-        """Keys of chunks with the values of many shots."""
-        counts = {name: -(-self.shots // self._lengths[name]) for name in self.of_many_shots}
-        return [self.key(name, index) for name in counts for index in range(counts[name])]
 
 
 def _has_shots(description: Mapping[str, Any]) -> bool:
@@ -508,7 +502,9 @@ def find_damage(
             }
     if numbers is not None:
         return Damage(shots)
-    keys = [*layout.keys_of_many, *layout.fixed]
+    many = layout.of_many_shots.items()
+    keys = [layout.key(name, k) for name, n in many for k in range(-(-layout.shots // n))]
+    keys += layout.fixed
     damaged = {key: text for key in keys if (text := _chunk_problem(layout, key, every_byte))}
     problems = [*damaged.values()]
     if every_byte:

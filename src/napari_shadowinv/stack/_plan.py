@@ -124,7 +124,6 @@ class Stack:
         return replace(self, shots=replace(self.shots, items=items), columns=table.columns)
 
     def with_sites(self, n_sites: int) -> Stack:
-        """Return the stack with the number of sites derived from the accuracy."""
         assert isinstance(self.task, InvertTask)
         return replace(self, task=self.task.with_sites(n_sites))
 

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import PLANE, unpack_array
+from napari_shadowinv._system.arrays import PLANE, unpack_array, unpack_planes
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -355,7 +355,6 @@ class Shots:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the shots."""
         return tuple(shot.name for shot in self.items)
 
     def label(self, index: int) -> str:
@@ -364,7 +363,6 @@ class Shots:
         return f"shot {index}" if name == str(index) else f"shot {index} ({name})"
 
     def reordered(self, order: Sequence[int]) -> Shots:
-        """Return these shots in another order."""
         if list(order) == list(range(len(self))):
             return self
         return replace(
@@ -395,11 +393,10 @@ def find_shots(
                 f"shots have shapes {', '.join(map(str, sorted(shapes)))}: expected the same "
                 "shape for all"
             )
-        planes = [unpack_array(item, f"shots[{k}]") for k, item in enumerate(shots)]
-        shots = np.stack([np.asarray(values) for values, _ in planes])
-        if any(usable is not None for _, usable in planes):
-            masked = [np.zeros(shots.shape[1:], bool) if use is None else ~use for _, use in planes]
-            shots = np.ma.MaskedArray(shots, np.stack(masked))
+        planes, usable = unpack_planes(list(shots), "shots")
+        shots = np.stack([np.asarray(values) for values in planes])
+        if usable is not None:
+            shots = np.ma.MaskedArray(shots, ~usable)
     if not hasattr(shots, "ndim"):
         raise InputError(
             f"shots are a {type(shots).__name__}: expected an array (shot, y, x), an xarray "

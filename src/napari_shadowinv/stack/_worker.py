@@ -397,7 +397,6 @@ class FitTask(Task):
         return {name: plane for name, plane in planes.items() if plane is not None}, field
 
     def report(self, result: Fit) -> dict[str, Any]:
-        """Return the report of a shot."""
         report, doubt = dataclasses.asdict(result.report), result.verdict_caution
         entries = {
             **column_values(FITS, result),
@@ -587,7 +586,6 @@ def try_shot(
 def write_shot(
     writer: ShotWriter | GrowingStore, task: AnyTask, index: int, attempt: Attempt
 ) -> ShotOutcome:
-    """Write the result or the failure of a shot."""
     result: Any = attempt.result
     cautions = [dataclasses.asdict(caution) for caution in attempt.origin.get("warnings", ())]
     if result is None:
@@ -604,7 +602,6 @@ def write_shot(
 
 
 def failure_text(error: Exception) -> str:
-    """Return the reason of a failure."""
     if isinstance(error, MemoryError):
         return "there is not enough memory for this shot on its worker"
     kind = type(error).__name__

@@ -437,7 +437,6 @@ class Watch:
         return write_shot(store, self._task, index, attempt)
 
     def _create_store(self, names: Sequence[str]) -> GrowingStore:
-        """Create the store with its first shots."""
         assert self._stack is not None
         items = [Shot(name, _NoImage()) for name in dict.fromkeys(names)]
         stack = replace(self._stack, shots=replace(self._stack.shots, items=items))
