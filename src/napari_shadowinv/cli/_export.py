@@ -174,7 +174,7 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
         rows = csv.writer(f)
         listed = [column.heading for column in content.columns]
         rows.writerow(["shot", "name", "status", *listed, "reason", *headings])
-        keys = [*(column.entry or column.key for column in content.columns), "reason"]
+        keys = [*(column.entry for column in content.columns), "reason"]
         for index in indices:
             report = (_escape_cell(reports[index].get(key, "")) for key in keys)
             peak = (f"{columns[name][index]:.9g}" for name in names)

@@ -109,8 +109,8 @@ def describe_columns(columns: Iterable[Column]) -> str:
 def _column(key: str, title: str, unit: str, kind: type) -> Column:
     return Column(
         key,
-        title if unit == "1" else f"{title} ({unit})",
         title,
+        title=title if unit == "1" else f"{title} ({unit})",
         unit=unit,
         kind=kind,
         format=_FORMATS[kind],

@@ -29,8 +29,8 @@ class Column:
     """Quantity of each shot of a store."""
 
     key: str  # name of its array and of its entry in a shot's report
-    title: str  # heading of tables for people
     long_name: str  # label of the array
+    title: str = ""  # heading of tables for people, if it is not the key
     stores: tuple[str, ...] = (INVERSIONS, ROWS, FITS)  # kinds of stores that have the column
     unit: str = "1"  # of the array
     kind: type = float  # or bool, int or str
@@ -40,6 +40,10 @@ class Column:
     format: str = ""  # specification in tables for people, which omit columns without one
     width: int = 0  # least number of characters of a table's column
     entry: str = ""  # name of its entry in a shot's report, if it is not the key
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "title", self.title or self.key.replace("_", " "))
+        object.__setattr__(self, "entry", self.entry or self.key)
 
     @property
     def fill(self) -> Any:
@@ -63,12 +67,11 @@ class Column:
 
     def of(self, report: Mapping[str, Any]) -> Any:
         """Return the value from a shot's report, or the fill value."""
-        return report.get(self.entry or self.key, self.fill)
+        return report.get(self.entry, self.fill)
 
     def text(self, report: Mapping[str, Any]) -> str:
         """Return the value from a shot's report as text, empty without a value."""
-        entry = self.entry or self.key
-        return format(report[entry], self.format) if entry in report else ""
+        return format(report[self.entry], self.format) if self.entry in report else ""
 
 
 def _error(part: str) -> Callable[[Any], float]:
@@ -84,9 +87,8 @@ def _uncertainty(fit: Any) -> float | None:
 
 # In the order of all tables.
 COLUMNS: tuple[Column, ...] = (
-    Column("seconds", "seconds", "Time its worker spent on the shot", unit="s", format=".1f"),
+    Column("seconds", "Time its worker spent on the shot", unit="s", format=".1f"),
     Column(
-        "verdict",
         "verdict",
         "Whether the field may be believed",
         kind=str,
@@ -96,37 +98,36 @@ COLUMNS: tuple[Column, ...] = (
     ),
     Column(
         "chi2",
-        "χ²",
         "Largest χ² of the shot's images",
+        title="χ²",
         stores=(FITS,),
         value=lambda fit: float(fit.chi2.max()),
         format=".3g",
     ),
     Column(
         "folded",
-        "crossed",
         "Share of the pixels whose rays have crossed",
+        title="crossed",
         stores=(FITS,),
         value=attrgetter("folded"),
         format=".1%",
     ),
     Column(
         "uncertainty",
-        "error bars",
         "Displacement's error bar, r.m.s., as a share of it",
+        title="error bars",
         stores=(FITS,),
         value=_uncertainty,
         format=".2%",
     ),
     Column(
         "total_error",
-        "errors",
         "Error of the displacement, r.m.s., as a share of it",
+        title="errors",
         value=attrgetter("total_error"),
     ),
     Column(
         "limited_by",
-        "limited by",
         "Largest part of the error, as a share of the displacement",
         kind=str,
         value=attrgetter("limited_by"),
@@ -134,21 +135,15 @@ COLUMNS: tuple[Column, ...] = (
         width=len("beam 12 %"),
     ),
     Column(
-        "converged",
-        "converged",
-        "Whether the solver converged",
-        kind=bool,
-        value=attrgetter("report.converged"),
+        "converged", "Whether the solver converged", kind=bool, value=attrgetter("report.converged")
     ),
     Column(
         "flux_residual",
-        "flux residual",
         "Largest relative flux error of a cell",
         stores=(INVERSIONS, ROWS),
         value=attrgetter("report.residual"),
     ),
     Column(
-        "iterations",
         "iterations",
         "Solver iterations, summed over all levels",
         kind=int,
@@ -157,7 +152,6 @@ COLUMNS: tuple[Column, ...] = (
     ),
     Column(
         "iterations",
-        "iterations",
         "Iterations at full size",
         kind=int,
         stores=(FITS,),
@@ -165,7 +159,6 @@ COLUMNS: tuple[Column, ...] = (
     ),
     Column(
         "image_residual",
-        "image residual",
         "Image minus re-projection, r.m.s. relative to the mean",
         stores=(INVERSIONS, ROWS),
         value=attrgetter("report.image_residual"),
@@ -173,7 +166,6 @@ COLUMNS: tuple[Column, ...] = (
     ),
     Column(
         "noise_error",
-        "noise error",
         "Standard error of the displacement by noise, r.m.s.",
         unit=PIXEL,
         stores=(INVERSIONS, ROWS),
@@ -181,7 +173,6 @@ COLUMNS: tuple[Column, ...] = (
     ),
     Column(
         "discretisation_error",
-        "discretisation error",
         "Error of the displacement by too few sites, r.m.s.",
         unit=PIXEL,
         stores=(INVERSIONS, ROWS),
@@ -203,8 +194,8 @@ def _beam_column(setup_kind: str) -> Column:
     quantity = SETUPS.get(setup_kind, SETUPS["proton"]).beam_quantity()
     return Column(
         quantity.name,
-        quantity.noun if quantity.unit == "m" else quantity.unit,
         quantity.long_name,
+        title=quantity.noun if quantity.unit == "m" else quantity.unit,
         unit=quantity.unit,
         stores=(ROWS,),
         value=lambda inversion: inversion.setup and inversion.setup.beam_value,
