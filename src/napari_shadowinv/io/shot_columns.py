@@ -174,7 +174,8 @@ def _table_of(path: Path, titles: Sequence[str], lines: Mapping[str, list[str]])
     columns: dict[int, Column] = {}  # by their positions
     for position, key in enumerate(keys):
         if key and position != place:
-            kind = _kind_of(cells[position] for cells in lines.values())
+            filled = [cells[position] for cells in lines.values() if cells[position]]
+            kind = float if filled and all(map(is_number, filled)) else str
             columns[position] = _column(key, names[position], units[position] or "1", kind)
     rows: dict[int, dict[str, Any]] = {}
     origins: dict[int, str] = {}
@@ -197,11 +198,6 @@ def _table_of(path: Path, titles: Sequence[str], lines: Mapping[str, list[str]])
 def _name_and_unit(title: str) -> tuple[str, str]:
     match = _NAME_AND_UNIT.fullmatch(title.strip())
     return (match["name"], match["unit"].strip()) if match else (title.strip(), "")
-
-
-def _kind_of(cells: Iterable[str]) -> type:
-    filled = [cell for cell in cells if cell]
-    return float if filled and all(map(is_number, filled)) else str
 
 
 def _shot_number(path: Path, line: str, text: str) -> int:

@@ -119,8 +119,8 @@ class ShotWriter:
             for name, array in fields_of(group).items():
                 if name in arrays:
                     array[index : index + 1] = np.asarray(arrays[name])[np.newaxis]
-                else:
-                    self._erase(array, index)
+                else:  # without its chunk, it is read as the fill value
+                    chunk_file(self.path, array, index).unlink(missing_ok=True)
             copied = [column.key for column in columns_of_store(attributes)]
             note = note_shot(self.path, self.store_id, group, index, copied)
             text = json.dumps({**report, **note})
@@ -138,11 +138,7 @@ class ShotWriter:
         with _as_store_errors(self.path):
             group["status"][index : index + 1] = np.int8(PENDING)
             for array in (group["report"], *fields_of(group).values()):
-                self._erase(array, index)
-
-    def _erase(self, array: Any, index: int) -> None:
-        """Remove the chunk of a shot, which is read as the fill value then."""
-        chunk_file(self.path, array, index).unlink(missing_ok=True)
+                chunk_file(self.path, array, index).unlink(missing_ok=True)
 
     def write_columns(
         self, columns: Sequence[Column], reports: Sequence[Mapping[str, Any]], shots: slice

@@ -119,13 +119,10 @@ class WorkerDiedError(Exception):
 class _Threads:
     """Threads of this process; `_Cluster` has the same methods."""
 
-    stop: threading.Event  # set to end tasks that run; None where they have their own process
-    workers: int  # None where they may be on other machines
-
     def __init__(self, pool: ThreadPoolExecutor, workers: int) -> None:
         self.name = f"{workers} thread{'s' if workers > 1 else ''}"
-        self.workers = workers
-        self.stop = threading.Event()
+        self.workers = workers  # None where they may be on other machines
+        self.stop = threading.Event()  # ends tasks that run; None where they have their own process
         self._pool = pool
 
     def window(self, *, files: bool) -> int:

@@ -128,8 +128,7 @@ class Arrivals:
     def take_all(self) -> list[str]:
         """Return the names of all waiting files."""
         with self._changed:
-            names = list(self._ready)
-            self._ready.clear()
+            names, self._ready = list(self._ready), {}
             return names
 
     def peek(self, count: int) -> list[str]:

@@ -428,9 +428,8 @@ def _find_table(shots: Any) -> Path | Sequence[ShotRow] | None:
     if isinstance(shots, Sequence) and shots and all(isinstance(row, ShotRow) for row in shots):
         return shots
     single = shots[0] if isinstance(shots, (list, tuple)) and len(shots) == 1 else shots
-    if not isinstance(single, (str, Path)) or not os.path.isfile(single):
-        return None
-    return Path(single) if is_table(Path(single)) else None
+    is_file = isinstance(single, (str, Path)) and os.path.isfile(single)
+    return Path(single) if is_file and is_table(Path(single)) else None
 
 
 def _describe_table(

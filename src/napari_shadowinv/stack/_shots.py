@@ -125,7 +125,7 @@ class FileReference(ImageReference):
 
     def read(self) -> tuple[AnyArray, dict[str, Any]]:
         parts = {"page": self.page, "variable": self.variable}
-        options: dict[str, Any] = {k: v for k, v in parts.items() if v is not None}
+        options: dict[str, Any] = {name: part for name, part in parts.items() if part is not None}
         warnings: list[Caution] = []
         if "warnings" in inspect.signature(self.reader).parameters:
             options["warnings"] = warnings
