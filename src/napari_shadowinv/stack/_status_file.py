@@ -7,11 +7,11 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,9 +21,7 @@ from napari_shadowinv.io.files import check_output, replacing
 from napari_shadowinv.io.store_columns import FITS, INVERSIONS, column_values
 from napari_shadowinv.physics.units import shown_fields
 from napari_shadowinv.stack._folder_events import Arrivals
-
-if TYPE_CHECKING:
-    from napari_shadowinv.stack._run import RunStatus
+from napari_shadowinv.stack._run import WATCHING, OnStatus, RunStatus
 
 _INTERVAL_S = 1.0  # between two files without a new shot
 _MIN_INTERVAL_S = 0.2  # between two files, however fast shots end
@@ -33,19 +31,17 @@ _RATE_S = 60.0  # of which the rate is the mean
 class StatusFile:
     """A file that is replaced after shots and once a second, in a thread, while its block lasts.
 
-    `on_note` receives a sentence if it cannot be written, once.
+    `on_progress` receives each status, too, and a sentence if the file cannot be written, once.
     """
 
-    def __init__(
-        self, path: Path, arrivals: Arrivals, store: Path, on_note: Callable[[str], None]
-    ) -> None:
+    def __init__(self, path: Path, arrivals: Arrivals, store: Path, on_progress: OnStatus) -> None:
         self.path = check_output(path, overwrite=True)
         if resolved_path(path.parent) == arrivals.folder and arrivals.matches(path.name):
             raise InputError(
                 f"the status file {path} would be taken for a shot of the watched folder: choose "
                 "another folder or name"
             )
-        self._folder, self._store, self._on_note = arrivals.folder, store, on_note
+        self._folder, self._store, self._on_progress = arrivals.folder, store, on_progress
         self._changed = threading.Condition()
         self._counts: dict[str, int] = {}
         self._newest: dict[str, Any] | None = None
@@ -71,7 +67,7 @@ class StatusFile:
         self._write_or_note()
 
     def update(self, status: RunStatus) -> None:
-        """Take over the numbers of shots, and the shot that has just ended."""
+        """Take over the numbers of shots and the shot that has just ended; pass the status on."""
         with self._changed:
             names = ("done", "failed", "skipped", "waiting")
             self._counts = {name: getattr(status, name) for name in names}
@@ -80,6 +76,7 @@ class StatusFile:
                 self._note_shot(status)
             self._is_due = True
             self._changed.notify_all()
+        self._on_progress(status)
 
     def _note_shot(self, status: RunStatus) -> None:
         outcome, result = status.outcome, status.result
@@ -114,7 +111,8 @@ class StatusFile:
         except OSError as error:
             if not self._has_failed:
                 self._has_failed = True
-                self._on_note(f"the status file cannot be written: {error}")
+                note = f"the status file cannot be written: {error}"
+                self._on_progress(RunStatus(engine=WATCHING, note=note))
 
     def _write(self) -> None:
         with self._changed:

@@ -181,9 +181,9 @@ class Watch:
         if self._stack is not None:
             self._use_stack(match_store(store, self._stack))
 
-    def _stack_of(self, shots: Sequence[Shot]) -> Stack:
+    def _stack_of(self, shots: Iterable[Shot]) -> Stack:
         """Return the stack of some shots, the first of which can be read."""
-        stack = self._describe(Shots(shots, (0, 0)))
+        stack = self._describe(Shots(list(shots), (0, 0)))
         # Shots start from each other only on the same sites.
         on_same_sites = stack.beam is not None and isinstance(stack.task, InvertTask)
         chained = self._options.warm_start and on_same_sites
@@ -209,8 +209,12 @@ class Watch:
             self._abandoned.set()
             self._pool.shutdown(cancel_futures=True)
             if self._options.latest:
-                self._skip_waiting()
+                unfinished = [shot.name for shot in self._running]
+                self._running.clear()
+                self._skip([*unfinished, *self._arrivals.take_all()])
             if self.store is not None:
+                with suppress(OSError):  # a watch without this choice finds their files
+                    self._store_skipped(self.store)
                 with suppress(OSError):  # the folder's own copy has the length
                     self.store.close()
             self.report()
@@ -269,15 +273,6 @@ class Watch:
             if not is_stored and name not in running and self._previous_report(name) is None:
                 self._skipped[name] = None
 
-    def _skip_waiting(self) -> None:
-        """Store as skipped what is not inverted when the watch ends."""
-        unfinished = [shot.name for shot in self._running]
-        self._running.clear()
-        self._skip([*unfinished, *self._arrivals.take_all()])
-        if self.store is not None:
-            with suppress(OSError):  # a watch without this choice finds their files
-                self._store_skipped(self.store)
-
     def _store_skipped(self, store: GrowingStore, *following: str) -> None:
         """Number the skipped shots, and shots that follow them."""
         store.skip(self._skipped, *following)
@@ -318,7 +313,7 @@ class Watch:
         self._running.popleft()
         if not self._running:
             self._busy_s += time.monotonic() - self._busy_since
-        stamp_after = {**stamp_before, **attempt.origin}
+        origin = stamp_after = {**stamp_before, **attempt.origin}
         if attempt.failure:
             with suppress(OSError):
                 stamp_after = stamp(self._file(running.name).path)
@@ -335,9 +330,7 @@ class Watch:
             if begin_next:
                 self._begin_waiting(running.name)
         finally:
-            self._store_outcome(
-                running.name, replace(attempt, origin={**stamp_before, **attempt.origin})
-            )
+            self._store_outcome(running.name, replace(attempt, origin=origin))
 
     def _store_outcome(self, file: str, attempt: Attempt) -> None:
         """Write the outcome of an attempt at a file, and report it."""
@@ -399,13 +392,13 @@ class Watch:
                 done = store.done_names()
                 existing = (name for name in done if self._file(name).path.exists())
                 names = [*islice(existing, MAX_TRIED_SHOTS), *names]
-            stack = self._stack_of(list(map(self._shot, names)))
+            stack = self._stack_of(map(self._shot, names))
             if store is not None:
                 self._use_stack(match_store(StackStore(self._path), stack))
                 return None
         if stack.chooses_sites:
             self.report(stage="how many sites the first shots need")
-            shots = self._stack_of(list(map(self._shot, names))).shots
+            shots = self._stack_of(map(self._shot, names)).shots
             shares = needed_shares(replace(stack, shots=shots), self._should_stop)
             if not shares:
                 # It fails the same way, and a later shot decides.
@@ -512,7 +505,8 @@ def watch_stack(
     on_progress = on_progress or (lambda _: None)
     with ExitStack() as opened:
         if watch.status_file is not None:
-            on_progress = _with_status_file(watch.status_file, arrivals, path, on_progress, opened)
+            status_file = StatusFile(watch.status_file, arrivals, path, on_progress)
+            on_progress = opened.enter_context(status_file).update
         loop = Watch(path, watch, describe, reader, arrivals, on_progress, should_stop)
         try:
             ensure_compiled(
@@ -528,20 +522,3 @@ def watch_stack(
             ):
                 loop.run()
         return None if loop.store is None else read_stack(path)
-
-
-def _with_status_file(
-    file: Path, arrivals: Arrivals, store: Path, on_progress: OnStatus, opened: ExitStack
-) -> OnStatus:
-    """Return a receiver of the status that also writes it to a file until `opened` closes."""
-
-    def notify(text: str) -> None:
-        on_progress(RunStatus(engine=WATCHING, note=text))
-
-    status_file = opened.enter_context(StatusFile(file, arrivals, store, notify))
-
-    def update(status: RunStatus) -> None:
-        status_file.update(status)
-        on_progress(status)
-
-    return update
