@@ -20,7 +20,6 @@ from napari_shadowinv import InputError, WatchOptions, read, run_stack, watch_st
 from napari_shadowinv.io.store import DONE, FAILED, SKIPPED, StackStore
 from napari_shadowinv.io.store_writing import GrowingStore
 from napari_shadowinv.stack import _status_file
-from napari_shadowinv.stack._run import NUMBERED_AS_ARRIVED
 
 pytestmark = pytest.mark.usefixtures("impatient")
 
@@ -137,7 +136,7 @@ def test_shots_in_work_are_skipped_when_the_watch_ends(folder, out):
 def test_room_of_a_growing_store_is_not_seen_and_given_back(folder, out):
     put(folder, 0, 1)
     watched_once(folder, out)
-    growing = GrowingStore(StackStore(out), NUMBERED_AS_ARRIVED)
+    growing = GrowingStore(StackStore(out))
     growing.skip(["shot_8.npy", "shot_9.npy"])
     assert zarr.open_array(out / "displacement").shape[0] > 4  # by its own description
     store = StackStore(out, every_byte=True)  # as if the watch had been killed

@@ -62,6 +62,8 @@ from napari_shadowinv.io.store_columns import Column
 
 _TOGETHER = 1024  # values of a coordinate along shots that are one file
 _SMALL = 64  # values that are not worth compressing
+# Attribute: the order of the shots does not follow from their names.
+NUMBERED_AS_ARRIVED = {"order": "as they arrived"}
 _ROOM = 64  # shots for which the arrays of a growing store are extended at a time
 
 
@@ -239,13 +241,11 @@ def _create_columns(store: StackStore, columns: Sequence[Column], description: s
     for column in columns:
         shutil.rmtree(store.path / column.key, ignore_errors=True)  # left by a killed process
         _create_array(group, column.key, _variable_of(column, shots), {"shot": shots})
-    file = store.path / "zarr.json"
-    document = json.loads(file.read_text(encoding="utf-8"))
-    document["attributes"][JOINED] = description
-    for column in columns:
-        text = (store.path / column.key / "zarr.json").read_text(encoding="utf-8")
-        document["consolidated_metadata"]["metadata"][column.key] = json.loads(text)
-    _replace_description(store.path, document)
+    with _changing_description(store.path) as document:
+        document["attributes"][JOINED] = description
+        for column in columns:
+            text = (store.path / column.key / "zarr.json").read_text(encoding="utf-8")
+            document["consolidated_metadata"]["metadata"][column.key] = json.loads(text)
     _open_arrays.cache_clear()  # it has been opened without them
 
 
@@ -329,11 +329,9 @@ def finish_shards(path: Path) -> None:
     remove_unfinished(path)
     remove_drafts(path)
     remove_drafts(path / "zarr.json", ".json")
-    with _as_store_errors(path):
-        document = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+    with _as_store_errors(path), _changing_description(path) as document:
         for name in (SHARDS, SHOT_FILES):
             document["attributes"].pop(name, None)
-        _replace_description(path, document)
 
 
 def grow_store(
@@ -348,10 +346,10 @@ def grow_store(
     The coordinates, `values`, are of the new shots. `arrays` are open already, or opened; they get
     `room` for more shots than the store has then.
     """
-    with _as_store_errors(path):
+    # The store is longer once its description is replaced.
+    with _as_store_errors(path), _changing_description(path) as metadata:
         arrays = _open_to_write(path) if arrays is None else arrays
         longer = [name for name, array in arrays.items() if is_along_shots(array)]
-        metadata = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
         before = metadata["consolidated_metadata"]["metadata"]["status"]["shape"][0]
         length = before + len(values["shot"])
         for name in longer:
@@ -367,11 +365,13 @@ def grow_store(
         metadata["attributes"].update(attributes)
         for name in longer:
             metadata["consolidated_metadata"]["metadata"][name]["shape"][0] = length
-        # From here on the store is longer.
-        _replace_description(path, metadata)
 
 
-def _replace_description(path: Path, document: dict[str, Any]) -> None:
+@contextmanager
+def _changing_description(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the description of a store, and replace it when the block ends well."""
+    document = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+    yield document
     with replacing(path / "zarr.json", overwrite=True) as draft:
         # Without indentation, which takes ten times as long, for each shot of a watched folder.
         draft.write_text(json.dumps(reseal(document)), encoding="utf-8")
@@ -468,9 +468,8 @@ class GrowingStore:
     It is opened once: the cost of a shot does not depend on how many there are already.
     """
 
-    def __init__(self, store: StackStore, attributes: Mapping[str, Any]) -> None:
+    def __init__(self, store: StackStore) -> None:
         self.path = store.path
-        self._attributes = attributes  # of a store that has grown so
         # Not the cached arrays, as these grow: other code in this process needs a fixed length.
         self._writer = replace(ShotWriter.of(store), opened=_open_to_write(store.path))
         self._columns = store.columns
@@ -504,7 +503,7 @@ class GrowingStore:
         if new:
             numbers = range(len(self), len(self) + len(new))
             values = {"shot": np.array(numbers), "name": np.array(new, dtype=object)}
-            grow_store(self.path, values, self._attributes, self._writer.arrays(), _ROOM)
+            grow_store(self.path, values, NUMBERED_AS_ARRIVED, self._writer.arrays(), _ROOM)
             self._numbers.update(zip(new, numbers, strict=True))
             self._statuses.extend([PENDING] * len(new))
         return self._numbers[names[-1]]

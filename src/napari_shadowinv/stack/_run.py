@@ -45,6 +45,7 @@ from napari_shadowinv.io.store import (
     check_store_path,
 )
 from napari_shadowinv.io.store_writing import (
+    NUMBERED_AS_ARRIVED,
     Contents,
     ShotWriter,
     Variable,
@@ -82,8 +83,6 @@ WATCHING = "watching"  # name of the engine of a watched folder
 _POLL_S = 0.25  # between two looks at the engine and at `should_stop`
 _CHOSEN_SITES = "chosen_sites"  # attribute: number of sites from the accuracy and the first shots
 _APPENDED = "appended_at"  # attribute: numbers of the first shots appended by later runs
-# Attribute: the order does not follow from the names.
-NUMBERED_AS_ARRIVED = {"order": "as they arrived"}
 _ALTERNATIVES = "use the same, overwrite the store, or choose another name"
 
 
@@ -237,9 +236,10 @@ def run_stack(
         stack = stack.with_table(read_shot_table(run.shot_table))
     again = (PENDING, SKIPPED, *([FAILED] if run.redo_failed else []))
 
+    on_progress = on_progress or (lambda _: None)
+
     def prepare(stage: str) -> None:
-        if on_progress is not None:
-            on_progress(RunStatus(total=len(stack.shots), stage=stage))
+        on_progress(RunStatus(total=len(stack.shots), stage=stage))
 
     if is_local(scheduler):
         # Once, instead of in all workers during their first shot.
@@ -335,13 +335,12 @@ class _Run:
         stack: Stack,
         store: StackStore,
         again: tuple[int, ...],
-        on_progress: OnStatus | None,
+        on_progress: OnStatus,
         should_stop: ShouldStop | None,
     ) -> None:
         self._stack = stack
         self._store, self._writer = store, ShotWriter.of(store)
-        self._on_progress = on_progress or (lambda _: None)
-        self._should_stop = should_stop
+        self._on_progress, self._should_stop = on_progress, should_stop
         statuses, reports = store.statuses(), store.reports()
         self._todo = {int(index) for index in np.flatnonzero(np.isin(statuses, again))}
         self._failures = [

@@ -39,7 +39,6 @@ from napari_shadowinv.stack._plan import (
     with_enough_sites,
 )
 from napari_shadowinv.stack._run import (
-    NUMBERED_AS_ARRIVED,
     WATCHING,
     OnStatus,
     RunStatus,
@@ -177,7 +176,7 @@ class Watch:
         self._redo = {store.names[i] for i in np.flatnonzero(np.isin(store.statuses(), again))}
         for name, report in zip(store.names, store.reports(), strict=True):
             self._note_report(name, report)
-        self.store = GrowingStore(store, NUMBERED_AS_ARRIVED)
+        self.store = GrowingStore(store)
         if self._stack is not None:
             self._use_stack(match_store(store, self._stack))
 
@@ -434,7 +433,7 @@ class Watch:
         items = [Shot(name, _NoImage()) for name in dict.fromkeys(names)]
         stack = replace(self._stack, shots=replace(self._stack.shots, items=items))
         created = create_store(self._path, contents_of(stack), overwrite=self._options.overwrite)
-        self.store = GrowingStore(created, NUMBERED_AS_ARRIVED)
+        self.store = GrowingStore(created)
         return self.store
 
 
