@@ -26,12 +26,12 @@ from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.inversion.variables import dataset_from_field, setup_from_dataset
 from napari_shadowinv.io.hdf5 import hdf5_in_memory, list_arrays, load_dataset, member, open_hdf5
 from napari_shadowinv.io.read_write import require
+from napari_shadowinv.physics.beam import displacement_from_potential
+from napari_shadowinv.physics.setup import Setup, Species, setup_from_dict
 from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
     import xarray
-
-    from napari_shadowinv.physics.setup import Setup, Species
 
 _VERSION = "0.2.0"
 _EV_PER_MEV = 1e6
@@ -156,9 +156,6 @@ def _read_distances(attributes: dict[str, Any]) -> tuple[float | None, float | N
 
 
 def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
-    from napari_shadowinv.physics.beam import displacement_from_potential
-    from napari_shadowinv.physics.setup import setup_from_dict
-
     setup = setup_from_dict(_read_geometry(path, attributes, "dr"), str(path))
     arrays = _read_datasets(path, ("phi", "defl_ax1", "defl_ax2"))
     has_angles = {"defl_ax1", "defl_ax2"} <= arrays.keys()

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import zarr
 
 from napari_shadowinv._system.safety import as_file_errors, small_text
 from napari_shadowinv._typing import AnyArray, FloatArray
@@ -244,8 +245,6 @@ def check_files(store: StackStore) -> None:
 
 @as_file_errors
 def _open_readable(path: Path) -> dict[str, Any]:
-    import zarr
-
     arrays: dict[str, Any] = dict(zarr.open_group(CheckedStore(path), mode="r").arrays())
     names = arrays["name"]
     shots = names.shape[0]

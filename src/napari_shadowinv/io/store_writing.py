@@ -26,6 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zarr
+from zarr.codecs import BloscCodec, Crc32cCodec
 
 from napari_shadowinv._system.hidden_files import hidden_name, remove_drafts, sweep
 from napari_shadowinv._system.machine import defer_interrupts
@@ -158,8 +160,6 @@ class ShotWriter:
 
 
 def _open_to_write(path: Path) -> dict[str, Any]:
-    import zarr
-
     # Also chunks that are empty: one that is not there has been lost.
     return {
         name: array.with_config({"write_empty_chunks": True})
@@ -234,8 +234,6 @@ def _kind_text(column: Column) -> str:
 
 def _create_columns(store: StackStore, columns: Sequence[Column], description: str) -> None:
     """Create the arrays of more columns; the folder lists them once all are there."""
-    import zarr
-
     shots = len(store.names)
     group = zarr.open_group(store.path, mode="r+")
     for column in columns:
@@ -378,8 +376,6 @@ def _changing_description(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _write_template(path: Path, contents: Contents) -> None:
-    import zarr
-
     extra = [name for name in contents.coordinates if name not in contents.sizes]
     group = zarr.create_group(
         path,
@@ -430,8 +426,6 @@ def _variable_of(column: Column, shots: int) -> Variable:
 
 
 def _create_array(group: Any, name: str, variable: Variable, sizes: Mapping[str, int]) -> None:
-    from zarr.codecs import BloscCodec, Crc32cCodec
-
     shape = tuple(sizes[dim] for dim in variable.dims)
     chunks = _chunks(variable, shape)
     is_text = variable.dtype is str
