@@ -1,7 +1,7 @@
 """Arrays of any HDF5 file, by name.
 
-- the array that the user names: `read_hdf5`, as an image `read_plane`; the choice: `list_arrays`
-- one of many frames in an array: `read_hdf5_frame`; their number: `count_frames`
+- the array that the user names, or one of its frames: `read_hdf5`, as an image `read_plane`; the
+  choice: `list_arrays`; the number of frames: `count_frames`
 - for callers that know the layout: `open_hdf5`; an item, `member`; its values, `load_dataset`
 - refuse a file whose arrays are elsewhere or too large: `check_arrays`
 - a NetCDF4 file, for xarray: `opened_netcdf`
@@ -209,13 +209,12 @@ def check_hdf5_seal(path: Path) -> None:
 
 
 @as_file_errors
-def read_hdf5(path: Path, name: str) -> AnyArray:
-    """Read one array by its name with groups: ``shots/3/image``."""
+def read_hdf5(path: Path, name: str, number: int | None = None) -> AnyArray:
+    """Read an array, ``shots/3/image``, or its frame `number` over the axes before the last two."""
     with open_hdf5(path) as file:
-        dataset, number = _find_array(path, file, name)
-        if number is not None:
-            return _load_frame(path, dataset, number)
-        return load_dataset(path, dataset)
+        dataset, own_number = _find_array(path, file, name)
+        number = own_number if number is None else number
+        return load_dataset(path, dataset) if number is None else _load_frame(path, dataset, number)
 
 
 def read_plane(path: Path, name: str) -> tuple[AnyArray, dict[str, Any]]:
@@ -227,8 +226,7 @@ def read_plane(path: Path, name: str) -> tuple[AnyArray, dict[str, Any]]:
             f"{path} holds {math.prod(axes)} frames in {name!r}: expected one image; choose one, "
             f"such as '{name}[{first}]', or invert all as a stack of shots"
         )
-    array = read_hdf5_frame(path, name, 0) if axes else read_hdf5(path, name)
-    return array, {"kind": "hdf5", "variable": name}
+    return read_hdf5(path, name, 0 if axes else None), {"kind": "hdf5", "variable": name}
 
 
 @as_file_errors
@@ -242,13 +240,6 @@ def count_frames(path: Path, name: str) -> tuple[int, ...]:
                 "(height, width), or many with the shots first; choose another array"
             )
         return dataset.shape[:-2] if number is None else ()
-
-
-@as_file_errors
-def read_hdf5_frame(path: Path, name: str, number: int) -> AnyArray:
-    """Read frame `number` of an array, counted over all its axes before the last two."""
-    with open_hdf5(path) as file:
-        return _load_frame(path, _find_array(path, file, name)[0], number)
 
 
 def _find_array(path: Path, file: Any, name: str) -> tuple[Any, int | None]:

@@ -112,18 +112,15 @@ def mat_variables(path: Path) -> list[Variable]:
 
 def _choose_image(path: Path, variables: list[Variable], name: str | None) -> Variable:
     content = ", ".join(map(str, variables)) or "nothing"
-    images = [item for item in variables if item.is_image]
-    if name is not None:
-        images = [item for item in images if item.name == name]
-        if not images:
-            raise InputError(f"{path} has no numeric plane {name!r}: it holds {content}")
-        return images[0]
+    images = [item for item in variables if item.is_image and name in (None, item.name)]
+    if name is not None and not images:
+        raise InputError(f"{path} has no numeric plane {name!r}: it holds {content}")
     if not images:
         raise FileFormatError(
             f"{path} holds {content}: expected a numeric array (height, width); save the image as "
             "a variable of its own"
         )
-    if len(images) > 1:
+    if name is None and len(images) > 1:
         raise InputError(
             f"{path} holds {len(images)} images: choose one with variable, of "
             f"{', '.join(map(str, images))}"

@@ -39,7 +39,7 @@ from napari_shadowinv.io.hdf5 import (
     check_hdf5_seal,
     hdf5_in_memory,
     opened_netcdf,
-    read_hdf5_frame,
+    read_hdf5,
 )
 from napari_shadowinv.io.images import film_warnings, read_tiff_page, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
@@ -112,7 +112,7 @@ def read_frame(frame: Frame, *, channel: str | int | None = None) -> Radiograph:
     if frame.variable is None:
         image, warnings = read_tiff_page(frame.path, frame.number, channel=channel)
         return Radiograph(image, warnings=warnings)
-    array = read_hdf5_frame(frame.path, frame.variable, frame.number)
+    array = read_hdf5(frame.path, frame.variable, frame.number)
     return Radiograph(to_grey(array, channel, frame.path))
 
 
