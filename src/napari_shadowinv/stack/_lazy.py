@@ -191,7 +191,7 @@ def invert_stack(
             "leave the section out"
         )
     stack = describe_stack(shots, recipe, source, mask, source_mask, reader, variables, warm_start)
-    return _Graph(choose_sites(stack)).dataset()
+    return _lazy_dataset(choose_sites(stack))
 
 
 def _invert(
@@ -222,87 +222,79 @@ def _pick(record: dict[str, Any], name: str) -> AnyArray:
     return np.asarray(record[name])[np.newaxis]
 
 
-class _Graph:
-    """Tasks of a stack: one for each shot, and one for each of its variables."""
+def _lazy_records(stack: Stack, beam: Any) -> tuple[Any, str]:
+    """Return an array of each shot's variables as a dictionary, a task for each, and its token."""
+    from dask.base import tokenize
+    from dask.delayed import delayed
+    from dask.highlevelgraph import HighLevelGraph
 
-    def __init__(self, stack: Stack) -> None:
-        from dask.base import tokenize
-        from dask.delayed import delayed
-        from dask.highlevelgraph import HighLevelGraph
-
-        self._stack, shots = stack, stack.shots
-        self._token = token = tokenize(
-            [shot.images for shot in shots.items] if shots.array is None else shots.array.name,
-            [shot.source and shot.source.images for shot in shots.items],
-            None if stack.beam is None else stack.beam.key,
-            stack.source_text(None),
-            stack.task.inputs.shot.mask,
-            stack.task.inputs.shot.source_mask,
-            stack.task.recipe.model_dump_json(),
-            stack.task.variables,
-            stack.warm_start,
-        )
-        self._inverted = f"invert-shot-{token}"
-        dependencies: list[Any] = [] if shots.array is None else [shots.array]
-        self._beam: Any = None
-        if stack.beam is not None:
-            # One node, so that a worker gets the source once and not with each shot.
-            self._beam = delayed(stack.beam, name=f"beam-{stack.beam.key}", traverse=False)
-            dependencies.append(self._beam)
-        task = delayed(stack.task, name=f"task-{token}", traverse=False)
-        tasks: dict[Any, Any] = {
-            (self._inverted, index): self._task(index, task.key) for index in range(len(shots))
-        }
-        graph = HighLevelGraph.from_collections(
-            self._inverted, tasks, dependencies=[*dependencies, task]
-        )
-        da: Any = import_module("dask.array")
-        # The block of a shot is the dictionary of its variables.
-        self._records = da.Array(graph, self._inverted, ((1,) * len(shots),), dtype=object)
-
-    def _task(self, index: int, task: Any) -> tuple[Any, ...]:
-        stack = self._stack
-        shot, array, block = stack.shots.items[index], stack.shots.array, None
+    da: Any = import_module("dask.array")
+    shots, array, group = stack.shots, stack.shots.array, stack.warm_start
+    token = tokenize(
+        [shot.images for shot in shots.items] if array is None else array.name,
+        [shot.source and shot.source.images for shot in shots.items],
+        None if stack.beam is None else stack.beam.key,
+        stack.source_text(None),
+        stack.task.inputs.shot.mask,
+        stack.task.inputs.shot.source_mask,
+        stack.task.recipe.model_dump_json(),
+        stack.task.variables,
+        stack.warm_start,
+    )
+    name = f"invert-shot-{token}"
+    task = delayed(stack.task, name=f"task-{token}", traverse=False)
+    dependencies = [node for node in (array, beam, task) if node is not None]
+    tasks: dict[Any, Any] = {}
+    for index, item in enumerate(shots.items):
+        shot, block = item, None
         if array is not None:
-            shot, block = replace(shot, images=ImageReference()), (array.name, index, 0, 0)
-        beam = None if self._beam is None else self._beam.key
-        run = stack.warm_start
-        previous = (self._inverted, index - 1) if index % run else None
-        keep = run > 1 and (index + 1) % run != 0
-        return (_invert, stack.shots.label(index), shot, block, beam, task, previous, keep)
+            shot, block = replace(item, images=ImageReference()), (array.name, index, 0, 0)
+        previous = (name, index - 1) if index % group else None
+        keep = group > 1 and (index + 1) % group != 0
+        inputs = (shots.label(index), shot, block, None if beam is None else beam.key)
+        tasks[name, index] = (_invert, *inputs, task.key, previous, keep)
+    graph = HighLevelGraph.from_collections(name, tasks, dependencies=dependencies)
+    return da.Array(graph, name, ((1,) * len(shots),), dtype=object), token
 
-    def dataset(self) -> xarray.Dataset:
-        import xarray as xr
-        from dask.delayed import delayed
 
-        da: Any = import_module("dask.array")
-        stack = self._stack
-        shared = delayed(values_of_beam, pure=True)(self._beam, stack.task.recipe.options)
-        variables: dict[str, Any] = {}
-        for name, (dims, labels) in stack.task.labels.items():
-            if name not in stack.task.variables:
-                continue
-            if stack.is_shared(name):
-                shape = tuple(stack.sizes[dim] for dim in dims)
-                values = da.from_delayed(shared[name], shape, dtype=dtype_of(name))
-                variables[name] = (dims, values, labels)
-            else:
-                variables[name] = (("shot", *dims), self._per_shot_array(name, dims), labels)
-        setups = stack.setups
-        if setups is not None:
-            variables["setup"] = (("shot",), da.from_array(np.array(setups, "O"), 1), SETUPS_LABEL)
-        for column in columns_of(INVERSIONS):
-            if column.value is not None:
-                values = self._per_shot_array(column.key, (), column.kind)
-                variables[column.key] = (("shot",), values, column.labels)
-        dataset = xr.Dataset(variables, coords=coordinates_of(stack), attrs=attributes_of(stack))
-        return dataset if setups is None else with_places(dataset)
+def _lazy_dataset(stack: Stack) -> xarray.Dataset:
+    """Return the dataset of a stack, with a task for each variable of each shot."""
+    import xarray as xr
+    from dask.delayed import delayed
 
-    def _per_shot_array(self, name: str, dims: tuple[str, ...], dtype: Any = None) -> Any:
-        return self._records.map_blocks(
+    da: Any = import_module("dask.array")
+    beam: Any = None
+    if stack.beam is not None:
+        # One node, so that a worker gets the source once and not with each shot.
+        beam = delayed(stack.beam, name=f"beam-{stack.beam.key}", traverse=False)
+    records, token = _lazy_records(stack, beam)
+
+    def of_each_shot(name: str, dims: tuple[str, ...], dtype: Any) -> Any:
+        return records.map_blocks(
             partial(_pick, name=name),
-            name=f"{name}-{self._token}",
-            chunks=(*self._records.chunks, *((self._stack.sizes[dim],) for dim in dims)),
+            name=f"{name}-{token}",
+            chunks=(*records.chunks, *((stack.sizes[dim],) for dim in dims)),
             new_axis=list(range(1, 1 + len(dims))),
-            meta=np.empty((0,) * (1 + len(dims)), dtype or dtype_of(name)),
+            meta=np.empty((0,) * (1 + len(dims)), dtype),
         )
+
+    shared = delayed(values_of_beam, pure=True)(beam, stack.task.recipe.options)
+    variables: dict[str, Any] = {}
+    for name, (dims, labels) in stack.task.labels.items():
+        if name not in stack.task.variables:
+            continue
+        if stack.is_shared(name):
+            shape = tuple(stack.sizes[dim] for dim in dims)
+            values = da.from_delayed(shared[name], shape, dtype=dtype_of(name))
+            variables[name] = (dims, values, labels)
+        else:
+            variables[name] = (("shot", *dims), of_each_shot(name, dims, dtype_of(name)), labels)
+    setups = stack.setups
+    if setups is not None:
+        variables["setup"] = (("shot",), da.from_array(np.array(setups, "O"), 1), SETUPS_LABEL)
+    for column in columns_of(INVERSIONS):
+        if column.value is not None:
+            values = of_each_shot(column.key, (), column.kind)
+            variables[column.key] = (("shot",), values, column.labels)
+    dataset = xr.Dataset(variables, coords=coordinates_of(stack), attrs=attributes_of(stack))
+    return dataset if setups is None else with_places(dataset)
