@@ -214,11 +214,10 @@ class StackStore:
                 values = self._values(name, slice(first, end)).tolist()
                 column = columns.get(name)
                 # Numbers of one shot only: others may have been computed again since.
-                is_intact = all(
+                if not all(
                     _agrees(values[index - first], damage.noted[index], name, column)
                     for index in (sound if column is None else sound[:1])
-                )
-                if not is_intact:
+                ):
                     yield f"{key} does not belong to shots {first} to {end - 1}"
 
     def _values(self, name: str, which: Any = ...) -> AnyArray:

@@ -427,7 +427,11 @@ def _variable_of(column: Column, shots: int) -> Variable:
 
 def _create_array(group: Any, name: str, variable: Variable, sizes: Mapping[str, int]) -> None:
     shape = tuple(sizes[dim] for dim in variable.dims)
-    chunks = _chunks(variable, shape)
+    # A chunk is one file. Values of the start are in few files, with room for new shots; others in
+    # a file for each shot.
+    together = 1 if variable.values is None else _TOGETHER
+    along_shots = (together, *shape[1:])
+    chunks = along_shots if variable.along_shots else tuple(max(1, length) for length in shape)
     is_text = variable.dtype is str
     is_float = not is_text and np.dtype(variable.dtype).kind == "f"
     # Fields compress well once their slowly changing bytes are next to each other.
@@ -446,14 +450,6 @@ def _create_array(group: Any, name: str, variable: Variable, sizes: Mapping[str,
     )
     if variable.values is not None:
         array[...] = variable.values
-
-
-def _chunks(variable: Variable, shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the shape of a chunk, which is one file."""
-    if not variable.along_shots:
-        return tuple(max(1, length) for length in shape)
-    # Values of the start are in few files, with room for new shots; others in a file for each shot.
-    return (1 if variable.values is None else _TOGETHER, *shape[1:])
 
 
 class GrowingStore:
