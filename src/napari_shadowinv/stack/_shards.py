@@ -54,12 +54,9 @@ class Shard:
         """Return a shard of the shots for a store; None for all shots."""
         if part is None:
             return None
-        digest = hashlib.sha256()
-        for shot in shots.items:
-            for images in (shot.images, None if shot.source is None else shot.source.images):
-                identity = "" if images is None else images.identity(out.parent)
-                digest.update(f"{identity}\n".encode())
-        return cls(*part, digest.hexdigest())
+        exposures = [each for shot in shots.items for each in (shot, shot.source)]
+        lines = (f"{each.images.identity(out.parent) if each else ''}\n" for each in exposures)
+        return cls(*part, hashlib.sha256("".join(lines).encode()).hexdigest())
 
 
 def numbers_of(run: RunOptions, shots: int) -> list[int] | None:
