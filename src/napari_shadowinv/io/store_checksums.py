@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import google_crc32c
 import numpy as np
@@ -46,20 +46,12 @@ _METADATA, _CHUNKS = "zarr.json", "/c/"
 _TEXTS, _BLOSC = "vlen-utf8", "blosc"
 
 
-class _Chunk(NamedTuple):
-    """Size and codecs of each chunk of an array."""
-
-    values: int
-    value_bytes: int
-    codecs: tuple[str, ...]
-
-
 class CheckedStore(LocalStore):
     """Folder that Zarr may only read, and only as far as its files really reach."""
 
     def __init__(self, root: Path, *, read_only: bool = True) -> None:
         super().__init__(root, read_only=True)
-        self._chunks: dict[str, _Chunk] = {}
+        self._chunks: dict[str, tuple[int, int, tuple[str, ...]]] = {}  # as of `_chunk_of`
         # Distinguishes this store from the shorter one before it grew, where dask keeps both.
         self._opened = time.time_ns()
 
@@ -133,14 +125,13 @@ class CheckedStore(LocalStore):
     def _check_chunk(self, path: Path, name: str) -> None:
         if name not in self._chunks:
             self._chunks[name] = _chunk_of(self._metadata(name))
-        chunk = self._chunks[name]
-        size = chunk.values * chunk.value_bytes
+        values, size, codecs = self._chunks[name]
         check_size(path, max(size, path.stat().st_size))
         with path.open("rb") as file:
             head = np.frombuffer(file.read(8).ljust(8, b"\0"), "<u4")
-        if _TEXTS in chunk.codecs:
-            check_promise(path, "chunk's", int(head[0]), chunk.values)
-        elif _BLOSC in chunk.codecs:
+        if _TEXTS in codecs:
+            check_promise(path, "chunk's", int(head[0]), values)
+        elif _BLOSC in codecs:
             check_promise(path, "chunk's", int(head[1]), size)
 
 
@@ -154,14 +145,15 @@ def _json(path: Path) -> dict[str, Any]:
     return dict(json.loads(small_text(path, "metadata of the store")))
 
 
-def _chunk_of(content: dict[str, Any]) -> _Chunk:
-    shape = content["chunk_grid"]["configuration"]["chunk_shape"]
+def _chunk_of(content: dict[str, Any]) -> tuple[int, int, tuple[str, ...]]:
+    """Return the numbers of values and bytes, and the codecs, of each chunk of an array."""
+    values = math.prod(content["chunk_grid"]["configuration"]["chunk_shape"])
     kind = content["data_type"]
     if isinstance(kind, dict):
         width = int(kind["configuration"].get("length_bytes", 8))
     else:
         width = 8 if kind == "string" else np.dtype(kind).itemsize
-    return _Chunk(math.prod(shape), width, tuple(codec["name"] for codec in content["codecs"]))
+    return values, values * width, tuple(codec["name"] for codec in content["codecs"])
 
 
 SEAL = "metadata_sha256"  # attribute: checksum of the folder's description
