@@ -18,8 +18,8 @@ from napari_shadowinv.io.store_columns import COLUMNS, FITS, INVERSIONS, ROWS, C
 def site_column(monkeypatch) -> Column:
     column = Column(
         "site_count",
-        "places",
         "Number of sites",
+        title="places",
         kind=int,
         stores=(INVERSIONS,),
         value=lambda inversion: len(inversion.sites),

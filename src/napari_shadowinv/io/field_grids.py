@@ -175,8 +175,7 @@ def _read_mesh(path: Path, record: Any, symbol: str) -> tuple[FloatArray, FloatA
         places.append(place[order])
     parts, place = _collocate(parts, np.array(places))
     spacing, offset = spacing[order], offset[order]
-    counts = np.array(parts[0].shape)
-    middle = offset + spacing * (place + (counts - 1) / 2)
+    middle = offset + spacing * (place + (np.array(parts[0].shape) - 1) / 2)
     return np.stack(parts), spacing, middle
 
 

@@ -223,8 +223,7 @@ def read_tiff_page(
     """Read page `number`, from 0, of a TIFF that holds many, with warnings as of a `Radiograph`."""
     with _open_tiff(path) as tiff:
         array, _ = _read_page(path, tiff.pages[number].aspage())
-    where = f"page {number} of {path}"
-    return to_grey(array, channel, where), film_warnings(array, channel)
+    return to_grey(array, channel, f"page {number} of {path}"), film_warnings(array, channel)
 
 
 def _decode(path: Path, page: Any) -> AnyArray:

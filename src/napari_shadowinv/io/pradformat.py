@@ -51,8 +51,7 @@ def is_result(path: Path) -> bool:
 
     if not h5py.is_hdf5(path):
         return False
-    attributes = _root_attributes(path)
-    return str(attributes.get("format", "")).startswith(tuple(ResultKind))
+    return str(_root_attributes(path).get("format", "")).startswith(tuple(ResultKind))
 
 
 @as_file_errors

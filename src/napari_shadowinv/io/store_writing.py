@@ -199,8 +199,7 @@ def join_columns(
     """
     before = {column.key: column for column in joined_columns(store.attributes)}
     arrays = ShotWriter.of(store).arrays()
-    taken = {*arrays, *(column.key for column in store.columns)} - before.keys()
-    check_column_keys(columns, taken)
+    check_column_keys(columns, {*arrays, *(column.key for column in store.columns)} - before.keys())
     for column in columns:
         existing = before.get(column.key, column)
         if (existing.unit, existing.kind) != (column.unit, column.kind):
@@ -219,8 +218,7 @@ def join_columns(
             kept = {key: value for key, value in report.items() if key not in entries}
             changed = {**kept, **rows[index]}
             if changed != report:
-                text = np.array([json.dumps(changed)], dtype=object)
-                arrays["report"][index : index + 1] = text
+                arrays["report"][index : index + 1] = np.array([json.dumps(changed)], dtype=object)
     joined_store = StackStore(store.path)
     summarise(joined_store)
     return joined_store

@@ -229,8 +229,7 @@ def run_stack(
     stack = describe_stack(
         shots, recipe, source, mask, source_mask, reader, variables, run.warm_start
     )
-    shard = Shard.of(run.part, stack.shots, path)
-    stack = replace(stack, shard=shard, dtype=run.dtype)
+    stack = replace(stack, shard=Shard.of(run.part, stack.shots, path), dtype=run.dtype)
     numbers = numbers_of(run, len(stack.shots))
     if run.shot_table is not None:
         stack = stack.with_table(read_shot_table(run.shot_table))

@@ -223,8 +223,7 @@ class Watch:
         if (most is not None and self._ended >= most) or self._is_stopped():
             return True
         quiet = time.monotonic() - max(self._arrivals.last_event, self._last)
-        is_quiet = self._arrivals.is_quiet and not self._running
-        return idle is not None and quiet > idle and is_quiet
+        return idle is not None and quiet > idle and self._arrivals.is_quiet and not self._running
 
     def _is_stopped(self) -> bool:
         requested = self._should_stop is not None and self._should_stop()
@@ -357,8 +356,7 @@ class Watch:
         status = None if store is None else store.status(name)
         if store is None or status is None or name in self._early:
             return self._early.get(name)
-        pending = name in self._redo or status in (PENDING, SKIPPED)
-        return None if pending else store.report(name)
+        return None if name in self._redo or status in (PENDING, SKIPPED) else store.report(name)
 
     def _submit(self, name: str, lane: int) -> Future[Attempt]:
         shot = self._shot(name)
@@ -388,9 +386,8 @@ class Watch:
             store = self.store
             if store is not None:
                 # Earlier shots are a better reference for the size of the images.
-                done = store.done_names()
-                existing = (name for name in done if self._file(name).path.exists())
-                names = [*islice(existing, MAX_TRIED_SHOTS), *names]
+                done = (name for name in store.done_names() if self._file(name).path.exists())
+                names = [*islice(done, MAX_TRIED_SHOTS), *names]
             stack = self._stack_of(map(self._shot, names))
             if store is not None:
                 self._use_stack(match_store(StackStore(self._path), stack))
@@ -499,8 +496,7 @@ def watch_stack(
     def describe(arrived: Shots) -> Stack:
         return describe_stack(arrived, recipe, source, mask, source_mask, reader, variables)
 
-    existing = not watch.skip_existing
-    arrivals = Arrivals(place, watch.pattern, settle=watch.settle, existing=existing)
+    arrivals = Arrivals(place, watch.pattern, settle=watch.settle, existing=not watch.skip_existing)
     on_progress = on_progress or (lambda _: None)
     with ExitStack() as opened:
         if watch.status_file is not None:
