@@ -415,7 +415,7 @@ def _check_again(inspect: Callable[[], tuple[str, Report]]) -> tuple[str, Report
 def _inspect_shot(
     layout: Layout, index: int, names: Sequence[str], every_byte: bool = False, ended: bool = False
 ) -> tuple[str, Report]:
-    """Describe the damage to a shot, if any, which perhaps must have `ended`; return its report."""
+    """Describe the damage to a shot (only if it has `ended`), empty if none; return its report."""
     part = "status"
     try:
         if ended and _read_status(layout.root, index) not in (Status.DONE, Status.FAILED):
@@ -494,9 +494,10 @@ def find_damage(
             }
     if numbers is not None:
         return Damage(shots)
-    many = layout.of_many_shots.items()
-    keys = [layout.key(name, k) for name, n in many for k in range(-(-layout.shots // n))]
-    keys += layout.fixed
+    keys: list[str] = []
+    for name, length in layout.of_many_shots.items():
+        keys += [layout.key(name, index) for index in range(-(-layout.shots // length))]
+    keys.extend(layout.fixed)
     damaged = {key: text for key in keys if (text := _chunk_problem(layout, key, every_byte))}
     problems = [*damaged.values()]
     if every_byte:
