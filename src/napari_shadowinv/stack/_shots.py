@@ -385,7 +385,8 @@ def find_shots(
     if hasattr(shots, "dims") and hasattr(shots, "coords"):
         return _from_xarray(shots)
     if isinstance(shots, Sequence) and all(isinstance(item, (str, Path)) for item in shots):
-        return _from_files(shots, reader, shape)
+        items = _shots_of_files(shots, reader)
+        return Shots(items, shape or usual_shape(items))
     if isinstance(shots, Sequence) and all(np.ndim(item) == 2 for item in shots):
         shapes = {np.shape(item) for item in shots}
         if len(shapes) > 1:
@@ -429,9 +430,7 @@ def _shots_of(frames: Sequence[Frame], reader: Reader) -> list[Shot]:
     ]
 
 
-def _from_files(
-    paths: Sequence[str | Path], reader: Reader, shape: tuple[int, int] | None
-) -> Shots:
+def _shots_of_files(paths: Sequence[str | Path], reader: Reader) -> list[Shot]:
     if not paths:
         raise InputError("shots are an empty list: expected at least one path")
     frames: list[Frame] = []
@@ -441,8 +440,7 @@ def _from_files(
             frames.append(Frame(Path(path), text_of(Path(path).name)))
         else:
             frames += find_frames(path, **parts)
-    items = _shots_of(frames, reader)
-    return Shots(items, shape or usual_shape(items))
+    return _shots_of(frames, reader)
 
 
 def _distinct_names(frames: Sequence[Frame]) -> tuple[str, ...]:
