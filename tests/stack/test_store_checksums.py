@@ -7,7 +7,6 @@ import os
 import shutil
 import struct
 from pathlib import Path
-from types import SimpleNamespace
 
 import google_crc32c
 import numpy as np
@@ -172,10 +171,9 @@ def test_files_beyond_the_limit_of_memory_are_not_read(store, monkeypatch):
 
 def test_store_without_checksums_gets_none():
     assert reseal({"attributes": {}}) == {"attributes": {}}
-    codec = SimpleNamespace(to_dict=lambda: {"name": "bytes"})
-    metadata = SimpleNamespace(dimension_names=("shot",), codecs=[codec])
-    array = SimpleNamespace(metadata=metadata, chunks=(1,))
-    assert note_shot(Path(), "id", {"potential": array}, 0, []) == {}
+    array = zarr.create_array({}, shape=(1,), chunks=(1,), dtype="f8", dimension_names=("shot",))
+    layout = Layout.of_open(Path(), "id", {"potential": array})
+    assert note_shot(layout, {"potential": array}, 0, []) == {}
 
 
 def test_swapped_chunks_damage_both_shots(store):

@@ -228,6 +228,12 @@ class Layout:
         arrays, attributes = document["consolidated_metadata"]["metadata"], document["attributes"]
         return cls(root, attributes["store_id"], arrays, json.loads(attributes[FIXED]))
 
+    @classmethod
+    def of_open(cls, root: Path, store_id: str, arrays: Mapping[str, Any]) -> Layout:
+        """Return the layout of open Zarr arrays, of a store with or without checksums."""
+        described = {name: array.metadata.to_dict() for name, array in arrays.items()}
+        return cls(root, store_id, described, {})
+
     @cached_property
     def shots(self) -> int:
         return int(self.arrays["status"]["shape"][0])
@@ -280,39 +286,24 @@ def chunk_file(root: Path, array: Any, index: int) -> Path:
     return Path(root, array.basename, key)
 
 
-def _has_checksums(array: Any) -> bool:
-    """Return whether the chunks of an open Zarr array end with their checksums."""
-    return any(codec.to_dict()["name"] == _CODEC for codec in array.metadata.codecs)
-
-
-def fields_of(arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the open Zarr arrays that hold a chunk of values for each shot."""
-    return {
-        name: array
-        for name, array in arrays.items()
-        if is_along_shots(array) and array.chunks[0] == 1 and name not in RECORD
-    }
-
-
 def note_shot(
-    root: Path, store_id: str, arrays: Mapping[str, Any], index: int, copied: Collection[str]
+    layout: Layout, arrays: Mapping[str, Any], index: int, copied: Collection[str]
 ) -> dict[str, Any]:
     """Return a shot's place, labels and the checksums of its written chunks, for its report.
 
     Arrays that are `copied` from reports are no labels.
     """
     labels = {
-        name: np.asarray(array[index]).tolist()
-        for name, array in arrays.items()
-        if is_along_shots(array) and array.chunks[0] > 1 and name not in copied
+        name: np.asarray(arrays[name][index]).tolist()
+        for name in layout.of_many_shots
+        if name not in copied
     }
-    fields = fields_of(arrays)
-    if not all(map(_has_checksums, fields.values())):
-        return {}
-    chunks = {
-        name: stored_checksum(chunk_file(root, array, index)) for name, array in fields.items()
-    }
-    return {CHUNKS: chunks, LABELS: labels, PLACE: [store_id, index]}
+    chunks = {}
+    for name in layout.of_each_shot:
+        if all(codec["name"] != _CODEC for codec in layout.arrays[name]["codecs"]):
+            return {}  # its chunks do not end with their checksums
+        chunks[name] = stored_checksum(chunk_file(layout.root, arrays[name], index))
+    return {CHUNKS: chunks, LABELS: labels, PLACE: [layout.store_id, index]}
 
 
 def stored_checksum(file: Path) -> str | None:

@@ -51,8 +51,8 @@ from napari_shadowinv.io.store import (
 )
 from napari_shadowinv.io.store_checksums import (
     FIXED,
+    Layout,
     chunk_file,
-    fields_of,
     fixed_keys,
     is_along_shots,
     note_shot,
@@ -120,13 +120,14 @@ class ShotWriter:
             )
         group = self.arrays()
         with _as_store_errors(self.path):
-            for name, array in fields_of(group).items():
+            layout = Layout.of_open(self.path, self.store_id, group)
+            for name in layout.of_each_shot:
                 if name in arrays:
-                    array[index : index + 1] = np.asarray(arrays[name])[np.newaxis]
+                    group[name][index : index + 1] = np.asarray(arrays[name])[np.newaxis]
                 else:  # without its chunk, it is read as the fill value
-                    chunk_file(self.path, array, index).unlink(missing_ok=True)
+                    chunk_file(self.path, group[name], index).unlink(missing_ok=True)
             copied = [column.key for column in columns_of_store(attributes)]
-            note = note_shot(self.path, self.store_id, group, index, copied)
+            note = note_shot(layout, group, index, copied)
             text = json.dumps({**report, **note})
             group["report"][index : index + 1] = np.array([text], dtype=object)
             group["status"][index : index + 1] = np.int8(status)
@@ -141,8 +142,9 @@ class ShotWriter:
         group = self.arrays()
         with _as_store_errors(self.path):
             group["status"][index : index + 1] = np.int8(PENDING)
-            for array in (group["report"], *fields_of(group).values()):
-                chunk_file(self.path, array, index).unlink(missing_ok=True)
+            layout = Layout.of_open(self.path, self.store_id, group)
+            for name in ("report", *layout.of_each_shot):
+                chunk_file(self.path, group[name], index).unlink(missing_ok=True)
 
     def write_columns(
         self, columns: Sequence[Column], reports: Sequence[Mapping[str, Any]], shots: slice
