@@ -108,14 +108,6 @@ def _metadata(
         }
         for label, (low, high) in limits.items()
     ]
-    return {
-        "version": "0.5",
-        "multiscales": [
-            {
-                "name": name,
-                "axes": axes,
-                "datasets": [{"path": "0", "coordinateTransformations": scale}],
-            }
-        ],
-        "omero": {"channels": channels},
-    }
+    datasets = [{"path": "0", "coordinateTransformations": scale}]
+    image = {"name": name, "axes": axes, "datasets": datasets}
+    return {"version": "0.5", "multiscales": [image], "omero": {"channels": channels}}

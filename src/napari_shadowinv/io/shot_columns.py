@@ -97,13 +97,11 @@ def joined_columns(attributes: Mapping[Any, Any]) -> tuple[Column, ...]:
 
 def describe_columns(columns: Iterable[Column]) -> str:
     """Return columns of a shot table as an attribute of a store."""
-    return json.dumps(
-        [
-            {"key": c.key, "title": c.long_name, "unit": c.unit, "kind": c.kind.__name__}
-            for c in columns
-        ],
-        ensure_ascii=False,
-    )
+    entries = [
+        {"key": c.key, "title": c.long_name, "unit": c.unit, "kind": c.kind.__name__}
+        for c in columns
+    ]
+    return json.dumps(entries, ensure_ascii=False)
 
 
 def _column(key: str, title: str, unit: str, kind: type) -> Column:

@@ -376,17 +376,10 @@ def _changing_description(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _write_template(path: Path, contents: Contents) -> None:
-    extra = [name for name in contents.coordinates if name not in contents.sizes]
-    group = zarr.create_group(
-        path,
-        zarr_format=3,
-        attributes={
-            **contents.attributes,
-            "format": FORMAT,
-            "store_id": secrets.token_hex(8),
-            "coordinates": " ".join(extra),
-        },
-    )
+    extra = " ".join(name for name in contents.coordinates if name not in contents.sizes)
+    identity = {"format": FORMAT, "store_id": secrets.token_hex(8), "coordinates": extra}
+    attributes = {**contents.attributes, **identity}
+    group = zarr.create_group(path, zarr_format=3, attributes=attributes)
     shot_variables = _shot_variables(contents.sizes["shot"], contents.attributes)
     arrays = {**contents.coordinates, **contents.variables, **shot_variables}
     for name, variable in arrays.items():

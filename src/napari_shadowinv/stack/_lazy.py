@@ -211,11 +211,8 @@ def _invert(
         inversion = task.run(images, beam, source, start=start)
     except InputError as error:
         raise error.about(label) from error
-    return {
-        **task.arrays(inversion),
-        **column_values(INVERSIONS, inversion),
-        **({"inversion": inversion} if keep else {}),
-    }
+    kept = {"inversion": inversion} if keep else {}
+    return {**task.arrays(inversion), **column_values(INVERSIONS, inversion), **kept}
 
 
 def _pick(record: dict[str, Any], name: str) -> AnyArray:

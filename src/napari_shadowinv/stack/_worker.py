@@ -262,14 +262,10 @@ class InvertTask(Task):
         bare = Radiograph(
             image.image / (row.brightness or 1.0), path=image.path, metadata=image.metadata
         )
-        recipe = common.recipe.model_copy(
-            update={
-                # A common source is already in the beam.
-                "source": self.estimate if beam is None else common.recipe.source,
-                "setup": row.setup,
-                "mask": row.mask,
-            }
-        )
+        # A common source is already in the beam.
+        recipe_source = self.estimate if beam is None else common.recipe.source
+        changes = {"source": recipe_source, "setup": row.setup, "mask": row.mask}
+        recipe = common.recipe.model_copy(update=changes)
         inputs = collect_inputs(
             recipe,
             bare,
