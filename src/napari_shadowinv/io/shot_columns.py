@@ -55,11 +55,8 @@ class ShotTable:
             If the names have no number that identifies a shot, or the table lacks a shot.
         """
         numbers = self._numbers_in(names)
-        missing = [
-            f"{number} ({name})"
-            for number, name in zip(numbers, names, strict=True)
-            if number not in self.rows
-        ]
+        shots = zip(numbers, names, strict=True)
+        missing = [f"{number} ({name})" for number, name in shots if number not in self.rows]
         if missing:
             more = f" and {len(missing) - _MAX_LISTED} more" if len(missing) > _MAX_LISTED else ""
             raise InputError(

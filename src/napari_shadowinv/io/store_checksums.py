@@ -293,11 +293,8 @@ def note_shot(
 
     Arrays that are `copied` from reports are no labels.
     """
-    labels = {
-        name: np.asarray(arrays[name][index]).tolist()
-        for name in layout.of_many_shots
-        if name not in copied
-    }
+    own_names = (name for name in layout.of_many_shots if name not in copied)
+    labels = {name: np.asarray(arrays[name][index]).tolist() for name in own_names}
     chunks = {}
     for name in layout.of_each_shot:
         if all(codec["name"] != _CODEC for codec in layout.arrays[name]["codecs"]):
@@ -478,11 +475,8 @@ def find_damage(
             shots[index] = problem
         elif report:
             values = {**report, **report.get(LABELS, {})}
-            noted[index] = {
-                key: value
-                for key, value in values.items()
-                if key in layout.of_many_shots or key.startswith(PREFIX)
-            }
+            repeated = [k for k in values if k in layout.of_many_shots or k.startswith(PREFIX)]
+            noted[index] = {key: values[key] for key in repeated}
     if numbers is not None:
         return Damage(shots)
     keys: list[str] = []

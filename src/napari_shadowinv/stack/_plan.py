@@ -143,10 +143,8 @@ class Stack:
         if not self.task.by_row or self.task.setup is None:
             return None
         bare = replace(self.task.inputs.shot, mask=None, source_mask=None)
-        moved = (
-            self.task.recipe.move(replace(bare, setup=_row_of(shot).setup)).setup
-            for shot in self.shots.items
-        )
+        recorded = (replace(bare, setup=_row_of(shot).setup) for shot in self.shots.items)
+        moved = (self.task.recipe.move(shot).setup for shot in recorded)
         return ["" if setup is None else setup.model_dump_json() for setup in moved]
 
     def source_text(self, shots: int | None) -> str:

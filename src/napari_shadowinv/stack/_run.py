@@ -629,12 +629,10 @@ def _difference(before: str, now: str) -> str:
 
 def append_shots(store: StackStore, stack: Stack) -> StackStore:
     """Append shots that arrived since the last run, as pending, to the store."""
-    coordinates = {
-        name: np.asarray(coordinate.values)[len(store.names) :]
-        for name, coordinate in _coordinates(stack).items()
-        if coordinate.along_shots
-    }
-    begins = [*store.attributes.get(_APPENDED, []), len(store.names)]
+    count, coordinates = len(store.names), _coordinates(stack).items()
+    along_shots = {name: variable for name, variable in coordinates if variable.along_shots}
+    values = {name: np.asarray(variable.values)[count:] for name, variable in along_shots.items()}
+    begins = [*store.attributes.get(_APPENDED, []), count]
     attributes = {"source_image": stack.source_text(None), _APPENDED: begins}
-    grow_store(store.path, coordinates, attributes)
+    grow_store(store.path, values, attributes)
     return StackStore(store.path)
