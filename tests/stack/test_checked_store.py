@@ -41,7 +41,7 @@ def status(path: Path):
 
 @pytest.fixture
 def unsealed(store) -> Path:
-    """A store as an earlier version wrote it, which did not note checksums."""
+    """A store without checksums, as a copy by another program."""
     file = store / "zarr.json"
     document = json.loads(file.read_text())
     for name in (SEAL, FIXED):

@@ -325,7 +325,7 @@ def test_shot_that_was_done_keeps_no_field(make_night, out, way):
     assert not arrays["caustic"][1].any()
 
 
-def test_store_of_an_earlier_version_is_read_without_checksums(finished, tmp_path):
+def test_store_without_checksums_is_read(finished, tmp_path):
     path = tmp_path / "old.shadowinv.zarr"
     shutil.copytree(finished, path)
     document = json.loads((path / "zarr.json").read_text())

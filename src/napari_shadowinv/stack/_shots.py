@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import PLANE, unpack_array, unpack_planes
+from napari_shadowinv._system.validation import map_paths
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -585,10 +586,7 @@ def table_shots(
 
 def _with_absolute_paths(rows: Sequence[ShotRow]) -> tuple[ShotRow, ...]:
     """Return rows with absolute paths, for workers elsewhere."""
-    return tuple(
-        row.model_copy(update={name: path.absolute() for name, path in row.files.items()})
-        for row in rows
-    )
+    return tuple(map_paths(row, Path.absolute) for row in rows)
 
 
 def _read_geometry(row: ShotRow, channel: str | None, variable: str | None) -> Radiograph:
