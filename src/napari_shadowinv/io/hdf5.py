@@ -212,8 +212,8 @@ def check_hdf5_seal(path: Path) -> None:
 def read_hdf5(path: Path, name: str, number: int | None = None) -> AnyArray:
     """Read an array, ``shots/3/image``, or its frame `number` over the axes before the last two."""
     with open_hdf5(path) as file:
-        dataset, own_number = _find_array(path, file, name)
-        number = own_number if number is None else number
+        dataset, frame_in_name = _find_array(path, file, name)
+        number = frame_in_name if number is None else number
         return load_dataset(path, dataset) if number is None else _load_frame(path, dataset, number)
 
 

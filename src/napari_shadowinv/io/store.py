@@ -394,7 +394,7 @@ def _field_of_block(block: AnyArray, texts: AnyArray | None, name: str, setup: A
     setups = [None] * len(block) if texts is None else _parse_setups(texts)
     # A shot that is not done yet is NaN with any setup.
     pairs = zip(setups, block, strict=True)
-    return np.stack([(its_setup or setup).field_in_si(name, values) for its_setup, values in pairs])
+    return np.stack([(each or setup).field_in_si(name, values) for each, values in pairs])
 
 
 def _parse_setups(texts: AnyArray) -> list[Any]:

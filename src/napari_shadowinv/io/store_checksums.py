@@ -293,8 +293,8 @@ def note_shot(
 
     Arrays that are `copied` from reports are no labels.
     """
-    own_names = (name for name in layout.of_many_shots if name not in copied)
-    labels = {name: np.asarray(arrays[name][index]).tolist() for name in own_names}
+    label_names = (name for name in layout.of_many_shots if name not in copied)
+    labels = {name: np.asarray(arrays[name][index]).tolist() for name in label_names}
     chunks = {}
     for name in layout.of_each_shot:
         if all(codec["name"] != _CODEC for codec in layout.arrays[name]["codecs"]):

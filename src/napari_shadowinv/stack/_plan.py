@@ -276,8 +276,8 @@ def describe_stack(
     if own_sources is not None:
         items = [
             # A row may name its own.
-            shot if task.by_row and shot.rows[0].source else replace(shot, source=own_source)
-            for shot, own_source in zip(stack_shots.items, own_sources, strict=True)
+            shot if task.by_row and shot.rows[0].source else replace(shot, source=source_shot)
+            for shot, source_shot in zip(stack_shots.items, own_sources, strict=True)
         ]
         stack_shots = replace(stack_shots, items=items)
     return Stack(stack_shots, task, beam, common, reader_text(reader), warm_start)
