@@ -188,6 +188,7 @@ def fit_exactly(
             [(plane[use] ** 2).mean() for plane, use in zip(residual, mask, strict=True)]
         )
         / 0.05**2,
+        "noise": np.full(count, 0.05),
         "basins": tuple(
             Basin(start, value, 1.01, away, rng.normal(size=(len(names), 2, 24, 32)))
             for start, value, away in (("from far", 100 / 3, 0.0), ("from near", 40.0, 0.3))

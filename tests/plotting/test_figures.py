@@ -331,6 +331,7 @@ def left_out_of(fit: Fit, limit: float) -> LeaveOneOut:
         alone=fit.chi2,
         limit=np.append(np.full(count - 1, 2.0), limit),
         rms=fit.chi2,
+        noise=fit.noise,
         explanation="a sentence",
         setups=fit.setups,
     )

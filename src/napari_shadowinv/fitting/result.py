@@ -86,11 +86,13 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
         PIXEL,
         "Displacement where a start has led, at every other pixel",
     ),
+    "noise": (_IMAGES, FLUX_DENSITY, "Standard deviation of the noise"),  # or of images
 }
 # Those with the name of their attribute.
 _OF_IMAGES = "images", "source", "reprojection", "residual", "mask", "chi2", "brightness"
+_OF_BASINS = "objective", "chi2", "distance", "displacement"
 _LINEAR_ENOUGH, _SPREAD_ENOUGH = 0.5, 0.3
-_ATTRIBUTES = ("options", "report", "verdict", "explanation", "folded", "setups")
+_ATTRIBUTES = ("options", "instrument", "report", "verdict", "explanation", "folded", "setups")
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,7 @@ class FittedField:
         The weights λ and κ of its squared fourth and sixth derivatives (px).
     samples : ndarray of float32, shape (n, H, W), or None
         Random changes of the potential, px², that its total error allows, if error bars were
-        asked for; None in files of earlier versions.
+        asked for.
     """
 
     name: str
@@ -291,9 +293,9 @@ class Fit:
         The images as explained, and data minus that; the residual is 0 where masked.
     chi2 : ndarray, shape (L,)
         Mean of (residual / σ)² over each image.
-    noise : ndarray, shape (L,) or (L, H, W), or None
+    noise : ndarray, shape (L,) or (L, H, W)
         Standard deviation σ of the noise in each image, or in each pixel if it varies, then NaN
-        where masked; None in files of earlier versions.
+        where masked.
     basins : tuple of Basin
         Where the starts have led, the best first.
     folded : float
@@ -326,6 +328,7 @@ class Fit:
     reprojection: FloatArray
     residual: FloatArray
     chi2: FloatArray
+    noise: FloatArray
     basins: tuple[Basin, ...]
     folded: float
     verdict: Verdict
@@ -335,12 +338,11 @@ class Fit:
     instrument: Instrument = dataclasses.field(default_factory=Instrument)
     setups: tuple[Setup, ...] = ()
     provenance: Provenance | None = None
-    noise: FloatArray | None = None
 
     @property
     def normalised_residual(self) -> FloatArray:
         """The residual over σ, shape (L, H, W); NaN where masked."""
-        return normalise_residual(self.residual, self.mask, self.noise, self.chi2)
+        return normalise_residual(self.residual, self.mask, self.noise)
 
     @property
     def used(self) -> BoolArray:
@@ -596,9 +598,7 @@ class Fit:
         merged["basin"] = ("basin", [basin.start for basin in self.basins])
         for name, values in self._arrays().items():
             dims, units, text = _VARIABLES[name]
-            merged[name] = dims, values, label(units, text)
-        if self.noise is not None:
-            merged["noise"] = noise_variable(self.noise)
+            merged[name] = dims[: values.ndim], values, label(units, text)
         return merged
 
     @classmethod
@@ -624,20 +624,18 @@ class Fit:
         arrays = {name: numbers_of(dataset, name) for name in _VARIABLES}
         attributes = dataset.attrs
         content = json.loads(attributes["report"])
-        if content.get("beam") is not None:
+        if content["beam"] is not None:
             content["beam"] = BeamError(**content["beam"])
-        fit_fields = {field.name for field in dataclasses.fields(FitReport)}
         names = [str(name) for name in dataset["field"].values]
         fields = [
             _field(dataset, name, f"_{name}" if len(names) > 1 else "", smoothness)
             for name, smoothness in zip(names, arrays["smoothness"], strict=True)
         ]
+        rows = zip(*(arrays[f"basin_{name}"] for name in _OF_BASINS), strict=True)
         basins = [
             Basin(str(start), float(objective), float(chi2), float(distance), displacement)
-            for start, objective, chi2, distance, displacement in zip(
-                dataset["basin"].values,
-                *(arrays[name] for name in _VARIABLES if name.startswith("basin_")),
-                strict=True,
+            for start, (objective, chi2, distance, displacement) in zip(
+                dataset["basin"].values, rows, strict=True
             )
         ]
         return cls(
@@ -649,9 +647,9 @@ class Fit:
             folded=float(attributes["folded"]),
             verdict=Verdict(attributes["verdict"]),
             explanation=str(attributes["explanation"]),
-            report=FitReport(**{name: content[name] for name in fit_fields & content.keys()}),
+            report=FitReport(**content),
             options=FitOptions.model_validate_json(attributes["options"]),
-            instrument=Instrument.model_validate_json(attributes.get("instrument", "{}")),
+            instrument=Instrument.model_validate_json(attributes["instrument"]),
             setups=setups_in(dataset),
             provenance=Provenance.of(attributes),
             noise=noise_in(dataset, "noise"),
@@ -664,30 +662,18 @@ class Fit:
             "strength": self.strengths,
             "frame": self.frames,
             "smoothness": np.array([field.smoothness for field in self.fields]),
-            "basin_objective": np.array([basin.objective for basin in self.basins]),
-            "basin_chi2": np.array([basin.chi2 for basin in self.basins]),
-            "basin_distance": np.array([basin.distance for basin in self.basins]),
-            "basin_displacement": np.stack([basin.displacement for basin in self.basins]),
+            **{
+                f"basin_{name}": np.array([getattr(basin, name) for basin in self.basins])
+                for name in _OF_BASINS
+            },
+            "noise": self.noise,
         }
 
 
-def normalise_residual(
-    residual: FloatArray, mask: BoolArray, noise: FloatArray | None, chi2: FloatArray
-) -> FloatArray:
-    """Return a residual over the noise, NaN where masked; see `Fit` for the shapes.
-
-    Without the noise, as in files of earlier versions, over its r.m.s. by χ² in each image.
-    """
-    if noise is None:
-        squares = (residual**2).sum(axis=(1, 2)) / mask.sum(axis=(1, 2))
-        noise = np.sqrt(np.divide(squares, chi2, out=np.ones_like(chi2), where=chi2 > 0))
+def normalise_residual(residual: FloatArray, mask: BoolArray, noise: FloatArray) -> FloatArray:
+    """Return a residual over the noise, NaN where masked; see `Fit` for the shapes."""
     noise = noise if noise.ndim == residual.ndim else noise[:, None, None]
     return np.where(mask, residual / noise, np.nan)
-
-
-def noise_variable(noise: FloatArray) -> tuple[tuple[str, ...], FloatArray, dict[str, str]]:
-    """Return the variable of the noise of images, or of their pixels, in a dataset."""
-    return _IMAGES[: noise.ndim], noise, label(FLUX_DENSITY, "Standard deviation of the noise")
 
 
 def setups_in(dataset: xarray.Dataset) -> tuple[Setup, ...]:
@@ -723,10 +709,8 @@ def merge_fields(names: Sequence[str], parts: Sequence[xarray.Dataset]) -> xarra
     return merged
 
 
-def noise_in(dataset: xarray.Dataset, name: str) -> FloatArray | None:
-    """Return the noise in a dataset; None if it has none, as in files of earlier versions."""
-    if name not in dataset:
-        return None
+def noise_in(dataset: xarray.Dataset, name: str) -> FloatArray:
+    """Return the noise of the images in a dataset, or of their pixels."""
     noise, shape = numbers_of(dataset, name), dataset["images"].shape
     if noise.shape not in (shape, shape[:1]):
         raise ValueError(f"{name} has shape {noise.shape}, expected {shape[:1]} or {shape}")

@@ -20,19 +20,19 @@ from napari_shadowinv.fitting.result import (
     field_dataset,
     merge_fields,
     noise_in,
-    noise_variable,
     normalise_residual,
     setups_in,
 )
 from napari_shadowinv.physics.beam import BeamQuantity
 from napari_shadowinv.physics.setup import Setup, beam_values, deflector_titles
-from napari_shadowinv.physics.units import PIXEL, label, shown_fields
+from napari_shadowinv.physics.units import FLUX_DENSITY, PIXEL, label, shown_fields
 from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
     import xarray
 
 _PLANES = ("image", "y", "x")
+_NOISE = "left_out_noise"
 # Attribute: variable, dimensions, units, long name.
 _VARIABLES: dict[str, tuple[str, tuple[str, ...], str, str]] = {
     "images": ("images", _PLANES, "flux/px²", "Image"),
@@ -49,9 +49,9 @@ _VARIABLES: dict[str, tuple[str, tuple[str, ...], str, str]] = {
     "alone": ("left_out_alone", ("image",), "1", "The same with a field of the image's own"),
     "limit": ("left_out_limit", ("image",), "1", "Largest χ² that one static field would give"),
     "rms": ("left_out_rms", ("image",), "1", "R.m.s. residual over the image's mean"),
+    "noise": (_NOISE, _PLANES, FLUX_DENSITY, "Standard deviation of the noise"),  # or of images
 }
 _SENTENCE = "left_out"
-_NOISE = "left_out_noise"
 _LARGE = 100.0
 _LEAST_IMAGES = 3
 
@@ -85,7 +85,7 @@ class LeaveOneOut:
         The experiment of each image, if they are known.
     names : tuple of str
         The names of the images, if they have any.
-    noise : ndarray, shape (L,) or (L, H, W), or None
+    noise : ndarray, shape (L,) or (L, H, W)
         Standard deviation σ of the noise, as in `Fit`.
     """
 
@@ -98,15 +98,15 @@ class LeaveOneOut:
     alone: FloatArray
     limit: FloatArray
     rms: FloatArray
+    noise: FloatArray
     explanation: str
     setups: tuple[Setup, ...] = ()
     names: tuple[str, ...] = ()
-    noise: FloatArray | None = None
 
     @property
     def normalised_residual(self) -> FloatArray:
         """The residual over σ, shape (L, H, W); NaN where masked."""
-        return normalise_residual(self.residual, self.mask, self.noise, self.chi2)
+        return normalise_residual(self.residual, self.mask, self.noise)
 
     @property
     def explained(self) -> BoolArray:
@@ -116,13 +116,11 @@ class LeaveOneOut:
     def only(self, numbers: Sequence[int]) -> LeaveOneOut:
         """Return some of the images, in this order."""
         chosen = list(numbers)
-        arrays = {name: getattr(self, name)[chosen] for name in _VARIABLES}
-        return LeaveOneOut(
-            **arrays,
-            explanation=self.explanation,
+        return replace(
+            self,
+            **{name: getattr(self, name)[chosen] for name in _VARIABLES},
             setups=tuple(self.setups[k] for k in chosen if self.setups),
             names=tuple(self.names[k] for k in chosen if self.names),
-            noise=None if self.noise is None else self.noise[chosen],
         )
 
     @property
@@ -150,11 +148,9 @@ class LeaveOneOut:
         import xarray as xr
 
         variables: dict[str, Any] = {
-            variable: (dims, getattr(self, name), label(units, text))
+            variable: (dims[: getattr(self, name).ndim], getattr(self, name), label(units, text))
             for name, (variable, dims, units, text) in _VARIABLES.items()
         }
-        if self.noise is not None:
-            variables[_NOISE] = noise_variable(self.noise)
         return xr.Dataset(variables, attrs={_SENTENCE: self.explanation})
 
     @classmethod
@@ -176,6 +172,7 @@ class LeaveOneOut:
             name: np.ascontiguousarray(dataset[variable].values)
             for name, (variable, *_) in _VARIABLES.items()
         }
+        arrays["noise"] = noise_in(dataset, _NOISE)
         provenance = Provenance.of(dataset.attrs)
         names = () if provenance is None else tuple(each.file for each in provenance.images)
         return cls(
@@ -183,7 +180,6 @@ class LeaveOneOut:
             explanation=str(dataset.attrs[_SENTENCE]),
             setups=setups_in(dataset),
             names=names if all(names) else (),
-            noise=noise_in(dataset, _NOISE),
         )
 
 
