@@ -259,55 +259,43 @@ def window_facts(dataset: xarray.Dataset) -> tuple[Fact, ...]:
     """
     if f"{PREFIX}chi2" not in dataset:
         return ()
-    numbers = dataset[f"{PREFIX}image_number"].values - 1
-    setups, fields = setups_in(dataset), [str(name) for name in dataset["field"].values]
-    beams = beam_values(setups)
-    means, times = (
-        dataset[variable].values if variable in dataset.variables else None
-        for variable in (f"{PREFIX}{beams[0].name}" if beams else "", f"{PREFIX}time_of_flight")
-    )
-    endings = [f"_{name}" if len(fields) > 1 else "" for name in fields]
+    names = [name for name in dataset.variables if str(name).startswith(PREFIX)]
+    windows = dataset[names].rename({name: str(name).removeprefix(PREFIX) for name in names})
+    numbers = windows["image_number"].values - 1
+    used = np.array([dataset["mask"].values[group].any(axis=0) for group in numbers])
+    setups, beams = setups_in(dataset), beam_values(setups_in(dataset))
     return _describe_windows(
-        numbers,
-        dataset[f"{PREFIX}chi2"].values,
-        [str(verdict) for verdict in dataset[f"{PREFIX}verdict"].values],
-        {
-            name: dataset[f"{PREFIX}displacement{ending}"].values
-            for name, ending in zip(fields, endings, strict=True)
-        },
-        np.array([dataset["mask"].values[group].any(axis=0) for group in numbers]),
+        windows,
+        [str(name) for name in dataset["field"].values],
+        used,
         setups[numbers[0][0]] if setups else None,
         None if beams is None else beams[0],
-        means,
-        times,
     )
 
 
 def _describe_windows(
-    numbers: Sequence[Sequence[int]] | AnyArray,
-    chi2: Sequence[FloatArray] | FloatArray,
-    verdicts: Sequence[str],
-    displacements: Mapping[str, FloatArray],
+    windows: xarray.Dataset,
+    fields: Sequence[str],
     used: BoolArray,
     setup: Setup | None,
     quantity: BeamQuantity | None,
-    means: FloatArray | None,
-    times: FloatArray | None,
 ) -> tuple[Fact, ...]:
     """A fact for each group: its images, energy, time, χ², the peaks of its fields, its verdict."""
     peaks = {}
-    for name, planes in displacements.items():
+    for name in fields:
+        planes = windows[f"displacement_{name}" if len(fields) > 1 else "displacement"].values
         unmasked = list(np.where(used[:, None], planes, np.nan))
         shown = shown_fields(unmasked, setup, deflector_titles()[name])
         peaks[name] = [field.peak_text() for field in shown]
     facts = []
-    for w, verdict in enumerate(verdicts):
-        parts = [image_numbers(numbers[w])]
-        if quantity is not None and means is not None:
-            parts.append(f"mean {quantity.noun} {quantity.text(means[w])}")
-        if times is not None:
-            parts.append(f"time of flight {times[w] * 1e12:.4g} ps")
-        parts.append(f"χ² {', '.join(f'{value:.3g}' for value in chi2[w])}")
+    for w, verdict in enumerate(map(str, windows["verdict"].values)):
+        window = windows.isel(window=w)
+        parts = [image_numbers(window["image_number"].values - 1)]
+        if quantity is not None and quantity.name in window:
+            parts.append(f"mean {quantity.noun} {quantity.text(float(window[quantity.name]))}")
+        if "time_of_flight" in window:
+            parts.append(f"time of flight {float(window['time_of_flight']) * 1e12:.4g} ps")
+        parts.append(f"χ² {', '.join(f'{value:.3g}' for value in window['chi2'].values)}")
         parts += [f"{name} {texts[w]}" for name, texts in peaks.items()]
         level = Level.SOUND if verdict == Verdict.DETERMINED else Level.DOUBTFUL
         text = f"{', '.join(parts)}: {verdict}"
@@ -341,17 +329,12 @@ class FitWindows:
     @property
     def facts(self) -> tuple[Fact, ...]:
         """The result in words: each group with the peaks of its fields and its verdict."""
-        names = [field.name for field in self.fits[0].fields]
         return _describe_windows(
-            self.numbers,
-            [fit.chi2 for fit in self.fits],
-            [str(fit.verdict) for fit in self.fits],
-            dict(zip(names, self.displacement.swapaxes(0, 1), strict=True)),
+            self.to_dataset(),
+            [field.name for field in self.fits[0].fields],
             np.stack([fit.used for fit in self.fits]),
             self.setup,
             self.beam_quantity,
-            self.beam_means,
-            self.times_of_flight,
         )
 
     @property
