@@ -6,6 +6,8 @@ row of them is traced at once; the spline's values along y, which a row shares, 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray, IntArray
@@ -19,10 +21,29 @@ _TABLE = 8 * MOST_RAYS  # numbers of splines and slopes for cells with one numbe
 _ROWS = 8 * MOST_RAYS
 _V, _U, _SHARE_V, _SHARE_U, _SLOPE_V, _SLOPE_U, _DOWN, _RIGHT = range(0, 8 * MOST_RAYS, MOST_RAYS)
 _LANDED = 8 * MOST_RAYS
+_OfSplines = tuple[float, float, float, float]  # sums for the four splines along x
 _FAST = {"contract", "reassoc", "nsz"}  # sums in an order that suits the processor
 # A part that is compiled by itself, too, may sum in another order there, and which of both a
 # process calls depends on whether it compiled them or found them compiled.
 _PART = {"nogil": True, "error_model": "numpy", "fastmath": _FAST, "inline": "always"}
+
+
+class Rays(NamedTuple):
+    """Arguments of `RayModel.image`, as kernels trace rays.
+
+    `tables` are values and slopes of splines by the number of rays along a cell's side, flat;
+    `frame` is about the corner of a detector of `size`, with the guard around it; `steepness`
+    is by how much a ray's share in the next pixel rises in a px.
+    """
+
+    potential: FloatArray
+    counts: IntArray
+    beam: FloatArray
+    tables: FloatArray
+    frame: FloatArray
+    pad: int
+    steepness: float
+    size: tuple[int, int]
 
 
 def spline_tables(places: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -34,22 +55,16 @@ def spline_tables(places: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 @njit(**_PART)
-def _misses(
-    potential: FloatArray,
-    row: int,
-    column: int,
-    cells: tuple[int, int],
-    frame: FloatArray,
-    pad: int,
-    size: tuple[int, int],
-) -> bool:
+def _misses(rays: Rays, row: int, column: int) -> bool:
     """Whether a cell of the strip is certain to send no ray to a pixel inside the guard.
 
     Slopes of a spline lie between the least and the largest difference of its coefficients.
     """
-    y, x = KNOT * row - pad, KNOT * column - pad
-    strip = (pad + 1) // KNOT
-    if strip <= row < cells[0] - strip and strip <= column < cells[1] - strip:
+    potential, frame, size = rays.potential, rays.frame, rays.size
+    y, x = KNOT * row - rays.pad, KNOT * column - rays.pad
+    strip = (rays.pad + 1) // KNOT
+    rows, columns = rays.counts.shape[1], rays.counts.shape[2]
+    if strip <= row < rows - strip and strip <= column < columns - strip:
         return False
     least_y = most_y = potential[row + 1, column] - potential[row, column]
     least_x = most_x = potential[row, column + 1] - potential[row, column]
@@ -74,11 +89,9 @@ def _misses(
 # suspect that what it writes changes what it reads; loops go on to a multiple of 8, where tables
 # are zero.
 @njit(**_PART)
-def _evaluate_rows(
-    potential: FloatArray, row: int, column: int, tables: FloatArray, n: int, out: FloatArray
-) -> None:
+def _evaluate_rows(rays: Rays, row: int, column: int, n: int, out: FloatArray) -> None:
     """Slopes along y, then values, of the four columns of splines at a cell's n rows of rays."""
-    at = tables[_TABLE * n : _TABLE * (n + 1)]
+    potential, at = rays.potential, rays.tables[_TABLE * n : _TABLE * (n + 1)]
     for s in range(4):
         c0, c1 = potential[row, column + s], potential[row + 1, column + s]
         c2, c3 = potential[row + 2, column + s], potential[row + 3, column + s]
@@ -93,20 +106,20 @@ def _evaluate_rows(
 
 @njit(**_PART)
 def _land(
+    rays: Rays,
     rows: FloatArray,
+    row: int,
+    column: int,
     a: int,
-    tables: FloatArray,
+    n: int,
     m: int,
-    y: float,
-    x: float,
-    frame: FloatArray,
-    steepness: float,
-    size: tuple[int, int],
     with_slopes: bool,
     out: FloatArray,
 ) -> None:
     """The pixel at or before each ray of row `a`, and the share of the next one, with its slope."""
-    at = tables[_TABLE * m : _TABLE * (m + 1)]
+    at = rays.tables[_TABLE * m : _TABLE * (m + 1)]
+    frame, steepness, size = rays.frame, rays.steepness, rays.size
+    y, x = (row + (a + 0.5) / n) * KNOT - rays.pad, column * KNOT - rays.pad
     s0, s1, s2, s3 = rows[a], rows[64 + a], rows[128 + a], rows[192 + a]
     p0, p1, p2, p3 = rows[256 + a], rows[320 + a], rows[384 + a], rows[448 + a]
     f0, f1, f2, f3, f4, f5 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
@@ -161,14 +174,7 @@ def _flux_of_row(
 def deposit(
     start: int,
     stop: int,
-    potential: FloatArray,
-    counts: IntArray,
-    beam: FloatArray,
-    tables: FloatArray,
-    frame: FloatArray,
-    pad: int,
-    steepness: float,
-    size: tuple[int, int],
+    rays: Rays,
     corners: FloatArray,
     reached: IntArray,
 ) -> None:
@@ -178,22 +184,21 @@ def deposit(
     it, and that below to the right. `reached` are the first row of each band, and that after the
     last.
     """
-    cells = counts.shape[1], counts.shape[2]
-    bands, width = len(corners), np.uint32(size[1])
+    counts, cells = rays.counts, (rays.counts.shape[1], rays.counts.shape[2])
+    bands, width = len(corners), np.uint32(rays.size[1])
     rows, landed, flux = np.zeros(_ROWS), np.zeros(_LANDED), np.zeros(MOST_RAYS)
     for band in range(start, stop):
         sums = corners[band]
-        first, last = np.uint32(size[0]), np.uint32(0)
+        first, last = np.uint32(rays.size[0]), np.uint32(0)
         for row in range(cells[0] * band // bands, cells[0] * (band + 1) // bands):
             for column in range(cells[1]):
-                if _misses(potential, row, column, cells, frame, pad, size):
+                if _misses(rays, row, column):
                     continue
                 n, m = counts[0, row, column], counts[1, row, column]
-                _evaluate_rows(potential, row, column, tables, n, rows)
+                _evaluate_rows(rays, row, column, n, rows)
                 for a in range(n):
-                    y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
-                    _land(rows, a, tables, m, y, x, frame, steepness, size, False, landed)
-                    _flux_of_row(beam, row, column, a, n, m, flux)
+                    _land(rays, rows, row, column, a, n, m, False, landed)
+                    _flux_of_row(rays.beam, row, column, a, n, m, flux)
                     for b in range(m):
                         i, j = np.uint32(landed[_V + b]), np.uint32(landed[_U + b])
                         first, last = min(first, i), max(last, i)
@@ -265,17 +270,9 @@ def _add_to_beam(
 
 
 @njit(**_PART)
-def _add_row(
-    pulls: FloatArray,
-    tables: FloatArray,
-    a: int,
-    n: int,
-    m: int,
-    frame: FloatArray,
-    sums: FloatArray,
-) -> None:
+def _add_row(rays: Rays, pulls: FloatArray, a: int, n: int, m: int, sums: FloatArray) -> None:
     """Add the pull on row `a` of rays to sums over a cell's rows, for each spline along y."""
-    at = tables[_TABLE * n : _TABLE * (n + 1)]
+    frame, at = rays.frame, rays.tables[_TABLE * n : _TABLE * (n + 1)]
     p0, p1, p2, p3 = at[a], at[64 + a], at[128 + a], at[192 + a]
     s0, s1, s2, s3 = at[256 + a], at[320 + a], at[384 + a], at[448 + a]
     f1, f2, f4, f5 = frame[1], frame[2], frame[4], frame[5]
@@ -316,14 +313,7 @@ def _subtract_sums(
 def gather(
     start: int,
     stop: int,
-    potential: FloatArray,
-    counts: IntArray,
-    beam: FloatArray,
-    tables: FloatArray,
-    frame: FloatArray,
-    pad: int,
-    steepness: float,
-    size: tuple[int, int],
+    rays: Rays,
     slopes: FloatArray,
     gradients: FloatArray,
     of_beam: FloatArray,
@@ -336,23 +326,22 @@ def gather(
     `slopes` are the pull at each pixel, how much more it is to the right, and below, and how much
     the latter grows to the right; flat.
     """
-    cells = counts.shape[1], counts.shape[2]
-    bands, width = len(gradients), np.uint32(size[1])
+    counts, cells = rays.counts, (rays.counts.shape[1], rays.counts.shape[2])
+    bands, width = len(gradients), np.uint32(rays.size[1])
     rows, landed, flux = np.zeros(_ROWS), np.zeros(_LANDED), np.zeros(MOST_RAYS)
     pulls, sums = np.zeros(3 * MOST_RAYS), np.zeros(8 * MOST_RAYS)
     for band in range(start, stop):
         gradient, moments = gradients[band], of_frame[band]
         for row in range(cells[0] * band // bands, cells[0] * (band + 1) // bands):
             for column in range(cells[1]):
-                if _misses(potential, row, column, cells, frame, pad, size):
+                if _misses(rays, row, column):
                     continue
                 n, m = counts[0, row, column], counts[1, row, column]
-                _evaluate_rows(potential, row, column, tables, n, rows)
+                _evaluate_rows(rays, row, column, n, rows)
                 sums[:] = 0.0
                 for a in range(n):
-                    y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
-                    _land(rows, a, tables, m, y, x, frame, steepness, size, True, landed)
-                    _flux_of_row(beam, row, column, a, n, m, flux)
+                    _land(rays, rows, row, column, a, n, m, True, landed)
+                    _flux_of_row(rays.beam, row, column, a, n, m, flux)
                     for b in range(m):
                         i, j = np.uint32(landed[_V + b]), np.uint32(landed[_U + b])
                         pixel = (i * width + j) * np.uint32(4)
@@ -367,42 +356,34 @@ def gather(
                         pulls[64 + b] = flux[b] * landed[_SLOPE_U + b] * to_right
                         if beam_is_free:
                             pulls[128 + b] = slopes[pixel] + below * to_below + right * to_right
-                    _add_row(pulls, tables, a, n, m, frame, sums)
+                    _add_row(rays, pulls, a, n, m, sums)
                     if frame_is_free:
                         _add_moments(pulls, landed, m, moments)
                     if beam_is_free:
                         _add_to_beam(pulls, row, column, a, n, m, of_beam)
-                _subtract_sums(sums, tables, m, row, column, gradient)
+                _subtract_sums(sums, rays.tables, m, row, column, gradient)
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
 def boxes(
     start: int,
     stop: int,
-    potential: FloatArray,
-    counts: IntArray,
-    beam: FloatArray,
-    tables: FloatArray,
-    frame: FloatArray,
-    pad: int,
-    steepness: float,
-    size: tuple[int, int],
+    rays: Rays,
     found: IntArray,
 ) -> None:
     """First row and column of the pixels that each cell reaches, and those after the last."""
-    cells = counts.shape[1], counts.shape[2]
+    counts, cells = rays.counts, (rays.counts.shape[1], rays.counts.shape[2])
     rows, landed = np.zeros(_ROWS), np.zeros(_LANDED)
     for row in range(start, stop):
         for column in range(cells[1]):
             found[row, column] = 0
-            if _misses(potential, row, column, cells, frame, pad, size):
+            if _misses(rays, row, column):
                 continue
             n, m = counts[0, row, column], counts[1, row, column]
-            _evaluate_rows(potential, row, column, tables, n, rows)
-            first_row, first_column, last_row, last_column = size[0], size[1], 0, 0
+            _evaluate_rows(rays, row, column, n, rows)
+            first_row, first_column, last_row, last_column = rays.size[0], rays.size[1], 0, 0
             for a in range(n):
-                y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
-                _land(rows, a, tables, m, y, x, frame, steepness, size, False, landed)
+                _land(rays, rows, row, column, a, n, m, False, landed)
                 for b in range(m):
                     i, j = int(landed[_V + b]), int(landed[_U + b])
                     first_row, last_row = min(first_row, i), max(last_row, i + 2)
@@ -412,37 +393,19 @@ def boxes(
 
 @njit(**_PART)
 def _subtract(
-    block: FloatArray,
-    c: int,
-    steep: float,
-    plain: float,
-    u0: float,
-    u1: float,
-    u2: float,
-    u3: float,
-    v0: float,
-    v1: float,
-    v2: float,
-    v3: float,
+    block: FloatArray, c: int, steep: float, plain: float, u: _OfSplines, v: _OfSplines
 ) -> None:
-    block[c] -= steep * u0 + plain * v0
-    block[c + 1] -= steep * u1 + plain * v1
-    block[c + 2] -= steep * u2 + plain * v2
-    block[c + 3] -= steep * u3 + plain * v3
+    block[c] -= steep * u[0] + plain * v[0]
+    block[c + 1] -= steep * u[1] + plain * v[1]
+    block[c + 2] -= steep * u[2] + plain * v[2]
+    block[c + 3] -= steep * u[3] + plain * v[3]
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
 def collect(
     start: int,
     stop: int,
-    potential: FloatArray,
-    counts: IntArray,
-    beam: FloatArray,
-    tables: FloatArray,
-    frame: FloatArray,
-    pad: int,
-    steepness: float,
-    size: tuple[int, int],
+    rays: Rays,
     boxes: IntArray,
     begins: IntArray,
     guard: int,
@@ -459,12 +422,12 @@ def collect(
     without the guard, its derivatives by the 16 coefficients, and by 4 pixels of the beam and the
     frame, of which there may be none.
     """
-    cells = counts.shape[1], counts.shape[2]
+    counts, cells = rays.counts, (rays.counts.shape[1], rays.counts.shape[2])
     rows, landed = np.zeros(_ROWS), np.zeros(_LANDED)
     flux = np.zeros(MOST_RAYS)
     beam_is_free, frame_is_free = free
     instrument_columns = of_instrument.shape[1]
-    width = size[1] - 2 * guard
+    frame, tables, width = rays.frame, rays.tables, rays.size[1] - 2 * guard
     for row in range(start, stop):
         for column in range(cells[1]):
             n, m = counts[0, row, column], counts[1, row, column]
@@ -478,11 +441,10 @@ def collect(
             last_seen, touched = np.full(area, -1), np.empty(area, np.int64)
             of_y = tables[_TABLE * n : _TABLE * (n + 1)]
             of_x = tables[_TABLE * m : _TABLE * (m + 1)]
-            _evaluate_rows(potential, row, column, tables, n, rows)
+            _evaluate_rows(rays, row, column, n, rows)
             for a in range(n):
-                y, x = (row + (a + 0.5) / n) * KNOT - pad, column * KNOT - pad
-                _land(rows, a, tables, m, y, x, frame, steepness, size, True, landed)
-                _flux_of_row(beam, row, column, a, n, m, flux)
+                _land(rays, rows, row, column, a, n, m, True, landed)
+                _flux_of_row(rays.beam, row, column, a, n, m, flux)
                 upper = _first_pixels_share(a, n) / (n * m) * KNOT**2
                 lower = KNOT**2 / (n * m) - upper
                 plain0, plain1, plain2, plain3 = of_y[a], of_y[64 + a], of_y[128 + a], of_y[192 + a]
@@ -516,27 +478,18 @@ def collect(
                         is_reached[p] = True
                         along = frame[1] * to_v + frame[4] * to_u
                         across = frame[2] * to_v + frame[5] * to_u
+                        k = 8 * p
                         if last_seen[p] != a:
                             last_seen[p] = a
                             touched[n_touched] = p
                             n_touched += 1
-                            sums[8 * p : 8 * p + 8] = 0.0
-                        t0, t1, t2, t3 = (
-                            sums[8 * p],
-                            sums[8 * p + 1],
-                            sums[8 * p + 2],
-                            sums[8 * p + 3],
-                        )
-                        t4, t5, t6, t7 = (
-                            sums[8 * p + 4],
-                            sums[8 * p + 5],
-                            sums[8 * p + 6],
-                            sums[8 * p + 7],
-                        )
-                        sums[8 * p], sums[8 * p + 1] = t0 + along * p0, t1 + along * p1
-                        sums[8 * p + 2], sums[8 * p + 3] = t2 + along * p2, t3 + along * p3
-                        sums[8 * p + 4], sums[8 * p + 5] = t4 + across * s0, t5 + across * s1
-                        sums[8 * p + 6], sums[8 * p + 7] = t6 + across * s2, t7 + across * s3
+                            sums[k : k + 8] = 0.0
+                        t0, t1, t2, t3 = sums[k], sums[k + 1], sums[k + 2], sums[k + 3]
+                        t4, t5, t6, t7 = sums[k + 4], sums[k + 5], sums[k + 6], sums[k + 7]
+                        sums[k], sums[k + 1] = t0 + along * p0, t1 + along * p1
+                        sums[k + 2], sums[k + 3] = t2 + along * p2, t3 + along * p3
+                        sums[k + 4], sums[k + 5] = t4 + across * s0, t5 + across * s1
+                        sums[k + 6], sums[k + 7] = t6 + across * s2, t7 + across * s3
                         if frame_is_free:
                             instrument[p, -6] += to_v
                             instrument[p, -5] += to_v * landed_y
@@ -544,20 +497,14 @@ def collect(
                             instrument[p, -3] += to_u
                             instrument[p, -2] += to_u * landed_y
                             instrument[p, -1] += to_u * landed_x
-                for k in range(n_touched):
-                    p = touched[k]
-                    u0, u1, u2, u3 = sums[8 * p], sums[8 * p + 1], sums[8 * p + 2], sums[8 * p + 3]
-                    v0, v1, v2, v3 = (
-                        sums[8 * p + 4],
-                        sums[8 * p + 5],
-                        sums[8 * p + 6],
-                        sums[8 * p + 7],
-                    )
-                    c = 16 * p
-                    _subtract(block, c, steep0, plain0, u0, u1, u2, u3, v0, v1, v2, v3)
-                    _subtract(block, c + 4, steep1, plain1, u0, u1, u2, u3, v0, v1, v2, v3)
-                    _subtract(block, c + 8, steep2, plain2, u0, u1, u2, u3, v0, v1, v2, v3)
-                    _subtract(block, c + 12, steep3, plain3, u0, u1, u2, u3, v0, v1, v2, v3)
+                for q in range(n_touched):
+                    k, c = 8 * touched[q], 16 * touched[q]
+                    u = sums[k], sums[k + 1], sums[k + 2], sums[k + 3]
+                    v = sums[k + 4], sums[k + 5], sums[k + 6], sums[k + 7]
+                    _subtract(block, c, steep0, plain0, u, v)
+                    _subtract(block, c + 4, steep1, plain1, u, v)
+                    _subtract(block, c + 8, steep2, plain2, u, v)
+                    _subtract(block, c + 12, steep3, plain3, u, v)
             line = begins[row, column]
             for p in range(area):
                 if is_reached[p]:
@@ -611,19 +558,14 @@ def merge(
             place += 1
             for c in range(16):
                 number = (row + c // 4) * coefficients + column + c % 4
-                entry = _add_entry(
-                    number, of_splines[line, c], first, entry, places, columns, values
-                )
-            for c in range(4 * has_beam):
-                number = first_of_beam + (KNOT * row + c // 2) * beam + KNOT * column + c % 2
-                entry = _add_entry(
-                    number, of_instrument[line, c], first, entry, places, columns, values
-                )
-            for c in range(4 * has_beam, instrument_columns):
+                value = of_splines[line, c]
+                entry = _add_entry(number, value, first, entry, places, columns, values)
+            for c in range(instrument_columns):
                 number = first_of_frame + c - 4 * has_beam
-                entry = _add_entry(
-                    number, of_instrument[line, c], first, entry, places, columns, values
-                )
+                if c < 4 * has_beam:
+                    number = first_of_beam + (KNOT * row + c // 2) * beam + KNOT * column + c % 2
+                value = of_instrument[line, c]
+                entry = _add_entry(number, value, first, entry, places, columns, values)
         rows[pixel + 1] = entry
     rows[0] = 0
 

@@ -144,13 +144,12 @@ class RayModel:
         -------
         ndarray, with the shape `seen`
         """
-        size = self._guarded
-        corners = np.zeros((_BANDS, 4 * math.prod(size)))
+        corners = np.zeros((_BANDS, 4 * math.prod(self._guarded)))
         reached = np.zeros((_BANDS, 2), np.int64)
         model = potential, counts, beam, frame
-        self._in_ranges(kernels.deposit, _BANDS, model, size, corners, reached)
-        image = np.zeros(self.seen)
-        threads, sums = available_threads(self.threads), (corners, reached, size[1], _GUARD, image)
+        self._in_ranges(kernels.deposit, _BANDS, model, corners, reached)
+        image, width = np.zeros(self.seen), self._guarded[1]
+        threads, sums = available_threads(self.threads), (corners, reached, width, _GUARD, image)
         in_ranges(kernels.add_corners, len(image), threads, *sums, smallest=_WORTH_A_THREAD_ROWS)
         return image
 
@@ -177,10 +176,10 @@ class RayModel:
             Whether to compute the derivatives by the beam and by the frame; else they are zero.
         """
         pulls = Pulls(np.zeros((_BANDS, *self.shape)), np.zeros(beam.shape), np.zeros((_BANDS, 6)))
-        size, slopes = self._guarded, _slopes_between_pixels(np.pad(pull, _GUARD))
+        slopes = _slopes_between_pixels(np.pad(pull, _GUARD))
         model = potential, counts, beam, frame
         sums = pulls.potential, pulls.beam, of_beam, pulls.frame, of_frame
-        self._in_ranges(kernels.gather, _BANDS, model, size, slopes, *sums)
+        self._in_ranges(kernels.gather, _BANDS, model, slopes, *sums)
         about_middle = self._about_middle(pulls.frame.sum(axis=0))
         return Pulls(pulls.potential.sum(axis=0), pulls.beam, about_middle)
 
@@ -207,10 +206,9 @@ class RayModel:
             A row for each pixel; columns, in no order, for the coefficients, the beam's pixels and
             the frame; in single precision.
         """
-        size = self._guarded
         model = potential, counts, beam, frame
         reached = np.empty((*self.cells, 4), np.int64)
-        self._in_ranges(kernels.boxes, len(reached), model, size, reached)
+        self._in_ranges(kernels.boxes, len(reached), model, reached)
         # The guard belongs to no pixel.
         first = np.maximum(reached[..., :2], _GUARD)
         behind = np.minimum(reached[..., 2:], np.array(self.seen) + _GUARD)
@@ -222,7 +220,7 @@ class RayModel:
         of_splines, of_instrument = np.empty((most, 16)), np.empty((most, instrument_columns))
         begins, lines = ends - areas, (used, pixels, of_splines, of_instrument)
         places = begins, _GUARD, self._middle, (of_beam, of_frame)
-        self._in_ranges(kernels.collect, len(reached), model, size, reached, *places, *lines)
+        self._in_ranges(kernels.collect, len(reached), model, reached, *places, *lines)
         rows = np.empty(math.prod(self.seen) + 1, np.int32)
         entries = (16 + instrument_columns) * int(used.sum())
         columns, values = np.empty(entries, np.int32), np.empty(entries, np.float32)
@@ -309,8 +307,9 @@ class RayModel:
         if (counts[0] * counts[1]).sum() < _WORTH_A_THREAD:
             threads = 1
         steepness = self._at_rest / KNOT / _SHARED
-        fixed = (potential, counts, beam, _tables(), frame_px, self.pad, steepness)
-        in_ranges(kernel, ranges, threads, *fixed, *rest, smallest=1, uneven=True)
+        splines, size = _tables(), self._guarded
+        rays = kernels.Rays(potential, counts, beam, splines, frame_px, self.pad, steepness, size)
+        in_ranges(kernel, ranges, threads, rays, *rest, smallest=1, uneven=True)
 
     @property
     def _middle(self) -> tuple[float, float]:
