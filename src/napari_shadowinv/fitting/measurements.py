@@ -172,17 +172,23 @@ def collect_data(
     matrix = _checked_strengths(matrix, count)
     if strengths is not None and setups is not None:
         raise InputError("received both strengths and setups, expected one of them")
-    _refuse_what_one_image_cannot_tell(matrix, source, options)
+    if count == 1 and isinstance(source, str) and not options.ambiguous:
+        raise InputError(
+            "received one image and an unknown source: one image cannot tell the beam from the "
+            "object; give the source or an image of another energy, or allow an ambiguous fit, "
+            "one of many",
+            option="ambiguous",
+        )
     free_brightness, factors = _checked_brightness(brightness, count)
     beams = _checked_source(source, data, used)
     shapes = [beam / beam.mean() for beam in beams]
     if free_brightness:
-        factors = _brightness(data, beams, used)
+        factors = _means(data, used) / _means(beams, used)
     beams = factors[:, None, None] * beams
-    _refuse_other_units(_brightness(data, beams, used), names)
+    units = _means(beams, used)
+    _refuse_other_units(_means(data, used) / units, names)
     _refuse_what_is_given_twice(data, beams, used, matrix, names)
     unknown = isinstance(source, str)
-    units = np.array([beam[use].mean() for beam, use in zip(beams, used, strict=True)])
     scaled = np.where(used, data / units[:, None, None], 0.0)
     deviations = _deviations(noise, data, used) / units[:, None, None]
     _refuse_hopeless_noise(deviations, used, names)
@@ -416,18 +422,6 @@ def _checked_strengths(strengths: ArrayLike, count: int) -> FloatArray:
     return relative
 
 
-def _refuse_what_one_image_cannot_tell(
-    matrix: FloatArray, source: object, options: FitOptions
-) -> None:
-    if len(matrix) == 1 and isinstance(source, str) and not options.ambiguous:
-        raise InputError(
-            "received one image and an unknown source: one image cannot tell the beam from the "
-            "object; give the source or an image of another energy, or allow an ambiguous fit, "
-            "one of many",
-            option="ambiguous",
-        )
-
-
 def _refuse_what_is_given_twice(
     data: FloatArray,
     beams: FloatArray,
@@ -475,13 +469,9 @@ def _checked_brightness(brightness: ArrayLike | str, count: int) -> tuple[bool, 
     return False, factors
 
 
-def _brightness(data: FloatArray, beams: FloatArray, used: BoolArray) -> FloatArray:
-    """How much brighter each image is than its beam, on average."""
-    ratios = [
-        image[use].mean() / beam[use].mean()
-        for image, beam, use in zip(data, beams, used, strict=True)
-    ]
-    return np.array(ratios)
+def _means(planes: FloatArray, used: BoolArray) -> FloatArray:
+    """Mean of each plane over its used pixels."""
+    return np.array([plane[use].mean() for plane, use in zip(planes, used, strict=True)])
 
 
 def _fill(side: int, pad: int) -> int:
@@ -516,8 +506,7 @@ def _checked_source(source: Any, data: FloatArray, used: BoolArray) -> FloatArra
     if source is None or isinstance(source, str):
         if source not in (None, "unknown"):
             raise InputError(f"source is {source!r}: expected an array, None or 'unknown'")
-        levels = [image[use].mean() for image, use in zip(data, used, strict=True)]
-        return np.asarray(np.ones(data.shape) * np.array(levels)[:, None, None])
+        return np.asarray(np.ones(data.shape) * _means(data, used)[:, None, None])
     beams = _like_images("source", as_numbers("source", source), data)
     if not np.isfinite(beams).all() or beams.min() < 0 or not beams.any():
         raise InputError(
@@ -534,17 +523,16 @@ def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
                 f"noise is {noise!r}: expected {' or '.join(map(repr, KINDS_OF_NOISE))}, standard "
                 "deviations or None"
             )
-        means = np.stack([_smoothed(*plane) for plane in zip(data, used, strict=True)])
+        means = np.stack(list(map(_smoothed, data, used)))
         if noise == "proportional":
-            relative = zip(data / means, used, strict=True)
-            shares = np.array([estimated_noise(plane, use) for plane, use in relative])
+            shares = np.array(list(map(estimated_noise, data / means, used)))
             return shares[:, None, None] * means
         if (data[used] < 0).any():
             raise InputError("images have negative pixels, so they are no counts: give the noise")
         return np.asarray(np.sqrt(np.maximum(means, _LEAST_COUNTS)))
     if noise is None:
-        levels = [estimated_noise(plane, use) for plane, use in zip(data, used, strict=True)]
-        return np.asarray(np.ones(data.shape) * np.array(levels)[:, None, None])
+        levels = np.array(list(map(estimated_noise, data, used)))
+        return np.asarray(np.ones(data.shape) * levels[:, None, None])
     sigma = as_numbers("noise", noise)
     if not sigma.size or not np.isfinite(sigma).all() or sigma.min() <= 0:
         raise InputError("noise is not positive everywhere: expected standard deviations")
