@@ -193,7 +193,7 @@ class Scene(PriorTerms):
             value += of_image
             slope.brightness[k] += of_brightness
             self._add_light_pulls(slope, k, scaled)
-            seen.add_pulls(slope, k, scaled)
+            seen.effects.add_pulls(slope, k, scaled)
             self._add_potential_pulls(slope, unknowns, strengths[k], k, pulls.potential)
             entering = self._entering(unknowns, k)
             of_shape += self._add_beam_pulls(slope, k, pulls.beam, entering)
@@ -368,9 +368,9 @@ class Scene(PriorTerms):
         if imperfect.background:
             image = image + imperfect.offset(unknowns.separate[k])
             derivatives["background"] = np.full(image.shape, imperfect.background)
-        effects = [
+        effects = _Effects(
             (part, derivatives[part.key]) for part in imperfect.parts if part.key in derivatives
-        ]
+        )
         return _Seen(self._with_added(unknowns, k, image), slope, effects)
 
     def _variance(self, k: int) -> float:
@@ -401,8 +401,8 @@ class Scene(PriorTerms):
         imperfect, numbers = self.imperfect, (unknowns.common, unknowns.separate[k])
         light = self._light(unknowns, k)
         if not imperfect.changes_beam:
-            return _Entering(light, light, [])
-        effects = list(imperfect.entering_changes(self.beams[k], *numbers))
+            return _Entering(light, light, _Effects())
+        effects = _Effects(imperfect.entering_changes(self.beams[k], *numbers))
         return _Entering(light, light * self._beam_shape(unknowns), effects)
 
     def _add_beam_pulls(
@@ -413,9 +413,7 @@ class Scene(PriorTerms):
             return pull
         if self.imperfect.changes_beam:
             shaped = pull * entering.shaped
-            for part, logarithm in entering.effects:
-                derivatives = part.of(slope.common, slope.separate[k])
-                derivatives += np.einsum("yx,yx", shaped, logarithm)
+            entering.effects.add_pulls(slope, k, shaped)
             self.imperfect.pull_shapes(shaped, slope.common, slope.separate[k])
         return pull * entering.light
 
@@ -480,38 +478,36 @@ class _Shot(NamedTuple):
     frame: FloatArray
 
 
-class _Entering(NamedTuple):
-    """Light of a beam by its source, and with unknown modes; changes of its log by numbers."""
+class _Effects(list[tuple[Part, FloatArray]]):
+    """Derivatives of an image, or of a beam's logarithm, by the number of each imperfection."""
 
-    light: FloatArray
-    shaped: FloatArray
-    effects: list[tuple[Part, FloatArray]]
-
-
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """An image without its brightness.
-
-    `slope` is the derivative of the response, `effects` are the derivatives by the number of each
-    imperfection that acts where it is seen.
-    """
-
-    image: FloatArray
-    slope: FloatArray
-    effects: list[tuple[Part, FloatArray]]
-
-    def push(self, common: FloatArray, separate: FloatArray) -> FloatArray:
-        """Return the change of the image by changes of the instrument's numbers."""
-        total = np.zeros(())
-        for part, values in self.effects:
-            total = total + part.of(common, separate) * values
+    def push(self, change: Unknowns, k: int, total: FloatArray) -> FloatArray:
+        """Add the change by changes of the numbers of image `k` to a total, and return it."""
+        for part, values in self:
+            total = total + part.of(change.common, change.separate[k]) * values
         return total
 
     def add_pulls(self, slope: Unknowns, k: int, pull: FloatArray) -> None:
         """Add the transpose of `push` times a pull."""
-        for part, values in self.effects:
+        for part, values in self:
             derivatives = part.of(slope.common, slope.separate[k])
             derivatives += np.einsum("yx,yx", pull, values)
+
+
+class _Entering(NamedTuple):
+    """Light of a beam by its source, and with unknown modes; effects of numbers on its log."""
+
+    light: FloatArray
+    shaped: FloatArray
+    effects: _Effects
+
+
+class _Seen(NamedTuple):
+    """An image without its brightness, the derivative of the response, and effects of numbers."""
+
+    image: FloatArray
+    slope: FloatArray
+    effects: _Effects
 
 
 @dataclass(frozen=True)
@@ -551,8 +547,7 @@ class Linear:
         totals, pulls = scene.rays.normal_times(
             self.jacobians,
             [self._columns(change, potentials, k) for k in range(count)],
-            list(self._weights),
-            self._slopes,
+            *self._weights_and_slopes,
             [self._light_change(change, k) for k in range(count)]
             if self._has_light
             else self._dark,
@@ -611,14 +606,14 @@ class Linear:
     def _light_change(self, change: Unknowns, k: int) -> FloatArray:
         """The change of an image by numbers that act where it is seen."""
         image = change.brightness[k] * self.seen[k].image
-        image = image + self.seen[k].push(change.common, change.separate[k])
+        image = image + self.seen[k].effects.push(change, k, np.zeros(()))
         return self.scene._with_added(change, k, image)
 
     def _add_light_pulls(self, slope: Unknowns, k: int, pull: FloatArray) -> None:
         """Add derivatives by numbers that act where an image is seen."""
         slope.brightness[k] = np.einsum("yx,yx", pull, self.seen[k].image)
         self.scene._add_light_pulls(slope, k, pull)
-        self.seen[k].add_pulls(slope, k, pull)
+        self.seen[k].effects.add_pulls(slope, k, pull)
 
     def _complete(self, slope: Unknowns, of_shape: FloatArray) -> Unknowns:
         """Derivatives with those by the beam's modes, of unknowns that are free."""
@@ -638,8 +633,7 @@ class Linear:
         """Relative change of the light that enters for an image."""
         scene, imperfect = self.scene, self.scene.imperfect
         total = scene._modes(change.beam) if scene.beam_modes else np.zeros(())
-        for part, logarithm in self._entering[k].effects:
-            total = total + part.of(change.common, change.separate[k]) * logarithm
+        total = self._entering[k].effects.push(change, k, total)
         if imperfect.shapes:
             total = total + imperfect.shape_changes(change.common, change.separate[k])
         return np.asarray(total)
@@ -677,12 +671,9 @@ class Linear:
         return [np.zeros(self.scene.rays.seen)] * len(self.jacobians)
 
     @cached_property
-    def _weights(self) -> FloatArray:
-        return self._roots**2
-
-    @cached_property
-    def _slopes(self) -> list[FloatArray]:
-        return [np.full(self.scene.rays.seen, seen.slope) for seen in self.seen]
+    def _weights_and_slopes(self) -> tuple[list[FloatArray], list[FloatArray]]:
+        slopes = [np.full(self.scene.rays.seen, seen.slope) for seen in self.seen]
+        return list(self._roots**2), slopes
 
     @cached_property
     def _roots(self) -> FloatArray:
