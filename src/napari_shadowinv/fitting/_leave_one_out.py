@@ -16,7 +16,7 @@ import numpy as np
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, OnStep, ShouldStop, run_in_parallel
 from napari_shadowinv._system.validation import as_model
-from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting._fit import collect_starts, report_steps, reweight_counts
 from napari_shadowinv.fitting.compilation import ensure_compiled
@@ -402,7 +402,12 @@ def _align_image(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknow
     pair = scene.only([first, k])
     weights = np.append(np.where(scene.free_frames, scene.prior.frame_weights, 0.0), 1.0)
     now = unknowns.only([first, k])
-    units = _unit_changes(now, scene.free_frames)
+    # Of each number of the second image's frame that is free, and of its brightness.
+    places = np.flatnonzero(scene.free_frames)
+    units = [now.zeros() for _ in range(len(places) + 1)]
+    for unit, place in zip(units, places, strict=False):
+        unit.frames[1, place] = 1
+    units[-1].brightness[1] = 1
     for _ in range(_FRAME_STEPS):
         counts = pair.ray_counts(now)
         linear = pair.linear(now, counts)
@@ -418,17 +423,6 @@ def _align_image(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknow
         for unit, share in zip(units, step, strict=True):
             now = now.plus(now.like(share * unit.flat()))
     return unknowns.with_images([k], now.only([1]))
-
-
-def _unit_changes(unknowns: Unknowns, free: BoolArray) -> list[Unknowns]:
-    """A unit of each number of the second image's frame that is free, and of its brightness."""
-    moves = []
-    for place in np.flatnonzero(free):
-        moves.append(unknowns.zeros())
-        moves[-1].frames[1, place] = 1
-    moves.append(unknowns.zeros())
-    moves[-1].brightness[1] = 1
-    return moves
 
 
 def _brightness(made: FloatArray, data: FloatArray, weights: FloatArray) -> float:

@@ -413,17 +413,13 @@ class Posterior:
         total = 0.0
         for _ in range(_PROBES):
             of_fields = [chance.choice([-1.0, 1.0], free.size) for chance in chances]
-            signs = free * self._signs(of_fields)
+            probe = self._unknowns.like(of_fields[0])
+            for m, of_field in enumerate(of_fields):
+                probe.potentials[m] = self._unknowns.like(of_field).potentials[0]
+            signs = free * probe.flat()
             total += self._log_determinant(self._times, signs)
             total -= self._log_determinant(self._prior_times, is_potential * signs)
         return total / _PROBES / 2 - self._scales.log_size()
-
-    def _signs(self, of_fields: Sequence[FloatArray]) -> FloatArray:
-        """A probe: each field's from its own, the rest from the first."""
-        probe = self._unknowns.like(of_fields[0])
-        for m, signs in enumerate(of_fields):
-            probe.potentials[m] = self._unknowns.like(signs).potentials[0]
-        return probe.flat()
 
     def log_evidence(self, chances: Sequence[np.random.Generator]) -> float:
         """Return the logarithm of how likely the model makes the data, but for a constant.
