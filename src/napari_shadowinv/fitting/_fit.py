@@ -614,11 +614,15 @@ def _result(
     jacobian = max(jacobians, key=lambda each: int((each < 0).sum()))
     folded = float((jacobian < 0).mean())
     rivals = [(basin.objective / basins[0].objective - 1, basin.distance) for basin in basins[1:]]
+    names_of_images = [f"image {k + 1}" for k in range(len(images))]
+    if data.setups is not None:
+        pairs = zip(names_of_images, data.setups, strict=True)
+        names_of_images = [f"{name} ({setup.probe})" for name, setup in pairs]
     verdict, explanation = assess_verdict(
         report,
         options,
         chi2=chi2,
-        names=_names(data.setups, len(images)),
+        names=names_of_images,
         others=rivals,
         single=data.single,
         beam_unknown=scene.beam_modes > 0,
@@ -650,9 +654,3 @@ def _result(
         setups=data.setups or (),
         noise=data.noise_of(scene.weights),
     )
-
-
-def _names(setups: Sequence[Setup] | None, count: int) -> list[str]:
-    if setups is None:
-        return [f"image {k + 1}" for k in range(count)]
-    return [f"image {k + 1} ({setup.probe})" for k, setup in enumerate(setups)]

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy import ndimage
-from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Verdict
@@ -285,7 +284,10 @@ def _pattern_text(pattern: Pattern, names: Sequence[str]) -> str:
 
 def _edge_text(displacement: FloatArray, used: BoolArray, free: bool) -> str:
     """How the field goes on beyond the image's edge; "" if it does not."""
-    at_edge, bent = _share_at_edge(np.hypot(*displacement)), _share_bent_at_edge(displacement)
+    along_y, along_x = (np.gradient(part, axis=k) for k, part in enumerate(displacement))
+    divergence = np.abs(ndimage.gaussian_filter(along_y + along_x, _SMOOTHED))
+    at_edge = _share_at_edge(np.hypot(*displacement))
+    bent = _share_at_edge(divergence, _FROM_EDGE)
     most, most_bent = (_AT_FREE_EDGE, _BENT_AT_FREE_EDGE) if free else (_AT_EDGE, _BENT)
     turned = 0.0 if free else _share_turned_back(displacement, used)
     if at_edge <= most and bent <= most_bent and turned <= TURNED_BACK:
@@ -330,11 +332,6 @@ def _share_turned_back(displacement: FloatArray, used: BoolArray) -> float:
     sides = inner_sides(displacement, used)
     rms = float(np.sqrt((displacement**2).sum(axis=0).mean()))
     return 0.0 if sides is None else turning_displacement(sides) / max(rms, 1e-12)
-
-
-def _share_bent_at_edge(displacement: FloatArray) -> float:
-    along_y, along_x = (np.gradient(part, axis=k) for k, part in enumerate(displacement))
-    return _share_at_edge(np.abs(gaussian_filter(along_y + along_x, _SMOOTHED)), _FROM_EDGE)
 
 
 def _those(names: Sequence[str], chi2: FloatArray, which: BoolArray) -> str:
