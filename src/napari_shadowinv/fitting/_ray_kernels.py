@@ -346,10 +346,8 @@ def gather(
                         i, j = np.uint32(landed[_V + b]), np.uint32(landed[_U + b])
                         pixel = (i * width + j) * np.uint32(4)
                         below, right = landed[_SHARE_V + b], landed[_SHARE_U + b]
-                        to_right, to_below = (
-                            slopes[pixel + np.uint32(1)],
-                            slopes[pixel + np.uint32(2)],
-                        )
+                        to_right = slopes[pixel + np.uint32(1)]
+                        to_below = slopes[pixel + np.uint32(2)]
                         twist = slopes[pixel + np.uint32(3)]
                         to_right += below * twist
                         pulls[b] = flux[b] * landed[_SLOPE_V + b] * (to_below + right * twist)

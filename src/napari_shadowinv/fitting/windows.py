@@ -31,7 +31,7 @@ from napari_shadowinv.provenance import Provenance
 if TYPE_CHECKING:
     import xarray
 
-_PLANES = ("image", "y", "x")
+_IMAGE, _PLANES = ("image",), ("image", "y", "x")
 _NOISE = "left_out_noise"
 # Attribute: variable, dimensions, units, long name.
 _VARIABLES: dict[str, tuple[str, tuple[str, ...], str, str]] = {
@@ -39,16 +39,11 @@ _VARIABLES: dict[str, tuple[str, tuple[str, ...], str, str]] = {
     "mask": ("mask", _PLANES, "1", "Pixels that were used"),
     "predicted": ("left_out_prediction", _PLANES, "flux/px²", "Image as the others predict it"),
     "residual": ("left_out_residual", _PLANES, "flux/px²", "Image minus prediction"),
-    "brightness": (
-        "left_out_brightness",
-        ("image",),
-        "1",
-        "Brightness relative to the expected one",
-    ),
-    "chi2": ("left_out_chi2", ("image",), "1", "Mean squared residual over the noise"),
-    "alone": ("left_out_alone", ("image",), "1", "The same with a field of the image's own"),
-    "limit": ("left_out_limit", ("image",), "1", "Largest χ² that one static field would give"),
-    "rms": ("left_out_rms", ("image",), "1", "R.m.s. residual over the image's mean"),
+    "brightness": ("left_out_brightness", _IMAGE, "1", "Brightness relative to the expected one"),
+    "chi2": ("left_out_chi2", _IMAGE, "1", "Mean squared residual over the noise"),
+    "alone": ("left_out_alone", _IMAGE, "1", "The same with a field of the image's own"),
+    "limit": ("left_out_limit", _IMAGE, "1", "Largest χ² that one static field would give"),
+    "rms": ("left_out_rms", _IMAGE, "1", "R.m.s. residual over the image's mean"),
     "noise": (_NOISE, _PLANES, FLUX_DENSITY, "Standard deviation of the noise"),  # or of images
 }
 _SENTENCE = "left_out"
