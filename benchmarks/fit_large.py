@@ -17,7 +17,7 @@ import numpy as np
 
 from fit import blobs, counted, unit_of_time
 from napari_shadowinv import fit
-from napari_shadowinv.fitting.rays import RayModel
+from napari_shadowinv.fitting.rays import RayModel, TracedBeam
 from napari_shadowinv.physics.phantoms import paper_setup
 from reference import errors
 
@@ -66,11 +66,11 @@ def value_and_gradient(threads: int) -> float:
     y, x = np.indices(rays.shape) - 54.0
     potential = 60.0 * np.exp(-(y**2 + x**2) / 2 / 12**2)
     beam, pull = rays.around(np.ones((200, 200))), np.ones((200, 200))
-    counts = rays.ray_counts(potential)
+    traced = TracedBeam(potential, rays.ray_counts(potential), beam)
 
     def both() -> None:
-        rays.image(potential, counts, beam)
-        rays.gradient(potential, counts, beam, pull)
+        rays.image(traced)
+        rays.gradient(traced, pull)
 
     return fastest(both)
 

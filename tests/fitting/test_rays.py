@@ -9,7 +9,7 @@ import pytest
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
-from napari_shadowinv.fitting.rays import Pulls, RayModel, at_rest
+from napari_shadowinv.fitting.rays import Pulls, RayModel, TracedBeam, at_rest
 from napari_shadowinv.physics.forward import synthetic_image
 
 SIZE = (40, 54)
@@ -58,9 +58,9 @@ def test_a_beam_meets_nothing_and_stays_as_it_is() -> None:
     model, beam = model_of(spacing=0.25), uneven()
     still = np.zeros(model.shape)
     counts = model.ray_counts(still)
-    flat = model.image(still, counts, model.around(np.ones(SIZE)))
+    flat = model.image(TracedBeam(still, counts, model.around(np.ones(SIZE))))
     np.testing.assert_allclose(flat, 1, rtol=1e-12)
-    image = model.image(still, counts, model.around(beam))
+    image = model.image(TracedBeam(still, counts, model.around(beam)))
     shared = model.around(beam)
     for axis in (0, 1):
         before, after = np.roll(shared, 1, axis), np.roll(shared, -1, axis)
@@ -85,8 +85,8 @@ def test_rays_do_not_ripple(spacing: float, stretch: float) -> None:
         line = shift * place + (1 - stretch) / 2 * place**2
         potential = np.tile(line, (model.shape[0], 1))
         counts = model.ray_counts(potential)
-        image = stretch * model.image(potential, counts, beam)
-        change = stretch * (model.jacobian(potential, counts, beam) @ further)
+        image = stretch * model.image(TracedBeam(potential, counts, beam))
+        change = stretch * (model.jacobian(TracedBeam(potential, counts, beam)) @ further)
         change = change.reshape(image.shape)
         images.append(image[6:-6, 6:-6])
         changes.append(change[6:-6, 6:-6])
@@ -109,7 +109,9 @@ def test_flux_is_conserved_where_nothing_reaches_the_edge() -> None:
     y, x = places(model)
     inside = np.maximum(1 - ((y - 20) / 14) ** 2 - ((x - 26) / 18) ** 2, 0)
     potential = 15 * inside**3 * np.cos(y / 2)
-    image = model.image(potential, model.ray_counts(potential), model.around(np.ones(SIZE)))
+    image = model.image(
+        TracedBeam(potential, model.ray_counts(potential), model.around(np.ones(SIZE)))
+    )
     assert image.max() > 2
     assert image.sum() == pytest.approx(image.size, rel=1e-12)
 
@@ -120,7 +122,7 @@ def test_a_lens_magnifies_also_beyond_its_focus(curvature: float) -> None:
     model = RayModel((24, 24), 40, spacing=0.05)
     y, x = places(model)
     bowl = curvature * ((y - 11.5) ** 2 + (x - 11.5) ** 2) / 2
-    image = model.image(bowl, model.ray_counts(bowl), model.around(np.ones((24, 24))))
+    image = model.image(TracedBeam(bowl, model.ray_counts(bowl), model.around(np.ones((24, 24)))))
     np.testing.assert_allclose(image, (1 - curvature) ** -2, rtol=0.01)
     assert image.mean() == pytest.approx((1 - curvature) ** -2, rel=1e-3)
     offset = np.indices((24, 24)) - 11.5
@@ -133,7 +135,7 @@ def test_it_agrees_with_the_exact_deposit_of_triangles_also_where_rays_cross(
 ) -> None:
     model, beam = model_of(spacing=0.1), uneven()
     potential = wavy(model, strength)
-    image = model.image(potential, model.ray_counts(potential), model.around(beam))
+    image = model.image(TracedBeam(potential, model.ray_counts(potential), model.around(beam)))
     expected = synthetic_image(model.displacement(potential), beam, rays_per_pixel=64)
     assert (expected.max() > 4) == (strength == FOLDED)
     difference = (image - expected)[2:-2, 2:-2]
@@ -146,7 +148,7 @@ def test_rays_that_start_beyond_the_edge_arrive() -> None:
     beam = np.zeros(tuple(KNOT * n for n in model.cells))
     beam[:8] = 3.0
     y, _ = places(model)
-    image = model.image(-5 * y, model.ray_counts(y), beam)
+    image = model.image(TracedBeam(-5 * y, model.ray_counts(y), beam))
     np.testing.assert_allclose(image[:4], 3, rtol=1e-12)
     np.testing.assert_allclose(image[6:], 0, atol=1e-12)
     np.testing.assert_allclose(image[:6].sum(axis=0), 15, rtol=1e-12)
@@ -160,14 +162,13 @@ def test_beyond_the_image_lies_what_a_larger_detector_would_see(frame: FloatArra
     potential = wavy(larger, FOLDED) + 90 * np.cos(y / 15) * np.sin(x / 10)
     beam = larger.around(uneven())
     counts = larger.ray_counts(potential)
-    image = larger.image(potential, counts, beam, frame)
+    image = larger.image(TracedBeam(potential, counts, beam, frame))
     assert image.shape == larger.seen == (56, 70)
-    np.testing.assert_allclose(
-        image[8:-8, 8:-8], model_of().image(potential, counts, beam, frame), rtol=1e-12, atol=1e-12
-    )
+    smaller = model_of().image(TracedBeam(potential, counts, beam, frame))
+    np.testing.assert_allclose(image[8:-8, 8:-8], smaller, rtol=1e-12, atol=1e-12)
     strip = larger.around(np.zeros(SIZE))
     strip[:8] = strip[-8:] = strip[:, :8] = strip[:, -8:] = 1.0
-    of_strip = model_of().image(potential, counts, strip, frame)
+    of_strip = model_of().image(TracedBeam(potential, counts, strip, frame))
     assert of_strip.sum() > 20
 
 
@@ -177,8 +178,8 @@ def test_a_detector_shifted_by_whole_pixels_sees_the_image_shifted() -> None:
     counts = model.ray_counts(potential)
     frame = at_rest()
     frame[[0, 3]] = 2, -3
-    image = model.image(potential, counts, beam)
-    shifted = model.image(potential, counts, beam, frame)
+    image = model.image(TracedBeam(potential, counts, beam))
+    shifted = model.image(TracedBeam(potential, counts, beam, frame))
     np.testing.assert_allclose(shifted[2:, :-3], image[:-2, 3:], atol=1e-11)
 
 
@@ -189,7 +190,7 @@ def test_a_frame_turns_about_the_middle_of_the_image() -> None:
     beam = np.exp(-((y - 27) ** 2 + (x - 36) ** 2) / 2 / 2**2)
     still = np.zeros(model.shape)
     frame = np.array([0, 1.2, 0, 0, 0, 0.7])
-    image = model.image(still, model.ray_counts(still), beam, frame)
+    image = model.image(TracedBeam(still, model.ray_counts(still), beam, frame))
     rows, columns = np.indices(SIZE)
     middle = (image * rows).sum() / image.sum(), (image * columns).sum() / image.sum()
     assert middle[0] == pytest.approx(19.5 + 1.2 * (27 - 19.5), abs=0.01)
@@ -204,8 +205,8 @@ def test_gradient_and_jacobian_are_those_of_the_image(strength: float, part: str
     potential, beam, frame = wavy(model, strength), model.around(uneven()), turned()
     pull, counts = rng.normal(size=SIZE), model.ray_counts(potential)
     none = Pulls(np.zeros(model.shape), np.zeros(beam.shape), np.zeros(6))
-    gradient = model.gradient(potential, counts, beam, pull, frame)
-    jacobian = model.jacobian(potential, counts, beam, frame)
+    traced = TracedBeam(potential, counts, beam, frame)
+    gradient, jacobian = model.gradient(traced, pull), model.jacobian(traced)
     for _ in range(3):
         way = rng.normal(size=getattr(none, part).shape)
         # A turn moves rays at the edge by many pixels.
@@ -214,10 +215,12 @@ def test_gradient_and_jacobian_are_those_of_the_image(strength: float, part: str
 
         def image(step: float) -> FloatArray:
             return model.image(
-                potential + step * by.potential,  # noqa: B023
-                counts,
-                beam + step * by.beam,  # noqa: B023
-                frame + step * by.frame,  # noqa: B023
+                TracedBeam(
+                    potential + step * by.potential,  # noqa: B023
+                    counts,
+                    beam + step * by.beam,  # noqa: B023
+                    frame + step * by.frame,  # noqa: B023
+                )
             )
 
         slope = slope_along(image, pull, 1e-6)
@@ -233,8 +236,8 @@ def test_the_gradient_is_the_jacobians_transpose_times_the_pull() -> None:
     potential, beam, frame = wavy(model, FOLDED), model.around(uneven()), turned()
     counts = model.ray_counts(potential)
     pull = rng.normal(size=model.seen)
-    pulls = model.gradient(potential, counts, beam, pull, frame)
-    jacobian = model.jacobian(potential, counts, beam, frame)
+    traced = TracedBeam(potential, counts, beam, frame)
+    pulls, jacobian = model.gradient(traced, pull), model.jacobian(traced)
     assert jacobian.shape == (pull.size, flat(pulls).size)
     pulled, size = jacobian.T @ pull.ravel(), np.abs(jacobian).T @ np.abs(pull).ravel()
     rounding = np.finfo(jacobian.dtype).eps
@@ -246,9 +249,9 @@ def test_what_is_not_wanted_of_a_jacobian_is_zero_and_the_rest_the_same() -> Non
     model = model_of()
     potential, beam = wavy(model, FOLDED), model.around(uneven())
     counts = model.ray_counts(potential)
-    complete = model.jacobian(potential, counts, beam, turned()).toarray()
+    complete = model.jacobian(TracedBeam(potential, counts, beam, turned())).toarray()
     less = model.jacobian(
-        potential, counts, beam, turned(), of_beam=False, of_frame=False
+        TracedBeam(potential, counts, beam, turned()), of_beam=False, of_frame=False
     ).toarray()
     size = potential.size
     np.testing.assert_allclose(less[:, :size], complete[:, :size], atol=1e-14)
@@ -260,8 +263,8 @@ def test_what_is_not_wanted_of_a_gradient_is_zero_and_the_rest_the_same() -> Non
     model = model_of()
     potential, beam = wavy(model, FOLDED), model.around(uneven())
     counts, pull = model.ray_counts(potential), np.random.default_rng(2).normal(size=SIZE)
-    complete = model.gradient(potential, counts, beam, pull)
-    less = model.gradient(potential, counts, beam, pull, of_beam=False, of_frame=False)
+    complete = model.gradient(TracedBeam(potential, counts, beam), pull)
+    less = model.gradient(TracedBeam(potential, counts, beam), pull, of_beam=False, of_frame=False)
     assert complete.beam.any()
     assert complete.frame.any()
     assert not less.beam.any()
@@ -275,13 +278,13 @@ def test_a_potential_of_no_numbers_ends_in_no_other_memory(value: float) -> None
     model = model_of()
     potential, beam = wavy(model, WEAK), model.around(uneven())
     counts = model.ray_counts(potential)
-    sound = model.image(potential, counts, beam)
+    sound = model.image(TracedBeam(potential, counts, beam))
     potential[3:6, 4] = value
-    image = model.image(potential, counts, beam)
+    image = model.image(TracedBeam(potential, counts, beam))
     assert np.isfinite(image).all()
     np.testing.assert_allclose(image[20:], sound[20:], rtol=1e-12)
-    model.gradient(potential, counts, beam, np.ones(SIZE))
-    jacobian = model.jacobian(potential, counts, beam)
+    model.gradient(TracedBeam(potential, counts, beam), np.ones(SIZE))
+    jacobian = model.jacobian(TracedBeam(potential, counts, beam))
     assert jacobian.indices.max() < jacobian.shape[1]
 
 
@@ -291,21 +294,21 @@ def test_threads_do_not_change_a_bit() -> None:
     beam = alone.around(np.random.default_rng(3).uniform(0.5, 1.5, (80, 96)))
     counts, pull = alone.ray_counts(potential), np.random.default_rng(4).normal(size=(80, 96))
     assert (counts[0] * counts[1]).sum() > 100_000  # enough for threads
-    image = alone.image(potential, counts, beam, turned())
-    pulls = alone.gradient(potential, counts, beam, pull, turned())
-    jacobian = alone.jacobian(potential, counts, beam, turned())
+    traced = TracedBeam(potential, counts, beam, turned())
+    image, pulls = alone.image(traced), alone.gradient(traced, pull)
+    jacobian = alone.jacobian(traced)
     change = np.random.default_rng(5).normal(size=jacobian.shape[1])
     pushed, pulled = alone.push(jacobian, change), alone.pull(jacobian, pull)
     np.testing.assert_array_equal(pushed.ravel(), jacobian @ change)
     np.testing.assert_array_equal(pulled, jacobian.T @ pull.ravel())
     for threads in (2, 3):
         several = model_of((80, 96), threads=threads)
-        np.testing.assert_array_equal(several.image(potential, counts, beam, turned()), image)
-        again = several.gradient(potential, counts, beam, pull, turned())
+        np.testing.assert_array_equal(several.image(traced), image)
+        again = several.gradient(traced, pull)
         for first, repeated in zip(pulls, again, strict=True):
             np.testing.assert_array_equal(first, repeated)
         np.testing.assert_array_equal(several.push(jacobian, change), pushed)
-        repeated = several.jacobian(potential, counts, beam, turned())
+        repeated = several.jacobian(traced)
         np.testing.assert_array_equal(repeated.indices, jacobian.indices)
         np.testing.assert_array_equal(repeated.data, jacobian.data)
 

@@ -29,7 +29,7 @@ _PART = {"nogil": True, "error_model": "numpy", "fastmath": _FAST, "inline": "al
 
 
 class Rays(NamedTuple):
-    """Arguments of `RayModel.image`, as kernels trace rays.
+    """A `TracedBeam` of a `RayModel`, as kernels trace its rays.
 
     `tables` are values and slopes of splines by the number of rays along a cell's side, flat;
     `frame` is about the corner of a detector of `size`, with the guard around it; `steepness`

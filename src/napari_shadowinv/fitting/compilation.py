@@ -15,7 +15,7 @@ import numpy as np
 
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.fitting import _ray_kernels
-from napari_shadowinv.fitting.rays import RayModel
+from napari_shadowinv.fitting.rays import RayModel, TracedBeam
 from napari_shadowinv.geometry.compiler import is_code_cached
 from napari_shadowinv.inversion import compilation as of_transport
 from napari_shadowinv.inversion.machine_code import compilation_frequency
@@ -55,20 +55,20 @@ def _is_kept(kernel: Any) -> bool:
 
 def _compile_rays(report: Reporter) -> None:
     rays = RayModel(_SIZE, threads=1)
-    potential, beam = np.zeros(rays.shape), rays.around(np.ones(_SIZE))
-    counts = rays.ray_counts(potential)
+    potential = np.zeros(rays.shape)
+    traced = TracedBeam(potential, rays.ray_counts(potential), rays.around(np.ones(_SIZE)))
     weights = np.ones(rays.seen)
 
     def use_jacobian() -> None:
-        jacobian = rays.jacobian(potential, counts, beam)
+        jacobian = rays.jacobian(traced)
         columns = rays.pull(jacobian, rays.push(jacobian, np.zeros(jacobian.shape[1])))
         rays.normal_times([jacobian], [columns], [weights], [weights], [weights])
         potentials = potential[None]
         _ray_kernels.add_ties(potentials, potential > 0, 1.0, 1.0, np.zeros(potentials.shape))
 
     works: tuple[Callable[[], object], ...] = (
-        lambda: rays.image(potential, counts, beam),
-        lambda: rays.gradient(potential, counts, beam, weights),
+        lambda: rays.image(traced),
+        lambda: rays.gradient(traced, weights),
         use_jacobian,
     )
     for step, work in enumerate(works):

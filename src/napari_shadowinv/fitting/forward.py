@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 from napari_shadowinv._system.machine import available_threads, results_of
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.fitting.instrument import DARKEST, EXACT, Imperfect, Part, widen, widening
-from napari_shadowinv.fitting.rays import Pulls, RayModel, at_rest
+from napari_shadowinv.fitting.rays import Pulls, RayModel, TracedBeam, at_rest
 from napari_shadowinv.fitting.unknowns import Prior, PriorTerms, Unknowns
 
 _T = TypeVar("_T")
@@ -210,11 +210,8 @@ class Scene(PriorTerms):
         pull = np.sqrt(self.weights[k]) * blurred(residual, self.blur)
         scaled = np.exp(unknowns.brightness[k]) * pull
         of_rays = self.rays.gradient(
-            shot.potential,
-            shot.counts,
-            shot.beam,
+            shot.traced,
             self._spread_back(k, seen.slope * scaled, unknowns),
-            shot.frame,
             of_beam=self._has_beam,
             of_frame=k > 0 and bool(self.free_frames.any()),
         )
@@ -248,8 +245,8 @@ class Scene(PriorTerms):
         changes = np.empty_like(self.images)
         for k, shot in enumerate(self._shots(unknowns, counts)):
             slope = self._seen(unknowns, shot).slope if self.imperfect.gamma else 1.0
-            changed = shot._replace(beam=variations[k] * shot.beam)
-            bare = slope * self._spread(k, self.rays.image(*changed[1:]), unknowns)
+            changed = shot.traced._replace(beam=variations[k] * shot.traced.beam)
+            bare = slope * self._spread(k, self.rays.image(changed), unknowns)
             changes[k] = np.sqrt(self.weights[k]) * np.exp(unknowns.brightness[k]) * bare
         return changes
 
@@ -260,7 +257,7 @@ class Scene(PriorTerms):
 
         def differentiate(shot: _Shot) -> csr_array:
             of_its_frame = shot.number > 0 and of_frame
-            return self.rays.jacobian(*shot[1:], of_beam=of_beam, of_frame=of_its_frame)
+            return self.rays.jacobian(shot.traced, of_beam=of_beam, of_frame=of_its_frame)
 
         jacobians = self._of_each(differentiate, shots)
         if not of_beam and not of_frame:
@@ -340,7 +337,7 @@ class Scene(PriorTerms):
         counts = counts or self.ray_counts(unknowns)
         for k, psi in enumerate(self.potentials(unknowns)):
             beam = self._light(unknowns, k) * shape
-            yield _Shot(k, psi, counts[k], beam, unknowns.frames[k])
+            yield _Shot(k, TracedBeam(psi, counts[k], beam, unknowns.frames[k]))
 
     def _light(self, unknowns: Unknowns, k: int) -> FloatArray:
         """Light of an image's beam by its source, without the modes of an unknown beam."""
@@ -351,7 +348,7 @@ class Scene(PriorTerms):
     def _seen(self, unknowns: Unknowns, shot: _Shot) -> _Seen:
         """An image without its brightness, and its derivatives."""
         imperfect, k = self.imperfect, shot.number
-        rays = self.rays.image(*shot[1:])
+        rays = self.rays.image(shot.traced)
         image, slope = self._spread(k, rays, unknowns), np.ones(())
         derivatives = {}
         if imperfect.gamma:
@@ -469,13 +466,10 @@ class Scene(PriorTerms):
 
 
 class _Shot(NamedTuple):
-    """An image's rays: its number, potential, rays a cell, beam and frame."""
+    """The number of an image, and its rays."""
 
     number: int
-    potential: FloatArray
-    counts: IntArray
-    beam: FloatArray
-    frame: FloatArray
+    traced: TracedBeam
 
 
 class _Effects(list[tuple[Part, FloatArray]]):

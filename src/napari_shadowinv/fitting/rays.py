@@ -38,6 +38,27 @@ class Pulls(NamedTuple):
     frame: FloatArray
 
 
+class TracedBeam(NamedTuple):
+    """A beam behind a potential, as a detector sees it.
+
+    Attributes
+    ----------
+    potential : ndarray
+        The coefficients.
+    counts : ndarray of int64
+        As `RayModel.ray_counts` returns them.
+    beam : ndarray
+        As `RayModel.around` returns it.
+    frame : ndarray of 6, optional
+        Where the detector sees the rays. Default: where they land.
+    """
+
+    potential: FloatArray
+    counts: IntArray
+    beam: FloatArray
+    frame: FloatArray | None = None
+
+
 @dataclass(frozen=True)
 class RayModel:
     """Image of a beam behind a potential, by ray tracing.
@@ -120,84 +141,46 @@ class RayModel:
         ray_counts = np.rint(np.maximum(most, 0.5) * self._at_rest).astype(np.int64)
         return np.asarray(np.minimum(ray_counts, MOST_RAYS))
 
-    def image(
-        self,
-        potential: FloatArray,
-        counts: IntArray,
-        beam: FloatArray,
-        frame: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return the flux that lands in each pixel.
-
-        Parameters
-        ----------
-        potential : ndarray
-            The coefficients.
-        counts : ndarray of int64
-            As `ray_counts` returns them.
-        beam : ndarray
-            As `around` returns it.
-        frame : ndarray of 6, optional
-            Where the detector sees the rays. Default: where they land.
-
-        Returns
-        -------
-        ndarray, with the shape `seen`
-        """
+    def image(self, traced: TracedBeam) -> FloatArray:
+        """Return the flux that lands in each pixel, with the shape `seen`."""
         corners = np.zeros((_BANDS, 4 * math.prod(self._guarded)))
         reached = np.zeros((_BANDS, 2), np.int64)
-        model = potential, counts, beam, frame
-        self._in_ranges(kernels.deposit, _BANDS, model, corners, reached)
+        self._in_ranges(kernels.deposit, _BANDS, traced, corners, reached)
         image, width = np.zeros(self.seen), self._guarded[1]
         threads, sums = available_threads(self.threads), (corners, reached, width, _GUARD, image)
         in_ranges(kernels.add_corners, len(image), threads, *sums, smallest=_WORTH_A_THREAD_ROWS)
         return image
 
     def gradient(
-        self,
-        potential: FloatArray,
-        counts: IntArray,
-        beam: FloatArray,
-        pull: FloatArray,
-        frame: FloatArray | None = None,
-        *,
-        of_beam: bool = True,
-        of_frame: bool = True,
+        self, traced: TracedBeam, pull: FloatArray, *, of_beam: bool = True, of_frame: bool = True
     ) -> Pulls:
-        """Return the derivatives of ``(pull * image(…)).sum()`` at fixed `counts`.
+        """Return the derivatives of ``(pull * image(traced)).sum()`` at fixed `counts`.
 
         Parameters
         ----------
-        potential, counts, beam, frame
+        traced : TracedBeam
             As for `image`.
         pull : ndarray
             Weight of each pixel, with the shape `seen`.
         of_beam, of_frame : bool, default True
             Whether to compute the derivatives by the beam and by the frame; else they are zero.
         """
-        pulls = Pulls(np.zeros((_BANDS, *self.shape)), np.zeros(beam.shape), np.zeros((_BANDS, 6)))
+        potentials, beam = np.zeros((_BANDS, *self.shape)), np.zeros(traced.beam.shape)
+        pulls = Pulls(potentials, beam, np.zeros((_BANDS, 6)))
         slopes = _slopes_between_pixels(np.pad(pull, _GUARD))
-        model = potential, counts, beam, frame
         sums = pulls.potential, pulls.beam, of_beam, pulls.frame, of_frame
-        self._in_ranges(kernels.gather, _BANDS, model, slopes, *sums)
+        self._in_ranges(kernels.gather, _BANDS, traced, slopes, *sums)
         about_middle = self._about_middle(pulls.frame.sum(axis=0))
         return Pulls(pulls.potential.sum(axis=0), pulls.beam, about_middle)
 
     def jacobian(
-        self,
-        potential: FloatArray,
-        counts: IntArray,
-        beam: FloatArray,
-        frame: FloatArray | None = None,
-        *,
-        of_beam: bool = True,
-        of_frame: bool = True,
+        self, traced: TracedBeam, *, of_beam: bool = True, of_frame: bool = True
     ) -> csr_array:
         """Return the derivatives of each pixel of the image at fixed `counts`.
 
         Parameters
         ----------
-        potential, counts, beam, frame, of_beam, of_frame
+        traced, of_beam, of_frame
             As for `gradient`.
 
         Returns
@@ -206,9 +189,8 @@ class RayModel:
             A row for each pixel; columns, in no order, for the coefficients, the beam's pixels and
             the frame; in single precision.
         """
-        model = potential, counts, beam, frame
         reached = np.empty((*self.cells, 4), np.int64)
-        self._in_ranges(kernels.boxes, len(reached), model, reached)
+        self._in_ranges(kernels.boxes, len(reached), traced, reached)
         # The guard belongs to no pixel.
         first = np.maximum(reached[..., :2], _GUARD)
         behind = np.minimum(reached[..., 2:], np.array(self.seen) + _GUARD)
@@ -220,12 +202,12 @@ class RayModel:
         of_splines, of_instrument = np.empty((most, 16)), np.empty((most, instrument_columns))
         begins, lines = ends - areas, (used, pixels, of_splines, of_instrument)
         places = begins, _GUARD, self._middle, (of_beam, of_frame)
-        self._in_ranges(kernels.collect, len(reached), model, reached, *places, *lines)
+        self._in_ranges(kernels.collect, len(reached), traced, reached, *places, *lines)
         rows = np.empty(math.prod(self.seen) + 1, np.int32)
         entries = (16 + instrument_columns) * int(used.sum())
         columns, values = np.empty(entries, np.int32), np.empty(entries, np.float32)
         kernels.merge(begins, *lines, of_beam, rows, columns, values)
-        shape = (len(rows) - 1, potential.size + beam.size + 6)
+        shape = (len(rows) - 1, traced.potential.size + traced.beam.size + 6)
         return csr_array((values[: rows[-1]], columns[: rows[-1]], rows), shape=shape)
 
     def push(self, jacobian: csr_array, change: FloatArray) -> FloatArray:
@@ -294,14 +276,10 @@ class RayModel:
         return self.seen[0] + 2 * _GUARD, self.seen[1] + 2 * _GUARD
 
     def _in_ranges(
-        self,
-        kernel: Callable[..., Any],
-        ranges: int,
-        model: tuple[FloatArray, IntArray, FloatArray, FloatArray | None],
-        *rest: Any,
+        self, kernel: Callable[..., Any], ranges: int, traced: TracedBeam, *rest: Any
     ) -> None:
-        """Call a kernel for ranges, in threads; `model` are the arguments of `image`."""
-        potential, counts, beam, frame = model
+        """Call a kernel for ranges, in threads."""
+        potential, counts, beam, frame = traced
         frame_px = self._to_pixels(at_rest() if frame is None else frame)
         threads = available_threads(self.threads)
         if (counts[0] * counts[1]).sum() < _WORTH_A_THREAD:
