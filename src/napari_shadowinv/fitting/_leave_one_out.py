@@ -138,19 +138,12 @@ class _SampledFit:
         return float(np.mean(np.square(residuals)[:, linear.scene.weights > 0]))
 
 
-@dataclass(frozen=True)
-class _JointFit:
+class _JointFit(NamedTuple):
     """Fit of all images that agree, with dense rays, and the images to first order around it."""
 
     members: list[int]
     linear: Linear
     unknowns: Unknowns  # of all images
-
-    def only(self, members: list[int]) -> Linear | None:
-        """Return some images to first order; None if there is no such joint fit of them."""
-        if not set(members) <= set(self.members):
-            return None
-        return self.linear.only([self.members.index(k) for k in members])
 
 
 class _Work:
@@ -241,7 +234,7 @@ class _Work:
         while outside := [k for k in self._all if k not in agreeing]:
             fit = self._sample_fit(scene, common, agreeing, joint)
             for k in outside:
-                predictions[k] = self._predict(k, agreeing, scene, fit, alone[k], None)
+                predictions[k] = self._predict(k, agreeing, scene, fit, alone[k], joint)
             back = [k for k in outside if predictions[k].chi2 <= predictions[k].limit]
             if not back:
                 break
@@ -294,7 +287,7 @@ class _Work:
         self, scene: Scene, common: Minimum, members: list[int], joint: _JointFit | None
     ) -> _SampledFit:
         """Fit some images, from a joint fit of these and others if there is one."""
-        linear = None if joint is None else joint.only(members)
+        linear = _linear_of(members, joint)
         large = False
         if linear is not None and joint is not None:
             fine, start = linear.scene, joint.unknowns
@@ -337,7 +330,7 @@ class _Work:
         (image,) = scene.model(unknowns)
         brightness, weights = self._match_brightness(k, image, scene)
         chi2 = _chi2(brightness * image, scene.images[0], weights)
-        variance = fit.variance_in(_linear_of(k, scene, unknowns, joint))
+        variance = fit.variance_in(_linear_of([k], joint) or scene.linear(unknowns))
         variance += _RAY_VARIANCE_RATIO * _chi2(brightness * image, brightness * rough, weights)
         limit = _MAX_NOISE_RATIO + _MAX_VARIANCE_RATIO * variance
         own_chi2, noise_chi2 = alone
@@ -353,7 +346,7 @@ class _Work:
         unknowns = fit.unknowns.only([k])
         chi2 = float(fit.scene.chi2(unknowns)[0])
         # A field of an image's own follows the noise by as much as it is left open.
-        variance = fit.variance_in(_linear_of(k, fit.scene, unknowns, joint))
+        variance = fit.variance_in(_linear_of([k], joint) or fit.scene.linear(unknowns))
         share = min(variance, _MAX_FITTED_SHARE)
         return chi2, chi2 / (1 - share)
 
@@ -387,10 +380,11 @@ class _Work:
         return minimum.coarsen(scene.only(members)).chi2(minimum.unknowns.only(members))
 
 
-def _linear_of(k: int, scene: Scene, unknowns: Unknowns, joint: _JointFit | None) -> Linear:
-    """One image to first order, by a joint fit if it takes part in it."""
-    linear = None if joint is None else joint.only([k])
-    return linear or scene.linear(unknowns)
+def _linear_of(members: list[int], joint: _JointFit | None) -> Linear | None:
+    """Some images to first order by a joint fit; None if there is none in which all take part."""
+    if joint is None or not set(members) <= set(joint.members):
+        return None
+    return joint.linear.only([joint.members.index(k) for k in members])
 
 
 def _name(members: list[int]) -> str:
