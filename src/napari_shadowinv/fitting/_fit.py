@@ -44,7 +44,7 @@ from napari_shadowinv.fitting.posterior import (
     Posterior,
     Sample,
     compare_samples,
-    errors_by_noise,
+    displacement_errors,
     errors_by_part,
     largest_share,
     potentials_of,
@@ -387,6 +387,7 @@ def _find_openness(
         solved = posterior.solve(checked, steps=1)
     pairs = compare_samples(posterior.scene, checked, solved) if solved else None
     samples = solved if is_solved else samples
+    changes = [sample.change for sample in samples]
     by_part = errors_by_part(scene, posterior, samples, data.size)
     by_beam = shifts_by_beam(data, scene, posterior, samples, options)
     sensitivities = {}
@@ -402,7 +403,7 @@ def _find_openness(
         posterior if data.counted else None,  # its Jacobians are large
         samples,
         pairs,
-        errors=errors_by_noise(scene, samples, data.size),
+        errors=displacement_errors(scene, changes, data.size) if changes else None,
         by_part=by_part,
         by_beam=by_beam,
         sensitivities=sensitivities,

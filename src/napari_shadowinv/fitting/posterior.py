@@ -1,7 +1,7 @@
 """Uncertainty of the best unknowns by the Gauss-Newton Hessian, and the error bars from it.
 
 - random changes that the data leave open, and the evidence: `Posterior`, `Sample`, `Response`
-- error bars by the noise: `errors_by_noise`
+- error bars by random changes, such as those by the noise: `displacement_errors`
 - by an unmeasured or inexact beam: `shifts_by_beam`, `BeamError`, `draw_variations`
 - fields that noise, beam and instrument leave possible: `sampled_potentials`
 
@@ -563,16 +563,6 @@ _SAMPLES_PER_BEAM = 2
 _SMOOTHED_ERRORS = 4.0  # px
 
 
-def errors_by_noise(
-    scene: Scene, samples: Sequence[Sample], size: tuple[int, int]
-) -> FloatArray | None:
-    """Return the standard deviation of each field's displacement in px, (M, 2, H, W)."""
-    if not samples:
-        return None
-    changes = [sample.change for sample in samples]
-    return _spread(scene, changes, size, _SMOOTHED_ERRORS)
-
-
 def compare_samples(scene: Scene, linear: Sequence[Sample], solved: Sequence[Sample]) -> Pairs:
     """Return the displacements of samples to first order beside those that were solved."""
     moves, solved_moves = (
@@ -589,21 +579,24 @@ def errors_by_part(
 ) -> dict[str, FloatArray]:
     """Return standard deviations of each field's displacement by noise and by imperfections.
 
-    As `errors_by_noise`, from a few samples, of which each costs a solution for an imperfection.
+    From a few samples, of which each costs a solution for an imperfection.
     """
     if not scene.imperfect.parts:
         return {}
     effects = [posterior.effects(sample) for sample in samples[:_PART_SAMPLES]]
     return {
-        key: _spread(scene, [each[key] for each in effects], size, _SMOOTHED_ERRORS)
+        key: displacement_errors(scene, [each[key] for each in effects], size)
         for key in (effects[0] if effects else ())
     }
 
 
-def _spread(
-    scene: Scene, changes: Sequence[Unknowns], size: tuple[int, int], width: float
+def displacement_errors(
+    scene: Scene,
+    changes: Sequence[Unknowns],
+    size: tuple[int, int],
+    width: float = _SMOOTHED_ERRORS,
 ) -> FloatArray:
-    """Root of the mean square of the displacements, smoothed over a width in px."""
+    """Return the r.m.s. displacement of each field by changes, smoothed over a width in px."""
     height, across = size
     squares = np.zeros((scene.strengths.shape[1], 2, *scene.rays.size))
     for change in changes:
@@ -652,7 +645,7 @@ def shifts_by_beam(
         for _ in range(_BEAM_SAMPLES if has_open_beam else max(_BEAM_SAMPLES, enough))
     ]
     changes = posterior.moved_by_beams([0.01 * each for each in variations])
-    by_percent = _spread(scene, changes, data.size, length / 3)
+    by_percent = displacement_errors(scene, changes, data.size, length / 3)
     if not variation:
         return BeamShifts(by_percent, 0 * by_percent)
     if not data.common:
@@ -661,7 +654,7 @@ def shifts_by_beam(
         return BeamShifts(by_percent, scale * by_percent, scaled)
     # Several images exclude most of the beams that would move the field far.
     changes = posterior.open_beams(variation, samples[: max(_OPEN_BEAM_SAMPLES, enough)], rng)
-    errors = _spread(scene, changes, data.size, length / 3)
+    errors = displacement_errors(scene, changes, data.size, length / 3)
     return BeamShifts(by_percent, errors, tuple(changes))
 
 
