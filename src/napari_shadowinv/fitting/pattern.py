@@ -347,9 +347,8 @@ def name_cause(
 
 def gain_by_blur(scene: Scene, best: Minimum, on_step: OnStep) -> float:
     """Return by how much a wider point spread lowers the objective; kernels stay."""
-    return (
-        best.value - settle_minimum(_wider(scene, _WIDER_PX), best, on_step, "point spread").value
-    )
+    wider = settle_minimum(_wider(scene, _WIDER_PX), best, on_step, "point spread")
+    return best.value - wider.value
 
 
 def log_evidence(

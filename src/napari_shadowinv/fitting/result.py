@@ -596,7 +596,18 @@ class Fit:
         merged.attrs.update(history | dict(attributes or {}))
         merged["field"] = ("field", names)
         merged["basin"] = ("basin", [basin.start for basin in self.basins])
-        for name, values in self._arrays().items():
+        arrays = {
+            **{name: getattr(self, name) for name in _OF_IMAGES},
+            "strength": self.strengths,
+            "frame": self.frames,
+            "smoothness": np.array([field.smoothness for field in self.fields]),
+            **{
+                f"basin_{name}": np.array([getattr(basin, name) for basin in self.basins])
+                for name in _OF_BASINS
+            },
+            "noise": self.noise,
+        }
+        for name, values in arrays.items():
             dims, units, text = _VARIABLES[name]
             merged[name] = dims[: values.ndim], values, label(units, text)
         return merged
@@ -654,20 +665,6 @@ class Fit:
             provenance=Provenance.of(attributes),
             noise=noise_in(dataset, "noise"),
         )
-
-    def _arrays(self) -> dict[str, AnyArray]:
-        """The values of `_VARIABLES`."""
-        return {
-            **{name: getattr(self, name) for name in _OF_IMAGES},
-            "strength": self.strengths,
-            "frame": self.frames,
-            "smoothness": np.array([field.smoothness for field in self.fields]),
-            **{
-                f"basin_{name}": np.array([getattr(basin, name) for basin in self.basins])
-                for name in _OF_BASINS
-            },
-            "noise": self.noise,
-        }
 
 
 def normalise_residual(residual: FloatArray, mask: BoolArray, noise: FloatArray) -> FloatArray:
