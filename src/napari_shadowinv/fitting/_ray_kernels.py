@@ -21,6 +21,7 @@ _TABLE = 8 * MOST_RAYS  # numbers of splines and slopes for cells with one numbe
 _ROWS = 8 * MOST_RAYS
 _V, _U, _SHARE_V, _SHARE_U, _SLOPE_V, _SLOPE_U, _DOWN, _RIGHT = range(0, 8 * MOST_RAYS, MOST_RAYS)
 _LANDED = 8 * MOST_RAYS
+Entries = tuple[IntArray, IntArray, AnyArray]  # begins of a sparse matrix's rows, columns, values
 _OfSplines = tuple[float, float, float, float]  # sums for the four splines along x
 _FAST = {"contract", "reassoc", "nsz"}  # sums in an order that suits the processor
 # A part that is compiled by itself, too, may sum in another order there, and which of both a
@@ -171,13 +172,7 @@ def _flux_of_row(
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
-def deposit(
-    start: int,
-    stop: int,
-    rays: Rays,
-    corners: FloatArray,
-    reached: IntArray,
-) -> None:
+def deposit(start: int, stop: int, rays: Rays, corners: FloatArray, reached: IntArray) -> None:
     """Add the rays of bands of cells up at the pixel at or before each, by the pixel they go to.
 
     `corners` has the shape (bands, pixels × 4): for the pixel itself, that to its right, that below
@@ -363,12 +358,7 @@ def gather(
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST)
-def boxes(
-    start: int,
-    stop: int,
-    rays: Rays,
-    found: IntArray,
-) -> None:
+def boxes(start: int, stop: int, rays: Rays, found: IntArray) -> None:
     """First row and column of the pixels that each cell reaches, and those after the last."""
     counts, cells = rays.counts, (rays.counts.shape[1], rays.counts.shape[2])
     rows, landed = np.zeros(_ROWS), np.zeros(_LANDED)
@@ -588,16 +578,9 @@ def _add_entry(
 
 
 @njit(nogil=True, error_model="numpy")
-def rows_times(
-    start: int,
-    stop: int,
-    begins: IntArray,
-    columns: IntArray,
-    values: AnyArray,
-    vector: FloatArray,
-    out: FloatArray,
-) -> None:
+def rows_times(start: int, stop: int, matrix: Entries, vector: FloatArray, out: FloatArray) -> None:
     """Rows of a sparse matrix times a vector, while other threads run."""
+    begins, columns, values = matrix
     for row in range(start, stop):
         total = 0.0
         for entry in range(begins[row], begins[row + 1]):
@@ -609,9 +592,7 @@ def rows_times(
 def normal_times(
     start: int,
     stop: int,
-    begins: IntArray,
-    columns: IntArray,
-    values: AnyArray,
+    matrix: Entries,
     vector: FloatArray,
     weights: FloatArray,
     slopes: FloatArray,
@@ -620,6 +601,7 @@ def normal_times(
     out: FloatArray,
 ) -> None:
     """Add Jᵀ s w (s J v + l) for rows of a sparse matrix J; `pulls` are w (s J v + l)."""
+    begins, columns, values = matrix
     for row in range(start, stop):
         total = 0.0
         for entry in range(begins[row], begins[row + 1]):
@@ -631,14 +613,9 @@ def normal_times(
 
 
 @njit(nogil=True, error_model="numpy")
-def transpose_times(
-    begins: IntArray,
-    columns: IntArray,
-    values: AnyArray,
-    vector: FloatArray,
-    out: FloatArray,
-) -> None:
+def transpose_times(matrix: Entries, vector: FloatArray, out: FloatArray) -> None:
     """Add the transpose of a sparse matrix times a vector, while other threads run."""
+    begins, columns, values = matrix
     for row in range(len(begins) - 1):
         for entry in range(begins[row], begins[row + 1]):
             out[columns[entry]] += values[entry] * vector[row]

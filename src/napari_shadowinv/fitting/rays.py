@@ -118,17 +118,7 @@ class RayModel:
         return np.pad(image, ((self.pad, rows), (self.pad, columns)), mode="edge")
 
     def ray_counts(self, potential: FloatArray) -> IntArray:
-        """Return how many rays along y and x each cell needs to land so densely.
-
-        Parameters
-        ----------
-        potential : ndarray
-            The coefficients.
-
-        Returns
-        -------
-        ndarray of int64, shape (2, *cells)
-        """
+        """Return how many rays along y and x each cell needs to land so densely, (2, *cells)."""
         middle = potential[1:-1, 1:-1]
         yy = (potential[2:, 1:-1] - 2 * middle + potential[:-2, 1:-1]) / KNOT**2
         xx = (potential[1:-1, 2:] - 2 * middle + potential[1:-1, :-2]) / KNOT**2
@@ -214,13 +204,13 @@ class RayModel:
         """Return a Jacobian times a change of its columns, (n,), with the shape `seen`."""
         out = np.empty(jacobian.shape[0])
         threads = available_threads(self.threads)
-        in_ranges(kernels.rows_times, len(out), threads, *_entries(jacobian), change, out)
+        in_ranges(kernels.rows_times, len(out), threads, _entries(jacobian), change, out)
         return out.reshape(self.seen)
 
     def pull(self, jacobian: csr_array, image: FloatArray) -> FloatArray:
         """Return the transpose of `push` times an image, (n,)."""
         out = np.zeros(jacobian.shape[1])
-        kernels.transpose_times(*_entries(jacobian), image.ravel(), out)
+        kernels.transpose_times(_entries(jacobian), image.ravel(), out)
         return out
 
     def normal_times(
@@ -248,7 +238,7 @@ class RayModel:
             rows = jacobian.shape[0]
             for part in range(_PARTS):
                 bounds = rows * part // _PARTS, rows * (part + 1) // _PARTS
-                arguments = *bounds, *_entries(jacobian), change, *images, totals[k][part]
+                arguments = *bounds, _entries(jacobian), change, *images, totals[k][part]
                 works.append(partial(kernels.normal_times, *arguments))
         threads = available_threads(self.threads)
         run_together(works, threads if jacobians[0].nnz > _WORTH_A_PRODUCT else 1)
@@ -322,7 +312,7 @@ def _slopes_between_pixels(pull: FloatArray) -> FloatArray:
     return slopes.reshape(-1)
 
 
-def _entries(matrix: csr_array) -> tuple[IntArray, IntArray, FloatArray]:
+def _entries(matrix: csr_array) -> kernels.Entries:
     """Begins of rows, columns and values; unsigned, for which no index counts from the end."""
     unsigned = _UNSIGNED[matrix.indices.itemsize]
     return matrix.indptr.view(unsigned), matrix.indices.view(unsigned), matrix.data
