@@ -232,9 +232,9 @@ def test_effects_of_noise_and_instrument_add_to_each_sample() -> None:
         strengths=STRENGTHS,
         noise=NOISE,
         instrument=Instrument(beam_rms=0.05, background=0.1, gamma=0.1),
-        options=FEW,
+        options=FEW.model_copy(update={"smoothness": 100.0}),
     )
-    scene = coarser(data.scene_with(100.0), 2)
+    scene = coarser(data.scene, 2)
     posterior = Posterior(scene, scene.nothing(), np.random.default_rng(0))
     sample = posterior.draw_samples(1)[0]
     effects = posterior.effects(sample)

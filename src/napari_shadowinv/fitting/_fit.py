@@ -185,7 +185,7 @@ def fit(
         options=options,
     )
     ensure_compiled(on_progress, should_stop)
-    scene = data.scene_with(options.smoothness)
+    scene = data.scene
     on_step = report_steps("fit", on_progress, should_stop)
     with _timed("starts", seconds):
         rough = replace(scene, held=_HELD_IN_SEARCH)
@@ -540,11 +540,7 @@ def _basins(
 
 
 def _added_light(
-    data: FitData,
-    scene: Scene,
-    unknowns: Unknowns,
-    samples: Sequence[Sample],
-    amplification: float,
+    data: FitData, scene: Scene, unknowns: Unknowns, samples: Sequence[Sample], amplification: float
 ) -> dict[str, list[list[list[float]]]]:
     """Coefficients of light that adds to each image, in its unit, with standard deviations."""
     units = (data.units * np.exp(unknowns.brightness))[:, None]

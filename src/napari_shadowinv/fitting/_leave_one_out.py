@@ -101,8 +101,9 @@ def leave_one_out(
             "because that image is left out, too"
         )
     ensure_compiled(on_progress, should_stop)
-    work = _Work(data, options, report_steps("leave one out", on_progress, should_stop))
-    first = work.search_all(should_stop)
+    on_step = report_steps("leave one out", on_progress, should_stop)
+    first, *_ = search(data.scene, collect_starts(data, on_step, should_stop), on_step)
+    work = _Work(data, options, on_step)
     agreeing = work.find_agreeing(first)
     scene, common = work.estimate_smoothness(agreeing, first)
     predictions = work.predict_all(agreeing, scene, common)
@@ -152,7 +153,7 @@ class _Work:
     def __init__(self, data: FitData, options: FitOptions, on_step: OnStep) -> None:
         self._data, self._options, self._on_step = data, options, on_step
         self._all = list(range(len(data.units)))
-        self._scene = data.scene_with(options.smoothness)
+        self._scene = data.scene
 
     def _run_for_each(self, numbers: list[int], work: Callable[[_Work, int], _T]) -> dict[int, _T]:
         """Call `work(context, number)` for images, in threads."""
@@ -163,11 +164,6 @@ class _Work:
         threads = available_threads(self._options.threads)
         results = run_in_parallel([partial(run, k) for k in numbers], threads, self._on_step)
         return dict(zip(numbers, results, strict=True))
-
-    def search_all(self, should_stop: ShouldStop | None) -> Minimum:
-        """Where a search in all images ends, in pixels of two."""
-        begun = collect_starts(self._data, self._on_step, should_stop)
-        return search(self._scene, begun, self._on_step)[0]
 
     def find_agreeing(self, begun: Minimum) -> list[int]:
         """The most images that one field explains, found in pixels of two."""

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -79,7 +79,8 @@ _ALIGNED = {
 class FitData:
     """Images in units of their beams, with their instrument.
 
-    `scene` has the sides of blocks; the images are its first `size` pixels. `units` (L,) are
+    `scene` has the sides of blocks, and λ and κ if they are given, else 0; the images are its first
+    `size` pixels. `units` (L,) are
     the recorded values of one unit, `brightness` (L,) the brightness of each image relative to its
     source, approximate where it is unknown; `counted` is true for Poisson noise. The beam is
     `assumed` if no source was given, and `common` if its source is the same for all images.
@@ -104,15 +105,8 @@ class FitData:
     def noise_of(self, weights: FloatArray) -> FloatArray:
         """Return the standard deviation of each image's noise, or of each pixel's if it varies.
 
-        Parameters
-        ----------
-        weights : ndarray, shape (L, H', W')
-            Of the pixels of a scene, 0 where masked.
-
-        Returns
-        -------
-        ndarray, shape (L,) or (L, H, W)
-            In the unit of the images; NaN where masked.
+        In the unit of the images, (L,) or (L, H, W), for the weights of a scene's pixels; NaN where
+        masked.
         """
         height, width = self.size
         weights = weights[:, :height, :width]
@@ -120,12 +114,6 @@ class FitData:
         noise = self.units[:, None, None] / roots
         least, largest = (limit(noise, axis=(1, 2)) for limit in (np.nanmin, np.nanmax))
         return noise if (least < largest).any() else np.asarray(least)
-
-    def scene_with(self, smoothness: float | None) -> Scene:
-        """Return the scene with λ as it was given, or none yet, for each field."""
-        fields = self.scene.strengths.shape[1]
-        each = (smoothness or 0.0, 0.0) if self.near is None else self.near.smoothness
-        return replace(self.scene, smoothness=np.tile(each, (fields, 1)))
 
 
 def collect_data(
@@ -223,13 +211,16 @@ def collect_data(
     # A beam of another shape, or behind an object that absorbs, does not have its source's.
     is_dimmed |= not single and (bool(imperfect.shapes) or instrument.absorption > 0)
     align = "affine" if options.align == "none" and instrument.registration else options.align
+    start = value_of_first(shots, "start")
+    near = start if isinstance(start, NearField) else None
+    smoothness = (options.smoothness or 0.0, 0.0) if near is None else near.smoothness
     scene = Scene(
         images=np.pad(scaled, fill),
         weights=np.pad(weights, fill),
         strengths=matrix,
         beams=np.pad(beams / units[:, None, None], ((0, 0), *around), mode="edge"),
         psf=check_point_spread(psf, count, size),
-        smoothness=np.zeros((matrix.shape[1], 2)),
+        smoothness=np.tile(smoothness, (matrix.shape[1], 1)),
         pad=pad,
         tie=_FREE_TIE if free else 30.0,
         decay=(options.decay_length or pad) if free else np.inf,
@@ -242,8 +233,6 @@ def collect_data(
         added=additive_blocks(options),
         imperfect=imperfect,
     )
-    start = value_of_first(shots, "start")
-    near = start if isinstance(start, NearField) else None
     return FitData(
         scene=scene,
         size=(height, width),
