@@ -405,18 +405,14 @@ def imperfect_instrument(
 
     Parameters
     ----------
-    instrument : Instrument
-        As stated.
     beam : BeamPrior
         Of the difference of beams and sources.
     sources : ndarray, shape (L, H, W)
-        Recorded or assumed, in units of their means.
+        Recorded or assumed, in units of their means; `is_common` if that of all images is the same.
     used : ndarray of bool, shape (H, W)
         Pixels in which the variation of beams has its r.m.s.
     around : pairs of int
         Pixels by which the scene's beams reach beyond the images.
-    is_common : bool
-        Whether all images have the same source.
     is_unknown : bool
         Whether the beam is fitted in any case.
     other_strengths : ndarray, shape (L, M), or None
@@ -452,10 +448,7 @@ def imperfect_instrument(
 
 
 def absorption_shapes(
-    rms: float,
-    displacement: FloatArray,
-    used: BoolArray,
-    around: Around,
+    rms: float, displacement: FloatArray, used: BoolArray, around: Around
 ) -> Shapes:
     """Return the transmission of an object with a displacement in px, (2, H, W)."""
     scene = Scene(displacement, used.astype(np.float64), used)

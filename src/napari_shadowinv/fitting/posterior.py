@@ -342,13 +342,7 @@ class Posterior:
         return product(slope.flat(), self._change(slope, _ROUGHLY).flat())
 
     def moved_by_beams(self, variations: Sequence[FloatArray]) -> list[Unknowns]:
-        """Return the changes of the unknowns if the beams differ from their sources.
-
-        Parameters
-        ----------
-        variations : sequence of ndarray, shape (L, …)
-            Differences as shares of the beams, of the shape of the scene's beams.
-        """
+        """Return the changes of the unknowns by variations of the beams, as shares of them."""
         slopes = [
             self._linear.pull(self.scene.changed_by_beams(self._unknowns, self._counts, each))
             for each in variations
@@ -360,23 +354,10 @@ class Posterior:
     ) -> list[Unknowns]:
         """Return random differences of a common beam that the images leave possible.
 
-        Parameters
-        ----------
-        variation : float
-            R.m.s. difference that is possible before the images are looked at.
-        samples : sequence of Sample
-            For the beam as it is; each makes one of the differences.
-        rng : numpy.random.Generator
-            For the beam's prior.
+        Each sample, for the beam as it is, makes one of them: the beam's difference, that of
+        `Scene.with_free_beam`, with the change of the other unknowns that it causes. Before the
+        images are looked at, an r.m.s. difference of `variation` is possible.
 
-        Returns
-        -------
-        list of Unknowns
-            The beam's difference, `Scene.with_free_beam`'s, with the change of the other unknowns
-            that it causes.
-
-        Notes
-        -----
         With J and B the derivatives of the residuals by the unknowns and by the beam's cosines, H
         and P the Hessian and the beam's prior, a sample x = H⁻¹ (Jᵀη + ξ) becomes one of both,
         (x + δ, θ), by
@@ -524,22 +505,9 @@ class BeamError:
 def draw_variations(
     scene: Scene, length: float, count: int, rng: np.random.Generator
 ) -> FloatArray:
-    """Return random smooth fields with a mean of 0 and an r.m.s. of 1 over the image.
+    """Return random smooth fields with a mean of 0 and an r.m.s. of 1 over the image, (count, …).
 
-    Parameters
-    ----------
-    scene : Scene
-        Its beams, of the shape (L, …), reach beyond the image.
-    length : float
-        Distance over which the fields vary, px of the scene.
-    count : int
-        Number of fields.
-    rng : numpy.random.Generator
-        For the waves.
-
-    Returns
-    -------
-    ndarray, shape (count, …)
+    They vary over a `length` in px of the scene, and like its beams they reach beyond the image.
     """
     height, width = scene.beams.shape[1:]
     inside = np.s_[scene.pad : height - scene.pad, scene.pad : width - scene.pad]
@@ -572,10 +540,7 @@ def compare_samples(scene: Scene, linear: Sequence[Sample], solved: Sequence[Sam
 
 
 def errors_by_part(
-    scene: Scene,
-    posterior: Posterior,
-    samples: Sequence[Sample],
-    size: tuple[int, int],
+    scene: Scene, posterior: Posterior, samples: Sequence[Sample], size: tuple[int, int]
 ) -> dict[str, FloatArray]:
     """Return standard deviations of each field's displacement by noise and by imperfections.
 
@@ -667,25 +632,8 @@ def sampled_potentials(
 ) -> FloatArray:
     """Return random changes of each field's potential, px², that its total error allows.
 
-    Those by a beam that is not fitted are random combinations of the changes of `by_beam`.
-
-    Parameters
-    ----------
-    scene : Scene
-        In recorded pixels.
-    samples : sequence of Sample
-        The posterior's.
-    by_beam : BeamShifts or None
-        Changes by the beam.
-    size : tuple of int
-        Height H and width W of the images.
-    seed : int
-        Of the combinations.
-
-    Returns
-    -------
-    ndarray of float32, shape (M, len(samples), H, W)
-        Their mean over the border is 0.
+    Shape (M, len(samples), H, W); their mean over the border is 0. Those by a beam that is not
+    fitted are random combinations, by a seed, of the changes of `by_beam`.
     """
     changes = [potentials_of(scene, sample.change, size) for sample in samples]
     shifts = () if by_beam is None else by_beam.changes

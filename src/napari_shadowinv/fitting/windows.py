@@ -188,21 +188,12 @@ def check_count(count: int) -> None:
 
 
 def explanation_of(
-    chi2: FloatArray,
-    limit: FloatArray,
-    setups: Sequence[Setup] | None,
-    names: Sequence[str] | None,
+    chi2: FloatArray, limit: FloatArray, setups: Sequence[Setup] | None, names: Sequence[str] | None
 ) -> str:
     """Say which images one static field does not explain, in a sentence.
 
-    Parameters
-    ----------
-    chi2, limit : ndarray, shape (L,)
-        χ² of the prediction of each image, and its upper limit.
-    setups : sequence of Setup or None
-        Their energies name the images.
-    names : sequence of str or None
-        Names of the images in messages. Default: their numbers.
+    χ² of the prediction of each has an upper limit. The energies of setups of one kind name the
+    images, else their names, or their numbers.
     """
     wrong = np.flatnonzero(chi2 > limit)
     if not len(wrong):
