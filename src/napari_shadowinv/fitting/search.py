@@ -130,8 +130,7 @@ def search(scene: Scene, starts: Sequence[Start], on_step: OnStep) -> list[Minim
     same stage before the last, the best go on.
     """
     rough = replace(
-        scene,
-        smoothness=_COARSE_SMOOTHNESS * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1)),
+        scene, smoothness=_COARSE_SMOOTHNESS * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1))
     )
 
     def begin(start: Start) -> Minimum:
@@ -211,12 +210,7 @@ def _in_smaller_pixels(scene: Scene, minimum: Minimum) -> Unknowns:
 
 
 def estimate_smoothness(
-    scene: Scene,
-    end: Minimum,
-    rng: np.random.Generator,
-    on_step: OnStep,
-    *,
-    is_near: bool = False,
+    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep, *, is_near: bool = False
 ) -> tuple[Scene, Minimum]:
     """Find λ and κ, unless they are given, and the unknowns that belong to them.
 
@@ -350,12 +344,7 @@ def settle_minimum(
 
 
 def refine_minimum(
-    scene: Scene,
-    minimum: Minimum,
-    options: FitOptions,
-    on_step: OnStep,
-    *,
-    is_near: bool = False,
+    scene: Scene, minimum: Minimum, options: FitOptions, on_step: OnStep, *, is_near: bool = False
 ) -> tuple[Scene, Unknowns, float, int, bool]:
     """Descend with the pixels as recorded, with rays as dense as the data need.
 
