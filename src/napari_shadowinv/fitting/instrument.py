@@ -418,11 +418,11 @@ def imperfect_instrument(
     other_strengths : ndarray, shape (L, M), or None
         Of the displacement by another field, if one was equal to each field in the first image.
     """
-    weights = used.astype(np.float64)
+    weights, beyond = used.astype(np.float64), ((0, 0), *around)
     shapes = []
     if beam.rms and not is_unknown:
         excess = BeamExcess(beam, weights, _FITTED_VARIANCE)
-        planes = _beyond(beam.rms * excess.shapes, around)
+        planes = np.pad(beam.rms * excess.shapes, beyond, mode="edge")
         rest = ProductShapes.of_field(excess.rest, beam.rms * excess.rest_share, around)
         shapes.append(Shapes("beam", planes, rest, is_common))
     if beam.between and len(sources) > 1:
@@ -433,7 +433,7 @@ def imperfect_instrument(
         source = np.maximum(sources[0], _DIMMEST)
         planes = instrument.registration * motions(source) / source
         if np.any(planes):
-            shapes.append(Shapes("registration", _beyond(planes, around)))
+            shapes.append(Shapes("registration", np.pad(planes, beyond, mode="edge")))
     return Imperfect(
         gamma=instrument.gamma,
         blur=instrument.blur**2,
@@ -456,11 +456,6 @@ def absorption_shapes(
     smooth = SmoothField(radius, scene.source, _FITTED_VARIANCE)
     products = ProductShapes.of_field(smooth, rms, around, envelope)
     return Shapes("absorption", _no_planes(products), products)
-
-
-def _beyond(planes: FloatArray, around: Around) -> FloatArray:
-    """Planes that go on beyond the image as at its edge."""
-    return np.pad(planes, ((0, 0), *around), mode="edge")
 
 
 def _no_planes(products: ProductShapes) -> FloatArray:

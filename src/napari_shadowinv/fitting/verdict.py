@@ -280,7 +280,9 @@ def _edge_text(displacement: FloatArray, used: BoolArray, free: bool) -> str:
     at_edge = _share_at_edge(np.hypot(*displacement))
     bent = _share_at_edge(divergence, _FROM_EDGE)
     most, most_bent = (_AT_FREE_EDGE, _BENT_AT_FREE_EDGE) if free else (_AT_EDGE, _BENT)
-    turned = 0.0 if free else _share_turned_back(displacement, used)
+    sides = None if free else inner_sides(displacement, used)  # None, too, if masked there
+    rms = float(np.sqrt((displacement**2).sum(axis=0).mean()))
+    turned = 0.0 if sides is None else turning_displacement(sides) / max(rms, 1e-12)
     if at_edge <= most and bent <= most_bent and turned <= TURNED_BACK:
         return ""
     if at_edge > most or bent > most_bent:
@@ -316,13 +318,6 @@ def _share_at_edge(values: FloatArray, inwards: int = 0) -> float:
     first, last = inwards, -1 - inwards
     sides = values[first], values[last], values[:, first], values[:, last]
     return float(max(side.max() for side in sides) / max(values.max(), 1e-12))
-
-
-def _share_turned_back(displacement: FloatArray, used: BoolArray) -> float:
-    """The mean displacement across the edge over the r.m.s. one; 0 if a mask covers the edge."""
-    sides = inner_sides(displacement, used)
-    rms = float(np.sqrt((displacement**2).sum(axis=0).mean()))
-    return 0.0 if sides is None else turning_displacement(sides) / max(rms, 1e-12)
 
 
 def _those(names: Sequence[str], chi2: FloatArray, which: BoolArray) -> str:
