@@ -102,7 +102,7 @@ def leave_one_out(
         )
     ensure_compiled(on_progress, should_stop)
     on_step = report_steps("leave one out", on_progress, should_stop)
-    first, *_ = search(data.scene, collect_starts(data, on_step, should_stop), on_step)
+    first = search(data.scene, collect_starts(data, on_step, should_stop), on_step)[0]
     work = _Work(data, options, on_step)
     agreeing = work.find_agreeing(first)
     scene, common = work.estimate_smoothness(agreeing, first)

@@ -80,10 +80,10 @@ class FitData:
     """Images in units of their beams, with their instrument.
 
     `scene` has the sides of blocks, and λ and κ if they are given, else 0; the images are its first
-    `size` pixels. `units` (L,) are
-    the recorded values of one unit, `brightness` (L,) the brightness of each image relative to its
-    source, approximate where it is unknown; `counted` is true for Poisson noise. The beam is
-    `assumed` if no source was given, and `common` if its source is the same for all images.
+    `size` pixels. `units` (L,) are the recorded values of one unit, `brightness` (L,) the
+    brightness of each image relative to its source, approximate where it is unknown; `counted` is
+    true for Poisson noise. The beam is `assumed` if no source was given, and `common` if its source
+    is the same for all images.
     """
 
     scene: Scene

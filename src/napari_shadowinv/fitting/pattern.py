@@ -7,7 +7,8 @@
 
 χ² hides structure: a beam that is 2 % wrong adds 0.1 to χ² at 5 % noise, spread over the whole
 image, and bends the field by tens of per cent. Smoothed, the same residual stands out of white
-noise by many standard deviations.
+noise by many standard deviations. Residuals are images minus models over the standard deviation of
+the noise in each pixel.
 """
 
 from __future__ import annotations
@@ -42,10 +43,10 @@ _MAX_VARIANCE_RATIO = 0.85
 def pattern_strength(residual: FloatArray, used: BoolArray, correlation: float = 0.0) -> float:
     """Return how far a smoothed residual stands out of smoothed noise of its own r.m.s.
 
-    That is the power of the residual over the noise in its `used` pixels, smoothed by Gaussians of
-    2, 4 and 8 px, minus the expected one, in standard deviations of that; the largest. White noise
-    gives about 0 ± 1, and less where the model has absorbed part of it. `correlation` is the
-    standard deviation in px of the Gaussian that has blurred the noise.
+    That is the power of the residual in `used` pixels, smoothed by Gaussians of 2, 4 and 8 px,
+    minus the expected one, in standard deviations of that; the largest. White noise gives about
+    0 ± 1, and less where the model has absorbed part of it. `correlation` is the standard deviation
+    in px of the Gaussian that has blurred the noise.
     """
     values = np.where(used, residual, 0.0)
     variance = float((values**2).sum() / max(used.sum(), 1))

@@ -192,8 +192,8 @@ def explanation_of(
 ) -> str:
     """Say which images one static field does not explain, in a sentence.
 
-    χ² of the prediction of each has an upper limit. The energies of setups of one kind name the
-    images, else their names, or their numbers.
+    Those are the images whose prediction has a χ² above its limit. Energies name them if the setups
+    are of one kind, else their names, or their numbers.
     """
     wrong = np.flatnonzero(chi2 > limit)
     if not len(wrong):
