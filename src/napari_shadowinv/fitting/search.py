@@ -228,7 +228,13 @@ def estimate_smoothness(
     if is_fixed and not response:
         return scene, end
     if not is_fixed:
-        smoothness, scene, end = _settle_smoothness(scene, end, rng, on_step)
+        for _ in range(_ROUNDS):  # towards the likeliest λ and κ
+            estimate, change = posterior_of(scene, end, rng, on_step).likely_smoothness()
+            smoothness = estimate / smoothness_in_pixels(end.bin)
+            if change < _SETTLED:
+                break
+            scene = replace(scene, smoothness=smoothness)
+            end = settle_minimum(scene, end, on_step, is_rough=True)
         scene = replace(scene, smoothness=SMOOTHNESS_RATIO * smoothness)
     if response and scene.images.size <= _MOST_RECORDED and not is_near:
         # In larger pixels fine structure is lost by which a blur differs from a smooth object.
@@ -239,20 +245,6 @@ def estimate_smoothness(
         return scene, end
     rounds = _NEAR_ROUNDS if is_near else _RESPONSE_ROUNDS
     return _settle_response(scene, end, rng, on_step, rounds=rounds, least_gain=least_gain)
-
-
-def _settle_smoothness(
-    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep
-) -> tuple[FloatArray, Scene, Minimum]:
-    """Find the likeliest λ and κ; also returns the scene and the minimum of the last before."""
-    for _ in range(_ROUNDS):
-        likely, change = posterior_of(scene, end, rng, on_step).likely_smoothness()
-        smoothness = likely / smoothness_in_pixels(end.bin)
-        if change < _SETTLED:
-            break
-        scene = replace(scene, smoothness=smoothness)
-        end = settle_minimum(scene, end, on_step, is_rough=True)
-    return smoothness, scene, end
 
 
 def _with_likely_numbers(scene: Scene, end: Minimum) -> Minimum:
