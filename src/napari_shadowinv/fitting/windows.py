@@ -249,7 +249,8 @@ def window_facts(dataset: xarray.Dataset) -> tuple[Fact, ...]:
     windows = dataset[names].rename({name: str(name).removeprefix(PREFIX) for name in names})
     numbers = windows["image_number"].values - 1
     used = np.array([dataset["mask"].values[group].any(axis=0) for group in numbers])
-    setups, beams = setups_in(dataset), beam_values(setups_in(dataset))
+    setups = setups_in(dataset)
+    beams = beam_values(setups)
     return _describe_windows(
         windows,
         [str(name) for name in dataset["field"].values],
