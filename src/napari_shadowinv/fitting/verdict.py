@@ -34,8 +34,8 @@ _STRONGEST = 0.99  # quantile of the contrast, over the image
 def hidden_contrast(contrast: FloatArray, used: BoolArray) -> float:
     """Return the contrast around the holes of a mask, as a share of the strongest; 0 without holes.
 
-    The contrast is that of model images to their beams; the share is the largest of all images. A
-    hole is where no image has `used` pixels; smaller ones than 12 px are bridged by their
+    The contrast is model images over their beams, minus 1; the share is the largest of all images.
+    A hole is where no image has `used` pixels; smaller ones than 12 px are bridged by their
     surroundings.
     """
     used_anywhere = used.any(axis=0)
