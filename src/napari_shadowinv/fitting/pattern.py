@@ -275,23 +275,20 @@ def name_cause(
     pixels = best.coarsen(scene)
     misfit = pixels.chi2(best.unknowns) - 1
     excess = float((misfit * (pixels.weights > 0).sum(axis=(1, 2))).sum())
-    rivals = list(_rivals(scene, best, names, setups))
 
-    def gain(rival: _Rival, on_step: OnStep) -> float:
+    def settle_rival(rival: _Rival, on_step: OnStep) -> tuple[float, str]:
         start = replace(best, unknowns=rival.unknowns, modes=SoftModes())
         end = settle_minimum(
             rival.scene, start, on_step, "rivals", steps=_STEPS, to_beat=best.value, is_rough=True
         )
-        return 2 * (best.value - end.value) - rival.free_numbers
+        return 2 * (best.value - end.value) - rival.free_numbers, rival.cause
 
-    works = [partial(gain, rival) for rival in rivals]
-    causes = [rival.cause for rival in rivals]
+    works = [partial(settle_rival, rival) for rival in _rivals(scene, best, names, setups)]
     threads = available_threads(scene.threads)
-    gains = list(zip(run_in_parallel(works, threads, on_step), causes, strict=True))
-    gains.sort(reverse=True)
-    if not gains or gains[0][0] < _MIN_GAIN:
+    gains = sorted(run_in_parallel(works, threads, on_step), reverse=True)
+    largest, _ = gains[0]
+    if largest < _MIN_GAIN:
         return ""
-    largest = gains[0][0]
     is_doubtful = largest < _MIN_EXPLAINED_SHARE * excess
     least = _MIN_GAIN if is_doubtful else _AS_LIKELY * largest
     # Two rivals may have the same cause.

@@ -314,19 +314,18 @@ class Posterior:
         respond = exact or self._held
         none = respond._unknowns.zeros()
         displacements = self.scene.displacement(self._unknowns)
-        keys, pulls = [], []
+        pulls = {}
         for part in self.scene.imperfect.parts:
             numbers = self._unknowns.zeros()
             size = part.places.stop - part.places.start
             block = part.of(numbers.common, numbers.separate)
             block[...] = rng.normal(size=size) if size > 1 else 1.0
-            keys.append(part.key)
             pull = self._linear.pull(-self._linear.push(numbers))
-            pulls.append(pull._replace(common=none.common, separate=none.separate))
-
-        moved = map(self.scene.displacement, respond._changes(pulls, _ROUGHLY))
+            pulls[part.key] = pull._replace(common=none.common, separate=none.separate)
+        changes = respond._changes(list(pulls.values()), _ROUGHLY)
         return {
-            key: largest_share(each, displacements) for key, each in zip(keys, moved, strict=True)
+            key: largest_share(self.scene.displacement(change), displacements)
+            for key, change in zip(pulls, changes, strict=True)
         }
 
     @property
