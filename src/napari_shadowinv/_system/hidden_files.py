@@ -43,9 +43,13 @@ _swept: set[Path] = set()
 
 
 def hidden_name(path: Path, ending: str = "") -> Path:
-    """Return an unused hidden name in the folder of a path, with an ending such as ``.tif``.
+    """Return an unused hidden name in the folder of a path, however long the path's name is.
 
-    It is no longer than file systems allow, however long the path's own name is.
+    Parameters
+    ----------
+    path : Path
+    ending : str, optional
+        Of the name, such as ``.tif``.
     """
     stem = path.name.removesuffix(ending)
     tail = f"-{_signature()}-{secrets.token_hex(4)}{ending}"
@@ -56,7 +60,13 @@ def hidden_name(path: Path, ending: str = "") -> Path:
 
 @contextmanager
 def temporary_folder(kind: Literal["shadowinv", "film-pack"]) -> Iterator[Path]:
-    """Make a folder in the system's temporary folder, which is removed with the block."""
+    """Make a folder in the system's temporary folder, which is removed with the block.
+
+    Parameters
+    ----------
+    kind : {"shadowinv", "film-pack"}
+        Begins its name.
+    """
     sweep(Path(tempfile.gettempdir()))
     with tempfile.TemporaryDirectory(prefix=f"{kind}-{_signature()}-") as name:
         yield Path(name)

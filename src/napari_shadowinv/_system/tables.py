@@ -48,8 +48,13 @@ class Table(NamedTuple):
 def read_table(path: Path) -> Table:
     """Read the column names and rows of a table.
 
-    A `FileFormatError` if the file cannot be read as a table, an `InputError` if it has no rows, or
-    one with more cells than there are columns; the message names the line.
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read as a table.
+    InputError
+        If it has no rows, or one with more cells than there are columns; the message names the
+        line.
     """
     records = _records(path, small_text(path, _EXPECTED, "utf-8-sig"))
     _, names = next(records, (0, []))
@@ -77,11 +82,24 @@ def read_rows(
 ) -> dict[int, Model]:
     """Return the rows of a table as models, by their lines in the file.
 
-    The names of the columns are those of the model's fields, unless `columns` are given. Empty
-    cells stand for the `shared` values of all rows, or else for the model's defaults; file names
-    are relative to the folder of the table. A `FileFormatError` if the file cannot be read as a
-    table, an `InputError` if a column is unknown, missing or given twice, or a row is invalid; the
-    message names the line.
+    Parameters
+    ----------
+    path : Path
+    model : type
+        Model of a row. Empty cells stand for its defaults, file names are relative to the folder
+        of the table.
+    columns : collection of str, optional
+        Names of the columns. Default: the model's fields.
+    shared : mapping, optional
+        Values of all rows where cells are empty.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read as a table.
+    InputError
+        If a column is unknown, missing or given twice, or a row is invalid; the message names the
+        line.
     """
     table = read_table(path)
     known = {name.lower(): name for name in columns or model.model_fields}

@@ -47,8 +47,17 @@ _SMOOTHINGS = tuple(10.0 ** (power / 2) for power in range(-4, 11))
 def deflection_matrix(count: int, offset: float = FIRST_OFFSET) -> FloatArray:
     """Return the deflections at y = offset + 0, 1, … by a profile at r = 0, 1, … px.
 
-    Times f in px the matrix, shape (count, count), gives δ in px, positive away from the axis. The
-    offset is from 0 to 1 px. An `InputError` refuses fewer than 4 radii.
+    Parameters
+    ----------
+    count : int
+        Number of radii, R in px; at least 4, else an `InputError`.
+    offset : float
+        From 0 to 1 px.
+
+    Returns
+    -------
+    ndarray, shape (count, count)
+        Times f in px gives δ in px, positive away from the axis.
 
     Examples
     --------
@@ -70,7 +79,15 @@ def deflection_matrix(count: int, offset: float = FIRST_OFFSET) -> FloatArray:
 def projection_matrix(count: int, offset: float = 0.0) -> FloatArray:
     """Return the line integrals at y = offset + 0, 1, … of a profile at r = 0, 1, … px.
 
-    Times f the matrix gives F, in units of f times px; see `deflection_matrix`.
+    Parameters
+    ----------
+    count, offset
+        As of `deflection_matrix`.
+
+    Returns
+    -------
+    ndarray, shape (count, count)
+        Times f gives F, in units of f times px.
     """
     y, radii, integral = _grid(count, offset)
     root = np.sqrt(np.maximum(radii**2 - y**2, 0.0))
@@ -84,11 +101,21 @@ def projection_matrix(count: int, offset: float = 0.0) -> FloatArray:
 
 
 def inverse_matrix(matrix: FloatArray, smoothing: float) -> FloatArray:
-    """Return the linear operator from deflections or projections to the profile, shape (n, m).
+    """Return the linear operator from deflections or projections to the profile.
 
-    It minimises |K f - δ|² + s |f''|², with the matrix K (m, n) of the object's deflections or
-    projections, the smoothing s of 0 or more, and second differences of f, which is even at the
-    axis and zero beyond R.
+    It minimises |K f - δ|² + s |f''|² with second differences of f, which is even at the axis and
+    zero beyond R.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (m, n)
+        The operator K, such as `deflection_matrix`.
+    smoothing : float
+        Weight s of the penalty, at least 0.
+
+    Returns
+    -------
+    ndarray, shape (n, m)
     """
     count = matrix.shape[1]
     bends = -2.0 * np.eye(count) + np.eye(count, k=1) + np.eye(count, k=-1)
@@ -100,10 +127,21 @@ def inverse_matrix(matrix: FloatArray, smoothing: float) -> FloatArray:
 def choose_smoothing(matrix: FloatArray, side: FloatArray, opposite_side: FloatArray) -> float:
     """Return the largest smoothing whose error is small against that by noise.
 
-    The sides of an axisymmetric object, shape (slices, m) and both positive away from the axis,
-    differ by their noise, and half of their difference is the error of their mean. The profile is
-    smoothed as far as one more smoothing changes it by a quarter of that (r.m.s.), so that bands by
-    noise hold. An `InputError` refuses deflections that are not finite.
+    The sides of an axisymmetric object differ by their noise, and half of their difference is the
+    error of their mean. The profile is smoothed as far as one more smoothing changes it by a
+    quarter of that (r.m.s.), so that bands by noise hold.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (m, n)
+        Such as `deflection_matrix`.
+    side, opposite_side : ndarray, shape (slices, m)
+        Deflections of the two sides, both positive away from the axis.
+
+    Raises
+    ------
+    InputError
+        If a deflection is not finite.
     """
     if not np.isfinite([side, opposite_side]).all():
         raise InputError("the deflections are not finite, expected numbers everywhere")

@@ -69,12 +69,25 @@ class Axis:
 def sample_sides(
     component: FloatArray, axis: Axis, radius: int, *, is_odd: bool = True, every: int = 1
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a component (H, W) of the field right and left of an axis, (places, radius) each.
+    """Return a component of the field on both sides of an axis.
 
-    Places are `every` px apart along the axis. An odd component changes its sign across the axis of
-    a symmetric object, so the left side is turned round: the sides of a symmetric field are equal.
-    Distances from the axis are those of `abel.deflection_matrix`, or of `projection_matrix` if it
-    is not odd.
+    Parameters
+    ----------
+    component : ndarray, shape (H, W)
+    axis : Axis
+    radius : int
+        Largest distance from the axis in px.
+    is_odd : bool
+        Whether the component changes its sign across the axis of a symmetric object; the second
+        side is then turned round.
+    every : int
+        Distance of places along the axis in px.
+
+    Returns
+    -------
+    right, left : ndarray, shape (places, radius)
+        At the distances of `abel.deflection_matrix`, or of `projection_matrix` if it is not odd.
+        They are equal if the field is symmetric.
     """
     first = FIRST_OFFSET if is_odd else 0.0
     offsets, places = first + np.arange(float(radius)), axis.places()[::every]
@@ -103,9 +116,21 @@ def find_axis(
 ) -> Axis:
     """Return the axis about which the deflection across it is most nearly odd.
 
-    It starts from an axis to refine, or the best of all positions along the rough direction,
-    "vertical" or "horizontal". It is so long that all of both its sides are inside the image, or as
-    long as the start.
+    Parameters
+    ----------
+    displacement : ndarray, shape (2, H, W)
+        In px.
+    direction : {"vertical", "horizontal"}
+        Rough direction of the axis, unless a start is stated.
+    start : Axis, optional
+        To refine. Default: the best of all positions along that direction.
+    find_tilt : bool
+        Whether the axis may be inclined.
+
+    Returns
+    -------
+    Axis
+        So long that all of its both sides are inside the image; of a start, as long as that.
     """
     shape = displacement.shape[1:]
     is_free = start is None

@@ -68,10 +68,16 @@ def smooth(plane: FloatArray, width: float, order: int = ORDER) -> FloatArray:
 
 
 def chosen_width(plane: FloatArray, noise: FloatArray, spacing: float) -> float:
-    """Return the width in px that minimises the expected error of a smoothed noisy plane.
+    """Return the width in px that minimises the expected error of a smoothed plane.
 
-    The error follows from samples of the noise, (k, H, W). Structures of single cells, by the
-    spacing of the sites in px, are smoothed away in any case.
+    Parameters
+    ----------
+    plane : ndarray, shape (H, W)
+        With its noise.
+    noise : ndarray, shape (k, H, W)
+        Samples of the noise.
+    spacing : float
+        Spacing of the sites in px; structures of single cells are smoothed away in any case.
     """
     square = dctn(plane, norm="ortho") ** 2
     by_noise = np.mean([dctn(sample, norm="ortho") ** 2 for sample in noise], axis=0)

@@ -44,8 +44,17 @@ _SMOOTHED_SHARE = 0.1  # of k, over which the response is averaged
 def window_weights(mask: BoolArray, taper: float) -> FloatArray:
     """Return weights that rise from 0 at the border and at masked pixels to 1.
 
-    They rise as a squared sine, at each end over the share `taper` of the shorter side. An
-    `InputError` refuses an image of less than 32 px, and a mask of used pixels that leaves nothing.
+    Parameters
+    ----------
+    mask : ndarray of bool, shape (H, W)
+        Pixels to be used.
+    taper : float
+        Share of the shorter side, at each end, over which the weights rise as a squared sine.
+
+    Raises
+    ------
+    InputError
+        If the image is smaller than 32 px, or the masked pixels leave nothing.
     """
     side = min(mask.shape)
     if side < _MIN_SIDE_PX:
@@ -88,9 +97,19 @@ class RingSpectrum:
 
 
 def ring_spectrum(potential: FloatArray, weights: FloatArray) -> RingSpectrum:
-    """Return the spectrum of the displacement d = -∇φ in a window with `window_weights`.
+    """Return the spectrum of the displacement d = -∇φ in a window.
 
-    It reaches from one wavelength in the shorter side up to 0.9 of the Nyquist frequency.
+    Parameters
+    ----------
+    potential : ndarray, shape (H, W)
+        In px².
+    weights : ndarray, shape (H, W)
+        Of `window_weights`.
+
+    Returns
+    -------
+    RingSpectrum
+        From one wavelength in the shorter side up to 0.9 of the Nyquist frequency.
     """
     plane = np.pad(potential, 1, mode="edge")
     curvature = plane[2:, 1:-1] + plane[:-2, 1:-1] + plane[1:-1, 2:] + plane[1:-1, :-2]
@@ -155,8 +174,17 @@ def random_displacement(
 ) -> tuple[FloatArray, FloatArray]:
     """Return potential and displacement of a Gaussian random field, periodic in its shape.
 
-    The density is the ring-averaged spectrum of the displacement at wavenumbers in rad/px, in px²
-    for each (rad/px)².
+    Parameters
+    ----------
+    density : callable
+        Ring-averaged spectrum of the displacement at wavenumbers in rad/px, px² for each (rad/px)².
+    shape : tuple of int
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    potential : ndarray, shape (H, W)
+    displacement : ndarray, shape (2, H, W)
     """
     k_y, k_x = (2 * np.pi * np.fft.fftfreq(count) for count in shape)
     k = np.hypot(k_y[:, None], k_x)
@@ -200,9 +228,24 @@ def measure_response(
     measured spectrum is too low where power is lost, it is corrected by the response of a first
     field, and again by that of a second, before the response is measured.
 
-    The measured spectrum, less its noise, belongs to a window with the weights. The response itself
-    is a mean over one or more `phantoms`. The reporter is called before each random field, and
-    raises an `InversionCancelled` if it is asked to stop.
+    Parameters
+    ----------
+    spectrum : RingSpectrum
+        As measured, less its noise.
+    weights : ndarray, shape (H, W)
+        Of the window.
+    n_sites : int
+        Number of sites of the inversion.
+    phantoms : int
+        Number of random fields for the response itself, at least 1.
+    seed : int
+    report : Reporter
+        Called before each random field.
+
+    Raises
+    ------
+    InversionCancelled
+        If the reporter is asked to stop.
     """
     ratio = np.ones(len(spectrum.k))
     spread, contrast = np.zeros(len(spectrum.k)), 0.0

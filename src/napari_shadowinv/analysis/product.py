@@ -267,7 +267,14 @@ def corrected(quantity: Quantity) -> FloatArray:
 def quantity_text(quantity: Quantity, unit: str, frame: FieldFrame) -> str:
     """Return a number, corrected for a bias by noise, with its bands in words; "none" for NaN.
 
-    Its values are in `unit`; a field is shown in the unit of the frame.
+    Parameters
+    ----------
+    quantity : Quantity
+        Of a single number.
+    unit : str
+        Of its values.
+    frame : FieldFrame
+        Has the unit that a field is shown in.
     """
     value = float(corrected(quantity))
     if np.isnan(value):

@@ -105,8 +105,15 @@ class FitData:
     def noise_of(self, weights: FloatArray) -> FloatArray:
         """Return the standard deviation of each image's noise, or of each pixel's if it varies.
 
-        In the unit of the images, (L,) or (L, H, W), for the weights of a scene's pixels; NaN where
-        masked.
+        Parameters
+        ----------
+        weights : ndarray, shape (L, H', W')
+            Of the pixels of a scene, 0 where masked.
+
+        Returns
+        -------
+        ndarray, shape (L,) or (L, H, W)
+            In the unit of the images; NaN where masked.
         """
         height, width = self.size
         weights = weights[:, :height, :width]

@@ -341,7 +341,13 @@ class Posterior:
         return product(slope.flat(), self._change(slope, _ROUGHLY).flat())
 
     def moved_by_beams(self, variations: Sequence[FloatArray]) -> list[Unknowns]:
-        """Return the changes of the unknowns by variations of the beams, as shares of them."""
+        """Return the changes of the unknowns if the beams differ from their sources.
+
+        Parameters
+        ----------
+        variations : sequence of ndarray, shape (L, …)
+            Differences as shares of the beams, of the shape of the scene's beams.
+        """
         slopes = [
             self._linear.pull(self.scene.changed_by_beams(self._unknowns, self._counts, each))
             for each in variations
@@ -353,10 +359,23 @@ class Posterior:
     ) -> list[Unknowns]:
         """Return random differences of a common beam that the images leave possible.
 
-        Each sample, for the beam as it is, makes one of them: the beam's difference, that of
-        `Scene.with_free_beam`, with the change of the other unknowns that it causes. Before the
-        images are looked at, an r.m.s. difference of `variation` is possible.
+        Parameters
+        ----------
+        variation : float
+            R.m.s. difference that is possible before the images are looked at.
+        samples : sequence of Sample
+            For the beam as it is; each makes one of the differences.
+        rng : numpy.random.Generator
+            For the beam's prior.
 
+        Returns
+        -------
+        list of Unknowns
+            The beam's difference, `Scene.with_free_beam`'s, with the change of the other unknowns
+            that it causes.
+
+        Notes
+        -----
         With J and B the derivatives of the residuals by the unknowns and by the beam's cosines, H
         and P the Hessian and the beam's prior, a sample x = H⁻¹ (Jᵀη + ξ) becomes one of both,
         (x + δ, θ), by
@@ -504,9 +523,22 @@ class BeamError:
 def draw_variations(
     scene: Scene, length: float, count: int, rng: np.random.Generator
 ) -> FloatArray:
-    """Return random smooth fields with a mean of 0 and an r.m.s. of 1 over the image, (count, …).
+    """Return random smooth fields with a mean of 0 and an r.m.s. of 1 over the image.
 
-    They vary over a `length` in px of the scene, and like its beams they reach beyond the image.
+    Parameters
+    ----------
+    scene : Scene
+        Its beams, of the shape (L, …), reach beyond the image.
+    length : float
+        Distance over which the fields vary, px of the scene.
+    count : int
+        Number of fields.
+    rng : numpy.random.Generator
+        For the waves.
+
+    Returns
+    -------
+    ndarray, shape (count, …)
     """
     height, width = scene.beams.shape[1:]
     inside = np.s_[scene.pad : height - scene.pad, scene.pad : width - scene.pad]
@@ -631,8 +663,25 @@ def sampled_potentials(
 ) -> FloatArray:
     """Return random changes of each field's potential, px², that its total error allows.
 
-    Shape (M, len(samples), H, W); their mean over the border is 0. Those by a beam that is not
-    fitted are random combinations, by a seed, of the changes of `by_beam`.
+    Those by a beam that is not fitted are random combinations of the changes of `by_beam`.
+
+    Parameters
+    ----------
+    scene : Scene
+        In recorded pixels.
+    samples : sequence of Sample
+        The posterior's.
+    by_beam : BeamShifts or None
+        Changes by the beam.
+    size : tuple of int
+        Height H and width W of the images.
+    seed : int
+        Of the combinations.
+
+    Returns
+    -------
+    ndarray of float32, shape (M, len(samples), H, W)
+        Their mean over the border is 0.
     """
     changes = [potentials_of(scene, sample.change, size) for sample in samples]
     shifts = () if by_beam is None else by_beam.changes

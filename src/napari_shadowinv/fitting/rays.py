@@ -118,7 +118,17 @@ class RayModel:
         return np.pad(image, ((self.pad, rows), (self.pad, columns)), mode="edge")
 
     def ray_counts(self, potential: FloatArray) -> IntArray:
-        """Return how many rays along y and x each cell needs to land so densely, (2, *cells)."""
+        """Return how many rays along y and x each cell needs to land so densely.
+
+        Parameters
+        ----------
+        potential : ndarray
+            The coefficients.
+
+        Returns
+        -------
+        ndarray of int64, shape (2, *cells)
+        """
         middle = potential[1:-1, 1:-1]
         yy = (potential[2:, 1:-1] - 2 * middle + potential[:-2, 1:-1]) / KNOT**2
         xx = (potential[1:-1, 2:] - 2 * middle + potential[1:-1, :-2]) / KNOT**2

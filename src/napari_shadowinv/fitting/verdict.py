@@ -32,11 +32,20 @@ _STRONGEST = 0.99  # quantile of the contrast, over the image
 
 
 def hidden_contrast(contrast: FloatArray, used: BoolArray) -> float:
-    """Return the contrast around the holes of a mask, as a share of the strongest; 0 without holes.
+    """Return the contrast around the holes of a mask, as a share of the strongest.
 
-    The contrast is model images over their beams, minus 1; the share is the largest of all images.
-    A hole is where no image has `used` pixels; smaller ones than 12 px are bridged by their
-    surroundings.
+    Parameters
+    ----------
+    contrast : ndarray, shape (L, H, W)
+        Model images over their beams, minus 1.
+    used : ndarray of bool, shape (L, H, W)
+        The pixels that were fitted. A hole is where no image has any; smaller ones than 12 px are
+        bridged by their surroundings.
+
+    Returns
+    -------
+    float
+        The largest of all images; 0 without holes.
     """
     used_anywhere = used.any(axis=0)
     # Holes begin where pixels are missing inside the image, not at its edge.

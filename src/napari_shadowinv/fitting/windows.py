@@ -192,8 +192,14 @@ def explanation_of(
 ) -> str:
     """Say which images one static field does not explain, in a sentence.
 
-    Those are the images whose prediction has a χ² above its limit. Energies name them if the setups
-    are of one kind, else their names, or their numbers.
+    Parameters
+    ----------
+    chi2, limit : ndarray, shape (L,)
+        χ² of the prediction of each image, and its upper limit.
+    setups : sequence of Setup or None
+        Their energies name the images.
+    names : sequence of str or None
+        Names of the images in messages. Default: their numbers.
     """
     wrong = np.flatnonzero(chi2 > limit)
     if not len(wrong):

@@ -50,10 +50,19 @@ def takes_prefixes(unit: str) -> bool:
 
 
 def number_in_unit(text: str, unit: str) -> float:
-    """Read a number with a unit, such as ``"1.3 mm"``, exact to the last digit.
+    """Read a number with a unit, exact to the last digit.
 
-    The unit of the answer `takes_prefixes`, such as "m" or "MeV". A `ValueError` is raised if the
-    text is no number, or its unit does not measure the same.
+    Parameters
+    ----------
+    text : str
+        Such as ``"1.3 mm"``.
+    unit : str
+        Unit of the answer that `takes_prefixes`, such as "m" or "MeV".
+
+    Raises
+    ------
+    ValueError
+        If the text is no number, or its unit does not measure the same.
     """
     base = next(base for base in _BASES if unit.endswith(base))
     match = _QUANTITY.fullmatch(text.strip())

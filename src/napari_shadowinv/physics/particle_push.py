@@ -193,9 +193,16 @@ def integrate_rays(
 ) -> None:
     """Integrate the field's components across the beam over z along straight rays.
 
-    Exact for a trilinear field: the ray is cut where it passes from cell to cell. A ray is a row of
-    a point in m and a direction, its integrals are ∫B_y dz and ∫B_x dz in T m, then ∫E_y dz and
-    ∫E_x dz in V; for the other arguments see `push_particles`.
+    Exact for a trilinear field: the ray is cut where it passes from cell to cell.
+
+    Parameters
+    ----------
+    first, last, field, origin, spacing
+        As for `push_particles`.
+    rays : ndarray, shape (N, 6)
+        A point of each ray in m and its direction.
+    integrals : ndarray, shape (N, 2) or (N, 4)
+        ∫B_y dz and ∫B_x dz in T m; then ∫E_y dz and ∫E_x dz in V.
     """
     rim_x, rim_y, rim_z = field.shape[1] - 1.0, field.shape[0] - 1.0, field.shape[2] - 1.0
     for p in range(first, last):

@@ -132,8 +132,18 @@ def find_structures(
     1,000, 5.5 σ for a million), and covers at least nine resolution elements. The level holds
     whether or not the errors of pixels are correlated.
 
-    Only the pixels of the mask count, by default all. An element of resolution has an area in
-    pixels, such as pixels for each site.
+    Parameters
+    ----------
+    significant : ndarray, shape (H, W)
+        Map of `significance`.
+    mask : ndarray of bool, shape (H, W), optional
+        Pixels that count. Default: all.
+    element : float, optional
+        Area of a resolution element in pixels, such as pixels for each site.
+
+    Returns
+    -------
+    Structures
     """
     from scipy.ndimage import label
 

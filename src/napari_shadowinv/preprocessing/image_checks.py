@@ -466,9 +466,17 @@ _PATTERN_DEVIATIONS = 2.0
 def dark_level(planes: Sequence[CheckedImage]) -> float:
     """Estimate an offset that was left in an image, as a share of its mean, from its noise.
 
-    After the image comes the recorded beam, if any, in the same unit; it has an offset of its own,
-    or shares the image's. The offset is 0 unless the noise cannot be explained without it, by any
-    sum of a constant variance, one in proportion to the signal, and one to its square.
+    Parameters
+    ----------
+    planes : sequence of CheckedImage
+        The image, and the recorded beam, if any, in the same unit. It has an offset of its own, or
+        shares the image's.
+
+    Returns
+    -------
+    float
+        0 unless the noise cannot be explained without an offset, by any sum of a constant
+        variance, one in proportion to the signal, and one to its square.
     """
     is_small = min(planes[0].image.shape) < _WINDOW_PX
     if is_small or any(plane.brightness.size < _MIN_PIXELS for plane in planes):

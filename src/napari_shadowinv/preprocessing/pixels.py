@@ -277,10 +277,21 @@ def fit_polynomial(
 
 
 def nonnegative_fit(columns: FloatArray, values: FloatArray) -> tuple[FloatArray, float]:
-    """Fit values (N,) by columns (N, K) whose coefficients are not negative, by least squares.
+    """Fit values by columns whose coefficients are not negative, by least squares.
 
     Every subset of the columns is tried, which suits the two or three terms of a detector's noise.
-    Returns the coefficients and the root of the sum of squared residuals.
+
+    Parameters
+    ----------
+    columns : ndarray of float64, shape (N, K)
+    values : ndarray of float64, shape (N,)
+
+    Returns
+    -------
+    coefficients : ndarray of float64, shape (K,)
+        One in the values' unit over the column's.
+    distance : float
+        Root of the sum of squared residuals, in the values' unit.
     """
     norms = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(np.float64).tiny)
     scaled = columns / norms
