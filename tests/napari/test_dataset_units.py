@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 import pint
 import pytest
-import xarray as xr
 from napari.components import ViewerModel
 
 from napari import __version__ as napari_version
 from napari_shadowinv import Recipe, invert_stack, read, write
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.inversion.variables import update_labels
 from napari_shadowinv.physics.setup import OpticalSetup
 
 PIXEL_M = 2e-6
@@ -26,31 +24,14 @@ reads_coordinates = pytest.mark.skipif(
 )
 
 
-def as_written_before(dataset: xr.Dataset) -> xr.Dataset:
-    """A result as version 0.1.0 labelled it: indices in px, metres in y_si and x_si."""
-    earlier = {"pixel": "px", "pixel**2": "px²", "1/pixel**2": "flux/px²"}
-    for name in ("y", "x"):
-        index = np.arange(dataset.sizes[name], dtype=float)
-        places = (name, index * PIXEL_M, {"units": "m", "long_name": name})
-        dataset = dataset.assign_coords(
-            {name: (name, index, {"units": "px", "long_name": name}), f"{name}_si": places}
-        )
-    for variable in dataset.variables.values():
-        units = variable.attrs.get("units", "1")
-        variable.attrs["units"] = earlier.get(units, units)
-    return dataset
-
-
 @reads_coordinates
-@pytest.mark.parametrize("origin", ["memory", "file", "earlier file", "stack"])
+@pytest.mark.parametrize("origin", ["memory", "file", "stack"])
 def test_field_in_metres_lies_over_a_layer_of_its_pixels(
     origin: str, inversion: Inversion, tmp_path: Path
 ) -> None:
     dataset = inversion.to_dataset(SETUP)
     path = tmp_path / "shot.shadowinv"
-    if origin == "earlier file":
-        dataset = as_written_before(dataset)
-    if "file" in origin:
+    if origin == "file":
         write(path, dataset)
         dataset = read(path)
     if origin == "stack":
@@ -88,12 +69,3 @@ def test_units_of_a_result_are_parsed_by_pint_as_meant(inversion: Inversion) -> 
     allowed = {"[printing_unit]", "[length]"}
     for name, unit in units.items():
         assert set(unit.dimensionality) <= allowed, name
-
-
-def test_labels_of_an_earlier_file_become_those_of_today(inversion: Inversion) -> None:
-    today = inversion.to_dataset(SETUP)
-    updated = update_labels(as_written_before(inversion.to_dataset(SETUP)))
-    for name, variable in today.variables.items():
-        assert updated[name].attrs["units"] == variable.attrs["units"], name
-    assert set(updated.coords) == set(today.coords)
-    np.testing.assert_array_equal(updated.x, today.x)

@@ -4,7 +4,6 @@
 - the names, dimensions and units alone: `variable_labels`
 - the setup that a dataset was made with: `setup_from_dataset`
 - variables of a fit of one field: `fit_labels`
-- the labels of files of earlier versions: `update_labels`
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from napari_shadowinv.physics.units import (
     PIXEL_AREA,
     label,
     place_coordinates,
-    place_label,
 )
 
 if TYPE_CHECKING:
@@ -34,7 +32,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 _FLUX = "1"
-_EARLIER_UNITS = {"px": PIXEL, "px²": PIXEL_AREA, "flux": _FLUX, "flux/px²": FLUX_DENSITY}
 
 _VECTORS = ("component", "y", "x")
 _SITE_VECTORS = ("site", "component")
@@ -66,7 +63,7 @@ DISPLACEMENT_STD = (
 UNCERTAINTY = (_VECTORS, PIXEL, "Standard deviation of the displacement")
 """Variable of a fit in addition to potential and displacement."""
 
-BEAM_UNCERTAINTY = (_VECTORS, "px", "Standard deviation of the displacement by the beam")
+BEAM_UNCERTAINTY = (_VECTORS, PIXEL, "Standard deviation of the displacement by the beam")
 """Another variable of a fit."""
 
 POTENTIAL_SAMPLES = (
@@ -159,23 +156,6 @@ def setup_from_dataset(dataset: xarray.Dataset) -> Setup | None:
 
 SETUPS_LABEL = {"units": "1", "long_name": "Setup of the shot (JSON)"}
 """Attributes of the variable ``setup`` of a stack whose shots have setups of their own."""
-
-
-def update_labels(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Return the dataset of a file with today's units and coordinates.
-
-    Earlier versions wrote pixel indices in ``px`` as y and x, and the coordinates in metres as y_si
-    and x_si.
-    """
-    for variable in dataset.variables.values():
-        if variable.attrs.get("units") in _EARLIER_UNITS:
-            variable.attrs["units"] = _EARLIER_UNITS[variable.attrs["units"]]
-    for name in PLANE:
-        places = dataset.coords.get(f"{name}_si")
-        if places is not None and places.dims == (name,):
-            metres = {name: (name, places.values, place_label(name))}
-            dataset = dataset.drop_vars(f"{name}_si").assign_coords(metres)
-    return dataset
 
 
 def _vectors_first(setup: Setup) -> list[SIField]:

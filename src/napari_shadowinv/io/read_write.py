@@ -23,7 +23,6 @@ from napari_shadowinv._system.safety import as_file_errors, small_text
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
-from napari_shadowinv.inversion.variables import update_labels
 from napari_shadowinv.io.files import check_output, replacing, sha256
 from napari_shadowinv.io.formats import (
     CPSA,
@@ -305,7 +304,7 @@ def read_result(path: Path) -> xarray.Dataset:
     check_arrays(path)
     # Nothing in it is a time, whatever its units look like.
     with opened_netcdf(path) as store:
-        return update_labels(xr.load_dataset(store, decode_times=False))
+        return xr.load_dataset(store, decode_times=False)
 
 
 def write_sites(path: Path, dataset: xarray.Dataset) -> None:

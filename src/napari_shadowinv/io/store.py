@@ -27,7 +27,6 @@ from napari_shadowinv.inversion.variables import (
     SETUPS_LABEL,
     fit_labels,
     setup_from_dataset,
-    update_labels,
     variable_labels,
 )
 from napari_shadowinv.io.files import check_folder_of
@@ -308,7 +307,7 @@ def read_stack(path: Path, *, numbers: Sequence[int] | None = None) -> xarray.Da
         If it is no store, or is damaged.
     """
     store = StackStore(path, numbers=numbers)
-    dataset = update_labels(open_dataset(path))
+    dataset = open_dataset(path)
     if dataset.sizes["shot"] > len(store.names):  # grown since
         dataset = dataset.isel(shot=slice(len(store.names)))
     check_files(store)
