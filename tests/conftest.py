@@ -116,6 +116,9 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
         "levels": ((4, 10, 0.1), (17, 21, 1 / 3000)),
         "seconds": {"prepare": 0.1, "sites": 0.2, "transport": 1.0, "read-out": 0.1},
         "warnings": (Caution("negative-pixels", "1 negative pixel was set to zero"),),
+        "flux_scale": 1.0,
+        "flux_left": {},
+        "flux_entered": {},
         "sites_reason": "as requested",
         "errors": Errors(
             peak=float(np.hypot(*blob.displacement).max()),
@@ -124,7 +127,13 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
             noise=ErrorEstimate(0.1, 0.05),
             effects={"solver": ErrorEstimate(1e-5, 2e-5)},
             beam=ErrorEstimate(2.0, 1.0),
+            beam_sensitivity=ErrorEstimate(0.4, 0.2),
+            sensitivities={"blur, 1 px": ErrorEstimate(0.02, 0.03)},
+            sizes={},
             beam_variation=0.05,
+            beam_scale=0.25,
+            beam_basis="assumed",
+            noise_correlation=0.0,
         ),
         "image_residual": image_residual(image, reprojection, np.ones(shape, dtype=bool)),
     }

@@ -6,8 +6,6 @@ so that an inversion takes a few tenths of a second.
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,7 +17,7 @@ from scipy import ndimage
 from helpers.public_data import load_donut, public_file, public_names
 from helpers.toroid import noisy_toroid_image, toroid_image
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.inversion import Inversion, Report, invert, solution_checks
+from napari_shadowinv.inversion import invert, solution_checks
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.solution_checks import (
@@ -140,20 +138,6 @@ def test_the_report_has_the_residual_of_the_used_pixels():
         axes.get_title(loc) for axes in report_figure(inversion).axes for loc in ("left", "center")
     ]
     assert f"Residual {percent}" in titles
-
-
-def test_a_file_that_does_not_tell_the_residual_is_still_read(inversion: Inversion):
-    dataset = inversion.to_dataset()
-    report = json.loads(dataset.attrs["report"])
-    del report["image_residual"], dataset.attrs["image_residual"]
-    old = Inversion.from_dataset(dataset.assign_attrs(report=json.dumps(report)))
-    assert old.report == inversion.report
-
-
-def test_a_report_of_an_older_version_has_no_residual(inversion: Inversion):
-    facts = dataclasses.asdict(inversion.report)
-    del facts["image_residual"]
-    assert np.isnan(Report(**facts).image_residual)
 
 
 # The picture does not fit

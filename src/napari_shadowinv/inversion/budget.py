@@ -11,10 +11,9 @@ of finer waves than the one before, their squares add.
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -36,7 +35,6 @@ from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.inversion.readout import LinearResponse
 from napari_shadowinv.options import (
-    ASSUMED_BEAM,
     BeamComponents,
     BeamPrior,
     Instrument,
@@ -65,19 +63,12 @@ _NEAR = 2.5  # site spacings
 _LEAST_NOISE = 0.1  # of the mean square, where correlation takes waves away
 
 _TESTED_VARIATION = 0.01  # of a beam, r.m.s.
-_BEAM_TEXTS = {
-    "assumed": "beam assumed, {:.2g} %",
-    "stated": "beam stated, {:.2g} %",
-    "seen": "image and source differ by {:.2g} %",
-    "references": "beam by its references, {:.2g} %",
-    "outside": "beam measured outside the object, {:.2g} %",
-}
-_BASES = {
-    "assumed": "assumed",
-    "stated": "stated",
-    "seen": "seen outside the object",
-    "references": "by its references",
-    "outside": "measured outside the object",
+_BEAM_BASES = {  # name of the part, and its basis in a text
+    "assumed": ("beam assumed, {:.2g} %", "assumed"),
+    "stated": ("beam stated, {:.2g} %", "stated"),
+    "seen": ("image and source differ by {:.2g} %", "seen outside the object"),
+    "references": ("beam by its references, {:.2g} %", "by its references"),
+    "outside": ("beam measured outside the object, {:.2g} %", "measured outside the object"),
 }
 
 _REDUCED_SHARE = 0.25  # of the wanted mean square, at least for parts that are to be reduced
@@ -89,6 +80,10 @@ class ErrorEstimate(NamedTuple):
 
     rms: float  # length of the error, root mean square over the image
     at_peak: float  # of the largest displacement
+
+    def times(self, factor: float) -> ErrorEstimate:
+        """Return the error in another unit, or by a larger cause."""
+        return ErrorEstimate(factor * self.rms, factor * self.at_peak)
 
 
 @dataclass(frozen=True)
@@ -112,8 +107,8 @@ class Errors:
     beam : ErrorEstimate or None
         Effect of a beam that differs from the source by `beam_variation`; None if the source was
         recorded, no variation was stated, and none was seen.
-    beam_sensitivity : ErrorEstimate or None
-        Effect of a beam that differs from the source by 1 %; None in reports of older versions.
+    beam_sensitivity : ErrorEstimate
+        Effect of a beam that differs from the source by 1 %.
     sensitivities : dict of str to ErrorEstimate
         Effects of imperfections of the instrument, by their names with a size, such as
         "background, 5 %".
@@ -137,14 +132,14 @@ class Errors:
     discretisation: ErrorEstimate
     noise: ErrorEstimate
     effects: dict[str, ErrorEstimate]
-    beam: ErrorEstimate | None = None
-    beam_sensitivity: ErrorEstimate | None = None
-    sensitivities: dict[str, ErrorEstimate] = dataclasses.field(default_factory=dict)
-    sizes: dict[str, float] = dataclasses.field(default_factory=dict)
-    beam_variation: float = 0.0
-    beam_scale: float = ASSUMED_BEAM.length
-    beam_basis: str = "assumed"
-    noise_correlation: float = 0.0
+    beam: ErrorEstimate | None
+    beam_sensitivity: ErrorEstimate
+    sensitivities: dict[str, ErrorEstimate]
+    sizes: dict[str, float]
+    beam_variation: float
+    beam_scale: float
+    beam_basis: str
+    noise_correlation: float
 
     @property
     def total(self) -> ErrorEstimate:
@@ -178,7 +173,7 @@ class Errors:
 
     @property
     def _beam_name(self) -> str:
-        return _BEAM_TEXTS[self.beam_basis].format(100 * self.beam_variation)
+        return _BEAM_BASES[self.beam_basis][0].format(100 * self.beam_variation)
 
     @property
     def limited_by(self) -> str:
@@ -214,7 +209,7 @@ class Errors:
         share = _percent(self.parts[name].rms, self.rms)
         if name == self._beam_name:
             size = f"{100 * self.beam_variation:.2g} % rms over {self._beam_length}"
-            return f"beam {share} ({size}, {_BASES[self.beam_basis]})"
+            return f"beam {share} ({size}, {_BEAM_BASES[self.beam_basis][1]})"
         title, _, size = name.partition(", ")
         return f"{title} {share} ({size})" if size else f"{title} {share}"
 
@@ -295,24 +290,21 @@ class Errors:
 
     def times(self, factor: float) -> Errors:
         """Return the budget in another unit; 1 px of displacement is `factor` of it."""
-        lengths: dict[str, Any] = {
-            field.name: _scale_error(getattr(self, field.name), factor)
-            for field in dataclasses.fields(self)
-            if field.name in ("peak", "rms") or isinstance(getattr(self, field.name), ErrorEstimate)
-        }
-        for name in ("effects", "sensitivities"):
-            table = getattr(self, name)
-            lengths[name] = {cause: _scale_error(error, factor) for cause, error in table.items()}
-        return dataclasses.replace(self, **lengths)
+        lengths: dict[str, Any] = {"peak": factor * self.peak, "rms": factor * self.rms}
+        for name, value in vars(self).items():
+            if isinstance(value, ErrorEstimate):
+                lengths[name] = value.times(factor)
+            elif name in ("effects", "sensitivities"):
+                lengths[name] = {cause: error.times(factor) for cause, error in value.items()}
+        return replace(self, **lengths)
 
     def with_scale(self, cause: str, size: float, share: float) -> Errors:
         """Return the budget of a quantity whose scale has a relative error `share` by a cause.
 
         The cause, such as "energy, 5 %", is known to `size`.
         """
-        lengths = ErrorEstimate(self.rms, self.peak)
-        effects = {**self.effects, cause: _scale_error(lengths, share)}
-        return dataclasses.replace(self, effects=effects, sizes={**self.sizes, cause: size})
+        effects = {**self.effects, cause: ErrorEstimate(self.rms, self.peak).times(share)}
+        return replace(self, effects=effects, sizes={**self.sizes, cause: size})
 
     def rows(self, subject: str = "displacement") -> list[tuple[str, str]]:
         """Describe the budget of a subject in words: names and texts."""
@@ -325,24 +317,19 @@ class Errors:
         rows = [("errors", text)]
         if next_step := self.measure_next(self.share / 2):
             rows.append(("measure next", next_step))
-        if self.beam_sensitivity is not None:
-            basis = "recorded" if self.beam is None else self._beam_name.removeprefix("beam ")
-            rows.append(
-                (
-                    "beam",
-                    f"{basis}; a source that differs from it by 1 % (r.m.s.) over "
-                    f"{self._beam_length} of the image's shorter side moves the displacement by "
-                    f"{_percent(self.beam_sensitivity.rms, self.rms)} (r.m.s.), its peak by "
-                    f"{_percent(self.beam_sensitivity.at_peak, self.peak)}",
-                )
-            )
-        if self.sensitivities:
-            effects = ", ".join(
-                f"{_percent(error.rms, self.rms)} ({name})"
-                for name, error in self.sensitivities.items()
-            )
-            rows.append(("instrument", f"the displacement would move by (r.m.s.): {effects}"))
-        return rows
+        basis = "recorded" if self.beam is None else self._beam_name.removeprefix("beam ")
+        by_beam = (
+            f"{basis}; a source that differs from it by 1 % (r.m.s.) over {self._beam_length} of "
+            "the image's shorter side moves the displacement by "
+            f"{_percent(self.beam_sensitivity.rms, self.rms)} (r.m.s.), its peak by "
+            f"{_percent(self.beam_sensitivity.at_peak, self.peak)}"
+        )
+        effects = ", ".join(
+            f"{_percent(error.rms, self.rms)} ({name})"
+            for name, error in self.sensitivities.items()
+        )
+        by_instrument = f"the displacement would move by (r.m.s.): {effects}"
+        return [*rows, ("beam", by_beam), ("instrument", by_instrument)]
 
     def beam_caution(self) -> Caution | None:
         """Warn if image and source differ outside the object so that the peak is uncertain."""
@@ -358,19 +345,6 @@ class Errors:
             f"{_percent(self.beam.at_peak, self.peak)}; use a source of the same exposure, or fit "
             "the beam",
         )
-
-    @classmethod
-    def of(cls, content: Mapping[str, Any]) -> Errors:
-        """Rebuild the budget from its form in a file."""
-        values: dict[str, Any] = {
-            name: ErrorEstimate(*value) if isinstance(value, list | tuple) else value
-            for name, value in content.items()
-        }
-        tables = {
-            name: {cause: ErrorEstimate(*value) for cause, value in content.get(name, {}).items()}
-            for name in ("effects", "sensitivities")
-        }
-        return cls(**{**values, **tables})
 
 
 def discretisation_share(times: float, rate: float = _USUAL_RATE) -> float:
@@ -507,7 +481,7 @@ class Budget:
             errors[name] = estimate(part)
         if share := self.instrument.other_field:
             name = f"other field, {100 * share:.2g} %"
-            effects[name], sizes[name] = _scale_error(lengths, share), share
+            effects[name], sizes[name] = lengths.times(share), share
         for cause, flux_errors in FLUX_ERRORS.items():
             samples = flux_errors(response, solved[-1], self.options)
             if samples is not None:
@@ -515,7 +489,7 @@ class Budget:
         by_percent = estimate(
             _TESTED_VARIATION * response.to(_unit_beams(response.level, *self._beam_waves))
         )
-        beam = _scale_error(by_percent, variation / _TESTED_VARIATION) if variation else None
+        beam = by_percent.times(variation / _TESTED_VARIATION) if variation else None
         components = self._beam.components
         if components is not None and basis == components.basis:
             beam = estimate(response.to(self._beams_of(response, components)))
@@ -701,12 +675,6 @@ A function takes the response, of n cells, the solution of the finest level and 
 returns k independent samples of the error, shape (k, n), or None if the options exclude it. Each
 sample sums to about 0: the total flux of the image is scaled to that of the source.
 """
-
-
-def _scale_error(value: float | ErrorEstimate, factor: float) -> Any:
-    if isinstance(value, ErrorEstimate):
-        return ErrorEstimate(factor * value.rms, factor * value.at_peak)
-    return factor * value
 
 
 def _mean_square(moves: FloatArray) -> FloatArray:

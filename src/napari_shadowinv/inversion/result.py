@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -29,7 +29,7 @@ from napari_shadowinv.facts import (
     verdict_fact,
 )
 from napari_shadowinv.inversion.budget import Errors
-from napari_shadowinv.inversion.solution_checks import Assessment, assess_verdict, image_residual
+from napari_shadowinv.inversion.solution_checks import Assessment, assess_verdict
 from napari_shadowinv.inversion.variables import (
     DISPLACEMENT_STD,
     VARIABLES,
@@ -89,11 +89,10 @@ class Report:
     sites_reason : str
         Reason for the number of sites.
     errors : Errors or None
-        Error budget of the displacement; None if the solver did not converge, and in reports of
-        older versions.
+        Error budget of the displacement; None if the solver did not converge.
     image_residual : float
         Difference of re-projection and image, r.m.s. over the used pixels, as a share of the
-        image's mean there. NaN in reports of older versions.
+        image's mean there.
     """
 
     converged: bool
@@ -107,10 +106,10 @@ class Report:
     levels: tuple[tuple[int, int, float], ...]
     seconds: dict[str, float]
     warnings: tuple[Caution, ...]
-    flux_scale: float = 1.0
-    flux_left: dict[str, float] = field(default_factory=dict)
-    flux_entered: dict[str, float] = field(default_factory=dict)
-    image_residual: float = math.nan
+    flux_scale: float
+    flux_left: dict[str, float]
+    flux_entered: dict[str, float]
+    image_residual: float
     sites_reason: str = ""
     errors: Errors | None = None
 
@@ -469,19 +468,12 @@ class Inversion:
     def _from_parts(cls, dataset: xarray.Dataset) -> Inversion:
         arrays: dict[str, Any] = {name: numbers_of(dataset, name) for name in VARIABLES}
         content = json.loads(dataset.attrs["report"])
-        names = {field.name for field in dataclasses.fields(Report)} & content.keys()
-        report = Report(**{name: _tuples(content[name]) for name in names})
-        report = replace(report, warnings=tuple(map(Caution.from_json, report.warnings)))
-        if content.get("errors"):
-            report = replace(report, errors=Errors.of(content["errors"]))
-        if math.isnan(report.image_residual):  # a file of an older version
-            residual = image_residual(arrays["image"], arrays["reprojection"], arrays["mask"])
-            report = replace(report, image_residual=residual)
+        content["warnings"] = [Caution.from_json(caution) for caution in content["warnings"]]
         return cls(
             **arrays,
-            report=report,
+            report=TypeAdapter(Report).validate_python(content),
             options=InversionOptions.model_validate_json(dataset.attrs["options"]),
-            instrument=Instrument.model_validate_json(dataset.attrs.get("instrument", "{}")),
+            instrument=Instrument.model_validate_json(dataset.attrs["instrument"]),
             provenance=Provenance.of(dataset.attrs),
             pixel_errors=_pixel_errors(dataset, "displacement_std"),
         )
@@ -501,11 +493,6 @@ def _pixel_errors(dataset: xarray.Dataset, name: str) -> PixelErrors | None:
         raise ValueError(f"{name} has shape {std.shape}, displacement {shape}")
     causes = json.loads(dataset.attrs.get("error_causes", "[]"))
     return PixelErrors(std, tuple(map(str, causes)))
-
-
-def _tuples(value: Any) -> Any:
-    # JSON knows lists only.
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
 
 # A store does not keep the error by an assumed beam.
