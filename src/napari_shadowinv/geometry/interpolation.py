@@ -27,14 +27,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from napari_shadowinv._system.machine import LIGHT_ITEMS, available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.geometry.compiler import njit
+from napari_shadowinv.geometry.compiler import kernel, njit
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
@@ -49,16 +49,37 @@ _STRIPS_AT_ONCE = 4  # between two reports of progress
 _MIN_PIXELS_PER_THREAD = 1 << 13
 
 
+class _Mesh(NamedTuple):
+    """A triangulation, as kernels take it."""
+
+    # Short kernels do not count references: that costs as much as the geometry.
+    vertices: Indices
+    neighbors: Indices
+    points: FloatArray
+
+    @classmethod
+    def of(cls, triangulation: RegularTriangulation) -> _Mesh:
+        return cls(triangulation.vertices, triangulation.neighbors, triangulation.points)
+
+
+class _Surface(NamedTuple):
+    """Values and gradients at the sites of a mesh."""
+
+    mesh: _Mesh
+    values: FloatArray
+    gradients: FloatArray
+
+
 def _in_blocks(
-    kernel: Callable[..., None], queries: FloatArray, threads: int | None, *operands: Any
+    run: Callable[..., None], queries: FloatArray, threads: int | None, *operands: Any
 ) -> None:
     """Call a kernel on ranges of the blocks of queries."""
     blocks = -(-len(queries) // BLOCK)
     threads = available_threads(threads)
-    in_ranges(kernel, blocks, threads, queries, *operands, smallest=4, uneven=True)
+    in_ranges(run, blocks, threads, queries, *operands, smallest=4, uneven=True)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _circumcentre(
     ay: float, ax: float, by: float, bx: float, cy: float, cx: float
 ) -> tuple[float, float]:
@@ -72,7 +93,7 @@ def _circumcentre(
     return (b2 * cx - c2 * bx) / double_area, (c2 * by - b2 * cy) / double_area
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _circle_holds(points: FloatArray, corners: Indices, y: float, x: float) -> bool:
     """Return whether (y, x) lies inside the circumcircle of a counter-clockwise triangle."""
     a, b, c = corners[0], corners[1], corners[2]
@@ -84,17 +105,10 @@ def _circle_holds(points: FloatArray, corners: Indices, y: float, x: float) -> b
     return bool(signed > 0)
 
 
-@njit(nogil=True, cache=True)
-def _cavity(
-    vertices: Indices,
-    neighbors: Indices,
-    points: FloatArray,
-    start: int,
-    y: float,
-    x: float,
-    cavity: Indices,
-) -> int:
+@kernel
+def _cavity(mesh: _Mesh, start: int, y: float, x: float, cavity: Indices) -> int:
     """List the triangles whose circumcircles hold (y, x), from the one around it."""
+    vertices, neighbors, points = mesh
     cavity[0] = start
     count, done = 1, 0
     while done < count and count < cavity.shape[0]:
@@ -110,7 +124,7 @@ def _cavity(
     return count
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _index_of(items: Indices, count: int, item: int) -> int:
     for i in range(count):
         if items[i] == item:
@@ -118,22 +132,15 @@ def _index_of(items: Indices, count: int, item: int) -> int:
     return -1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _stolen_area(
-    vertices: Indices,
-    neighbors: Indices,
-    points: FloatArray,
-    cavity: Indices,
-    count: int,
-    t: int,
-    k: int,
-    y: float,
-    x: float,
+    mesh: _Mesh, cavity: Indices, count: int, t: int, k: int, y: float, x: float
 ) -> tuple[int, float]:
     """Return the end b of a rim edge of the cavity, and the area that it gives to (y, x)."""
     # The edge is the one opposite corner k of triangle t. Around b lie the centre of the new
     # triangle on this edge, those of the cavity's triangles at b, and the centre of the new
     # triangle on the next rim edge.
+    vertices, neighbors, points = mesh
     a, b = vertices[t, (k + 1) % 3], vertices[t, (k + 2) % 3]
     by, bx = points[b, 0], points[b, 1]
     first_y, first_x = _circumcentre(by, bx, y, x, points[a, 0], points[a, 1])
@@ -164,23 +171,17 @@ def _stolen_area(
 
 @njit(nogil=True, cache=True)
 def _interpolate_blocks(
-    start: int,
-    stop: int,
-    queries: FloatArray,
-    vertices: Indices,
-    neighbors: Indices,
-    points: FloatArray,
-    values: FloatArray,
-    out: FloatArray,
+    start: int, stop: int, queries: FloatArray, mesh: _Mesh, values: FloatArray, out: FloatArray
 ) -> None:
     """Interpolate blocks `start` to `stop` of the queries."""
+    vertices, neighbors, points = mesh
     n = values.shape[0]
     cavity = np.empty(_LARGEST_CAVITY, np.int32)
     for block in range(start, stop):
         t = 0
         for q in range(block * BLOCK, min((block + 1) * BLOCK, queries.shape[0])):
             y, x = queries[q]
-            t = _locate(vertices, neighbors, points, t, y, x)
+            t = _locate(mesh, t, y, x)
             met = -1
             for k in range(3):
                 corner = vertices[t, k]
@@ -189,7 +190,7 @@ def _interpolate_blocks(
             if met >= 0:
                 out[q] = values[met]
                 continue
-            count = _cavity(vertices, neighbors, points, t, y, x, cavity)
+            count = _cavity(mesh, t, y, x, cavity)
             total = 0.0
             out[q] = 0.0
             for c in range(count):
@@ -197,9 +198,7 @@ def _interpolate_blocks(
                     neighbour = neighbors[cavity[c], k]
                     if neighbour >= 0 and _index_of(cavity, count, neighbour) >= 0:
                         continue
-                    site, area = _stolen_area(
-                        vertices, neighbors, points, cavity, count, cavity[c], k, y, x
-                    )
+                    site, area = _stolen_area(mesh, cavity, count, cavity[c], k, y, x)
                     if site < n:
                         total += area
                         out[q] += area * values[site]
@@ -222,16 +221,17 @@ def natural_neighbor(
     >>> natural_neighbor(RegularTriangulation(corners), corners[:, 0], [[1.0, 2.5]])
     array([1.])
     """
-    at_sites = np.asarray(values, dtype=np.float64)
+    every_value = np.asarray(values, dtype=np.float64)
     points = np.ascontiguousarray(queries, dtype=np.float64)
-    columns = at_sites.reshape(len(at_sites), -1)
+    columns = every_value.reshape(len(every_value), -1)
     out = np.empty((len(points), columns.shape[1]))
+    mesh = _Mesh.of(triangulation)
     for column in range(columns.shape[1]):
         result = np.empty(len(points))
-        surface = (*_mesh_arrays(triangulation), np.ascontiguousarray(columns[:, column]))
-        _in_blocks(_interpolate_blocks, points, threads, *surface, result)
+        at_sites = np.ascontiguousarray(columns[:, column])
+        _in_blocks(_interpolate_blocks, points, threads, mesh, at_sites, result)
         out[:, column] = result
-    return out.reshape(len(points), *at_sites.shape[1:])
+    return out.reshape(len(points), *every_value.shape[1:])
 
 
 @njit(nogil=True, cache=True)
@@ -266,21 +266,13 @@ def _mean_slopes(
 
 
 @njit(nogil=True, cache=True)
-def _minimise_bending(
-    start: int,
-    stop: int,
-    vertices: Indices,
-    neighbors: Indices,
-    points: FloatArray,
-    values: FloatArray,
-    gradients: FloatArray,
-    surface: FloatArray,
-) -> None:
+def _minimise_bending(start: int, stop: int, surface: _Surface, fitted: FloatArray) -> None:
     """Make one Jacobi sweep towards the gradients of least bending along the edges.
 
-    For sites `start` to `stop`. Values (n, k) and gradients (n, 2, k) of k sets are written to the
-    surface (n, 3, k).
+    For sites `start` to `stop`, with k sets of values (n, k) and gradients (n, 2, k). Both are
+    written to `fitted`, (n, 3, k).
     """
+    (vertices, neighbors, points), values, gradients = surface
     n, width = values.shape
     system = np.zeros((stop - start, 3))
     for t in range(vertices.shape[0]):
@@ -303,20 +295,20 @@ def _minimise_bending(
                     rise = 3 * (values[b, s] - values[a, s])
                     slope_there = gradients[j, 0, s] * ey + gradients[j, 1, s] * ex
                     pull = stiffness * (rise - slope_there) / 2
-                    surface[i, 1, s] += pull * ey
-                    surface[i, 2, s] += pull * ex
+                    fitted[i, 1, s] += pull * ey
+                    fitted[i, 2, s] += pull * ex
     for i in range(start, stop):
         yy, yx, xx = system[i - start]
         determinant = yy * xx - yx * yx
-        fitted = determinant > 1e-12 * (yy + xx) ** 2
+        is_determined = determinant > 1e-12 * (yy + xx) ** 2
         for s in range(width):
-            surface[i, 0, s] = values[i, s]
-            ry, rx = surface[i, 1, s], surface[i, 2, s]
-            if fitted:
-                surface[i, 1, s] = (ry * xx - rx * yx) / determinant
-                surface[i, 2, s] = (rx * yy - ry * yx) / determinant
+            fitted[i, 0, s] = values[i, s]
+            ry, rx = fitted[i, 1, s], fitted[i, 2, s]
+            if is_determined:
+                fitted[i, 1, s] = (ry * xx - rx * yx) / determinant
+                fitted[i, 2, s] = (rx * yy - ry * yx) / determinant
             else:
-                surface[i, 1, s], surface[i, 2, s] = gradients[i, 0, s], gradients[i, 1, s]
+                fitted[i, 1, s], fitted[i, 2, s] = gradients[i, 0, s], gradients[i, 1, s]
 
 
 def with_gradients(triangulation: RegularTriangulation, values: FloatArray) -> FloatArray:
@@ -326,28 +318,22 @@ def with_gradients(triangulation: RegularTriangulation, values: FloatArray) -> F
     """
     gradients = np.zeros((len(values), 2, WIDTH))
     _mean_slopes(triangulation.vertices, triangulation.points, values, gradients)
-    return _bend_least(triangulation, values, gradients)
+    return _bend_least(_Surface(_Mesh.of(triangulation), values, gradients))
 
 
 @njit(nogil=True, cache=True)
 def _weigh_corners(
-    start: int,
-    stop: int,
-    queries: FloatArray,
-    vertices: Indices,
-    neighbors: Indices,
-    points: FloatArray,
-    n: int,
-    corners: Indices,
-    weights: FloatArray,
+    start: int, stop: int, queries: FloatArray, mesh: _Mesh, corners: Indices, weights: FloatArray
 ) -> None:
     """Do blocks `start` to `stop` of the queries."""
+    vertices, _, points = mesh
+    n = points.shape[0] - 4  # ghosts come last
     p, f, g, patch = np.empty((3, 2)), np.zeros(3), np.zeros((3, 2)), np.empty(_PATCH)
     for block in range(start, stop):
         t = 0
         for q in range(block * BLOCK, min((block + 1) * BLOCK, queries.shape[0])):
             y, x = queries[q]
-            t = _locate(vertices, neighbors, points, t, y, x)
+            t = _locate(mesh, t, y, x)
             a, b, c = vertices[t]
             if a < n and b < n and c < n:
                 p[0], p[1], p[2] = points[a], points[b], points[c]
@@ -380,8 +366,7 @@ def corner_weights(
     gradient along y and x. Neighbours in the list should be neighbours in the plane.
     """
     corners, weights = np.zeros((len(queries), 3), np.int32), np.zeros((len(queries), 3, 3))
-    mesh = *_mesh_arrays(triangulation), len(triangulation.sites)
-    _in_blocks(_weigh_corners, queries, threads, *mesh, corners, weights)
+    _in_blocks(_weigh_corners, queries, threads, _Mesh.of(triangulation), corners, weights)
     return corners, weights
 
 
@@ -417,35 +402,25 @@ def fit_gradients(
     threads: int | None = 1,
 ) -> FloatArray:
     """Improve gradients at the sites so that the surface bends least along the edges."""
+    mesh = _Mesh.of(triangulation)
     for _ in range(sweeps):
-        surface = _bend_least(triangulation, values[:, None], gradients[:, :, None], threads)
-        gradients = np.ascontiguousarray(surface[:, 1:, 0])
+        surface = _Surface(mesh, values[:, None], gradients[:, :, None])
+        gradients = np.ascontiguousarray(_bend_least(surface, threads)[:, 1:, 0])
     return gradients
 
 
-def _bend_least(
-    triangulation: RegularTriangulation,
-    values: FloatArray,
-    gradients: FloatArray,
-    threads: int | None = 1,
-) -> FloatArray:
-    n = len(values)
-    surface = np.zeros((n, 3, values.shape[1]))
-    operands = *_mesh_arrays(triangulation), values, gradients, surface
-    in_ranges(_minimise_bending, n, available_threads(threads), *operands, smallest=LIGHT_ITEMS)
-    return surface
+def _bend_least(surface: _Surface, threads: int | None = 1) -> FloatArray:
+    n, width = surface.values.shape
+    fitted = np.zeros((n, 3, width))
+    threads = available_threads(threads)
+    in_ranges(_minimise_bending, n, threads, surface, fitted, smallest=LIGHT_ITEMS)
+    return fitted
 
 
-def _mesh_arrays(triangulation: RegularTriangulation) -> tuple[Indices, Indices, FloatArray]:
-    """Return vertices, neighbours and points of a triangulation, as kernels take them."""
-    return triangulation.vertices, triangulation.neighbors, triangulation.points
-
-
-@njit(nogil=True, cache=True)
-def _locate(
-    vertices: Indices, neighbors: Indices, points: FloatArray, start: int, y: float, x: float
-) -> int:
+@kernel
+def _locate(mesh: _Mesh, start: int, y: float, x: float) -> int:
     """Walk to the triangle that holds (y, x)."""
+    vertices, neighbors, points = mesh
     t, came_from = start, -1
     for _ in range(2 * vertices.shape[0] + 10):
         moved = False
@@ -547,18 +522,11 @@ def _value_on_patch(patch: FloatArray, y: float, x: float) -> tuple[float, float
 
 @njit(nogil=True, cache=True)
 def _evaluate_blocks(
-    start: int,
-    stop: int,
-    queries: FloatArray,
-    vertices: Indices,
-    neighbors: Indices,
-    points: FloatArray,
-    values: FloatArray,
-    gradients: FloatArray,
-    out: FloatArray,
+    start: int, stop: int, queries: FloatArray, surface: _Surface, out: FloatArray
 ) -> None:
     """Evaluate blocks `start` to `stop` of the queries."""
-    n = values.shape[0]
+    mesh, values, _ = surface
+    vertices, n = mesh.vertices, values.shape[0]
     p, f, g = np.empty((3, 2)), np.empty(3), np.empty((3, 2))
     patches = np.empty((_CACHED_PATCHES, _PATCH))
     triangle_of_slot = np.empty(_CACHED_PATCHES, np.int64)
@@ -572,33 +540,25 @@ def _evaluate_blocks(
                 out[q], least = _value_on_patch(patch, y, x)
                 if least >= 0:
                     continue
-            t = _locate(vertices, neighbors, points, t, y, x)
+            t = _locate(mesh, t, y, x)
             slot = t % _CACHED_PATCHES
             patch = patches[slot]
             if triangle_of_slot[slot] == t:
                 out[q], _ = _value_on_patch(patch, y, x)
                 continue
             if max(vertices[t, 0], vertices[t, 1], vertices[t, 2]) < n:
-                _gather_corners(vertices, t, points, values, gradients, p, f, g)
+                _gather_corners(surface, t, p, f, g)
                 _fill_patch(p, f, g, patch)
                 triangle_of_slot[slot] = t
                 out[q], _ = _value_on_patch(patch, y, x)
             else:
-                out[q] = _value_beyond(vertices[t], points, values, gradients, y, x)
+                out[q] = _value_beyond(surface, t, y, x)
 
 
-@njit(nogil=True, cache=True, inline="always")
-def _gather_corners(
-    vertices: Indices,
-    t: int,
-    points: FloatArray,
-    values: FloatArray,
-    gradients: FloatArray,
-    p: FloatArray,
-    f: FloatArray,
-    g: FloatArray,
-) -> None:
+@kernel
+def _gather_corners(surface: _Surface, t: int, p: FloatArray, f: FloatArray, g: FloatArray) -> None:
     """Copy positions, values and gradients at the corners of a triangle."""
+    (vertices, _, points), values, gradients = surface
     for k in range(3):
         a = vertices[t, k]
         f[k] = values[a]
@@ -606,17 +566,11 @@ def _gather_corners(
             p[k, axis], g[k, axis] = points[a, axis], gradients[a, axis]
 
 
-@njit(nogil=True, cache=True)
-def _value_beyond(
-    corners: Indices,
-    points: FloatArray,
-    values: FloatArray,
-    gradients: FloatArray,
-    y: float,
-    x: float,
-) -> float:
-    """Return the value outside the sites' hull, by the gradient at the nearest corner."""
-    nearest = _nearest_corner(corners, points, values.shape[0], y, x)
+@kernel
+def _value_beyond(surface: _Surface, t: int, y: float, x: float) -> float:
+    """Return the value outside the sites' hull, by the gradient at the nearest corner of t."""
+    (vertices, _, points), values, gradients = surface
+    nearest = _nearest_corner(vertices[t], points, values.shape[0], y, x)
     if nearest < 0:
         return 0.0
     rise_y = gradients[nearest, 0] * (y - points[nearest, 0])
@@ -669,15 +623,13 @@ def _evaluate_strips(
     first: int,
     starts: Indices,
     members: Indices,
-    vertices: Indices,
-    neighbors: Indices,
-    points: FloatArray,
-    values: FloatArray,
-    gradients: FloatArray,
+    surface: _Surface,
     out: FloatArray,
 ) -> None:
     """Evaluate strips `start` to `stop`, counted from the `first`, on their triangles."""
     # A pixel on an edge takes the value of the last triangle that holds it.
+    mesh = surface.mesh
+    vertices, points = mesh.vertices, mesh.points
     height, width = out.shape
     p, f, g, patch = np.empty((3, 2)), np.empty(3), np.empty((3, 2)), np.empty(_PATCH)
     for strip in range(first + start, first + stop):
@@ -695,7 +647,7 @@ def _evaluate_strips(
             rightmost = math.floor(min(max(xa, xb, xc) + _EDGE_PX, width - 1.0))
             if top > bottom or leftmost > rightmost:
                 continue
-            _gather_corners(vertices, t, points, values, gradients, p, f, g)
+            _gather_corners(surface, t, p, f, g)
             _fill_patch(p, f, g, patch)
             for row in range(top, bottom + 1):
                 for column in range(leftmost, rightmost + 1):
@@ -706,13 +658,11 @@ def _evaluate_strips(
         for row in range(begin, end):
             for column in range(width):
                 if np.isnan(out[row, column]):
-                    t = _locate(vertices, neighbors, points, t, row, column)
-                    out[row, column] = _value_beyond(
-                        vertices[t], points, values, gradients, row, column
-                    )
+                    t = _locate(mesh, t, row, column)
+                    out[row, column] = _value_beyond(surface, t, row, column)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _nearest_corner(corners: Indices, points: FloatArray, n: int, y: float, x: float) -> int:
     """Return the corner nearest to (y, x) that is a site, or -1 between ghosts alone."""
     nearest, least = -1, np.inf
@@ -759,7 +709,7 @@ class CloughTocher:
         if not queries.flags.writeable:  # the kernel is compiled for one type
             queries = queries.copy()
         out = np.zeros(len(queries))
-        _in_blocks(_evaluate_blocks, queries, self.threads, *self._arrays, out)
+        _in_blocks(_evaluate_blocks, queries, self.threads, self._surface, out)
         return out
 
     def at_pixels(
@@ -772,12 +722,12 @@ class CloughTocher:
         """
         height, width = shape
         out = np.empty(shape)
-        vertices, _, points, values, _ = self._arrays
+        (vertices, _, points), values, _ = surface = self._surface
         starts, members = _triangles_by_strip(vertices, points, len(values), shape)
         smallest = max(1, _MIN_PIXELS_PER_THREAD // (STRIP_PX * width))
         for first in range(0, len(starts) - 1, _STRIPS_AT_ONCE):
             last = min(first + _STRIPS_AT_ONCE, len(starts) - 1)
-            operands = first, starts, members, *self._arrays, out
+            operands = first, starts, members, surface, out
             in_ranges(
                 _evaluate_strips,
                 last - first,
@@ -791,5 +741,5 @@ class CloughTocher:
         return out
 
     @property
-    def _arrays(self) -> tuple[Indices, Indices, FloatArray, FloatArray, FloatArray]:
-        return (*_mesh_arrays(self._triangulation), self._values, self._gradients)
+    def _surface(self) -> _Surface:
+        return _Surface(_Mesh.of(self._triangulation), self._values, self._gradients)
