@@ -29,6 +29,8 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.compiler import njit
 
 Triple = tuple[float, float, float]
+Segment = tuple[float, float, float, float]  # from (ya, xa) to (yb, xb)
+Integrals = tuple[float, float, float, float, float]  # as `walk_edge` returns them
 
 _MIN_PIXELS_PER_THREAD = 100_000  # pixels
 
@@ -133,17 +135,10 @@ def _moments(f: Triple, g: float, k: Triple, y0: float, y1: float) -> Triple:
 
 @njit(nogil=True, cache=True, inline="always")
 def _moments_in_pixel(
-    sums: FloatArray,
-    value: float,
-    row: int,
-    column: int,
-    y0: float,
-    x0: float,
-    y1: float,
-    x1: float,
-    with_inertia: bool,
+    sums: FloatArray, value: float, row: int, column: int, segment: Segment, with_inertia: bool
 ) -> Triple:
     """Return ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy, if wanted, over a segment inside one pixel."""
+    y0, x0, y1, x1 = segment
     x_left = float(column)
     x_left2 = x_left * x_left
     x_mid = 0.5 * (x0 + x1)
@@ -167,16 +162,10 @@ def _moments_in_pixel(
 
 @njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def walk_inside(
-    image: FloatArray,
-    sums: FloatArray,
-    ya: float,
-    xa: float,
-    yb: float,
-    xb: float,
-    with_moments: bool,
-    with_inertia: bool,
-) -> tuple[float, float, float, float, float]:
+    image: FloatArray, sums: FloatArray, segment: Segment, with_moments: bool, with_inertia: bool
+) -> Integrals:
     """Integrate along a segment inside the image, as `walk_edge` does."""
+    ya, xa, yb, xb = segment
     last_y, last_x = image.shape[0] - 1, image.shape[1] - 1
     row, column = min(int(ya), last_y), min(int(xa), last_x)
     last_row, last_column = min(int(yb), last_y), min(int(xb), last_x)
@@ -196,9 +185,8 @@ def walk_inside(
         flux += value * (t_next - t)
         mass += (sums[0, i, j] + value * (0.5 * (x + x_next) - column)) * (y_next - y)
         if with_moments:
-            of_y, of_x, of_both = _moments_in_pixel(
-                sums, value, row, column, y, x, y_next, x_next, with_inertia
-            )
+            part = y, x, y_next, x_next
+            of_y, of_x, of_both = _moments_in_pixel(sums, value, row, column, part, with_inertia)
             moment_y += of_y
             moment_x += of_x
             inertia += of_both
@@ -214,9 +202,8 @@ def walk_inside(
     flux += value * (1.0 - t)
     mass += (sums[0, i, j] + value * (0.5 * (x + xb) - column)) * (yb - y)
     if with_moments:
-        of_y, of_x, of_both = _moments_in_pixel(
-            sums, value, row, column, y, x, yb, xb, with_inertia
-        )
+        part = y, x, yb, xb
+        of_y, of_x, of_both = _moments_in_pixel(sums, value, row, column, part, with_inertia)
         moment_y += of_y
         moment_x += of_x
         inertia += of_both
@@ -246,37 +233,25 @@ def _walk_right_of_image(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def walk_edge(
-    image: FloatArray,
-    sums: FloatArray,
-    ya: float,
-    xa: float,
-    yb: float,
-    xb: float,
-    with_moments: bool,
-) -> tuple[float, float, float, float, float]:
-    """Integrate along the segment from (ya, xa) to (yb, xb), in corner coordinates.
+    image: FloatArray, sums: FloatArray, segment: Segment, with_moments: bool
+) -> Integrals:
+    """Integrate along a segment, in corner coordinates.
 
     The moments need all three sums. Returns ∫ I ds, ∫ F dy, and if `with_moments`, else 0,
     ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy.
     """
-    return walk_clipped(image, sums, ya, xa, yb, xb, with_moments, with_moments)
+    return walk_clipped(image, sums, segment, with_moments, with_moments)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def walk_clipped(
-    image: FloatArray,
-    sums: FloatArray,
-    ya: float,
-    xa: float,
-    yb: float,
-    xb: float,
-    with_moments: bool,
-    with_inertia: bool,
-) -> tuple[float, float, float, float, float]:
+    image: FloatArray, sums: FloatArray, segment: Segment, with_moments: bool, with_inertia: bool
+) -> Integrals:
     """Integrate as `walk_edge` does; only the inertia, else 0, needs the third of the sums."""
+    ya, xa, yb, xb = segment
     height, width = image.shape
     if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
-        return walk_inside(image, sums, ya, xa, yb, xb, with_moments, with_inertia)
+        return walk_inside(image, sums, segment, with_moments, with_inertia)
 
     start, end = _inside_share(ya, yb - ya, height)
     if start >= end:
@@ -286,16 +261,16 @@ def walk_clipped(
     t_leave = max(min(t_leave, end), t_enter)
     flux = mass = moment_y = moment_x = inertia = 0.0
     if t_leave > t_enter:
-        y0, x0 = _point(ya, xa, yb, xb, t_enter, height, width)
-        y1, x1 = _point(ya, xa, yb, xb, t_leave, height, width)
+        y0, x0 = _point(segment, t_enter, height, width)
+        y1, x1 = _point(segment, t_leave, height, width)
         flux, mass, moment_y, moment_x, inertia = walk_inside(
-            image, sums, y0, x0, y1, x1, with_moments, with_inertia
+            image, sums, (y0, x0, y1, x1), with_moments, with_inertia
         )
     # the parts before and after the image count where they are to its right
     for t0, t1 in ((start, t_enter), (t_leave, end)):
         if t1 > t0 and xa + 0.5 * (t0 + t1) * (xb - xa) > 0.5 * width:
-            y0, _ = _point(ya, xa, yb, xb, t0, height, width)
-            y1, _ = _point(ya, xa, yb, xb, t1, height, width)
+            y0, _ = _point(segment, t0, height, width)
+            y1, _ = _point(segment, t1, height, width)
             of_mass, of_y, of_x, of_both = _walk_right_of_image(image, sums, y0, y1, with_inertia)
             mass += of_mass
             if with_moments:
@@ -316,10 +291,9 @@ def _inside_share(position: float, step: float, size: int) -> tuple[float, float
 
 
 @njit(nogil=True, cache=True)
-def _point(
-    ya: float, xa: float, yb: float, xb: float, t: float, height: int, width: int
-) -> tuple[float, float]:
+def _point(segment: Segment, t: float, height: int, width: int) -> tuple[float, float]:
     """Return the point at share t of a segment, not beyond the image's border."""
+    ya, xa, yb, xb = segment
     y = ya + t * (yb - ya) if t < 1 else yb
     x = xa + t * (xb - xa) if t < 1 else xb
     return min(max(y, 0.0), float(height)), min(max(x, 0.0), float(width))

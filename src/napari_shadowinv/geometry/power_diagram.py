@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.compiler import kernel, njit
 from napari_shadowinv.geometry.density import (
     Density,
+    Integrals,
     walk_clipped,
     walk_edge,
     walk_inside,
@@ -73,75 +75,58 @@ def _power_centres(
         centres[t, 1] = points[a, 1] + (c_lift * by - b_lift * cy) / double_area
 
 
+class _Borders(NamedTuple):
+    """Borders between cells: the triangles of their two ends, over a density."""
+
+    sides: Indices
+    centres: FloatArray
+    image: FloatArray
+    sums: FloatArray
+
+
 @njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def _walk_border(
-    e: int,
-    sides: Indices,
-    centres: FloatArray,
-    image: FloatArray,
-    sums: FloatArray,
-    with_moments: bool,
-) -> tuple[float, float, float, float, float]:
+    a: int, b: int, centres: FloatArray, image: FloatArray, sums: FloatArray, with_moments: bool
+) -> Integrals:
     """Walk a border as `walk_clipped` does, without inertia; most lie inside the image."""
     height, width = float(image.shape[0]), float(image.shape[1])
-    a, b = np.uint32(sides[e, 0]), np.uint32(sides[e, 1])
-    ya, xa = centres[a, 0] + 0.5, centres[a, 1] + 0.5
-    yb, xb = centres[b, 0] + 0.5, centres[b, 1] + 0.5
+    first, last = np.uint32(a), np.uint32(b)
+    ya, xa = centres[first, 0] + 0.5, centres[first, 1] + 0.5
+    yb, xb = centres[last, 0] + 0.5, centres[last, 1] + 0.5
     if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
-        walk = walk_inside(image, sums, ya, xa, yb, xb, with_moments, False)
+        walk = walk_inside(image, sums, (ya, xa, yb, xb), with_moments, False)
     else:
-        walk = walk_clipped(image, sums, ya, xa, yb, xb, with_moments, False)
+        walk = walk_clipped(image, sums, (ya, xa, yb, xb), with_moments, False)
     return walk
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _integrate_edges(
-    start: int,
-    stop: int,
-    sides: Indices,
-    centres: FloatArray,
-    image: FloatArray,
-    sums: FloatArray,
-    integrals: FloatArray,
-) -> None:
+def _integrate_edges(start: int, stop: int, borders: _Borders, integrals: FloatArray) -> None:
     """Walk each border; columns of `integrals`: flux and mass."""
+    sides, centres, image, sums = borders
     for e in range(start, stop):
-        walk = _walk_border(e, sides, centres, image, sums, False)
+        walk = _walk_border(sides[e, 0], sides[e, 1], centres, image, sums, False)
         integrals[e, 0], integrals[e, 1] = walk[0], walk[1]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _integrate_moments(
-    start: int,
-    stop: int,
-    sides: Indices,
-    centres: FloatArray,
-    image: FloatArray,
-    sums: FloatArray,
-    integrals: FloatArray,
-) -> None:
+def _integrate_moments(start: int, stop: int, borders: _Borders, integrals: FloatArray) -> None:
     """Walk each border; columns of `integrals`: flux, mass, moments y and x."""
+    sides, centres, image, sums = borders
     for e in range(start, stop):
-        walk = _walk_border(e, sides, centres, image, sums, True)
+        walk = _walk_border(sides[e, 0], sides[e, 1], centres, image, sums, True)
         integrals[e, 0], integrals[e, 1] = walk[0], walk[1]
         integrals[e, 2], integrals[e, 3] = walk[2], walk[3]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _integrate_inertia(
-    start: int,
-    stop: int,
-    sides: Indices,
-    centres: FloatArray,
-    image: FloatArray,
-    sums: FloatArray,
-    integrals: FloatArray,
-) -> None:
+def _integrate_inertia(start: int, stop: int, borders: _Borders, integrals: FloatArray) -> None:
     """Walk each border for the moment of inertia, the only column of `integrals`."""
+    sides, centres, image, sums = borders
     for e in range(start, stop):
         ya, xa = centres[sides[e, 0], 0] + 0.5, centres[sides[e, 0], 1] + 0.5
         yb, xb = centres[sides[e, 1], 0] + 0.5, centres[sides[e, 1], 1] + 0.5
-        integrals[e, 0] = walk_edge(image, sums, ya, xa, yb, xb, True)[4]
+        integrals[e, 0] = walk_edge(image, sums, (ya, xa, yb, xb), True)[4]
 
 
 @kernel
@@ -279,10 +264,11 @@ class PowerDiagram:
         integrals = np.empty((len(sides), len(powers)))
         # seen in units of the density's squares
         ends = self.vertices if side == 1 else (self.vertices + 0.5) / side - 0.5
-        borders = sides, ends, density.image, sums, integrals
+        borders = _Borders(sides, ends, density.image, sums)
         squares_per_side = math.sqrt(density.image.size / self.n_sites)
         smallest = math.ceil(_MIN_SQUARES_PER_THREAD / max(squares_per_side, 1.0))
-        in_ranges(walk, len(sides), self._threads, *borders, smallest=smallest, uneven=True)
+        operands = borders, integrals
+        in_ranges(walk, len(sides), self._threads, *operands, smallest=smallest, uneven=True)
         if side > 1:
             integrals *= side**powers
         return integrals
@@ -434,10 +420,8 @@ def _list_shares(
                 share = 0.0
                 for k in range(around[i], around[i + 1]):
                     ya, xa, yb, xb, sense = borders[k]
-                    integrals = walk_edge(
-                        unit_image, sums, ya - row, xa - column, yb - row, xb - column, False
-                    )
-                    share += sense * integrals[1]
+                    segment = ya - row, xa - column, yb - row, xb - column
+                    share += sense * walk_edge(unit_image, sums, segment, False)[1]
                 pixels[starts[i] + count] = row * width + column
                 shares[starts[i] + count] = share
                 count += 1
