@@ -37,6 +37,21 @@ _NOT_CONNECTED = (
 )
 
 
+class Rows(NamedTuple):
+    """Rows of a sparse matrix, as kernels take them."""
+
+    starts: Indices
+    columns: Indices
+    values: FloatArray
+
+    @classmethod
+    def of(cls, matrix: csr_array) -> Rows:
+        starts, columns = (
+            indices.astype(np.int32, copy=False) for indices in (matrix.indptr, matrix.indices)
+        )
+        return cls(starts, columns, matrix.data.astype(np.float64, copy=False))
+
+
 class Network(NamedTuple):
     """Conductors as rows of (neighbour, conductance).
 
@@ -136,16 +151,10 @@ def _sort_row(
 
 @kernel
 def _read_blocks(
-    first: int,
-    last: int,
-    blocks: IntArray,
-    starts: Indices,
-    columns: Indices,
-    values: FloatArray,
-    network: Network,
-    spans: IntArray,
+    first: int, last: int, blocks: IntArray, rows: Rows, network: Network, spans: IntArray
 ) -> None:
     """Take the conductors of blocks out of a sparse matrix, in any order of columns."""
+    starts, columns, values = rows
     neighbors, conductances = network.neighbors, network.conductances
     step = np.uint32(1)
     end = np.uint32(starts[blocks[first]])
@@ -198,22 +207,22 @@ def _list_cuts(network: Network, start: int, stop: int) -> Cuts:
     return Cuts(first, second, values, nodes[:last], np.empty(last))
 
 
+class _Pairing(NamedTuple):
+    """Groups of the nodes of a level, made along its stronger ties."""
+
+    network: Network
+    weakest: float  # of the ties
+    inverses: FloatArray  # of the nodes' degrees
+    groups: Indices  # of each node, numbered from `first` on
+    first: int
+    group_inverses: FloatArray
+
+
 @kernel
-def _pair(
-    network: Network,
-    start: int,
-    stop: int,
-    weakest: float,
-    inverses: FloatArray,
-    groups: Indices,
-    first: int,
-    count: int,
-    group_inverses: FloatArray,
-) -> int:
+def _pair(pairing: _Pairing, start: int, stop: int, count: int) -> int:
     """Group each node of a block with a free neighbour or a group.
 
-    Groups are numbered from `count` on; the number after the last one is returned. `group_inverses`
-    begins with the group `first`.
+    Groups are numbered from `count` on; the number after the last one is returned.
     """
     # A tie is a conductance times the sum of the inverses of the two sides' degrees, where a
     # group's degree is the sum over the nodes of the level it stands for (Napov and Notay,
@@ -221,7 +230,7 @@ def _pair(
     # the groups. Nodes without a tie of at least `weakest` stay alone: where both sides are
     # held much more strongly by others, the sweeps do not smooth an error that differs between
     # them.
-    # the attributes are looked up once because each look-up counts references
+    network, weakest, inverses, groups, first, group_inverses = pairing
     starts, _, ends, neighbors, conductances, _, _ = network
     for i in range(start, stop):
         groups[i] = -1
@@ -408,12 +417,8 @@ def _build_levels(
     count = min(max(n // nodes_per_block, 1), _MOST_BLOCKS)
     block_bounds = np.arange(count + 1) * n // count
     spans = np.empty((count, 2), np.int64)
-    entries = (
-        laplacian.indptr.astype(np.int32, copy=False),
-        laplacian.indices.astype(np.int32, copy=False),
-        laplacian.data.astype(np.float64, copy=False),
-    )
-    in_ranges(_read_blocks, count, threads, block_bounds, *entries, network, spans, smallest=1)
+    operands = block_bounds, Rows.of(laplacian), network, spans
+    in_ranges(_read_blocks, count, threads, *operands, smallest=1)
     _close_gaps(network, block_bounds, spans)
     _tie_to_ground(network, 0, ground)
     bounds, blocks = [0, n], []
@@ -459,8 +464,8 @@ def _add_level(
         raise RuntimeError(_NOT_CONNECTED)
     inverses = np.empty(stop - start)
     for weakest in (_MIN_TIE, 0.0):
-        nodes = network, blocks, weakest, network.inverse_degrees
-        pair_blocks = _pair_blocks(*nodes, parents, 0, inverses, threads)
+        pairing = _Pairing(network, weakest, network.inverse_degrees, parents, 0, inverses)
+        pair_blocks = _pair_blocks(pairing, blocks, threads)
         count = int(pair_blocks[-1])
         if count <= _MAX_PAIRED_SHARE * (stop - start):
             break
@@ -469,8 +474,8 @@ def _add_level(
     pairs = _empty_network(count, network.starts[stop] - network.starts[start])
     _contract(network, blocks, parents, pairs, pair_blocks, pair_blocks, threads)
     groups = np.empty(count, np.int32)
-    nodes = pairs, pair_blocks, _MIN_TIE, inverses
-    ends = _pair_blocks(*nodes, groups, stop, np.empty(count), threads)
+    pairing = _Pairing(pairs, _MIN_TIE, inverses, groups, stop, np.empty(count))
+    ends = _pair_blocks(pairing, pair_blocks, threads)
     network = _grow_network(network, network.starts[stop] + pairs.starts[count])
     joined = _join_blocks(ends, nodes_per_block)
     _contract(pairs, pair_blocks, groups, network, ends, joined, threads)
@@ -480,39 +485,20 @@ def _add_level(
 
 @njit(nogil=True, cache=True)
 def _pair_within_blocks(
-    begin: int,
-    end: int,
-    blocks: IntArray,
-    network: Network,
-    weakest: float,
-    inverses: FloatArray,
-    groups: Indices,
-    first: int,
-    group_inverses: FloatArray,
-    ends: IntArray,
+    begin: int, end: int, pairing: _Pairing, blocks: IntArray, ends: IntArray
 ) -> None:
     """Pair blocks `begin` to `end`, as if each node of those before made a group of its own."""
     for b in range(begin, end):
         low, high = blocks[b], blocks[b + 1]
-        count = first + low - blocks[0]
-        ends[b] = _pair(network, low, high, weakest, inverses, groups, first, count, group_inverses)
+        ends[b] = _pair(pairing, low, high, pairing.first + low - blocks[0])
 
 
-def _pair_blocks(
-    network: Network,
-    blocks: IntArray,
-    weakest: float,
-    inverses: FloatArray,
-    groups: Indices,
-    first: int,
-    group_inverses: FloatArray,
-    threads: int,
-) -> IntArray:
-    """Pair the nodes of each block; return the bounds of its groups, numbered from `first` on."""
+def _pair_blocks(pairing: _Pairing, blocks: IntArray, threads: int) -> IntArray:
+    """Pair the nodes of each block; return the bounds of its groups."""
+    first, groups, group_inverses = pairing.first, pairing.groups, pairing.group_inverses
     count = len(blocks) - 1
     begins, ends = first + blocks[:-1] - blocks[0], np.empty(count, np.int64)
-    pairing = network, weakest, inverses, groups, first, group_inverses, ends
-    in_ranges(_pair_within_blocks, count, threads, blocks, *pairing, smallest=1)
+    in_ranges(_pair_within_blocks, count, threads, pairing, blocks, ends, smallest=1)
     bounds = np.concatenate([[first], first + np.cumsum(ends - begins)])
     for b in range(1, count):
         groups[blocks[b] : blocks[b + 1]] -= begins[b] - bounds[b]
@@ -566,9 +552,7 @@ def _invert_coarsest(network: Network, start: int, stop: int, *, grounded: bool)
 
 def require_connected(graph: csr_array) -> None:
     """Raise a RuntimeError if a symmetric matrix falls into several blocks."""
-    starts, columns = (
-        indices.astype(np.int32, copy=False) for indices in (graph.indptr, graph.indices)
-    )
+    starts, columns, _ = Rows.of(graph)
     if _count_reached(starts, columns) < graph.shape[0]:
         raise RuntimeError(_NOT_CONNECTED)
 

@@ -43,6 +43,7 @@ from napari_shadowinv.transport._coarsening import (
     Cuts,
     Hierarchy,
     Network,
+    Rows,
     build_hierarchy,
     require_connected,
 )
@@ -158,19 +159,13 @@ def _multiply(start: int, stop: int, network: Network, x: FloatArray, product: F
 
 @kernel
 def _descend(
-    start: int,
-    stop: int,
-    first: int,
-    last: int,
-    network: Network,
-    parents: Indices,
-    vectors: _Vectors,
+    start: int, stop: int, first: int, last: int, hierarchy: Hierarchy, vectors: _Vectors
 ) -> None:
     """Sweep forward from zero and pass the residual to the groups `first` to `last`."""
     # After such a sweep only the conductors to higher nodes leave a residual, and each is
     # also an entry of the higher node's row: both are done in one walk over half the entries.
-    starts, middles, _, neighbors, conductances, _, inverse_degrees = network
-    residual, x = vectors.residual, vectors.correction
+    starts, middles, _, neighbors, conductances, _, inverse_degrees = hierarchy.network
+    parents, residual, x = hierarchy.parents, vectors.residual, vectors.correction
     for i in range(np.uint32(first), np.uint32(last)):
         residual[i] = 0.0
     for i in range(np.uint32(start), np.uint32(stop)):
@@ -186,10 +181,10 @@ def _descend(
 
 
 @kernel
-def _ascend(start: int, stop: int, network: Network, parents: Indices, vectors: _Vectors) -> None:
+def _ascend(start: int, stop: int, hierarchy: Hierarchy, vectors: _Vectors) -> None:
     """Add the next level's correction and sweep backward."""
-    starts, _, ends, neighbors, conductances, _, inverse_degrees = network
-    residual, x = vectors.residual, vectors.correction
+    starts, _, ends, neighbors, conductances, _, inverse_degrees = hierarchy.network
+    parents, residual, x = hierarchy.parents, vectors.residual, vectors.correction
     for j in range(np.uint32(start), np.uint32(stop)):
         x[j] += x[np.uint32(parents[j])]
     for node in range(stop - 1, start - 1, -1):
@@ -252,7 +247,7 @@ def _cycle(hierarchy: Hierarchy, top: int, vectors: _Vectors) -> None:
     """Turn the residual of level `top` into its correction by one K-cycle."""
     # What the first step of each level has found waits in arrays, because a cached kernel
     # must not call itself.
-    bounds, twice, network, parents, inverse = hierarchy
+    bounds, twice, network, _, inverse = hierarchy
     deepest = bounds.shape[0] - 2
     energies, lengths = np.zeros(deepest + 1), np.zeros(deepest + 1)
     halfway = np.zeros(deepest + 1, np.bool_)
@@ -260,14 +255,14 @@ def _cycle(hierarchy: Hierarchy, top: int, vectors: _Vectors) -> None:
     while True:
         while level < deepest:
             start, stop, end = bounds[level], bounds[level + 1], bounds[level + 2]
-            _descend(start, stop, stop, end, network, parents, vectors)
+            _descend(start, stop, stop, end, hierarchy, vectors)
             level += 1
         _solve_coarsest(bounds[level], bounds[level + 1], inverse, vectors)
         again = False
         while level > top and not again:
             level -= 1
             start, stop = bounds[level], bounds[level + 1]
-            _ascend(start, stop, network, parents, vectors)
+            _ascend(start, stop, hierarchy, vectors)
             x = vectors.correction
             if twice[level] and halfway[level]:
                 _multiply(start, stop, network, x, vectors.product)
@@ -283,22 +278,22 @@ def _cycle(hierarchy: Hierarchy, top: int, vectors: _Vectors) -> None:
 
 @njit(nogil=True, cache=True)
 def _descend_blocks(
-    start: int, stop: int, blocks: Blocks, network: Network, parents: Indices, vectors: _Vectors
+    start: int, stop: int, blocks: Blocks, hierarchy: Hierarchy, vectors: _Vectors
 ) -> None:
     """Sweep blocks `start` to `stop` of a level forward."""
     bounds, groups = blocks.bounds, blocks.groups
     for b in range(start, stop):
         nodes = bounds[b], bounds[b + 1], groups[b], groups[b + 1]
-        _descend(nodes[0], nodes[1], nodes[2], nodes[3], network, parents, vectors)
+        _descend(nodes[0], nodes[1], nodes[2], nodes[3], hierarchy, vectors)
 
 
 @njit(nogil=True, cache=True)
 def _ascend_blocks(
-    start: int, stop: int, blocks: Blocks, network: Network, parents: Indices, vectors: _Vectors
+    start: int, stop: int, blocks: Blocks, hierarchy: Hierarchy, vectors: _Vectors
 ) -> None:
     """Sweep blocks `start` to `stop` of a level backward."""
     for b in range(start, stop):
-        _ascend(blocks.bounds[b], blocks.bounds[b + 1], network, parents, vectors)
+        _ascend(blocks.bounds[b], blocks.bounds[b + 1], hierarchy, vectors)
 
 
 # The sweep of a block uses the values that the other blocks had before: zero, and then those that
@@ -375,7 +370,7 @@ class LaplacianSolver:
         self._threads = available_threads(threads)
         self._n = int(laplacian.shape[0])
         self._grounded = ground is not None
-        self._rows = _rows(laplacian, ground)
+        self._rows = Rows.of(_with_ground(laplacian, ground))
         self._hierarchy, self._blocks = build_hierarchy(
             laplacian, ground, nodes_per_block=nodes_per_block, threads=self._threads
         )
@@ -398,7 +393,7 @@ class LaplacianSolver:
         of the setup, and should be similar to it.
         """
         if laplacian is not None:
-            self._rows = _rows(laplacian, ground)
+            self._rows = Rows.of(_with_ground(laplacian, ground))
         right = self._centre(right)
         scale = self._norm(right)
         solution: FloatArray = np.zeros(self._n)
@@ -459,7 +454,7 @@ class LaplacianSolver:
         """Sweep the blocks of a level forward, correct by the next level, and sweep backward."""
         blocks, vectors = self._blocks[level], self._vectors
         cuts, parents = blocks.cuts, self._hierarchy.parents
-        sweep = blocks, self._hierarchy.network, parents, vectors
+        sweep = blocks, self._hierarchy, vectors
         count = len(blocks.bounds) - 1
         in_ranges(_descend_blocks, count, self._threads, *sweep, smallest=1)
         _complete_descent(cuts, parents, vectors)
@@ -470,8 +465,8 @@ class LaplacianSolver:
 
     def _multiply(self, x: FloatArray, product: FloatArray) -> None:
         # Not with the hierarchy's rounded conductances.
-        vectors = *self._rows, x, product
-        in_ranges(_multiply_rows, self._n, self._threads, *vectors, smallest=_ROWS_PER_THREAD)
+        operands = self._rows, x, product
+        in_ranges(_multiply_rows, self._n, self._threads, *operands, smallest=_ROWS_PER_THREAD)
 
     def _norm(self, x: FloatArray) -> float:
         return float(np.sqrt(_dot(0, self._n, x, x)))
@@ -481,25 +476,9 @@ def _with_ground(laplacian: csr_array, ground: FloatArray | None) -> csr_array:
     return laplacian if ground is None else csr_array(laplacian + diags_array(ground))
 
 
-def _rows(laplacian: csr_array, ground: FloatArray | None) -> tuple[Indices, Indices, FloatArray]:
-    """Return starts, columns and values of the rows of a grounded Laplacian."""
-    matrix = _with_ground(laplacian, ground)
-    starts, columns = (
-        indices.astype(np.int32, copy=False) for indices in (matrix.indptr, matrix.indices)
-    )
-    return starts, columns, matrix.data.astype(np.float64, copy=False)
-
-
 @kernel
-def _multiply_rows(
-    start: int,
-    stop: int,
-    starts: Indices,
-    columns: Indices,
-    values: FloatArray,
-    x: FloatArray,
-    product: FloatArray,
-) -> None:
+def _multiply_rows(start: int, stop: int, rows: Rows, x: FloatArray, product: FloatArray) -> None:
+    starts, columns, values = rows
     for i in range(np.uint32(start), np.uint32(stop)):
         total = 0.0
         for k in range(np.uint32(starts[i]), np.uint32(starts[i + np.uint32(1)])):
