@@ -63,24 +63,17 @@ class Solution:
     reason: str = ""  # why it did not converge
 
 
+@dataclass(eq=False)
 class TransportObjective:
     """The function f(w) for given sites, their source flux S_i, and an image of the same flux.
 
     The triangulation of the sites follows the weights of the last call.
     """
 
-    def __init__(
-        self,
-        triangulation: RegularTriangulation,
-        mass: FloatArray,
-        image: Density,
-        *,
-        threads: int | None = None,
-    ) -> None:
-        self.triangulation = triangulation
-        self.mass = mass
-        self.image = image
-        self.threads = threads
+    triangulation: RegularTriangulation
+    mass: FloatArray
+    image: Density
+    threads: int | None = None
 
     def diagram(self, weights: FloatArray, *, with_moments: bool = False) -> PowerDiagram:
         """Return the power diagram for `weights`; empty cells are allowed."""
@@ -187,13 +180,13 @@ _METHODS: dict[str, tuple[str, dict[str, float]]] = {
 def newton(
     objective: TransportObjective,
     weights: FloatArray,
-    *,
     tolerance: float,
     max_iterations: int,
+    report: Reporter | None = None,
+    *,
     shortest_step: float = SHORTEST_STEP,
     fill: bool = False,
     even: float = EVEN_RESIDUAL,
-    report: Reporter | None = None,
 ) -> Solution:
     """Solve T(w) = S by damped Newton steps that never empty a cell.
 
@@ -243,8 +236,7 @@ def newton(
             reason = f"the error has not halved in {_HALVING_STEPS} steps"
             break
     converged = residual <= tolerance
-    reason = "" if converged else reason
-    return Solution(weights, residual, len(errors) - 1, converged, reason)
+    return Solution(weights, residual, len(errors) - 1, converged, "" if converged else reason)
 
 
 def _even_out(
@@ -334,7 +326,6 @@ def descend(
     objective: TransportObjective,
     start: FloatArray,
     solver: str,
-    *,
     tolerance: float,
     max_iterations: int,
     report: Reporter | None = None,
@@ -412,8 +403,7 @@ def blur_image(image: FloatArray, width: float, threads: int | None = 1) -> Floa
     """
     height, breadth = image.shape
     parts = max(1, int(width / _MAX_BLUR_IN_PIXELS))
-    few = _blur_means(image, width, parts, threads)
-    diffused: FloatArray = split_pixels(few, parts)[:height, :breadth]
+    diffused = split_pixels(_blur_means(image, width, parts, threads), parts)[:height, :breadth]
     diffused *= image.sum() / diffused.sum()
     return diffused
 
@@ -429,8 +419,11 @@ def blur_to_density(image: FloatArray, width: float, threads: int | None = 1) ->
 
 
 def _blur_means(image: FloatArray, width: float, parts: int, threads: int | None) -> FloatArray:
-    """Blur the means of squares of pixels."""
-    means = _means(image, parts)
+    """Blur the means of squares of pixels; the last are repeated beyond the border."""
+    height, breadth = image.shape
+    if height % parts or breadth % parts:
+        image = np.pad(image, ((0, -height % parts), (0, -breadth % parts)), mode="edge")
+    means = complete_block_means(image, parts)
     workers = available_threads(threads) if means.size > _MIN_PIXELS_PER_WORKER else 1
     spectrum = dctn(means, workers=workers)
     for axis in (0, 1):
@@ -440,19 +433,10 @@ def _blur_means(image: FloatArray, width: float, parts: int, threads: int | None
     return np.asarray(np.maximum(idctn(spectrum, workers=workers), means.min()))
 
 
-def _means(image: FloatArray, parts: int) -> FloatArray:
-    """Return the means of squares of pixels; the last pixels are repeated beyond the border."""
-    height, width = image.shape
-    if height % parts or width % parts:
-        image = np.pad(image, ((0, -height % parts), (0, -width % parts)), mode="edge")
-    return complete_block_means(image, parts)
-
-
 def sharpen(
     level: Level,
     sharp: TransportObjective,
     soften: Soften,
-    *,
     tolerance: float,
     max_iterations: int,
     report: Reporter | None = None,
@@ -479,10 +463,10 @@ def sharpen(
             solution = newton(
                 objective,
                 start,
-                tolerance=_PATH_TOLERANCE if width else tolerance,
-                max_iterations=max_iterations - steps,
+                _PATH_TOLERANCE if width else tolerance,
+                max_iterations - steps,
+                report,
                 shortest_step=_SHORTEST_STEP,
-                report=report,
             )
             steps += solution.iterations
             if not width and (nearest is None or solution.residual < nearest.residual):

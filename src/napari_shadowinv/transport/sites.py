@@ -219,7 +219,15 @@ class Levels(Sequence[Level]):
 
     def at(self, count: int) -> Level:
         """Return the level with `count` sites."""
-        return self._level(count, self._report)
+        slot = self._slots.setdefault(count, _Slot())
+        while not slot.lock.acquire(timeout=_POLL_S):
+            self._report("sites", 0, None, f"{count:,} sites")
+        try:
+            if slot.level is None:
+                slot.level = self._make(count, self._report)
+            return slot.level
+        finally:
+            slot.lock.release()
 
     def up_to(self, count: int) -> Levels:
         """Return the levels with fewer than `count` sites, and the level with `count`."""
@@ -268,17 +276,6 @@ class Levels(Sequence[Level]):
         finally:
             abandoned.set()
             pool.shutdown(cancel_futures=True)
-
-    def _level(self, count: int, report: Reporter) -> Level:
-        slot = self._slots.setdefault(count, _Slot())
-        while not slot.lock.acquire(timeout=_POLL_S):
-            report("sites", 0, None, f"{count:,} sites")
-        try:
-            if slot.level is None:
-                slot.level = self._make(count, report)
-            return slot.level
-        finally:
-            slot.lock.release()
 
 
 def _refuse_level(count: int, report: Reporter) -> Level:

@@ -183,11 +183,7 @@ def _solve_levels(
             if solution.residual <= options.tolerance:
                 return solutions
             final = newton(
-                objective,
-                solution.weights,
-                tolerance=options.tolerance,
-                max_iterations=options.max_iterations,
-                report=report,
+                objective, solution.weights, options.tolerance, options.max_iterations, report
             )
             if final.converged:
                 final = replace(final, iterations=solution.iterations + final.iterations)
@@ -247,12 +243,12 @@ def _solve_from(
         solution = newton(
             objective,
             start,
-            fill=not is_full,
-            tolerance=options.tolerance,
-            max_iterations=min(_MAX_WARM_STEPS, options.max_iterations),
+            options.tolerance,
+            min(_MAX_WARM_STEPS, options.max_iterations),
+            report,
             shortest_step=_SHORTEST_WARM_STEP,
+            fill=not is_full,
             even=_EVEN_WARM_RESIDUAL,
-            report=report,
         )
     else:
         solution = _solve_level(objective, start, options, options.tolerance, report)
@@ -288,24 +284,17 @@ class Target:
         decay_length = self.options.decay_length and factor * self.options.decay_length
         options = self.options.model_copy(update={"decay_length": decay_length})
         if margin is None:
-            density = blur_to_density(pixels, blur, options.threads)
-            return Target(density, margin, options).objective(level)
-        return Target.of(blur_image(pixels, blur, options.threads), margin, options).objective(
-            level
-        )
+            target = Target(blur_to_density(pixels, blur, options.threads), margin, options)
+        else:
+            target = Target.of(blur_image(pixels, blur, options.threads), margin, options)
+        return target.objective(level)
 
     def solve_blurred_first(
         self, level: Level, tolerance: float, report: Reporter | None
     ) -> Solution:
         """Solve a level from zero weights, by way of blurred images."""
-        return sharpen(
-            level,
-            self.objective(level),
-            self.blurred_objective,
-            tolerance=tolerance,
-            max_iterations=self.options.max_iterations,
-            report=report,
-        )
+        sharp, most = self.objective(level), self.options.max_iterations
+        return sharpen(level, sharp, self.blurred_objective, tolerance, most, report)
 
 
 def _solve_level(
@@ -320,14 +309,5 @@ def _solve_level(
     if weights is None:
         weights = np.zeros(len(objective.mass))
     if options.solver == "newton":
-        return newton(
-            objective,
-            weights,
-            fill=True,
-            tolerance=tolerance,
-            max_iterations=most,
-            report=report,
-        )
-    return descend(
-        objective, weights, options.solver, tolerance=tolerance, max_iterations=most, report=report
-    )
+        return newton(objective, weights, tolerance, most, report, fill=True)
+    return descend(objective, weights, options.solver, tolerance, most, report)
