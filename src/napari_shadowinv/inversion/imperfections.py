@@ -35,24 +35,12 @@ _STEP = 1e-3  # of a normal number, for a derivative
 
 @dataclass(frozen=True)
 class SolvedShot:
-    """A shot with its solved transport.
+    """A shot with its solved transport, of n cells."""
 
-    Attributes
-    ----------
-    prepared : Prepared
-        Image and source, in units of the source's power of two.
-    displacement : ndarray, shape (2, H, W)
-        Of the ray through each pixel, px.
-    response : LinearResponse
-        Of n cells.
-    seed : int
-        Of random patterns.
-    """
-
-    prepared: Prepared
-    displacement: FloatArray
+    prepared: Prepared  # in units of the source's power of two
+    displacement: FloatArray  # (2, H, W): of the ray through each pixel, px
     response: LinearResponse
-    seed: int
+    seed: int  # of random patterns
 
     @property
     def mean(self) -> float:
@@ -146,21 +134,11 @@ def _line_modes(size: int, length: float, share: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class Scene:
-    """The retrieved object of a shot.
+    """The retrieved object of a shot."""
 
-    Attributes
-    ----------
-    displacement : ndarray, shape (2, H, W)
-        Of the ray through each pixel, px.
-    source : ndarray, shape (H, W)
-        0 where masked.
-    mask : ndarray of bool, shape (H, W)
-        Pixels that are used.
-    """
-
-    displacement: FloatArray
-    source: FloatArray
-    mask: BoolArray
+    displacement: FloatArray  # (2, H, W): of the ray through each pixel, px
+    source: FloatArray  # (H, W): 0 where masked
+    mask: BoolArray  # (H, W): pixels that are used
 
     @cached_property
     def object_region(self) -> tuple[FloatArray, float]:
@@ -187,44 +165,25 @@ class RecordedShot:
         return float(values[self.scene.mask].mean())
 
 
+# k independent changes of the cells' flux, (k, n), for a standard deviation, with the mean square
+# of the imperfection.
 Pattern = Callable[[SolvedShot, float], FloatArray]
+# The shot with the imperfection of a standard deviation, drawn by independent normal numbers.
 Change = Callable[[RecordedShot, float, FloatArray], RecordedShot]
 
 
 @dataclass(frozen=True)
 class Imperfection:
-    """A quantity of the instrument that is known to a standard deviation only.
+    """A quantity of the instrument that is known to a standard deviation only."""
 
-    Attributes
-    ----------
-    key : str
-        Name in `Instrument`.
-    title : str
-        In texts.
-    size_text : str
-        Format of the standard deviation, such as "{:.2g} px".
-    tested : float
-        Standard deviation whose effect every budget states; 0 if it takes too long.
-    pattern : callable
-        Returns k independent changes of the cells' flux, (k, n), for a solved shot and a standard
-        deviation, with the mean square of the imperfection.
-    change : callable
-        Returns a recorded shot with the imperfection of a standard deviation, drawn by independent
-        normal numbers.
-    count : callable
-        Returns how many numbers that takes.
-    is_even : bool
-        Whether the imperfection grows with the square of its number.
-    """
-
-    key: str
-    title: str
-    size_text: str
-    tested: float
+    key: str  # name in `Instrument`
+    title: str  # in texts
+    size_text: str  # format of the standard deviation, such as "{:.2g} px"
+    tested: float  # standard deviation whose effect every budget states; 0 if it takes too long
     pattern: Pattern
     change: Change
-    count: Callable[[Scene], int] = lambda scene: 1
-    is_even: bool = False
+    count: Callable[[Scene], int] = lambda scene: 1  # of the numbers that a change takes
+    is_even: bool = False  # whether the imperfection grows with the square of its number
 
     def name(self, size: float) -> str:
         """Return the title with the size, such as "background, 5 %"."""
@@ -377,28 +336,20 @@ def _move(shot: RecordedShot, shift: float, numbers: FloatArray) -> RecordedShot
 
 
 IMPERFECTIONS: tuple[Imperfection, ...] = (
-    Imperfection(
-        "background", "background", "{:.2g} %", 0.05, pattern=_background, change=_add_background
-    ),
-    Imperfection("gamma", "gamma", "{:.2g}", 0.05, pattern=_response, change=_raise_to_power),
-    Imperfection("blur", "blur", "{:.2g} px", 1.0, pattern=_blur, change=_spread, is_even=True),
+    Imperfection("background", "background", "{:.2g} %", 0.05, _background, _add_background),
+    Imperfection("gamma", "gamma", "{:.2g}", 0.05, _response, _raise_to_power),
+    Imperfection("blur", "blur", "{:.2g} px", 1.0, _blur, _spread, is_even=True),
     Imperfection(
         "absorption",
         "absorption",
         "{:.2g} %",
         0.01,
-        pattern=_absorption,
-        change=_absorb,
+        _absorption,
+        _absorb,
         count=lambda scene: scene.transmission.count,
     ),
     Imperfection(
-        "registration",
-        "registration",
-        "{:.2g} px",
-        0.0,
-        pattern=_registration,
-        change=_move,
-        count=lambda scene: 4,
+        "registration", "registration", "{:.2g} px", 0.0, _registration, _move, lambda scene: 4
     ),
 )
 """Quantities of the instrument with their effects on an image, in the order of the budget."""
