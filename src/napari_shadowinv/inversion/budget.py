@@ -34,12 +34,7 @@ from napari_shadowinv.inversion.imperfections import (
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.inversion.readout import LinearResponse
-from napari_shadowinv.options import (
-    BeamComponents,
-    BeamPrior,
-    Instrument,
-    InversionOptions,
-)
+from napari_shadowinv.options import BeamComponents, BeamPrior, Instrument, InversionOptions
 from napari_shadowinv.physics.units import PeakError
 from napari_shadowinv.transport.minimise import Solution, with_full_cells
 from napari_shadowinv.transport.sites import RATIO, Level, SitePlan
@@ -350,12 +345,8 @@ class Errors:
 def discretisation_share(times: float, rate: float = _USUAL_RATE) -> float:
     """Return the discretisation error of a solution, as a share of its last change.
 
-    Parameters
-    ----------
-    times : float
-        Ratio of the numbers of sites, finer to coarser solution; above 1.
-    rate : float
-        Ratio of the changes by two successive fourfold increases of the number of sites.
+    That was by `times` as many sites; `rate` is the ratio of the changes by two successive
+    fourfold increases of their number.
     """
     return float((times ** (2 * _power_of(rate)) - 1) ** -0.5)
 
@@ -547,10 +538,7 @@ class Budget:
         return self._moves[solution]
 
     def _change(self, solved: Sequence[LevelSolution]) -> tuple[FloatArray, float]:
-        """Estimate the squared discretisation error at each place, and the power of its fall.
-
-        It falls with this power of the number of sites.
-        """
+        """Estimate squared discretisation errors at places, and the power of sites they fall by."""
         times = len(solved[-1].weights) / len(solved[-2].weights)
         # With less than four times the sites, the rate of the levels before is used.
         full_steps = solved if times > _MIN_STEP or len(solved) < 3 else solved[:-1]

@@ -482,7 +482,10 @@ def uncertainty(
                     of_solved.append(asked(pair.solved))
         scatter = reduce(add, _in_order(response.scatter, _blocks(seeds), workers, report))
     mean, std, of_samples = scatter.mean, scatter.std, _joined(scatter.quantities)
-    check = _LinearCheck() if pairs is None else _LinearCheck.of(pairs.part(np.s_[1:]))
+    check = _LinearCheck()
+    if pairs is not None:
+        moves = pairs.part(np.s_[1:])
+        check = _LinearCheck(moves.nonlinearity, moves.spread_ratio, moves.mean_shift)
     if draws is not None and pairs is not None:
         mean, std = mean + pairs.shift, std * pairs.factor
         for name, exact in _joined(of_solved).items():
@@ -511,9 +514,7 @@ def uncertainty(
         n=int(n),
         noise=noise_text,
         method=method,
-        nonlinearity=check.nonlinearity,
-        spread_ratio=check.spread_ratio,
-        mean_shift=check.mean_shift,
+        **asdict(check),
         imperfections=names,
         quantities={
             name: Quantity(value, of_samples[name], isinstance(functions[name], Maximum))
@@ -577,10 +578,6 @@ class _LinearCheck:
     nonlinearity: float = 0.0
     spread_ratio: float = 1.0
     mean_shift: float = 0.0
-
-    @classmethod
-    def of(cls, pairs: Pairs) -> _LinearCheck:
-        return cls(pairs.nonlinearity, pairs.spread_ratio, pairs.mean_shift)
 
     def caution(self, *, with_instrument: bool) -> Caution | None:
         """Warn if the linear answer is not enough."""

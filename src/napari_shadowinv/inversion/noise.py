@@ -25,7 +25,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from napari_shadowinv._system.arrays import NORMAL_MAD, order_by_value
@@ -54,21 +53,10 @@ def beam_difference(
 ) -> float:
     """Return the r.m.s. relative difference of image and source outside the object.
 
-    Parameters
-    ----------
-    prepared : Prepared
-        Image and source in units of the source's power of two.
-    noise : ImageNoise
-        Noise of that image; differences that it explains do not count.
-    patterns : ndarray, shape (k, H, W), optional
-        Changes of the source by one standard deviation of each number that is known so well, as of
-        its registration; what they explain does not count, either.
-
-    Returns
-    -------
-    float
-        0 where the difference is within the noise, or where too little of the frame along the
-        edge is free of the object for a comparison.
+    It is 0 where the noise explains it, or where too little of the frame along the edge is free of
+    the object for a comparison. Patterns, (k, H, W), are changes of the source by one standard
+    deviation of each number that is known so well, as of its registration; what they explain does
+    not count, either. Image and source are in units of the source's power of two.
     """
     shape = prepared.mask.shape
     cell = min(shape) // (_TILES * _CELLS)
@@ -243,7 +231,10 @@ class ImageNoise:
             self.is_correlated_far = False
         elif used.any():
             step = -(-len(differences) // _SAMPLES)
-            rows, columns = np.unravel_index(_every(used, step), used.shape)
+            places = np.arange(0, used.size, step)
+            if not used.all():
+                places = np.flatnonzero(used)[::step]
+            rows, columns = np.unravel_index(places, used.shape)
             low, right = rows + 1, columns + 1
             bright = image[low, right] + image[low, columns] + image[rows, right]
             bright = (bright + image[rows, columns]) / (4 * mean)
@@ -283,11 +274,6 @@ def _finest(values: FloatArray, used: BoolArray) -> FloatArray:
     finest /= 2
     np.abs(finest, out=finest)
     return finest.ravel() if used.all() else finest[used]
-
-
-def _every(used: BoolArray, step: int) -> NDArray[np.intp]:
-    """Return the flat indices of every n-th pixel in use."""
-    return np.arange(0, used.size, step) if used.all() else np.flatnonzero(used)[::step]
 
 
 def _rms(values: FloatArray) -> float:

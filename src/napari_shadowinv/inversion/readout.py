@@ -266,25 +266,18 @@ class LinearResponse:
     @cached_property
     def _slopes(self) -> tuple[Indices, FloatArray]:
         """Corners of the triangles between sites, and the gradient by each corner's value."""
-        corners, edges, double = _triangles(self.level.triangulation)
+        triangulation = self.level.triangulation
+        corners = triangulation.vertices
+        corners = corners[(corners < len(triangulation.sites)).all(axis=1)]
+        points = triangulation.sites[corners]
+        edges = np.roll(points, -2, axis=1) - np.roll(points, -1, axis=1)  # opposite to corners
+        double = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
         # Slivers along the border are too thin for a gradient by three values.
         longest = (edges**2).sum(axis=2).max(axis=1)
         is_round = np.abs(double) > _MIN_ROUNDNESS * longest
         corners, edges, double = corners[is_round], edges[is_round], double[is_round]
-        return corners, _normals(edges) / double[:, None, None]
-
-
-def _triangles(triangulation: RegularTriangulation) -> tuple[Indices, FloatArray, FloatArray]:
-    """Return corners of the triangles between sites, opposite edges, and double areas."""
-    corners = triangulation.vertices
-    corners = corners[(corners < len(triangulation.sites)).all(axis=1)]
-    points = triangulation.sites[corners]
-    edges = np.roll(points, -2, axis=1) - np.roll(points, -1, axis=1)
-    return corners, edges, edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
-
-
-def _normals(edges: FloatArray) -> FloatArray:
-    return np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
+        normals = np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
+        return corners, normals / double[:, None, None]
 
 
 def _within(places: FloatArray, plan: SitePlan) -> BoolArray:
