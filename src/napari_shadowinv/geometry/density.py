@@ -78,11 +78,6 @@ class Density:
         """Corners (y, x) of the image, half a pixel beyond the outermost centres, shape (2, 2)."""
         return np.array([[0.0, 0.0], self.shape]) - 0.5
 
-    @property
-    def total(self) -> float:
-        """The image's flux."""
-        return float(self.first_sums[0, :, -1].sum())
-
 
 @njit(nogil=True, cache=True)
 def _sum_rows(start: int, stop: int, image: FloatArray, sums: FloatArray) -> None:
@@ -115,13 +110,6 @@ def split_pixels(image: FloatArray, factor: int) -> FloatArray:
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _first_moments(f: Triple, g: float, y0: float, y1: float) -> tuple[float, float]:
-    """Return ∫ y F dy and ∫ G dy by Simpson's rule; g is the sum for G."""
-    y_mid, sixth = 0.5 * (y0 + y1), (y1 - y0) / 6
-    return sixth * (y0 * f[0] + 4 * y_mid * f[1] + y1 * f[2]), sixth * g
-
-
-@njit(nogil=True, cache=True, inline="always")
 def _moments(f: Triple, g: float, k: Triple, y0: float, y1: float) -> Triple:
     """Return ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy by Simpson's rule; g is the sum for G."""
     (f0, f_mid, f1), (k0, k_mid, k1) = f, k
@@ -148,8 +136,8 @@ def _moments_in_pixel(
     g = 6 * g_base + value * (x0 * x0 + 4 * x_mid * x_mid + x1 * x1) / 2
     f = f_base + value * x0, f_base + value * x_mid, f_base + value * x1
     if not with_inertia:
-        of_y, of_x = _first_moments(f, g, y0, y1)
-        return of_y, of_x, 0.0
+        y_mid, sixth = 0.5 * (y0 + y1), (y1 - y0) / 6
+        return sixth * (y0 * f[0] + 4 * y_mid * f[1] + y1 * f[2]), sixth * g, 0.0
     k_base = sums[2, i, j] - value * (x_left2 * x_left) / 3
     third = value / 3
     k = (

@@ -398,15 +398,11 @@ def fit_gradients(
     triangulation: RegularTriangulation,
     values: FloatArray,
     gradients: FloatArray,
-    sweeps: int = 1,
     threads: int | None = 1,
 ) -> FloatArray:
-    """Improve gradients at the sites so that the surface bends least along the edges."""
-    mesh = _Mesh.of(triangulation)
-    for _ in range(sweeps):
-        surface = _Surface(mesh, values[:, None], gradients[:, :, None])
-        gradients = np.ascontiguousarray(_bend_least(surface, threads)[:, 1:, 0])
-    return gradients
+    """Improve gradients at the sites so that the surface bends less along the edges."""
+    surface = _Surface(_Mesh.of(triangulation), values[:, None], gradients[:, :, None])
+    return np.ascontiguousarray(_bend_least(surface, threads)[:, 1:, 0])
 
 
 def _bend_least(surface: _Surface, threads: int | None = 1) -> FloatArray:
@@ -726,18 +722,13 @@ class CloughTocher:
         starts, members = _triangles_by_strip(vertices, points, len(values), shape)
         smallest = max(1, _MIN_PIXELS_PER_THREAD // (STRIP_PX * width))
         for first in range(0, len(starts) - 1, _STRIPS_AT_ONCE):
-            last = min(first + _STRIPS_AT_ONCE, len(starts) - 1)
+            strips = min(_STRIPS_AT_ONCE, len(starts) - 1 - first)
             operands = first, starts, members, surface, out
             in_ranges(
-                _evaluate_strips,
-                last - first,
-                self.threads,
-                *operands,
-                smallest=smallest,
-                uneven=True,
+                _evaluate_strips, strips, self.threads, *operands, smallest=smallest, uneven=True
             )
             if on_share is not None:
-                on_share(min(last * STRIP_PX / height, 1.0))
+                on_share(min((first + strips) * STRIP_PX / height, 1.0))
         return out
 
     @property
