@@ -112,17 +112,9 @@ def _empty_network(nodes: int, entries: int) -> Network:
 
 @kernel
 def _sort_row(
-    network: Network,
-    begin: np.uint32,
-    end: np.uint32,
-    node: int | np.uint32,
-    low: int,
-    high: int,
+    network: Network, begin: np.uint32, end: np.uint32, node: int | np.uint32, low: int, high: int
 ) -> None:
-    """Sort the entries of a node's row, and sum their conductances.
-
-    The nodes from `low` to `high` are those of its block.
-    """
+    """Sort the row of a node, whose block is from `low` to `high`, and sum its conductances."""
     starts, middles, ends, neighbors, conductances, degrees, inverse_degrees = network
     step = np.uint32(1)
     middle = begin
@@ -381,11 +373,7 @@ def _sum_conductances(
 
 
 def build_hierarchy(
-    laplacian: csr_array,
-    ground: FloatArray | None = None,
-    *,
-    nodes_per_block: int = NODES_PER_BLOCK,
-    threads: int = 1,
+    laplacian: csr_array, ground: FloatArray | None, *, nodes_per_block: int, threads: int
 ) -> tuple[Hierarchy, list[Blocks]]:
     """Group nodes, and groups of nodes, until few are left; see `LaplacianSolver`.
 
@@ -455,10 +443,7 @@ def _tie_to_ground(network: Network, start: int, ground: FloatArray | None) -> N
 def _add_level(
     network: Network, parents: Indices, blocks: IntArray, nodes_per_block: int, threads: int
 ) -> tuple[Network, IntArray]:
-    """Pair the nodes of each block of the last level, and pair the pairs.
-
-    Returns the network, and the bounds of each block's groups.
-    """
+    """Pair the nodes of each block of the last level, and the pairs; return the groups' bounds."""
     start, stop = int(blocks[0]), int(blocks[-1])
     if stop - start > 1 and not network.degrees[start:stop].min() > 0.0:
         raise RuntimeError(_NOT_CONNECTED)

@@ -2,8 +2,8 @@
 
 - solve systems one after the other whose matrices change little: `SimilarSystems`
 - several with the same matrix: `LaplacianSolver`
-- factors of the matrix, where those are better: `factorise`; solutions of many systems with them,
-  `WIDTH` at a time, for two substitutions each: `FactorisedLaplacian`
+- many with factors of the matrix, `WIDTH` at a time, for two substitutions each:
+  `FactorisedLaplacian`
 
 Flexible conjugate gradients, preconditioned by one cycle over the levels. One Gauss–Seidel sweep
 before and its mirror image after each visit of the next level smooth the error. Constants on
@@ -102,11 +102,6 @@ class FactorisedLaplacian:
         lower = factors.L
         lower.sort_indices()
         self._lower = lower.indptr, lower.indices, lower.data
-
-    @property
-    def size(self) -> int:
-        """Count of the numbers in one factor."""
-        return len(self._lower[2])
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve L x = b for each column of b, (n, k).
@@ -283,8 +278,7 @@ def _descend_blocks(
     """Sweep blocks `start` to `stop` of a level forward."""
     bounds, groups = blocks.bounds, blocks.groups
     for b in range(start, stop):
-        nodes = bounds[b], bounds[b + 1], groups[b], groups[b + 1]
-        _descend(nodes[0], nodes[1], nodes[2], nodes[3], hierarchy, vectors)
+        _descend(bounds[b], bounds[b + 1], groups[b], groups[b + 1], hierarchy, vectors)
 
 
 @njit(nogil=True, cache=True)
@@ -532,28 +526,18 @@ def _solve_by_factors(
     laplacian: csr_array, right: FloatArray, ground: FloatArray | None
 ) -> FloatArray:
     if ground is not None:
-        return np.asarray(factorise(laplacian, ground).solve(right))
+        return np.asarray(_factors(_with_ground(laplacian, ground)).solve(right))
     # Without a ground one unknown is free: all but the first are solved for.
     solution = np.zeros(len(right))
     if len(right) > 1:
-        solution[1:] = factorise(laplacian, ground).solve(right[1:] - right.mean())
+        solution[1:] = _factors(laplacian[1:, 1:]).solve(right[1:] - right.mean())
     solution -= solution.mean()
     return solution
 
 
-def factorise(laplacian: csr_array, ground: FloatArray | None) -> SuperLU:
-    """Factorise a Laplacian with its ground; without one, all of it but its first node."""
-    matrix = laplacian[1:, 1:] if ground is None else _with_ground(laplacian, ground)
-    return _factors(matrix, "MMD_AT_PLUS_A")
-
-
-def _factors(matrix: csr_array, order: str) -> SuperLU:
-    return splu(
-        matrix.tocsc(),
-        permc_spec=order,
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
+def _factors(matrix: csr_array, order: str = "MMD_AT_PLUS_A") -> SuperLU:
+    options = {"SymmetricMode": True}
+    return splu(matrix.tocsc(), permc_spec=order, diag_pivot_thresh=0.0, options=options)
 
 
 def _dissection_order(matrix: csr_array, positions: FloatArray) -> NDArray[np.intp]:

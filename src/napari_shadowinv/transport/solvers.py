@@ -202,11 +202,7 @@ def _restart(
 
 
 def fit_flux_factor(
-    levels: Levels,
-    image: FloatArray,
-    margin: Margin,
-    options: InversionOptions,
-    report: Reporter | None = None,
+    levels: Levels, image: FloatArray, margin: Margin, options: InversionOptions, report: Reporter
 ) -> float:
     """Find the factor on an image of unknown exposure that moves the flux at the edge least.
 
