@@ -16,12 +16,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import check_mask, unpack_array, unpack_shot
 from napari_shadowinv._system.machine import begin
-from napari_shadowinv._system.progress import (
-    OnProgress,
-    Progress,
-    Reporter,
-    ShouldStop,
-)
+from napari_shadowinv._system.progress import OnProgress, Progress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -109,22 +104,15 @@ def _plan(
 ) -> SitePlan:
     """Plan sites without computing any level."""
     domain = _site_domain(source, options, mask)
-    plan = plan_levels(
+    levels = plan_levels(
         domain.beam,
         domain.n_sites,
         lloyd_iterations=options.lloyd_iterations,
         lloyd_tolerance=options.lloyd_tolerance,
         seed=options.seed,
         threads=options.threads,
-    )
-    return replace(
-        plan,
-        source=domain.source,
-        mask=domain.mask,
-        margin=domain.margin,
-        unit=domain.unit,
-        measured=measured,
-    )
+    ).levels
+    return SitePlan(domain.source, levels, domain.mask, domain.margin, domain.unit, measured)
 
 
 def count_sites(
@@ -153,9 +141,7 @@ def _site_domain(
 ) -> _SiteDomain:
     usable = None if mask is None else check_mask(mask, np.shape(source))
     check_memory(np.shape(source), normalise.bytes_per_pixel(options), "an inversion")
-    checked = normalise.check_source(source, usable)
-    if usable is not None:
-        checked = normalise.masked_source(checked, usable, options)
+    checked = normalise.masked_source(normalise.check_source(source, usable), usable, options)
     n_sites = normalise.number_of_sites(checked.shape, options)
     unit = normalise.power_of_two(checked)
     beam = checked / unit
@@ -345,16 +331,13 @@ def invert(
     with _measure_time("errors", seconds):
         errors = wait_for_errors()
     finest = adaptive and len(answer.weights) == levels.counts[-1]
+    by_errors: list[Caution | None] = [] if errors is None else [errors.beam_caution()]
+    by_accuracy: list[Caution | None] = []
     if finest and errors is not None and quality.warnings == prepared.warnings:
-        missed = errors.accuracy_caution(
-            options.accuracy, "with the most sites placed unless more are given"
-        )
-        quality = replace(quality, warnings=(*quality.warnings, *filter(None, [missed])))
-    if errors is not None:
-        of_beam = filter(None, [errors.beam_caution()])
-        quality = replace(quality, warnings=(*of_beam, *quality.warnings))
+        why = "with the most sites placed unless more are given"
+        by_accuracy = [errors.accuracy_caution(options.accuracy, why)]
     with _measure_time("prepare", seconds):
-        quality = replace(quality, warnings=(*quality.warnings, *begin_checks()()))
+        warnings = *by_errors, *quality.warnings, *by_accuracy, *begin_checks()()
     reprojection = fields.reprojection * prepared.unit
     return Inversion(
         image=prepared.image,
@@ -374,6 +357,7 @@ def invert(
         mask=prepared.mask,
         report=replace(
             quality,
+            warnings=tuple(filter(None, warnings)),
             sites_reason=_sites_reason(levels, budget, adaptive, start, coarse),
             errors=errors,
         ),

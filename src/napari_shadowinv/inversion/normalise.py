@@ -173,9 +173,11 @@ def power_of_two(source: FloatArray) -> float:
     return float(2.0 ** np.floor(np.log2(source.max())))
 
 
-def masked_source(source: FloatArray, mask: BoolArray, options: InversionOptions) -> FloatArray:
+def masked_source(
+    source: FloatArray, mask: BoolArray | None, options: InversionOptions
+) -> FloatArray:
     """Return a source with its masked pixels at the floor, so that cells fill the image."""
-    if mask.all():
+    if mask is None or mask.all():
         return source
     return np.where(mask, source, options.floor * source[mask].mean())
 

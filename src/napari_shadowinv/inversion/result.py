@@ -271,14 +271,10 @@ class Inversion:
         setup : Setup or None
             None: the verdict on the displacement.
         """
-        errors = self.errors_in(setup)
+        errors, report = self.errors_in(setup), self.report
         subject = "displacement" if errors is self.errors else "field"
         return assess_verdict(
-            self.report.warnings,
-            errors,
-            self.options.max_error,
-            subject,
-            converged=self.report.converged,
+            report.warnings, errors, self.options.max_error, subject, converged=report.converged
         )
 
     @property
@@ -320,6 +316,7 @@ class Inversion:
             Gives the main field in SI units; None the displacement in px.
         """
         report, errors = self.report, self.errors_in(setup)
+        error_of_peak = None if errors is None else errors.of_peak
         flows = {
             "flux_left": ("Flux left", report.flux_left),
             "flux_entered": ("Flux entered", report.flux_entered),
@@ -328,12 +325,7 @@ class Inversion:
         return (
             verdict_fact(self.assess_in(setup).verdict),
             *caution_facts(report.warnings),
-            *peak_facts(
-                self.displacement,
-                setup,
-                mask=self.mask,
-                error=None if errors is None else errors.of_peak,
-            ),
+            *peak_facts(self.displacement, setup, mask=self.mask, error=error_of_peak),
             Fact(
                 "image_residual",
                 "Image residual",

@@ -36,7 +36,7 @@ from napari_shadowinv.inversion.readout import LinearReadout, read_out
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.transport.linear import FactorisedLaplacian, LaplacianSolver
-from napari_shadowinv.transport.sites import Level, Levels, Margin, SitePlan
+from napari_shadowinv.transport.sites import Levels, Margin, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target, solve
 
 Draw = Callable[[np.random.Generator, float], FloatArray]
@@ -218,11 +218,7 @@ def _with_source(plan: SitePlan, source: FloatArray, options: InversionOptions) 
     density = Density.from_image(beam, threads=options.threads)
     diagram = PowerDiagram(level.triangulation, density, with_moments=True, threads=options.threads)
     changed = replace(level, mass=diagram.masses, centroids=diagram.centroids)
-
-    def make(count: int, report: Reporter) -> Level:
-        return changed
-
-    levels = Levels((len(level.sites),), make)
+    levels = Levels((len(level.sites),), lambda count, report: changed)
     return replace(plan, source=source, levels=levels, margin=margin, unit=unit)
 
 
@@ -230,7 +226,7 @@ def _spread_beam(
     plan: SitePlan, source: FloatArray, options: InversionOptions
 ) -> tuple[FloatArray, float, Margin | None]:
     """Return a source as sites are spread over it, in its power of two, and its margin."""
-    beam = source if plan.mask is None else masked_source(source, plan.mask, options)
+    beam = masked_source(source, plan.mask, options)
     unit = power_of_two(beam)
     beam = beam / unit
     if plan.margin is None:
@@ -369,12 +365,6 @@ def _subtract_product(factors: FloatArray, strengths: FloatArray, values: FloatA
             values[i, s] = row[s]
 
 
-def _room_for_factors() -> int:
-    """Return the number of sites that half of the memory factorises."""
-    memory = physical_memory()
-    return _MOST_FACTORISED if memory is None else memory // 2 // _BYTES_FACTORISED
-
-
 class LinearResampling:
     """Linear response of an inversion to the changes of the image in its samples."""
 
@@ -392,7 +382,9 @@ class LinearResampling:
         self._shares = pixel_shares(diagram, level.shape, threads=threads)
         self._network = diagram.laplacian(), objective.ground(samples.start)
         self._factors = None
-        if len(level.sites) <= min(_MOST_FACTORISED, _room_for_factors()):
+        memory = physical_memory()
+        is_room = memory is None or len(level.sites) <= memory // 2 // _BYTES_FACTORISED
+        if is_room and len(level.sites) <= _MOST_FACTORISED:
             with suppress(RuntimeError):  # the multigrid reports it if it fails as well
                 laplacian, ground = self._network
                 self._factors = FactorisedLaplacian(laplacian, level.sites, ground)

@@ -17,13 +17,7 @@ from napari_shadowinv import __version__
 from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.physics.units import (
-    FLUX_DENSITY,
-    PIXEL,
-    PIXEL_AREA,
-    label,
-    place_coordinates,
-)
+from napari_shadowinv.physics.units import FLUX_DENSITY, PIXEL, PIXEL_AREA, label, place_coordinates
 
 if TYPE_CHECKING:
     import xarray
@@ -105,9 +99,11 @@ def dataset_from_field(
     return xr.Dataset(variables, coords=_coordinates(height, width, setup), attrs=attrs)
 
 
-def variable_labels(
-    setup: Setup | None = None,
-) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
+Labels = dict[str, tuple[tuple[str, ...], dict[str, str]]]
+"""Dimensions and attributes of variables by their names."""
+
+
+def variable_labels(setup: Setup | None = None) -> Labels:
     """Return dimensions, ``units`` and ``long_name`` of every variable of a result by its name."""
     labels = {
         name: (dims, label(unit, long_name)) for name, (dims, unit, long_name) in VARIABLES.items()
@@ -118,9 +114,7 @@ def variable_labels(
     return labels
 
 
-def fit_labels(
-    field: str, setup: Setup | None = None
-) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
+def fit_labels(field: str, setup: Setup | None = None) -> Labels:
     """Return dimensions, ``units`` and ``long_name`` of every variable of a fitted field."""
     result_labels = variable_labels(setup)
     dims, *unit_and_name = UNCERTAINTY
