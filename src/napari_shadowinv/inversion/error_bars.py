@@ -432,17 +432,13 @@ def uncertainty(
     # The threads are shared out among the samples; what noise drives below zero is clipped.
     threads = max(1, available_threads(options.threads) // workers)
     clipping = options.model_copy(update={"threads": threads, "negative": "clip"})
-    levels = plan.levels.up_to(len(inversion.weights))
+    plan = replace(plan, levels=plan.levels.up_to(len(inversion.weights)))
     correlation = 0.0 if inversion.errors is None else inversion.errors.noise_correlation
     if correlation and not isinstance(noise, str):
         noise_text += f", correlated over {correlation:.2g} px"
     resampling = FullResampling(
-        replace(plan, levels=levels),
-        inversion.weights,
-        lambda rng: draw_noise(rng, correlation),
-        clipping,
-    )
-    resampling = resampling.to_tolerance_of_noise(seeds[0])
+        plan, inversion.weights, lambda rng: draw_noise(rng, correlation), clipping
+    ).to_tolerance_of_noise(seeds[0])
     draws = None if instrument is None else _draws(image, inversion, instrument, plan)
     resampling = replace(resampling, instrument=draws)
     report = Reporter(on_progress, should_stop)
