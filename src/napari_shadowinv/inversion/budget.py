@@ -345,8 +345,12 @@ class Errors:
 def discretisation_share(times: float, rate: float = _USUAL_RATE) -> float:
     """Return the discretisation error of a solution, as a share of its last change.
 
-    That was by `times` as many sites; `rate` is the ratio of the changes by two successive
-    fourfold increases of their number.
+    Parameters
+    ----------
+    times : float
+        Ratio of the numbers of sites, finer to coarser solution; above 1.
+    rate : float
+        Ratio of the changes by two successive fourfold increases of the number of sites.
     """
     return float((times ** (2 * _power_of(rate)) - 1) ** -0.5)
 

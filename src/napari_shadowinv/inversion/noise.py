@@ -53,10 +53,21 @@ def beam_difference(
 ) -> float:
     """Return the r.m.s. relative difference of image and source outside the object.
 
-    It is 0 where the noise explains it, or where too little of the frame along the edge is free of
-    the object for a comparison. Patterns, (k, H, W), are changes of the source by one standard
-    deviation of each number that is known so well, as of its registration; what they explain does
-    not count, either. Image and source are in units of the source's power of two.
+    Parameters
+    ----------
+    prepared : Prepared
+        Image and source in units of the source's power of two.
+    noise : ImageNoise
+        Noise of that image; differences that it explains do not count.
+    patterns : ndarray, shape (k, H, W), optional
+        Changes of the source by one standard deviation of each number that is known so well, as of
+        its registration; what they explain does not count, either.
+
+    Returns
+    -------
+    float
+        0 where the difference is within the noise, or where too little of the frame along the
+        edge is free of the object for a comparison.
     """
     shape = prepared.mask.shape
     cell = min(shape) // (_TILES * _CELLS)

@@ -95,7 +95,15 @@ class Sides:
 
 
 def inner_sides(displacement: FloatArray, mask: BoolArray) -> Sides | None:
-    """Return a displacement along the sides; None if the used part of the image ends elsewhere."""
+    """Return a displacement along the sides; None if the used part of the image ends elsewhere.
+
+    Parameters
+    ----------
+    displacement : ndarray, shape (2, H, W)
+        In px.
+    mask : ndarray of bool, shape (H, W)
+        The pixels to use.
+    """
     depth = max(2, round(_DEPTH * min(mask.shape)))
     rows = slice(None)
 
@@ -241,9 +249,20 @@ def assess_verdict(
     *,
     converged: bool,
 ) -> Assessment:
-    """Return the verdict on an inversion: determined with at most `max_error`, relative r.m.s.
+    """Return the verdict on an inversion.
 
-    The errors are a share of the `subject`, displacement or field.
+    Parameters
+    ----------
+    cautions : sequence of Caution
+        About the solution.
+    errors : Errors or None
+        The error budget.
+    max_error : float
+        Largest error of a determined field, relative r.m.s.
+    subject : str
+        What the errors are a share of: displacement or field.
+    converged : bool
+        Whether the solver did.
     """
     by_code = {caution.code: caution for caution in reversed(cautions)}
     if not converged:
@@ -421,7 +440,22 @@ def mark_caustics(
 
     Wherever the field compresses the beam, noise takes single pixels below the threshold. A region
     below it is a caustic if its Jacobian averaged over the spacing of the sites, the resolution of
-    the map, falls below the threshold, too. No pixel outside the mask is marked.
+    the map, falls below the threshold, too.
+
+    Parameters
+    ----------
+    jacobian : ndarray, shape (H, W)
+        Jacobian determinant of the map.
+    mask : ndarray of bool, shape (H, W)
+        Pixels that were used; no other is marked.
+    n_sites : int
+        Number of sites.
+    threshold : float
+        Upper limit of the determinant in a caustic, `InversionOptions.caustic_jacobian`.
+
+    Returns
+    -------
+    ndarray of bool, shape (H, W)
     """
     below = (jacobian < threshold) & mask
     if not below.any():
