@@ -200,6 +200,9 @@ def test_it_survives_its_dataset(static: LeaveOneOut) -> None:
     for name in names:
         np.testing.assert_array_equal(getattr(again, name), getattr(static, name))
     assert again.explanation == static.explanation
+    flux_density = {"images", "left_out_prediction", "left_out_residual", "left_out_noise"}
+    stored = static.to_dataset()
+    assert {stored[name].attrs["units"] for name in flux_density} == {"1/pixel**2"}
     with pytest.raises(InputError, match="left_out_chi2"):
         LeaveOneOut.from_dataset(static.to_dataset().drop_vars("left_out_chi2"))
 

@@ -35,10 +35,10 @@ _IMAGE, _PLANES = ("image",), ("image", "y", "x")
 _NOISE = "left_out_noise"
 # Attribute: variable, dimensions, units, long name.
 _VARIABLES: dict[str, tuple[str, tuple[str, ...], str, str]] = {
-    "images": ("images", _PLANES, "flux/px²", "Image"),
+    "images": ("images", _PLANES, FLUX_DENSITY, "Image"),
     "mask": ("mask", _PLANES, "1", "Pixels that were used"),
-    "predicted": ("left_out_prediction", _PLANES, "flux/px²", "Image as the others predict it"),
-    "residual": ("left_out_residual", _PLANES, "flux/px²", "Image minus prediction"),
+    "predicted": ("left_out_prediction", _PLANES, FLUX_DENSITY, "Image as the others predict it"),
+    "residual": ("left_out_residual", _PLANES, FLUX_DENSITY, "Image minus prediction"),
     "brightness": ("left_out_brightness", _IMAGE, "1", "Brightness relative to the expected one"),
     "chi2": ("left_out_chi2", _IMAGE, "1", "Mean squared residual over the noise"),
     "alone": ("left_out_alone", _IMAGE, "1", "The same with a field of the image's own"),
