@@ -22,10 +22,13 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.layers import add_inversion
 from napari_shadowinv._napari.widgets._forms import dump_toml
+from napari_shadowinv._napari.widgets._qt import StateKeeper
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
+from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.forward_model import ForwardModel
 from napari_shadowinv._napari.widgets.invert_shot import EstimateSource, InvertShot
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
+from napari_shadowinv._napari.widgets.plan_experiment import PlanExperiment
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
@@ -524,3 +527,15 @@ def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
     assert source_of(prediction) is None
     # Opened in Invert shot, it is a file's setup like any other.
     assert opened(InvertShot).setup.setup() == entered
+
+
+@pytest.mark.parametrize(
+    "kind", [EstimateSource, FitImages, ForwardModel, InvertShot, InvertStack, PlanExperiment]
+)
+@pytest.mark.parametrize("value", [7, None, "text", [3], {"values": 4, "own": [1], "size": "x"}])
+def test_a_saved_state_of_another_form_keeps_no_widget_from_opening(
+    viewer: ViewerModel, opened: Any, kind: Any, value: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = opened(kind).state()
+    monkeypatch.setattr(StateKeeper, "load", lambda self: dict.fromkeys(parts, value))
+    assert opened(kind).state().keys() == parts.keys()

@@ -439,8 +439,8 @@ class StepsSection(QWidget):
         with QSignalBlocker(self):
             for form in list(self.forms):
                 self._move(form, None)
-            for values in state if isinstance(state, list) else ():
-                if isinstance(values, Mapping) and values.get("step") in self._kinds:
+            for values in state:
+                if values["step"] in self._kinds:
                     self.add(str(values["step"]), values).fold()
         self._on_change()
 

@@ -479,7 +479,7 @@ class ToolPanel(qt.Docked):
                 part.restore(state[name])
 
     def restore_last(self) -> None:
-        self.restore(self._keeper.load())
+        self._keeper.restore(self.restore)
 
     def keep(self) -> None:
         """Save the changed state soon."""

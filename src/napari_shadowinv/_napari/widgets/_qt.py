@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from itertools import groupby
 from typing import Any, TypeVar
 
@@ -229,6 +230,11 @@ class StateKeeper(QObject):
         except ValueError:
             return {}
         return state if isinstance(state, dict) else {}
+
+    def restore(self, restore: Callable[[Mapping[str, Any]], None]) -> None:
+        """Show the saved state, as far as it has the form that this version writes."""
+        with suppress(ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
+            restore(self.load())
 
     def changed(self) -> None:
         self._timer.start()

@@ -35,7 +35,7 @@ class ImageSetup(qt.Docked):
         self._keeper = qt.StateKeeper(self, "image-setup", self.setup.state)
         image = forms.labelled("Image", self.image)
         self.area, _ = qt.scrolling_column(self, image, self.setup, self.apply_button, self.status)
-        self.setup.restore(self._keeper.load())
+        self._keeper.restore(self.setup.restore)
         self.image.picked.connect(self._follow)
         self.setup.changed.connect(self._keeper.changed)
         self._follow()
