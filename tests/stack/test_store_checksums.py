@@ -335,7 +335,7 @@ def test_store_without_checksums_is_read(finished, tmp_path):
     np.testing.assert_array_equal(read(path).potential, read(finished).potential)
     result = shadowinv("status", path, "--verify")
     assert result.exit_code == 0
-    assert "written by an earlier version" in flat(result.output)
+    assert "copied by another program" in flat(result.output)
 
 
 def test_checksums_of_a_folder_are_not_passed_on(finished):
