@@ -392,6 +392,11 @@ def test_existing_files_need_overwrite(
     refused("invert", shot, names="shot.png exists")
 
 
+def test_outputs_of_one_name_are_refused(shot: Path, refused: Callable[..., None]) -> None:
+    refused("invert", shot, "--out", "a.png", "--figure", "a.png", names="a.png")
+    refused("invert", shot, "--figure", "a.toml", "--save-recipe", "a.toml", names="a.toml")
+
+
 def test_outputs_without_a_folder_are_refused(
     folder: Path, shot: Path, refused: Callable[..., None]
 ) -> None:

@@ -91,8 +91,8 @@ def analyse(
     from napari_shadowinv.pipeline.files import setup_from
 
     chosen = _products(product or [], products)
-    suffixes = {csv: SITES.suffixes, figure: FIGURE_SUFFIXES, out: RESULT.suffixes}
-    outputs = _inputs.check_outputs(suffixes, overwrite)
+    files = (csv, SITES.suffixes), (figure, FIGURE_SUFFIXES), (out, RESULT.suffixes)
+    outputs = _inputs.check_outputs(files, overwrite)
     _inputs.protect(outputs, [result, setup, products])
     if is_stack(result):
         if out is not None:

@@ -104,11 +104,11 @@ def film(
             "received no pack file: name one, or write one for a folder of scans with --new"
         )
     result, figure = _inputs.result_and_figure(pack, out, figure)
-    suffixes = _inputs.result_suffixes(ResultKind.FILM_DOSES, result, figure)
-    suffixes[corners] = SITES.suffixes
+    files = _inputs.result_outputs(ResultKind.FILM_DOSES, result, figure)
+    files.append((corners, SITES.suffixes))
     if layers is not None and (table := layers / LAYERS_TABLE).exists():
-        suffixes[table] = SITES.suffixes
-    outputs = _inputs.check_outputs(suffixes, overwrite)
+        files.append((table, SITES.suffixes))
+    outputs = _inputs.check_outputs(files, overwrite)
     content = read_pack(pack)
     _inputs.protect(outputs, [pack, *content.files])
     with work_callbacks(quiet) as callbacks:

@@ -126,8 +126,8 @@ def fit(
     checks: dict[str, Any] = {"left_out": leave_one_out, "window": energy_window}
     _fit_result.check_requests(len(rows), **checks, fiducials=fiducials, result=result)
     figures = [figure, *_fit_result.static_figures(figure, **checks)]
-    suffixes = _inputs.result_suffixes(ResultKind.FIT, result, *figures)
-    outputs = _inputs.check_outputs({**suffixes, save_recipe: (".toml",)}, overwrite)
+    files = _inputs.result_outputs(ResultKind.FIT, result, *figures)
+    outputs = _inputs.check_outputs([*files, (save_recipe, (".toml",))], overwrite)
     row_files = [file for row in rows for file in row.files.values()]
     _inputs.protect(outputs, [*images, fiducials, options, recipe, *row_files])
     chosen = _inputs.fit_recipe_from(

@@ -6,7 +6,7 @@ the work, and their files are written after it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from napari_shadowinv.pipeline.static_checks import StaticChecks
     from napari_shadowinv.preprocessing import Radiograph, Recipe
     from napari_shadowinv.results import AnyResult
+
+Output = tuple[Path | None, tuple[str, ...]]  # a file and the endings that it may have
 
 
 def result_and_figure(image: Path, out: Path | None, report: Path | None) -> tuple[Path, Path]:
@@ -43,21 +45,19 @@ def figure_beside(result: Path) -> Path:
     return result.with_suffix(PNG.suffix)
 
 
-def result_suffixes(
-    kind: ResultKind, result: Path, *figures: Path
-) -> dict[Path | None, tuple[str, ...]]:
-    """Return the endings that the files of a result and its figures may have."""
-    return {result: suffixes_for(kind), **dict.fromkeys(figures, FIGURE_SUFFIXES)}
+def result_outputs(kind: ResultKind, result: Path, *figures: Path) -> list[Output]:
+    """Return the files of a result and its figures, with the endings that they may have."""
+    return [(result, suffixes_for(kind)), *((figure, FIGURE_SUFFIXES) for figure in figures)]
 
 
-def check_outputs(outputs: Mapping[Path | None, tuple[str, ...]], overwrite: bool) -> list[Path]:
+def check_outputs(outputs: Iterable[Output], overwrite: bool) -> list[Path]:
     """Return the files to be written; refuse, before any work, one that cannot be."""
     from napari_shadowinv.io import check_output
 
-    paths = [path for path in outputs if path is not None]
-    for path in paths:
-        check_output(path, overwrite, suffixes=outputs[path])
-    return paths
+    wanted = [(path, suffixes) for path, suffixes in outputs if path is not None]
+    for path, suffixes in wanted:
+        check_output(path, overwrite, suffixes=suffixes)
+    return [path for path, _ in wanted]
 
 
 def protect(outputs: list[Path], inputs: list[Path | None]) -> None:
@@ -66,8 +66,10 @@ def protect(outputs: list[Path], inputs: list[Path | None]) -> None:
     for path in outputs:
         if resolved_path(path) in sources:
             raise InputError(f"{path} is both read and written: choose another name for the output")
-    if len({resolved_path(path) for path in outputs}) < len(outputs):
-        raise InputError(f"{outputs[0]} would be written twice: choose two names")
+    files = [resolved_path(path) for path in outputs]
+    for path, file in zip(outputs, files, strict=True):
+        if files.count(file) > 1:
+            raise InputError(f"{path} would be written twice: choose two names")
 
 
 def protect_files_of(recipe: Recipe, outputs: list[Path]) -> None:

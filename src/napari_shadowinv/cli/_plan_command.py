@@ -106,7 +106,7 @@ def plan(
     from napari_shadowinv.plotting.figures import save_figure
 
     page = figure or _inputs.figure_beside(out)
-    _inputs.check_outputs({out: SITES.suffixes, page: FIGURE_SUFFIXES}, overwrite)
+    _inputs.check_outputs([(out, SITES.suffixes), (page, FIGURE_SUFFIXES)], overwrite)
     _inputs.protect([out, page], [setup, recorded_with, _file_of(object)])
     view = {name: flags.pop(name) for name in GridView.model_fields if name in flags}
     options = _flags.choices_of(ExperimentOptions, flags)

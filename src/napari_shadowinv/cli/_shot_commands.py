@@ -133,8 +133,8 @@ def invert(
     from napari_shadowinv.preprocessing import MeasuredSource
 
     result, figure = _inputs.result_and_figure(image, out, figure)
-    suffixes = _inputs.result_suffixes(ResultKind.INVERSION, result, figure)
-    outputs = _inputs.check_outputs({**suffixes, save_recipe: (".toml",)}, overwrite)
+    files = _inputs.result_outputs(ResultKind.INVERSION, result, figure)
+    outputs = _inputs.check_outputs([*files, (save_recipe, (".toml",))], overwrite)
     _inputs.protect(outputs, [image, recipe, setup, options])
     chosen = _inputs.recipe_from(
         flags,
@@ -199,12 +199,12 @@ def rerun(
 
     target = out or Path(f"{result.stem}_again{result.suffix}")
     again_out, figure = _inputs.result_and_figure(result, target, figure)
-    suffixes = _inputs.result_suffixes(ResultKind.INVERSION, again_out, figure)
-    _inputs.check_outputs(suffixes, overwrite)
+    files = _inputs.result_outputs(ResultKind.INVERSION, again_out, figure)
+    _inputs.check_outputs(files, overwrite)
     inputs = collect_rerun(result, image, source=source, other_folders=other_folders)
     figures = _fit_result.static_figures(figure, **inputs.checks)
-    suffixes = _inputs.result_suffixes(inputs.kind, again_out, *figures)
-    _inputs.check_outputs(suffixes, overwrite)
+    files = _inputs.result_outputs(inputs.kind, again_out, *figures)
+    _inputs.check_outputs(files, overwrite)
     _inputs.protect([again_out, figure, *figures], [result, *inputs.files])
     warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in inputs.shots)
     with work_callbacks(quiet) as callbacks:
@@ -280,7 +280,7 @@ def forward(
     from napari_shadowinv.pipeline.files import setup_from
 
     path = Path(f"{field.stem}_image{TIFF.suffix}") if out is None else out
-    outputs = _inputs.check_outputs({path: tuple(IMAGE_WRITERS), truth: (".nc",)}, overwrite)
+    outputs = _inputs.check_outputs([(path, tuple(IMAGE_WRITERS)), (truth, (".nc",))], overwrite)
     _inputs.protect(outputs, [field, source, setup, recorded_with])
     if source_variable is not None and source is None:
         raise InputError("received --source-variable: it needs --source, the file that contains it")

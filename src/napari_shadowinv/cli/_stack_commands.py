@@ -110,7 +110,7 @@ def _stack_inputs(
     if setup is not None:
         chosen = chosen.model_copy(update={"setup": setup_from(setup)})
     if save_recipe is not None:
-        _inputs.check_outputs({save_recipe: (".toml",)}, run.overwrite)
+        _inputs.check_outputs([(save_recipe, (".toml",))], run.overwrite)
         _inputs.protect([save_recipe], [recipe, setup, options])
         _inputs.protect_files_of(chosen, [save_recipe])
         write_recipe(save_recipe, chosen, overwrite=run.overwrite)
