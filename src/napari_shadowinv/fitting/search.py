@@ -140,10 +140,16 @@ def search(scene: Scene, starts: Sequence[Start], on_step: OnStep) -> list[Minim
             unknowns.potentials[0] = _splines_of(first, start.potential)
         return Minimum(start.name, unknowns, np.inf, first.displacement(unknowns), first.bin)
 
-    firsts = {_first_stage(start): start for start in starts}
-    descents = [_Descent(start, begin(start), start.stages[:-1][:1]) for start in firsts.values()]
-    reached = dict(zip(firsts, _descend_together(rough, descents, on_step), strict=True))
-    descents = [_Descent(each, reached[_first_stage(each)], each.stages[1:-1]) for each in starts]
+    firsts = {(start.stages[0], start.beam_held): start for start in starts if _is_shared(start)}
+    descents = [_Descent(start, begin(start), start.stages[:1]) for start in firsts.values()]
+    shared = dict(zip(firsts, _descend_together(rough, descents, on_step), strict=True))
+    descents = []
+    for start in starts:
+        if _is_shared(start):
+            minimum = shared[start.stages[0], start.beam_held]
+            descents.append(_Descent(start, minimum, start.stages[1:-1]))
+        else:
+            descents.append(_Descent(start, begin(start), start.stages[:-1]))
     halfway: dict[object, list[Minimum]] = {}
     for start, minimum in zip(starts, _descend_together(rough, descents, on_step), strict=True):
         # A start with one stage has no rivals yet.
@@ -158,10 +164,9 @@ def search(scene: Scene, starts: Sequence[Start], on_step: OnStep) -> list[Minim
     return _distinct_minima(_descend_together(rough, descents, on_step))
 
 
-def _first_stage(start: Start) -> object:
-    """Key of what starts may share: the first of several stages, if they have no field."""
-    is_shared = start.potential is None and len(start.stages) > 1
-    return (start.stages[0], start.beam_held) if is_shared else start.name
+def _is_shared(start: Start) -> bool:
+    """Whether starts with the same first stage may share it: those without a field."""
+    return start.potential is None and len(start.stages) > 1
 
 
 def _descend_together(scene: Scene, descents: Sequence[_Descent], on_step: OnStep) -> list[Minimum]:
