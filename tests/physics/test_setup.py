@@ -337,7 +337,6 @@ NAMED_IN = {
     "physics/tracing.py": "only charged particles are traced",
     "physics/particle_flight.py": "only charged particles are traced",
     "physics/phantoms.py": "a magnetic field deflects particles, a plasma wave is probed by light",
-    "cli/_shot_commands.py": "the demonstration is a magnetic field",
     "film/pack.py": "stopping in film is that of protons",
     "film_doses.py": "stopping in film is that of protons",
 }

@@ -440,7 +440,7 @@ class StepsSection(QWidget):
             for form in list(self.forms):
                 self._move(form, None)
             for values in state:
-                if values["step"] in self._kinds:
+                if isinstance(values, Mapping) and values.get("step") in self._kinds:
                     self.add(str(values["step"]), values).fold()
         self._on_change()
 
