@@ -19,6 +19,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar, cast
 
+from pydantic import ValidationError
+
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
 
@@ -76,7 +78,13 @@ def _damage_error(path: str | Path, cause: BaseException) -> FileFormatError:
 
 
 def _error_reason(error: BaseException) -> str:
-    return " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__
+    text = str(error)
+    if isinstance(error, KeyError):
+        text = f"{error} is missing"
+    elif isinstance(error, ValidationError):
+        first = error.errors()[0]
+        text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    return " ".join(text.split())[:120].rstrip(".") or type(error).__name__
 
 
 @contextmanager

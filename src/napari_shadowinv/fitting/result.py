@@ -634,6 +634,7 @@ class Fit:
     def _from_parts(cls, dataset: xarray.Dataset) -> Fit:
         arrays = {name: numbers_of(dataset, name) for name in _VARIABLES}
         attributes = dataset.attrs
+        entries = {field.name for field in dataclasses.fields(FitReport)}
         content = json.loads(attributes["report"])
         if content["beam"] is not None:
             content["beam"] = BeamError(**content["beam"])
@@ -658,7 +659,7 @@ class Fit:
             folded=float(attributes["folded"]),
             verdict=Verdict(attributes["verdict"]),
             explanation=str(attributes["explanation"]),
-            report=FitReport(**content),
+            report=FitReport(**{name: content[name] for name in entries & content.keys()}),
             options=FitOptions.model_validate_json(attributes["options"]),
             instrument=Instrument.model_validate_json(attributes["instrument"]),
             setups=setups_in(dataset),

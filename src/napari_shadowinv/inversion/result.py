@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -447,7 +448,9 @@ class Inversion:
             If a variable or attribute is missing or damaged.
         """
         missing = [name for name in VARIABLES if name not in dataset.variables]
-        missing += [name for name in ("options", "report") if name not in dataset.attrs]
+        missing += [
+            name for name in ("options", "instrument", "report") if name not in dataset.attrs
+        ]
         if missing:
             raise InputError(
                 f"dataset has no {', '.join(map(repr, missing))}: expected the result of an "
@@ -463,12 +466,17 @@ class Inversion:
         content["warnings"] = [Caution.from_json(caution) for caution in content["warnings"]]
         return cls(
             **arrays,
-            report=TypeAdapter(Report).validate_python(content),
+            report=_report_schema().validate_python(content),
             options=InversionOptions.model_validate_json(dataset.attrs["options"]),
             instrument=Instrument.model_validate_json(dataset.attrs["instrument"]),
             provenance=Provenance.of(dataset.attrs),
             pixel_errors=_pixel_errors(dataset, "displacement_std"),
         )
+
+
+@cache
+def _report_schema() -> TypeAdapter[Report]:
+    return TypeAdapter(Report)
 
 
 def _significance_facts(structures: Structures | None, errors: PixelErrors | None) -> list[Fact]:
