@@ -159,7 +159,6 @@ class RayModel:
         Parameters
         ----------
         traced : TracedBeam
-            As for `image`.
         pull : ndarray
             Weight of each pixel, with the shape `seen`.
         of_beam, of_frame : bool, default True

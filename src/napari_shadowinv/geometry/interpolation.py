@@ -52,7 +52,6 @@ _MIN_PIXELS_PER_THREAD = 1 << 13
 class _Mesh(NamedTuple):
     """A triangulation, as kernels take it."""
 
-    # Short kernels do not count references: that costs as much as the geometry.
     vertices: Indices
     neighbors: Indices
     points: FloatArray
