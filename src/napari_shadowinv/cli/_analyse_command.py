@@ -118,14 +118,14 @@ def analyse(
             results = [each.result for each in series]
         else:
             results = measure(dataset, chosen, samples=samples, **common)
-    from napari_shadowinv.plotting import products_figure
-    from napari_shadowinv.plotting.figures import DOTS_PER_INCH
-
     with ExitStack() as stack:  # all files, or none
         if csv is not None:
             temporary = stack.enter_context(replacing(csv, overwrite))
             temporary.write_text(products_table(results), encoding="utf-8")
         if figure is not None:
+            from napari_shadowinv.plotting import products_figure
+            from napari_shadowinv.plotting.figures import DOTS_PER_INCH
+
             temporary = stack.enter_context(replacing(figure, overwrite))
             products_figure(results).savefig(temporary, dpi=DOTS_PER_INCH)
         if out is not None:

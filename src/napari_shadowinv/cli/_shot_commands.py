@@ -317,21 +317,7 @@ def forward(
     beam = content.source if original == target else None
     if source is not None:
         beam = read_radiograph(source, channel=channel, variable=source_variable).image
-    from napari_shadowinv.physics.forward import synthetic_image
-    from napari_shadowinv.physics.projection import default_deflector, project
-
-    note = ""
-    if original is None or target is None or original == target:
-        image = synthetic_image(content.displacement, beam)
-    else:
-        # Names of two words have a hyphen on the command line.
-        name = deflector.replace("-", " ") if deflector else default_deflector(original, target)
-        assumed: dict[str, Any] = {"deflector": name, "dispersion": dispersion, "source": beam}
-        image = project(content.displacement, original, target, **assumed)
-        note = (
-            f"From {setup_text(original)} to {setup_text(target)}, assuming that only a {name} "
-            "deflects the beam"
-        )
+    image, note = predict_image(content.displacement, beam, original, target, deflector, dispersion)
     write(path, image, setup=target, overwrite=overwrite)
     if not quiet:
         inside = image.sum() / (image.size if beam is None else beam.sum())
@@ -558,3 +544,29 @@ def choose_setups(
             "with --setup, and for a field in px also --recorded-with"
         )
     return original, target
+
+
+def predict_image(
+    displacement: FloatArray,
+    source: FloatArray | None,
+    recorded_with: Setup | None,
+    target: Setup | None,
+    deflector: str | None,
+    dispersion: float,
+) -> tuple[FloatArray, str]:
+    """Return the image, and a sentence with the assumptions."""
+    from napari_shadowinv.physics.forward import synthetic_image
+    from napari_shadowinv.physics.projection import default_deflector, project
+
+    if recorded_with is None or target is None or recorded_with == target:
+        return synthetic_image(displacement, source), ""
+    # Names of two words have a hyphen on the command line.
+    name = deflector and deflector.replace("-", " ")
+    name = name or default_deflector(recorded_with, target)
+    image = project(
+        displacement, recorded_with, target, deflector=name, dispersion=dispersion, source=source
+    )
+    return image, (
+        f"From {setup_text(recorded_with)} to {setup_text(target)}, assuming that only a {name} "
+        "deflects the beam"
+    )
