@@ -539,3 +539,13 @@ def test_a_saved_state_of_another_form_keeps_no_widget_from_opening(
     parts = opened(kind).state()
     monkeypatch.setattr(StateKeeper, "load", lambda self: dict.fromkeys(parts, value))
     assert opened(kind).state().keys() == parts.keys()
+
+
+def test_a_part_of_another_form_leaves_the_other_parts_restored(
+    viewer: ViewerModel, opened: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = opened(InvertShot)
+    first.options.set_values({"n_sites": 777})
+    saved = {**first.state(), "source": {"values": 5}, "steps": 3}
+    monkeypatch.setattr(StateKeeper, "load", lambda self: saved)
+    assert opened(InvertShot).options.model().n_sites == 777

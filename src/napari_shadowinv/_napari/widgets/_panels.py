@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -476,7 +477,9 @@ class ToolPanel(qt.Docked):
     def restore(self, state: Mapping[str, Any]) -> None:
         for name, part in self.parts().items():
             if name in state:
-                part.restore(state[name])
+                # A part whose state has another form keeps its defaults, the others do not.
+                with suppress(*qt.UNREADABLE):
+                    part.restore(state[name])
 
     def restore_last(self) -> None:
         self._keeper.restore(self.restore)

@@ -34,6 +34,8 @@ COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
 _WIDTH_PX = 330  # of a panel
 _CURVE_HEIGHT_PX = 210
 _CONSTANT_STAGES = ("samples",)  # do not change the objective
+# Errors by a saved state of another form, as other versions may write it.
+UNREADABLE = ArithmeticError, AttributeError, LookupError, TypeError, ValueError
 _WRITE_DELAY_MS = 300  # a moving slider is written once
 # napari's docks, which users expect to see next to a plugin's.
 _NAPARI_DOCKS = {"layer list", "layer controls", "console"}
@@ -232,8 +234,8 @@ class StateKeeper(QObject):
         return state if isinstance(state, dict) else {}
 
     def restore(self, restore: Callable[[Mapping[str, Any]], None]) -> None:
-        """Show the saved state, as far as it has the form that this version writes."""
-        with suppress(ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
+        """Hand over the saved state; ignore one of another form than this version writes."""
+        with suppress(*UNREADABLE):
             restore(self.load())
 
     def changed(self) -> None:
