@@ -288,3 +288,8 @@ def test_the_cross_of_the_progress_bar_ends_an_inversion(
     qtbot.waitUntil(lambda: bar not in progress._all_instances, timeout=30_000)
     assert len(window.layers) == 1
     assert messages == []
+
+
+def test_commands_are_described_by_their_work() -> None:
+    assert commands.invert_uniform.__name__ == "invert_uniform"
+    assert "uniform source" in str(commands.invert_uniform.__doc__)

@@ -63,6 +63,7 @@ def _in_thread(
         ) -> list[napari.types.LayerDataTuple]:
             return _start(_select_image(layer, viewer, usable), work, activity, viewer)
 
+        command.__name__, command.__doc__ = work.__name__, work.__doc__
         return viewer_sync.notify_errors(otherwise=list)(command)
 
     return as_command
