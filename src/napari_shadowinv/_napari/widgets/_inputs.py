@@ -553,15 +553,15 @@ class InversionInputs:
     def job_inputs(
         self, image: Any, name: str, recipe: preprocessing.Recipe, *others: Any
     ) -> dict[str, Any]:
-        """Return the fields of a job about its inputs: an image, or files of that name.
+        """Return the fields of a job about its inputs; without an image, files of that name.
 
-        Its companions are masks, source and other layers that lie on the image, if chosen.
+        Its companions are the chosen masks, source and other layers that lie on the image.
         """
         origins = Origins(
-            self.source.summary,
-            self.masks.summary(image),
-            self.setup.summary,
-            self.setup.origin,
+            source=self.source.summary,
+            mask=self.masks.summary(image),
+            setup=self.setup.summary,
+            setup_origin=self.setup.origin,
             image=name,
             source_mask=self.source_masks.summary(image) if self.source.is_estimated else "",
         )

@@ -207,7 +207,7 @@ class LastResults:
         return results
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Origins:
     """Origins of the inputs of an inversion or fit, in words; empty without a mask or setup."""
 

@@ -236,10 +236,10 @@ class FitImages(ToolPanel):
             f"{row.name}: {_beam_summary(shot)}" for row, shot in zip(rows, shots, strict=True)
         ]
         origins = Origins(
-            self.source.summary,
-            self.masks.summary(first.layer),
-            self.setup.summary,
-            self.setup.origin,
+            source=self.source.summary,
+            mask=self.masks.summary(first.layer),
+            setup=self.setup.summary,
+            setup_origin=self.setup.origin,
             steps="; ".join(step.summary for step in recipe.steps),
         )
         used_layers = (*(row.layer for row in rows), self.masks.layer, self.source.layer)
