@@ -255,9 +255,11 @@ def check_orientation(images: ArrayLike, usable: ArrayLike, names: Sequence[str]
         If a film lies another way round; the message says how each of them was scanned.
     """
     # Large structure in few pixels, and how much of each of them is known.
-    counts = block_sums(np.asarray(usable), _BLOCK_PX)
-    sums = block_sums(np.where(usable, images, 0.0), _BLOCK_PX)
-    planes = np.stack([sums / np.maximum(counts, 1.0), counts / _BLOCK_PX**2], axis=1)
+    planes = []
+    for image, known in zip(np.asarray(images), np.asarray(usable), strict=True):
+        counts = block_sums(known, _BLOCK_PX)
+        sums = block_sums(np.where(known, image, 0.0), _BLOCK_PX)
+        planes.append(np.stack([sums / np.maximum(counts, 1.0), counts / _BLOCK_PX**2]))
     flips = [(False, False)]  # of the rows and columns, so that films lie as the first
     clues = {}
     for number in range(1, len(planes)):
@@ -442,7 +444,8 @@ def _fit_poses(pairs: list[_Pair], edges: FloatArray) -> Poses:
     for pair in pairs:
         difference = np.zeros(count)
         films = [pair.first, pair.second]
-        difference[films], is_compared[films] = (-1.0, 1.0), True
+        difference[films] = -1.0, 1.0
+        is_compared[films] = True
         both = np.outer(difference, difference)
         normal += both / pair.error**2
         sides += difference[:, None] * pair.shift / pair.error**2
