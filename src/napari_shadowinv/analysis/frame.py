@@ -137,9 +137,10 @@ class FieldFrame:
 
     @cached_property
     def _si_field(self) -> SIField:
-        """The setup's field in the unit; the displacement in pixels if there is none."""
-        fields = () if self.setup is None else self.setup.si_fields
-        return next((field for field in fields if field.name == self.unit.field), _DISPLACEMENT)
+        """The setup's field in the unit, or the displacement in pixels."""
+        if self.setup is None or self.unit.field == _DISPLACEMENT.name:
+            return _DISPLACEMENT
+        return next(field for field in self.setup.si_fields if field.name == self.unit.field)
 
     @property
     def long_name(self) -> str:
