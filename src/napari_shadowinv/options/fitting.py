@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
@@ -10,10 +11,13 @@ from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv.options.inversion import MaxError
 from napari_shadowinv.physics.setup import deflector_titles
 
-*_FIRST_FIELDS, _LAST_FIELD = deflector_titles()
-
 MAX_STRENGTH = 1e4
 """Largest ratio of an image's displacement to the first one's."""
+
+
+def _any_of(names: Iterable[str]) -> str:
+    *most, last = names
+    return f"{', '.join(most)} or {last}"
 
 
 class FitOptions(CheckedModel, allow_inf_nan=False):
@@ -184,7 +188,7 @@ class FitChoices(CheckedModel, allow_inf_nan=False):
     fields: tuple[str, ...] | None = Field(
         default=None,
         description=(
-            f"Cause of the deflection: {', '.join(_FIRST_FIELDS)} or {_LAST_FIELD}. Two of them, "
+            f"Cause of the deflection: {_any_of(deflector_titles())}. Two of them, "
             "separated by a comma, need images at two energies. Default: B, or phase for light."
         ),
         json_schema_extra={"metavar": "NAMES"},

@@ -548,7 +548,13 @@ class IsotropicEstimate(Estimate):
         y, x = ((c + 0.5) / factor - 0.5 for c in (self.centre_y, self.centre_x))
         return self._at(y, x, bin_setup(self._setup, factor))
 
-    def source(self, image: FloatArray, mask: BoolArray | None, *_: Any, **__: Any) -> FloatArray:
+    def source(
+        self,
+        image: FloatArray,
+        mask: BoolArray | None,
+        should_stop: ShouldStop | None = None,
+        on_caution: OnCaution | None = None,
+    ) -> FloatArray:
         point_distance(self._setup)  # refuses a missing setup before a wrong image
         return isotropic_source(image, self._setup, mask=mask, **self.values())
 
