@@ -161,7 +161,7 @@ def test_attributes_contain_recipe_and_origins(tmp_path: Path, proton_setup: Pro
 
 
 def test_dataset_of_something_else_is_refused() -> None:
-    with pytest.raises(InputError, match=r"'potential'.*'options', 'report'"):
+    with pytest.raises(InputError, match=r"'potential'.*'options', 'instrument', 'report'"):
         Inversion.from_dataset(xr.Dataset())
 
 
