@@ -118,6 +118,12 @@ def test_a_room_imports_only_rooms_below_it():
     assert not above
 
 
+def test_public_names_are_listed_in_packages_only():
+    """In a module they are those without an underscore; the reference lists the phantoms."""
+    listing = {path.stem for path in FILES if "__all__" in path.read_text(encoding="utf-8")}
+    assert listing <= {"__init__", "phantoms"}
+
+
 def test_modules_do_not_import_each_other_in_circles():
     try:
         TopologicalSorter(needs()).prepare()
