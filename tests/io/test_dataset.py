@@ -165,6 +165,26 @@ def test_dataset_of_something_else_is_refused() -> None:
         Inversion.from_dataset(xr.Dataset())
 
 
+@pytest.mark.parametrize(
+    ("entry", "value", "reason"),
+    [
+        ("levels", None, r"\(levels: Field required\)"),
+        ("warnings", None, r"\('warnings' is missing\)"),
+        ("iterations", "many", r"\(iterations: Input should be a valid integer"),
+    ],
+)
+def test_a_damaged_report_is_refused_by_its_entry(
+    inversion: Inversion, entry: str, value: object, reason: str
+) -> None:
+    dataset = inversion.to_dataset()
+    report = {**json.loads(dataset.attrs["report"]), entry: value}
+    if value is None:
+        del report[entry]
+    dataset.attrs["report"] = json.dumps(report)
+    with pytest.raises(InputError, match=reason):
+        Inversion.from_dataset(dataset)
+
+
 def test_damaged_result_is_named(tmp_path: Path, inversion: Inversion) -> None:
     path = tmp_path / "shot.shadowinv"
     write(path, inversion)
