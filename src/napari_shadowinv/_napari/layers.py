@@ -230,8 +230,8 @@ class View:
     deflector: str | None = None
 
     def has(self, kind: Kind) -> bool:
-        other = "shot" if self.shot is not None else "stack"
-        if kind.shown_of == other or not self.along_shots(kind.variable):
+        excluded = "stack" if self.shot is None else "shot"
+        if kind.shown_of == excluded or not self.along_shots(kind.variable):
             return False
         if kind.role == "field arrows":
             return bool(self.field.arrows)

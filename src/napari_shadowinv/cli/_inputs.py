@@ -54,10 +54,10 @@ def check_outputs(outputs: Iterable[Output], overwrite: bool) -> list[Path]:
     """Return the files to be written; refuse, before any work, one that cannot be."""
     from napari_shadowinv.io import check_output
 
-    wanted = [(path, suffixes) for path, suffixes in outputs if path is not None]
-    for path, suffixes in wanted:
+    files = [(path, suffixes) for path, suffixes in outputs if path is not None]
+    for path, suffixes in files:
         check_output(path, overwrite, suffixes=suffixes)
-    return [path for path, _ in wanted]
+    return [path for path, _ in files]
 
 
 def protect(outputs: list[Path], inputs: list[Path | None]) -> None:

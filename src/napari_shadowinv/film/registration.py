@@ -256,9 +256,9 @@ def check_orientation(images: ArrayLike, usable: ArrayLike, names: Sequence[str]
     """
     # Large structure in few pixels, and how much of each of them is known.
     planes = []
-    for image, known in zip(np.asarray(images), np.asarray(usable), strict=True):
-        counts = block_sums(known, _BLOCK_PX)
-        sums = block_sums(np.where(known, image, 0.0), _BLOCK_PX)
+    for image, mask in zip(np.asarray(images), np.asarray(usable), strict=True):
+        counts = block_sums(mask, _BLOCK_PX)
+        sums = block_sums(np.where(mask, image, 0.0), _BLOCK_PX)
         planes.append(np.stack([sums / np.maximum(counts, 1.0), counts / _BLOCK_PX**2]))
     flips = [(False, False)]  # of the rows and columns, so that films lie as the first
     clues = {}
@@ -471,9 +471,9 @@ def _greatest_correlation(first: FloatArray, second: FloatArray) -> float:
     steps = _MAX_SHIFT_SAMPLES // _BLOCK_PX
     greatest = -1.0
     for shift in product(range(-steps, steps + 1), repeat=2):
-        there = tuple(slice(max(0, step) or None, min(0, step) or None) for step in shift)
-        back = tuple(slice(max(0, -step) or None, min(0, -step) or None) for step in shift)
-        (fixed, fixed_share), (moved, moved_share) = first[:, *there], second[:, *back]
+        on_first = tuple(slice(max(0, step) or None, min(0, step) or None) for step in shift)
+        on_second = tuple(slice(max(0, -step) or None, min(0, -step) or None) for step in shift)
+        (fixed, fixed_share), (moved, moved_share) = first[:, *on_first], second[:, *on_second]
         both = (fixed_share > 0.5) & (moved_share > 0.5)
         if both.sum() < both.size / 4:
             continue

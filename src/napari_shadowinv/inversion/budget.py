@@ -542,7 +542,7 @@ class Budget:
         return self._moves[solution]
 
     def _change(self, solved: Sequence[LevelSolution]) -> tuple[FloatArray, float]:
-        """Estimate squared discretisation errors, and the power of the sites by which they fall."""
+        """Estimate squared discretisation errors, and the power of the site count they follow."""
         times = len(solved[-1].weights) / len(solved[-2].weights)
         # With less than four times the sites, the rate of the levels before is used.
         full_steps = solved if times > _MIN_STEP or len(solved) < 3 else solved[:-1]

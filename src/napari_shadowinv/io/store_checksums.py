@@ -165,6 +165,7 @@ _CODEC = "crc32c"
 _CRC_BYTES = 4
 Report = dict[str, Any]
 
+_UNREADABLE = OSError, ValueError, TypeError, struct.error
 _READS = 3  # of a shot that another process may be writing again
 RECORD = ("status", "report")  # arrays with an entry for each shot that are no fields
 
@@ -401,14 +402,11 @@ def _check_again(inspect: Callable[[], tuple[str, Report]]) -> tuple[str, Report
 
 
 def _inspect_shot(
-    layout: Layout, index: int, names: Sequence[str], every_byte: bool = False, ended: bool = False
+    layout: Layout, index: int, names: Sequence[str], every_byte: bool = False
 ) -> tuple[str, Report]:
-    """Describe the damage to a shot (only if it has `ended`), empty if none; return its report."""
-    part = "status"
+    """Describe the damage to a shot that has ended, empty if there is none; return its report."""
+    part = "report"  # that is read, for the message
     try:
-        if ended and _read_status(layout.root, index) not in (Status.DONE, Status.FAILED):
-            return "", {}
-        part = "report"
         report = _read_report(layout.root, index)
         if CHUNKS not in report:
             part = "status"
@@ -424,9 +422,21 @@ def _inspect_shot(
                 return f"its {part} is {state}", report
             if every_byte:
                 _read_chunk(file)
-    except (OSError, ValueError, TypeError, struct.error) as error:
+    except _UNREADABLE as error:
         return f"its {part} is damaged ({error})", {}
     return "", report
+
+
+def _inspect_ended(
+    layout: Layout, index: int, names: Sequence[str], every_byte: bool
+) -> tuple[str, Report]:
+    """As `_inspect_shot`, but find nothing in a shot that has not ended."""
+    try:
+        if _read_status(layout.root, index) not in (Status.DONE, Status.FAILED):
+            return "", {}
+    except _UNREADABLE as error:
+        return f"its status is damaged ({error})", {}
+    return _inspect_shot(layout, index, names, every_byte)
 
 
 def _chunk_problem(layout: Layout, key: str, every_byte: bool) -> str:
@@ -469,8 +479,7 @@ def find_damage(
     shots: dict[int, str] = {}
     noted: dict[int, dict[str, Any]] = {}
     for index in range(layout.shots) if numbers is None else numbers:
-        inspect = partial(_inspect_shot, layout, index, names, every_byte, ended=True)
-        problem, report = _check_again(inspect)
+        problem, report = _check_again(partial(_inspect_ended, layout, index, names, every_byte))
         if problem:
             shots[index] = problem
         elif report:

@@ -211,8 +211,8 @@ def _invert(
         inversion = task.run(images, beam, source, start=start)
     except InputError as error:
         raise error.about(label) from error
-    kept = {"inversion": inversion} if keep else {}
-    return {**task.arrays(inversion), **column_values(INVERSIONS, inversion), **kept}
+    start_of_next = {"inversion": inversion} if keep else {}
+    return {**task.arrays(inversion), **column_values(INVERSIONS, inversion), **start_of_next}
 
 
 def _pick(record: dict[str, Any], name: str) -> AnyArray:

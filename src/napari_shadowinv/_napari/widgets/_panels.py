@@ -477,7 +477,7 @@ class ToolPanel(qt.Docked):
     def restore(self, state: Mapping[str, Any]) -> None:
         for name, part in self.parts().items():
             if name in state:
-                # A part whose state has another form keeps its defaults, the others do not.
+                # A part with an unreadable state keeps its defaults; the others are restored.
                 with suppress(*qt.UNREADABLE):
                     part.restore(state[name])
 

@@ -34,7 +34,7 @@ COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
 _WIDTH_PX = 330  # of a panel
 _CURVE_HEIGHT_PX = 210
 _CONSTANT_STAGES = ("samples",)  # do not change the objective
-# Errors by a saved state of another form, as other versions may write it.
+# Errors that a saved state causes which another version wrote in another form.
 UNREADABLE = ArithmeticError, AttributeError, LookupError, TypeError, ValueError
 _WRITE_DELAY_MS = 300  # a moving slider is written once
 # napari's docks, which users expect to see next to a plugin's.
@@ -234,7 +234,7 @@ class StateKeeper(QObject):
         return state if isinstance(state, dict) else {}
 
     def restore(self, restore: Callable[[Mapping[str, Any]], None]) -> None:
-        """Hand over the saved state; ignore one of another form than this version writes."""
+        """Restore the saved state by a widget's function; ignore a state that is unreadable."""
         with suppress(*UNREADABLE):
             restore(self.load())
 
