@@ -1273,7 +1273,6 @@ def test_ctrl_c_while_computing_leaves_nothing(folder: Path) -> None:
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")
 def test_ctrl_c_converted_by_a_library_still_cancels(folder: Path, shot: Path) -> None:
     half_imported = """
-        import time
         from napari_shadowinv import io
 
         class HalfMade:
@@ -1284,8 +1283,7 @@ def test_ctrl_c_converted_by_a_library_still_cancels(folder: Path, shot: Path) -
 
         def read_radiograph(*arguments, **options):
             try:
-                print("now")
-                time.sleep(60)
+                stall()
             except KeyboardInterrupt:
                 raise ImportError("a part of the library failed to import")
 
@@ -1300,13 +1298,11 @@ def test_ctrl_c_converted_by_a_library_still_cancels(folder: Path, shot: Path) -
 def test_ctrl_c_while_writing_keeps_the_old_result(folder: Path, shot: Path) -> None:
     (folder / "shot.shadowinv").write_text("old")
     slow_disk = """
-        import time
         from napari_shadowinv.io import read_write
 
         def write_slowly(path, dataset):
             path.write_text("half")
-            print("now")
-            time.sleep(60)
+            stall()
 
         read_write.write_result = write_slowly
     """
@@ -1336,7 +1332,7 @@ def test_neither_result_nor_figure_is_left_on_a_full_disk(
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")
 def test_a_second_ctrl_c_does_not_interrupt_the_clean_up(folder: Path, shot: Path) -> None:
     impatient = """
-        import signal, time
+        import signal
         from napari_shadowinv.io import read_write, files
 
         class Room:
@@ -1349,8 +1345,7 @@ def test_a_second_ctrl_c_does_not_interrupt_the_clean_up(folder: Path, shot: Pat
         def write_slowly(path, dataset):
             path.write_text("half")
             files.defer_interrupts = Room
-            print("now")
-            time.sleep(60)
+            stall()
 
         read_write.write_result = write_slowly
     """

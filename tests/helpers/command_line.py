@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import textwrap
+import time
 from functools import cache
 from pathlib import Path
 from unittest.mock import patch
@@ -15,6 +14,7 @@ import typer.testing
 from typer.main import get_command
 from typer.testing import CliRunner, Result
 
+from helpers.signals import start
 from napari_shadowinv.cli import app
 
 # Built once: to build all flags takes longer than most of the commands.
@@ -42,23 +42,16 @@ def content(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
-def interrupted(folder: Path, preparation: str, arguments: list[str]) -> tuple[int, str]:
-    """Run the command in its own process, and press Ctrl-C when it has said "now"."""
-    script = textwrap.dedent(preparation) + "\nfrom napari_shadowinv.cli import app\napp()\n"
-    process = subprocess.Popen(
-        [sys.executable, "-c", script, *arguments],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    )
+def interrupted(
+    folder: Path, preparation: str, arguments: list[str], pause: float = 0.0
+) -> tuple[int, str]:
+    """Run the command in its own processes, and press Ctrl-C a pause after they have said "now"."""
+    run = "\nfrom napari_shadowinv.cli import app\napp()\n"
+    body = textwrap.dedent(preparation) + run
+    process = start(body, *arguments, cwd=folder, start_new_session=True)
     try:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if "now" in line:
-                process.send_signal(signal.SIGINT)
-                break
+        time.sleep(pause)
+        os.killpg(process.pid, signal.SIGINT)
         _, errors = process.communicate(timeout=60)
     finally:
         process.kill()

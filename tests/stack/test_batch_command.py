@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import textwrap
 import time
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from rich import progress
 from rich.console import Console
 from typer.testing import Result
 
-from helpers.command_line import flat, shadowinv
+from helpers.command_line import flat, interrupted, shadowinv
 from napari_shadowinv import InversionOptions, invert, read
 from napari_shadowinv.cli._batch import progress_columns
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
@@ -517,27 +516,7 @@ def test_ctrl_c_leaves_a_store_that_is_resumed(make_night, tmp_path, monkeypatch
     assert (StackStore(out).statuses() == DONE).all()
 
 
-def interrupted(preparation: str, pause: float, *arguments: str) -> tuple[int, str]:
-    """Run a batch in its own processes; Ctrl-C some time after it has said "now"."""
-    script = textwrap.dedent(preparation) + "\nfrom napari_shadowinv.cli import app\napp()\n"
-    process = subprocess.Popen(
-        [sys.executable, "-c", script, "batch", "shots/shot_*.npy", "--out", "n.shadowinv.zarr",
-         "--n-sites", "100", *arguments],
-        env={**os.environ, "PYTHONPATH": str(SOURCES), "PYTHONUNBUFFERED": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )  # fmt: skip
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "now\n"
-        time.sleep(pause)
-        os.killpg(process.pid, signal.SIGINT)
-        _, stderr = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    return process.returncode, stderr
+BATCH = ["batch", "shots/shot_*.npy", "--out", "n.shadowinv.zarr", "--n-sites", "100"]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals to a process group")
@@ -554,7 +533,7 @@ def test_ctrl_c_while_workers_start_gives_one_sentence(night, folder):
     """
     before = sorted(folder.rglob("*"))
     # When the workers are about to import their modules.
-    code, output = interrupted(starting, 0.6, "--workers", "1")
+    code, output = interrupted(folder, starting, [*BATCH, "--workers", "1"], 0.6)
     assert code == 130
     assert output.splitlines() == [
         "Cancelled: nothing written. Repeat the command with --resume to continue."
@@ -584,7 +563,7 @@ def test_ctrl_c_while_the_store_is_made_leaves_nothing(night, folder):
         store._create_array = lambda *arguments: pool.submit(create_slowly, *arguments).result()
     """
     before = sorted(folder.rglob("*"))
-    code, output = interrupted(behind_our_back, 0.1, "--scheduler", "threads")
+    code, output = interrupted(folder, behind_our_back, [*BATCH, "--scheduler", "threads"], 0.1)
     assert code == 130
     assert "Cancelled: nothing written" in output
     assert sorted(folder.rglob("*")) == before

@@ -7,11 +7,11 @@ import signal
 import subprocess
 import sys
 import tempfile
-import textwrap
 from pathlib import Path
 
 import pytest
 
+from helpers.signals import start
 from napari_shadowinv._system import hidden_files
 from napari_shadowinv._system.hidden_files import hidden_name, locked, sweep, temporary_folder
 from napari_shadowinv.errors import FileFormatError
@@ -26,19 +26,6 @@ def unswept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hidden_files, "_swept", set())
 
 
-def start(body: str, *arguments: object) -> subprocess.Popen[str]:
-    """Run code in a process, up to its word "now"."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(body), *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "now\n"
-    return process
-
-
 # A process started by nohup ignores SIGHUP, as do the ones it starts.
 DEFAULT_SIGNALS = """
     import signal
@@ -50,21 +37,19 @@ IGNORED_HANGUP = """
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
 """
 WRITE = """
-    import sys, time
+    import sys
     from napari_shadowinv.io.files import replacing
     with replacing(sys.argv[1]) as draft:
         draft.write_text("half")
-        print("now", flush=True)
-        time.sleep(600)
+        stall()
 """
 KEEP = """
-    import sys, tempfile, time
+    import sys, tempfile
     tempfile.tempdir = sys.argv[1]
     from napari_shadowinv._system.hidden_files import temporary_folder
     with temporary_folder("shadowinv") as folder:
         (folder / "inner").mkdir()
-        print("now", flush=True)
-        time.sleep(600)
+        stall()
 """
 
 
@@ -77,7 +62,7 @@ def test_signal_while_writing_leaves_nothing(tmp_path: Path, number: int) -> Non
 
 
 def test_ignored_signal_does_not_stop_writing(tmp_path: Path) -> None:
-    process = start(IGNORED_HANGUP + WRITE.replace("600", "1"), tmp_path / "a.tif")
+    process = start(IGNORED_HANGUP + WRITE.replace("stall()", "stall(1)"), tmp_path / "a.tif")
     process.send_signal(signal.SIGHUP)
     assert process.wait(60) == 0
     assert (tmp_path / "a.tif").read_text() == "half"
