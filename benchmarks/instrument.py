@@ -615,7 +615,7 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     tables = ["totals", "bands", "ranks", "cost", "fits", "energies"]
-    parser.add_argument("tables", nargs="*", choices=[*tables, []], default=tables)
+    parser.add_argument("tables", nargs="*", choices=[*tables, []], help="default: all")
     parser.add_argument("--shots", type=int, default=210)
     parser.add_argument("--side", type=int, default=128)
     parser.add_argument("--first-seed", type=int, default=0)
@@ -625,17 +625,18 @@ def main() -> None:
     arguments = parser.parse_args()
     Shot.smoothness = arguments.smoothness
     size = arguments.side, arguments.shots, arguments.first_seed
-    if "totals" in arguments.tables:
+    chosen = arguments.tables or tables
+    if "totals" in chosen:
         table_of_totals(*size)
-    if "bands" in arguments.tables:
+    if "bands" in chosen:
         table_of_bands(*size)
-    if "ranks" in arguments.tables:
+    if "ranks" in chosen:
         table_of_ranks(*size, arguments.method)
-    if "cost" in arguments.tables:
+    if "cost" in chosen:
         table_of_cost()
-    if "fits" in arguments.tables:
+    if "fits" in chosen:
         table_of_fits(*size, arguments.times)
-    if "energies" in arguments.tables:
+    if "energies" in chosen:
         table_of_energies(arguments.side, arguments.first_seed)
 
 
