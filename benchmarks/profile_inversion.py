@@ -21,7 +21,8 @@ from napari_shadowinv import Inversion, InversionOptions, invert
 from napari_shadowinv.geometry import flips
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
-from napari_shadowinv.geometry.triangulation import FLIPS, RegularTriangulation
+from napari_shadowinv.geometry.triangle_mesh import FLIPS
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.transport.minimise import TransportObjective
 from reference import toroid_case
 

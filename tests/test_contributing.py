@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from importlib import import_module
 from pathlib import Path
@@ -291,6 +292,14 @@ def test_the_longest_module_is_as_long_as_stated():
     assert limit is not None
     lengths = [len(path.read_text("utf-8").splitlines()) for path in PACKAGE.rglob("*.py")]
     assert 500 < max(lengths) <= int(limit[1])
+
+
+def test_benchmarks_and_examples_import_what_is_there():
+    for folder in ("benchmarks", "docs", "examples"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+                if isinstance(node, ast.ImportFrom) and PACKAGE.name in str(node.module):
+                    exec(ast.unparse(node), {})
 
 
 def test_every_benchmark_is_listed_and_every_link_leads_somewhere():
