@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._flags import HelpfulCommand
@@ -61,20 +61,20 @@ class AnalyseCommand(HelpfulCommand):
 
 @notify_errors
 def analyse(
-    result: Annotated[Path, typer.Argument(help=HELP["result"], show_default=False)],
+    result: Annotated[Path, Argument(help=HELP["result"], show_default=False)],
     product: Annotated[
-        list[str] | None, typer.Argument(help=HELP["products"], show_default=False)
+        list[str] | None, Argument(help=HELP["products"], show_default=False)
     ] = None,
-    products: Annotated[Path | None, typer.Option(help=HELP["file"])] = None,
-    unit: Annotated[str | None, typer.Option(help=HELP["unit"])] = None,
-    deflector: Annotated[str | None, typer.Option(help=HELP["deflector"])] = None,
-    samples: Annotated[int, typer.Option(help=HELP["samples"], metavar="N")] = 100,
+    products: Annotated[Path | None, Option(help=HELP["file"])] = None,
+    unit: Annotated[str | None, Option(help=HELP["unit"])] = None,
+    deflector: Annotated[str | None, Option(help=HELP["deflector"])] = None,
+    samples: Annotated[int, Option(help=HELP["samples"], metavar="N")] = 100,
     setup: _flags.SetupFile = None,
-    shots: Annotated[str | None, typer.Option(help=HELP["shots"])] = None,
-    times: Annotated[str | None, typer.Option(help=HELP["times"])] = None,
-    csv: Annotated[Path | None, typer.Option(help="Table of all numbers with their bands.")] = None,
-    figure: Annotated[Path | None, typer.Option(help=HELP["figure"])] = None,
-    out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
+    shots: Annotated[str | None, Option(help=HELP["shots"])] = None,
+    times: Annotated[str | None, Option(help=HELP["times"])] = None,
+    csv: Annotated[Path | None, Option(help="Table of all numbers with their bands.")] = None,
+    figure: Annotated[Path | None, Option(help=HELP["figure"])] = None,
+    out: Annotated[Path | None, Option(help=HELP["out"])] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
 ) -> None:

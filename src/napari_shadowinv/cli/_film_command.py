@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
+from typer import Argument, Option
 
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._summary import fact_rows, two_columns, written_rows
@@ -57,15 +57,15 @@ Known films: EBT3, HDV2, MDV3; materials: Al, Au, Cu, Fe, Kapton, Mylar, Ta, Ti 
 
 @notify_errors
 def film(
-    pack: Annotated[Path | None, typer.Argument(help=HELP["pack"], show_default=False)] = None,
-    layers: Annotated[Path | None, typer.Option(help=HELP["layers"])] = None,
+    pack: Annotated[Path | None, Argument(help=HELP["pack"], show_default=False)] = None,
+    layers: Annotated[Path | None, Option(help=HELP["layers"])] = None,
     layers_format: Annotated[
-        LayersFormat, typer.Option(metavar="tiff|pradformat", help="Format of the layers' images.")
+        LayersFormat, Option(metavar="tiff|pradformat", help="Format of the layers' images.")
     ] = "tiff",
-    corners: Annotated[Path | None, typer.Option("--save-corners", help=HELP["corners"])] = None,
-    out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
+    corners: Annotated[Path | None, Option("--save-corners", help=HELP["corners"])] = None,
+    out: Annotated[Path | None, Option(help=HELP["out"])] = None,
     figure: _flags.Figure = None,
-    new: Annotated[Path | None, typer.Option(help=HELP["new"])] = None,
+    new: Annotated[Path | None, Option(help=HELP["new"])] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
 ) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._summary import fact_rows, two_columns, written_rows
@@ -73,31 +73,27 @@ Each result states whether its field can be trusted: "determined", "one of sever
 @notify_errors
 @_flags.takes_fit
 def fit(
-    images: Annotated[list[Path], typer.Argument(help=HELP["images"], show_default=False)],
-    energies: Annotated[
-        str | None, typer.Option(metavar="MEV,MEV,…", help=HELP["energies"])
-    ] = None,
+    images: Annotated[list[Path], Argument(help=HELP["images"], show_default=False)],
+    energies: Annotated[str | None, Option(metavar="MEV,MEV,…", help=HELP["energies"])] = None,
     strengths: Annotated[
-        str | None, typer.Option(metavar="NUMBER,NUMBER,…", help=HELP["strengths"])
+        str | None, Option(metavar="NUMBER,NUMBER,…", help=HELP["strengths"])
     ] = None,
-    setup: Annotated[Path | None, typer.Option(help=HELP["setup"])] = None,
-    source: Annotated[str | None, typer.Option(metavar="PATH|unknown", help=HELP["source"])] = None,
+    setup: Annotated[Path | None, Option(help=HELP["setup"])] = None,
+    source: Annotated[str | None, Option(metavar="PATH|unknown", help=HELP["source"])] = None,
     brightness: Annotated[
-        str | None, typer.Option(metavar="known|free|NUMBERS", help=HELP["brightness"])
+        str | None, Option(metavar="known|free|NUMBERS", help=HELP["brightness"])
     ] = None,
-    mask: Annotated[Path | None, typer.Option(help=HELP["mask"])] = None,
-    fiducials: Annotated[Path | None, typer.Option(help=HELP["fiducials"])] = None,
-    compare: Annotated[bool, typer.Option("--compare", help=HELP["compare"])] = False,
-    leave_one_out: Annotated[
-        bool, typer.Option("--leave-one-out", help=HELP["leave_one_out"])
-    ] = False,
-    energy_window: Annotated[int | None, typer.Option(help=HELP["energy_window"])] = None,
+    mask: Annotated[Path | None, Option(help=HELP["mask"])] = None,
+    fiducials: Annotated[Path | None, Option(help=HELP["fiducials"])] = None,
+    compare: Annotated[bool, Option("--compare", help=HELP["compare"])] = False,
+    leave_one_out: Annotated[bool, Option("--leave-one-out", help=HELP["leave_one_out"])] = False,
+    energy_window: Annotated[int | None, Option(help=HELP["energy_window"])] = None,
     recipe: _flags.RecipeFile = None,
     save_recipe: _flags.SaveRecipe = None,
-    options: Annotated[Path | None, typer.Option(help="TOML file with options of the fit.")] = None,
+    options: Annotated[Path | None, Option(help="TOML file with options of the fit.")] = None,
     channel: _flags.Channel = None,
     variable: _flags.Variable = None,
-    out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
+    out: Annotated[Path | None, Option(help=HELP["out"])] = None,
     figure: _flags.Figure = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.QuietInversion = False,

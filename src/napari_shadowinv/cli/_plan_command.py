@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Exit, Option
 
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._terminal import (
@@ -68,22 +68,22 @@ registration, other_field.
 @notify_errors
 @_flags.takes_plan
 def plan(
-    object: Annotated[str, typer.Argument(help=HELP["object"], show_default=False)],
+    object: Annotated[str, Argument(help=HELP["object"], show_default=False)],
     setup: _flags.SetupFile = None,
     energies: Annotated[
-        str | None, typer.Option(metavar="NUMBER,NUMBER,…", help=HELP["energies"])
+        str | None, Option(metavar="NUMBER,NUMBER,…", help=HELP["energies"])
     ] = None,
-    size: Annotated[str | None, typer.Option(metavar="HxW", help=HELP["size"])] = None,
+    size: Annotated[str | None, Option(metavar="HxW", help=HELP["size"])] = None,
     recorded_with: Annotated[
-        Path | None, typer.Option(help=HELP["recorded_with"], rich_help_panel=_OF_FILE)
+        Path | None, Option(help=HELP["recorded_with"], rich_help_panel=_OF_FILE)
     ] = None,
     deflector: Annotated[
         str | None,
-        typer.Option(metavar="WHAT", help="Cause of the deflection.", rich_help_panel=_OF_FILE),
+        Option(metavar="WHAT", help="Cause of the deflection.", rich_help_panel=_OF_FILE),
     ] = None,
-    sweep: Annotated[str | None, typer.Option(metavar="NAME=VALUES", help=HELP["sweep"])] = None,
-    out: Annotated[Path, typer.Option(help=HELP["out"])] = Path("plan.csv"),
-    figure: Annotated[Path | None, typer.Option(help=HELP["figure"])] = None,
+    sweep: Annotated[str | None, Option(metavar="NAME=VALUES", help=HELP["sweep"])] = None,
+    out: Annotated[Path, Option(help=HELP["out"])] = Path("plan.csv"),
+    figure: Annotated[Path | None, Option(help=HELP["figure"])] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
     *,
@@ -134,7 +134,7 @@ def plan(
         rows = [headline_row(result.headline), *fact_rows(result.facts), *written_rows([out, page])]
         say(two_columns("Sweep" if is_sweep else "Plan", rows))
     if not result.is_determined:
-        raise typer.Exit(EXIT_NOT_CONVERGED)
+        raise Exit(EXIT_NOT_CONVERGED)
 
 
 def _file_of(text: str) -> Path | None:

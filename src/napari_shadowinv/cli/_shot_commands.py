@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option, echo
 
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cli import _flags, _inputs
@@ -174,19 +174,13 @@ def invert(
 @notify_errors
 def rerun(
     result: Annotated[
-        Path, typer.Argument(help="A .shadowinv result of this program.", show_default=False)
+        Path, Argument(help="A .shadowinv result of this program.", show_default=False)
     ],
-    image: Annotated[
-        list[Path] | None, typer.Argument(help=HELP["image"], show_default=False)
-    ] = None,
-    source: Annotated[
-        Path | None, typer.Option(help="The measured source, if it has moved.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help=HELP["rerun_out"])] = None,
+    image: Annotated[list[Path] | None, Argument(help=HELP["image"], show_default=False)] = None,
+    source: Annotated[Path | None, Option(help="The measured source, if it has moved.")] = None,
+    out: Annotated[Path | None, Option(help=HELP["rerun_out"])] = None,
     figure: _flags.Figure = None,
-    other_folders: Annotated[
-        bool, typer.Option("--other-folders", help=HELP["other_folders"])
-    ] = False,
+    other_folders: Annotated[bool, Option("--other-folders", help=HELP["other_folders"])] = False,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.QuietInversion = False,
 ) -> None:
@@ -251,20 +245,20 @@ grid's x = y = z = 0, in its middle.
 @notify_errors
 @_flags.takes_trace
 def forward(
-    field: Annotated[Path, typer.Argument(help=HELP["field"], show_default=False)],
+    field: Annotated[Path, Argument(help=HELP["field"], show_default=False)],
     source: _flags.SourceFile = None,
-    setup: Annotated[Path | None, typer.Option(help=HELP["setup"])] = None,
-    recorded_with: Annotated[Path | None, typer.Option(help=HELP["recorded_with"])] = None,
-    deflector: Annotated[str | None, typer.Option(metavar="WHAT", help=HELP["deflector"])] = None,
-    dispersion: Annotated[float, typer.Option(help=HELP["dispersion"])] = 1.0,
+    setup: Annotated[Path | None, Option(help=HELP["setup"])] = None,
+    recorded_with: Annotated[Path | None, Option(help=HELP["recorded_with"])] = None,
+    deflector: Annotated[str | None, Option(metavar="WHAT", help=HELP["deflector"])] = None,
+    dispersion: Annotated[float, Option(help=HELP["dispersion"])] = 1.0,
     channel: _flags.Channel = None,
     variable: _flags.Variable = None,
     source_variable: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Name of the array in the source file.")
+        str | None, Option(metavar="NAME", help="Name of the array in the source file.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help=HELP["predicted_image"])] = None,
-    truth: Annotated[Path | None, typer.Option(help=HELP["truth"])] = None,
-    seed: Annotated[int, typer.Option(help=HELP["seed"])] = 0,
+    out: Annotated[Path | None, Option(help=HELP["predicted_image"])] = None,
+    truth: Annotated[Path | None, Option(help=HELP["truth"])] = None,
+    seed: Annotated[int, Option(help=HELP["seed"])] = 0,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
     *,
@@ -328,11 +322,9 @@ def forward(
 
 @notify_errors
 def info(
-    file: Annotated[
-        Path | None, typer.Argument(help="An image or a result.", show_default=False)
-    ] = None,
+    file: Annotated[Path | None, Argument(help="An image or a result.", show_default=False)] = None,
     variable: _flags.Variable = None,
-    system: Annotated[bool, typer.Option("--system", help=HELP["system"])] = False,
+    system: Annotated[bool, Option("--system", help=HELP["system"])] = False,
 ) -> None:
     """Describe a file and its contents."""
     from napari_shadowinv.cli import _info
@@ -340,7 +332,7 @@ def info(
     if system:
         if file is not None or variable is not None:
             raise InputError("--system describes the installation: it takes no file or variable")
-        typer.echo(_info.system_report())
+        echo(_info.system_report())
         return
     if file is None:
         raise InputError("no file given: name an image or a result, or use --system")
@@ -349,13 +341,13 @@ def info(
 
 @notify_errors
 def demo(
-    out: Annotated[Path, typer.Option(help="Output folder.")] = Path("demo"),
-    dm: Annotated[float, typer.Option(help="Peak path-integrated field in MG·µm.")] = 97.0,
+    out: Annotated[Path, Option(help="Output folder.")] = Path("demo"),
+    dm: Annotated[float, Option(help="Peak path-integrated field in MG·µm.")] = 97.0,
     noise: Annotated[
-        float, typer.Option(help="Standard deviation of the noise, as a fraction of the mean.")
+        float, Option(help="Standard deviation of the noise, as a fraction of the mean.")
     ] = 0.1,
     n_sites: Annotated[
-        int | None, typer.Option(help=InversionOptions.model_fields["n_sites"].description)
+        int | None, Option(help=InversionOptions.model_fields["n_sites"].description)
     ] = None,
 ) -> None:
     """Simulate a proton radiograph of a toroidal field, invert it and compare with the truth.

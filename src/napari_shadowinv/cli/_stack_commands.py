@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Exit, Option
 
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._summary import two_columns
@@ -84,14 +84,14 @@ by Ctrl-C while files were waiting.
 
 
 def _stack_inputs(
-    source: Annotated[Path | None, typer.Option(help=HELP["source"])] = None,
+    source: Annotated[Path | None, Option(help=HELP["source"])] = None,
     mask: _flags.MaskFile = None,
     source_mask: _flags.SourceMask = None,
     recipe: _flags.RecipeFile = None,
     save_recipe: _flags.SaveRecipe = None,
     setup: _flags.SetupFile = None,
     options: _flags.OptionsFile = None,
-    fit: Annotated[bool, typer.Option("--fit", help=HELP["fit"])] = False,
+    fit: Annotated[bool, Option("--fit", help=HELP["fit"])] = False,
     channel: _flags.Channel = None,
     variable: _flags.Variable = None,
     clip_negative: _flags.ClipNegative = False,
@@ -127,11 +127,11 @@ def _stack_inputs(
 @notify_errors
 @_flags.takes_run(RunOptions, _stack_inputs)
 def batch(
-    shots: Annotated[list[str], typer.Argument(help=HELP["shots"], show_default=False)],
-    out: Annotated[Path, typer.Option(help="Output store: name.shadowinv.zarr.")],
-    scheduler: Annotated[str | None, typer.Option(help=HELP["scheduler"])] = None,
+    shots: Annotated[list[str], Argument(help=HELP["shots"], show_default=False)],
+    out: Annotated[Path, Option(help="Output store: name.shadowinv.zarr.")],
+    scheduler: Annotated[str | None, Option(help=HELP["scheduler"])] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Resume an interrupted run and append new shots.")
+        bool, Option("--resume", help="Resume an interrupted run and append new shots.")
     ] = False,
     *,
     run: RunOptions,
@@ -163,10 +163,8 @@ def merge(store: _flags.StoreFolder, quiet: _flags.Quiet = False) -> None:
 @notify_errors
 @_flags.takes_run(WatchOptions, _stack_inputs)
 def watch(
-    folder: Annotated[
-        Path, typer.Argument(help="Folder in which the shots appear.", show_default=False)
-    ],
-    out: Annotated[Path, typer.Option(help="Output store: name.shadowinv.zarr.")],
+    folder: Annotated[Path, Argument(help="Folder in which the shots appear.", show_default=False)],
+    out: Annotated[Path, Option(help="Output store: name.shadowinv.zarr.")],
     *,
     run: WatchOptions,
     **inputs: Any,
@@ -180,8 +178,8 @@ def watch(
 @notify_errors
 def status(
     store: _flags.StoreFolder,
-    every: Annotated[bool, typer.Option("--all", help="Show one line per shot.")] = False,
-    verify: Annotated[bool, typer.Option("--verify", help=HELP["verify"])] = False,
+    every: Annotated[bool, Option("--all", help="Show one line per shot.")] = False,
+    verify: Annotated[bool, Option("--verify", help=HELP["verify"])] = False,
 ) -> None:
     """Show which shots of a store are done, pending, failed or damaged, and why."""
     from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, status_tables
@@ -190,13 +188,13 @@ def status(
     for table in tables:
         say(table)
     if verify and is_damaged:
-        raise typer.Exit(EXIT_FAILED_SHOTS)
+        raise Exit(EXIT_FAILED_SHOTS)
 
 
 @notify_errors
 def join(
     store: _flags.StoreFolder,
-    table: Annotated[str, typer.Argument(help=HELP["table"], show_default=False)],
+    table: Annotated[str, Argument(help=HELP["table"], show_default=False)],
     quiet: _flags.Quiet = False,
 ) -> None:
     """Join a shot table to a store by the numbers of the shots, such as after a watch."""
@@ -211,12 +209,10 @@ def join(
 @notify_errors
 def export(
     store: _flags.StoreFolder,
-    form: Annotated[
-        str, typer.Option("--format", metavar="tiff|pradformat|…", help=HELP["format"])
-    ],
+    form: Annotated[str, Option("--format", metavar="tiff|pradformat|…", help=HELP["format"])],
     shots: _flags.ChosenShots = None,
-    variables: Annotated[str, typer.Option(help=HELP["variables"])] = "potential",
-    out: Annotated[Path | None, typer.Option(help=HELP["out"])] = None,
+    variables: Annotated[str, Option(help=HELP["variables"])] = "potential",
+    out: Annotated[Path | None, Option(help=HELP["out"])] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
 ) -> None:
@@ -235,12 +231,12 @@ def export(
 @notify_errors
 def movie(
     store: _flags.StoreFolder,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Output movie: .mp4 or .gif.")],
-    variable: Annotated[str | None, typer.Option(help=HELP["variable"])] = None,
+    out: Annotated[Path, Option("--out", "-o", help="Output movie: .mp4 or .gif.")],
+    variable: Annotated[str | None, Option(help=HELP["variable"])] = None,
     shots: _flags.ChosenShots = None,
-    rate: Annotated[float, typer.Option(help="Shots per second.")] = 10.0,
+    rate: Annotated[float, Option(help="Shots per second.")] = 10.0,
     limits: Annotated[
-        tuple[float, float] | None, typer.Option(metavar="MIN MAX", help=HELP["limits"])
+        tuple[float, float] | None, Option(metavar="MIN MAX", help=HELP["limits"])
     ] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
