@@ -16,13 +16,7 @@ from .other_detectors import (
     ge_luminescence,
 )
 from .pack import FilmType, Material, Pack, PackLayer, Slab, Stopping
-from .registration import (
-    Poses,
-    check_orientation,
-    move_corners,
-    poses_by_fiducials,
-    register,
-)
+from .registration import Poses, check_orientation, move_corners, poses_by_fiducials, register
 from .scans import (
     burnt_edges,
     find_films,

@@ -223,12 +223,7 @@ class Luminescence(NamedTuple):
 
 
 def fuji_luminescence(
-    scan: ArrayLike,
-    *,
-    resolution: float,
-    sensitivity: float,
-    latitude: float = 5.0,
-    bits: int = 16,
+    scan: ArrayLike, *, resolution: float, sensitivity: float, latitude: float = 5.0, bits: int = 16
 ) -> Luminescence:
     """Convert values on a logarithmic scale, as Fuji's scanners write them.
 
@@ -263,12 +258,7 @@ def fuji_luminescence(
 
 
 def ge_luminescence(
-    scan: ArrayLike,
-    *,
-    resolution: float,
-    sensitivity: float,
-    latitude: float = 5.0,
-    bits: int = 16,
+    scan: ArrayLike, *, resolution: float, sensitivity: float, latitude: float = 5.0, bits: int = 16
 ) -> Luminescence:
     """Convert roots of the signal, as GE's scanners write them to ``.gel``.
 

@@ -99,11 +99,7 @@ def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[Floa
 
 
 def straighten_film(
-    scan: ArrayLike,
-    corners: ArrayLike,
-    *,
-    shape: tuple[int, int] | None = None,
-    scale: float = 1.0,
+    scan: ArrayLike, corners: ArrayLike, *, shape: tuple[int, int] | None = None, scale: float = 1.0
 ) -> AnyArray:
     """Return a film cut out of a scan and turned upright.
 

@@ -44,10 +44,7 @@ from napari_shadowinv.pipeline.experiment_result import (
     PlannedShot,
     percent,
 )
-from napari_shadowinv.pipeline.experiment_shots import (
-    ExperimentInputs,
-    ShotSimulator,
-)
+from napari_shadowinv.pipeline.experiment_shots import ExperimentInputs, ShotSimulator
 
 _MIN_SIDE_PX = 32
 _MIN_DISPLACEMENT_PX = 1e-6
@@ -201,16 +198,8 @@ _OWNERS: dict[str, tuple[type[BaseModel], Sequence[str]]] = {
     "instrument": (
         Instrument,
         (
-            "beam_rms",
-            "beam_length",
-            "beam_between",
-            "energy_error",
-            "background",
-            "gamma",
-            "blur",
-            "absorption",
-            "registration",
-            "other_field",
+            *("beam_rms", "beam_length", "beam_between", "energy_error", "background"),
+            *("gamma", "blur", "absorption", "registration", "other_field"),
         ),
     ),
 }

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -38,19 +37,8 @@ _LEAST_EXPONENT = 0.2
 
 # Streams of random numbers.
 _STREAMS = (
-    "energy",
-    "structure",
-    "beam",
-    "between",
-    "absorption",
-    "other_field",
-    "alignment",
-    "registration",
-    "blur",
-    "gamma",
-    "background",
-    "counts",
-    "reference",
+    *("energy", "structure", "beam", "between", "absorption", "other_field"),
+    *("alignment", "registration", "blur", "gamma", "background", "counts", "reference"),
 )
 
 
@@ -133,6 +121,8 @@ class ShotSimulator:
         self._grid = Grid(shape, _FINER, margin)
         self._nominal = [self._object.displacement(setup, self._grid) for setup in self._setups]
         self.truth = coarse[0]
+        passed = self._object.transmission(self._setups[0], self._grid)
+        self._open_share = np.ones(self._grid.sizes) if passed is None else passed
 
     def draw(self, number: int) -> SimulatedShots:
         """Return the shots of a draw; the same number gives the same shots."""
@@ -146,7 +136,6 @@ class ShotSimulator:
         structure = 1 + self._wave(streams["structure"], options.beam_structure)
         common = structure * (1 + self._wave(streams["beam"], beam.rms))
         common = common * (1 + self._absorption(streams["absorption"]))
-        open_share = self._open_share
         admixture = instrument.other_field * streams["other_field"].normal()
         width = instrument.blur * abs(streams["blur"].normal())
         exponent = max(1 + instrument.gamma * streams["gamma"].normal(), _LEAST_EXPONENT)
@@ -162,7 +151,7 @@ class ShotSimulator:
         for image, setup in enumerate(self._setups):
             between = beam.between if image else 0.0
             light = common * (1 + self._wave(streams["between"], between))
-            light = np.maximum(light, _DIMMEST) * open_share
+            light = np.maximum(light, _DIMMEST) * self._open_share
             scale = self._energy_factor(setup, energy) + admixture * self._other_ratio(setup)
             displacement = self._nominal[image] * scale
             if image and instrument.registration:  # onto a misaligned detector
@@ -172,19 +161,13 @@ class ShotSimulator:
             images.append(counts(flux, image, options.counts, "counts"))
         source, noise = None, 0.0
         if options.is_recorded:
-            reference = self._moved(structure * open_share, streams["registration"])
+            reference = self._moved(structure * self._open_share, streams["registration"])
             level = options.reference_counts or options.counts
             counted = counts(reference, 0, level, "reference")
             source, noise = options.counts * (counted / level), options.counts * (1 / level)
         elif self._object.shadow is not None:
-            source = options.counts * grid.inner(grid.in_pixels(open_share))
+            source = options.counts * grid.inner(grid.in_pixels(self._open_share))
         return SimulatedShots(np.stack(images), source, noise)
-
-    @cached_property
-    def _open_share(self) -> FloatArray:
-        """Share of the beam that passes the object at each sample."""
-        passed = self._object.transmission(self._setups[0], self._grid)
-        return np.ones(self._grid.sizes) if passed is None else passed
 
     def _energy_factor(self, setup: Setup | None, energy: float) -> float:
         """Displacement at `energy` times the stated energy, over the stated displacement."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -152,11 +152,9 @@ class RerunInputs:
             raise error.about(image.path) from error
         assert inversion.provenance is not None
         provenance = inversion.provenance.with_image(brightness=brightness)
-        return replace(inversion, provenance=self._with_masks(provenance))
-
-    def _with_masks(self, provenance: Provenance) -> Provenance:
-        """Return a new provenance with the origins of the masks, which were passed as arrays."""
-        return provenance.model_copy(update={"masks": self.masks})
+        # The masks were passed as arrays.
+        provenance = provenance.model_copy(update={"masks": self.masks})
+        return replace(inversion, provenance=provenance)
 
     def _fit(self, **callbacks: Any) -> tuple[Fit, StaticChecks]:
         start, choices = self.provenance.start, self.recipe.fit
@@ -167,11 +165,11 @@ class RerunInputs:
         fit = run_fit(self.recipe, self.shots, **callbacks)
         checks = run_checks(self.recipe, self.shots, fit, **self.checks, **callbacks)
         assert fit.provenance is not None
-        provenance = self._with_masks(fit.provenance)
+        # Masks and rows were passed as arrays.
+        origins: dict[str, Any] = {"masks": self.masks}
         if self.provenance.fiducial_rows is not None:
-            fiducials = {"fiducials": self.provenance.fiducials}
-            provenance = provenance.model_copy(update=fiducials)
-        return replace(fit, provenance=provenance), checks
+            origins["fiducials"] = self.provenance.fiducials
+        return replace(fit, provenance=fit.provenance.model_copy(update=origins)), checks
 
 
 def rerun(
@@ -243,10 +241,9 @@ def collect_rerun(
     provenance = _checked_provenance(dataset, name)
     listed: Any = () if images is None else images
     shots = (listed,) if isinstance(listed, (str, Path, Radiograph)) else tuple(listed)
-    version = provenance.version
     reader = _Reader(name, folder or Path(), shots, source, other_folders)
-    if version != __version__:
-        reader.changes.append(f"made by version {version}, now {__version__}")
+    if provenance.version != __version__:
+        reader.changes.append(f"made by version {provenance.version}, now {__version__}")
     if provenance.pack is not None:
         files = provenance.pack.files
         for file in files:
@@ -512,15 +509,12 @@ def _difference(before: xarray.Dataset, after: xarray.Dataset) -> str:
         return IDENTICAL
     verdict = before.attrs.get("verdict")  # a shot of a stack has none in its attributes
     is_changed = verdict not in (None, after.attrs.get("verdict"))
-    return _describe_pairs(pairs) + (f"; the verdict was '{verdict}'" if is_changed else "")
-
-
-def _describe_pairs(pairs: Mapping[str, tuple[Any, Any]]) -> str:
     displacements = [
         np.abs(old - new).max()
         for name, (old, new) in pairs.items()
         if name.startswith("displacement") and old.shape == new.shape
     ]
+    text = f"{', '.join(pairs)} differ{'s' * (len(pairs) == 1)}"
     if displacements:
-        return f"displacement differs by up to {max(displacements):.2g} px"
-    return f"{', '.join(pairs)} differ{'s' * (len(pairs) == 1)}"
+        text = f"displacement differs by up to {max(displacements):.2g} px"
+    return text + (f"; the verdict was '{verdict}'" if is_changed else "")

@@ -56,9 +56,7 @@ class ShotRow(CheckedModel):
         description="Displacement relative to the first image; with two fields '1 0.6'.",
     )
     brightness: float | None = Field(
-        default=None,
-        gt=0,
-        description="How many times brighter than the source the image is.",
+        default=None, gt=0, description="How many times brighter than the source the image is."
     )
     psf: float | None = Field(
         default=None,
@@ -70,8 +68,7 @@ class ShotRow(CheckedModel):
         default=None, description="Image of the same size, 0 at unusable pixels."
     )
     source: Literal["unknown"] | Path | None = Field(
-        default=None,
-        description="Image of the undisturbed beam, or unknown to fit a smooth one.",
+        default=None, description="Image of the undisturbed beam, or unknown to fit a smooth one."
     )
     noise: Noise | None = Field(
         default=None,
