@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -68,13 +68,6 @@ def _rate_text(status: RunStatus) -> str:
         return "no shot finished"
     rate = status.rate
     return f"{rate:.1f} shots/s" if rate >= 1 else f"{60 * rate:.1f} shots/min"
-
-
-def _remaining_text(status: RunStatus) -> str:
-    if status.remaining is None:
-        return ""
-    seconds = round(status.remaining)
-    return f"{timedelta(seconds=seconds)} left" if status.waiting else "finishing"
 
 
 def run_batch(
@@ -137,16 +130,12 @@ def exit_unless_reliable(store: StackStore) -> None:
     statuses = store.statuses()
     if not np.isin(statuses, (DONE, SKIPPED, UNREAD)).all():
         raise typer.Exit(EXIT_FAILED_SHOTS)
-    reports = zip(statuses, store.reports(), strict=True)
-    if not all(_is_reliable(report) for status, report in reports if status == DONE):
-        raise typer.Exit(EXIT_NOT_CONVERGED)
-
-
-def _is_reliable(report: Mapping[str, Any]) -> bool:
-    """Whether the report of a finished shot casts no doubt on its result."""
-    if "level" in report:  # an inversion
-        return bool(report.get("converged"))
-    return bool(report.get("verdict") == _DETERMINED)
+    for status, report in zip(statuses, store.reports(), strict=True):
+        is_sound = report.get("verdict") == _DETERMINED
+        if "level" in report:  # an inversion
+            is_sound = report.get("converged")
+        if status == DONE and not is_sound:
+            raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
 def _check_store(out: Path, resume: bool, overwrite: bool) -> None:
@@ -197,13 +186,17 @@ class _ProgressBar:
             return
         self.status, outcome = status, status.outcome
         last = "" if outcome is None else f"{status.name}, {outcome.seconds:.1f} s"
+        remaining = ""
+        if status.remaining is not None:
+            left = timedelta(seconds=round(status.remaining))
+            remaining = f"{left} left" if status.waiting else "finishing"
         self.bars.update(
             self._task,
             description=status.engine,
             total=status.total,
             completed=status.done + status.failed,
             rate=_rate_text(status),
-            remaining=_remaining_text(status),
+            remaining=remaining,
             failed=f"{status.failed} failed" if status.failed else "",
             last=plain(last).plain,
         )
@@ -374,7 +367,12 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
     listed = [_column_table(store, own_columns)]
     listed += [_column_table(store, joined)] if joined else []  # of a shot table
     # A column of the table above would leave them a few letters a line.
-    notes = [(f"shot {index}", note) for index, note in _notes(store)]
+    notes: Rows = []
+    for index, report in enumerate(store.reports()):
+        cautions = map(Caution.from_json, report.get("warnings", ()))
+        reason = report.get("reason")
+        texts = [reason] if reason else [caution.text for caution in cautions]
+        notes += [(f"shot {index}", text) for text in texts]
     tables += [*listed, *([two_columns("Reasons and warnings", notes)] if notes else [])]
     return tables, is_damaged
 
@@ -395,16 +393,6 @@ def _column_table(store: StackStore, columns: Sequence[StoreColumn]) -> Table:
             style="red" if status in (FAILED, DAMAGED) else "",
         )
     return shots
-
-
-def _notes(store: StackStore) -> Iterator[tuple[int, str]]:
-    """Yield the reason of each failed shot and the warnings of the others."""
-    for index, report in enumerate(store.reports()):
-        if reason := report.get("reason"):
-            yield index, reason
-            continue
-        cautions = map(Caution.from_json, report.get("warnings", ()))
-        yield from ((index, caution.text) for caution in cautions)
 
 
 def store_rows(store: StackStore, *, trouble: bool = True) -> Rows:
@@ -524,10 +512,7 @@ def run_watch(
             on_progress=printer.update,
             should_stop=is_interrupted,
         )
-    _print_summary(printer.status or RunStatus(), out, quiet)
-
-
-def _print_summary(status: RunStatus, out: Path, quiet: bool) -> None:
+    status = printer.status or RunStatus()
     done, failed, waiting = status.done, status.failed, status.waiting
     remaining = f", {status.skipped} skipped" if status.skipped else ""
     remaining += f", {waiting} not yet inverted" if waiting else ""

@@ -146,6 +146,7 @@ def _array_rows(array: AnyArray) -> _summary.Rows:
 
 
 def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
+    from napari_shadowinv.analysis import products_in
     from napari_shadowinv.cli._fit_result import fit_file_rows
 
     rows_by_kind = {
@@ -154,14 +155,8 @@ def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
         ResultKind.FILM_DOSES: _film_rows,
         ResultKind.FIELD: _field_rows,
     }
-    return [*rows_by_kind[ResultKind.of(dataset.attrs)](dataset), *_product_rows(dataset)]
-
-
-def _product_rows(dataset: xarray.Dataset) -> _summary.Rows:
-    """Return the numbers of the products in the file of a result."""
-    from napari_shadowinv.analysis import products_in
-
-    return [
+    rows = rows_by_kind[ResultKind.of(dataset.attrs)](dataset)
+    return rows + [
         (each.name, f"{fact.title.lower()} {fact.text}")
         for each in products_in(dataset)
         for fact in each.facts

@@ -134,8 +134,12 @@ def read_shot_table(path: str | Path) -> ShotTable:
         If no column has the numbers of the shots, a number is no whole one or occurs twice, or two
         columns have one name.
     """
+    import h5py
+
     file, name = split_address(path)
-    if name is not None or _is_hdf5(file):
+    if name is None:
+        check_regular(file, "a table of shots")
+    if name is not None or h5py.is_hdf5(file):
         titles, cells = _read_hdf5_columns(file, name or "/")
         lines = {f"row {row}": texts for row, texts in enumerate(cells)}
     else:
@@ -143,13 +147,6 @@ def read_shot_table(path: str | Path) -> ShotTable:
         titles = table.titles
         lines = {f"line {line}": texts for line, texts in table.rows.items()}
     return _table_of(Path(path), titles, lines)
-
-
-def _is_hdf5(path: Path) -> bool:
-    import h5py
-
-    check_regular(path, "a table of shots")
-    return bool(h5py.is_hdf5(path))
 
 
 def _table_of(path: Path, titles: Sequence[str], lines: Mapping[str, list[str]]) -> ShotTable:

@@ -403,7 +403,9 @@ class _Run:
             while True:
                 window = engine.window(files=stack.shots.array is None)
                 while len(running) < window and (batch := next(batches, None)) is not None:
-                    future = self._start(engine, batch, beam, context)
+                    labels = [(index, index in self._todo) for index in batch]
+                    items = [stack.shots.items[index] for index in batch]
+                    future = engine.submit(run_shots, items, labels, beam, context, engine.stop)
                     running[future] = batch
                     future.add_done_callback(ended.put)
                 if not running:
@@ -429,11 +431,6 @@ class _Run:
             if pending:
                 # From its beginning, so that the values do not depend on where a run stopped.
                 yield list(range(first, pending[-1] + 1))
-
-    def _start(self, engine: Engine, batch: list[int], beam: Any, context: Any) -> Any:
-        labels = [(index, index in self._todo) for index in batch]
-        items = [self._stack.shots.items[index] for index in batch]
-        return engine.submit(run_shots, items, labels, beam, context, engine.stop)
 
     def _wait(self, engine: Engine, ended: queue.SimpleQueue[Any]) -> Any:
         """Return a finished task, or None after a timeout."""

@@ -10,7 +10,6 @@ before the first shard and after the last. So shards hold no lock, on whatever f
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -112,10 +111,7 @@ def incomplete_shards(store: StackStore) -> str:
     shots, count = len(store.names), store.attributes[SHARDS]
     shards = _shard_numbers(shots, count, int(store.attributes["warm_start"]))
     has_ended = np.isin(store.statuses(), (DONE, FAILED))
-    return _ranges_text(np.unique(shards[~has_ended]).tolist())
-
-
-def _ranges_text(numbers: Sequence[int]) -> str:
+    numbers = np.unique(shards[~has_ended]).tolist()
     ranges = []
     for _, pairs in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0]):
         first, *others = (number for _, number in pairs)
