@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import nnls
 
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
-from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.pack import PROTON_MASS, Pack, Slab, Stopping
 
@@ -333,7 +333,11 @@ def _unfold_pixels(
     weighed = per_error[:, :, None] * matrix
     sides = per_error * doses
     # The bends refer to a spectrum as strong as the pixel's own.
-    strength = _strength(doses, per_error > 0, matrix)
+    ratio = np.where(per_error > 0, doses / matrix.sum(axis=1), np.nan)
+    strength = np.ones(len(doses))
+    some = (per_error > 0).any(axis=1)
+    strength[some] = np.nanmedian(ratio[some], axis=1)
+    strength = np.where(np.isfinite(strength) & (strength > 0), strength, 1.0)
     ties = bends / strength[:, None, None]
     normal = weighed.transpose(0, 2, 1) @ weighed + ties.transpose(0, 2, 1) @ ties
     normal += 1e-12 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(matrix.shape[1])
@@ -343,13 +347,3 @@ def _unfold_pixels(
     for k in np.flatnonzero((shares < 0).any(axis=1)):
         shares[k] = nnls(np.concatenate([weighed[k], ties[k]]), np.append(sides[k], nothing))[0]
     return shares, np.diagonal(inverse, axis1=1, axis2=2)
-
-
-def _strength(doses: FloatArray, usable: BoolArray, matrix: FloatArray) -> FloatArray:
-    """Return the strength of each pixel's spectrum relative to the usual one."""
-    expected = matrix.sum(axis=1)
-    ratio = np.where(usable, doses / expected, np.nan)
-    strength = np.ones(len(doses))
-    some = usable.any(axis=1)
-    strength[some] = np.nanmedian(ratio[some], axis=1)
-    return np.where(np.isfinite(strength) & (strength > 0), strength, 1.0)

@@ -186,20 +186,17 @@ def format_of(path: Path) -> Format:
     for each in FORMATS:
         if each.fits(path, head):
             return each
+    title = next((text for mark, text in _FOREIGN_FORMATS.items() if head.startswith(mark)), None)
+    is_text = _is_text(head[:_EXCERPT_BYTES])
+    title = title or ("a text file" if is_text else "not in a recognised image format")
     raise FileFormatError(
-        f"{path} is {_describe(head[:_EXCERPT_BYTES])}: expected {READABLE}; export the image to "
-        "one of these"
+        f"{path} is {title}: expected {READABLE}; export the image to one of these"
     )
 
 
 def kind_of(path: str | Path) -> str:
     """Return the name of a file's format; see `format_of`."""
     return format_of(path).name
-
-
-def _describe(head: bytes) -> str:
-    title = next((text for mark, text in _FOREIGN_FORMATS.items() if head.startswith(mark)), None)
-    return title or ("a text file" if _is_text(head) else "not in a recognised image format")
 
 
 def _is_text(head: bytes) -> bool:

@@ -214,7 +214,17 @@ def read_hdf5(path: Path, name: str, number: int | None = None) -> AnyArray:
     with open_hdf5(path) as file:
         dataset, frame_in_name = _find_array(path, file, name)
         number = frame_in_name if number is None else number
-        return load_dataset(path, dataset) if number is None else _load_frame(path, dataset, number)
+        if number is None:
+            return load_dataset(path, dataset)
+        index = tuple(map(int, np.unravel_index(number, dataset.shape[:-2])))
+        check_size(path, _memory_bytes(path, dataset, math.prod(dataset.shape[-2:])))
+        _check_filters(path, dataset)
+        if not _is_written(dataset, index):  # HDF5 would replace it by zeros
+            raise FileFormatError(
+                f"{path} does not hold frame {number} of {dataset.name!r} yet: wait until it is "
+                "written, or copy the file again"
+            )
+        return np.asarray(dataset[index])
 
 
 def read_plane(path: Path, name: str) -> tuple[AnyArray, dict[str, Any]]:
@@ -273,19 +283,6 @@ def _member_or_default(path: Path, file: Any, name: str) -> Any | None:
         default = default.decode() if isinstance(default, bytes) else default
         item = member(path, item, default) if isinstance(default, str) else None
     return item if isinstance(item, h5py.Dataset) else None
-
-
-def _load_frame(path: Path, dataset: Any, number: int) -> AnyArray:
-    """Return one frame, refusing a missing one, which HDF5 would replace by zeros."""
-    index = tuple(map(int, np.unravel_index(number, dataset.shape[:-2])))
-    check_size(path, _memory_bytes(path, dataset, math.prod(dataset.shape[-2:])))
-    _check_filters(path, dataset)
-    if not _is_written(dataset, index):
-        raise FileFormatError(
-            f"{path} does not hold frame {number} of {dataset.name!r} yet: wait until it is "
-            "written, or copy the file again"
-        )
-    return np.asarray(dataset[index])
 
 
 def _is_written(dataset: Any, index: tuple[int, ...]) -> bool:

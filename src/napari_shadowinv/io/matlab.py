@@ -140,13 +140,13 @@ def _describe_variable(path: Path, name: str, item: Any) -> Variable:
         type_name = f"complex {type_name}".rstrip()
     if not type_name:
         type_name = "double" if item.dtype.kind in "buif" else str(item.dtype)
+
+    def load() -> AnyArray:
+        with open_hdf5(path) as file:
+            return load_dataset(path, member(path, file, name)).T
+
     # HDF5 counts its axes from the other end than MATLAB does.
-    return Variable(name, item.shape[::-1], type_name, partial(_load_73, path, name))
-
-
-def _load_73(path: Path, name: str) -> AnyArray:
-    with open_hdf5(path) as file:
-        return load_dataset(path, member(path, file, name)).T
+    return Variable(name, item.shape[::-1], type_name, load)
 
 
 def _variables_5(path: Path, file: BinaryIO) -> Iterator[Variable]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from operator import attrgetter
 from typing import Any
 
@@ -74,6 +75,10 @@ class Column:
         return format(report[self.entry], self.format) if self.entry in report else ""
 
 
+_of_inversions = partial(Column, stores=(INVERSIONS, ROWS))
+_of_fits = partial(Column, stores=(FITS,))
+
+
 def _error(part: str) -> Callable[[Any], float]:
     """Return the reader of an error of an inversion, which may have no error budget."""
     rms = attrgetter(f"errors.{part}.rms")
@@ -96,27 +101,24 @@ COLUMNS: tuple[Column, ...] = (
         format="s",
         width=len("determined"),  # not broken into letters
     ),
-    Column(
+    _of_fits(
         "chi2",
         "Largest χ² of the shot's images",
         title="χ²",
-        stores=(FITS,),
         value=lambda fit: float(fit.chi2.max()),
         format=".3g",
     ),
-    Column(
+    _of_fits(
         "folded",
         "Share of the pixels whose rays have crossed",
         title="crossed",
-        stores=(FITS,),
         value=attrgetter("folded"),
         format=".1%",
     ),
-    Column(
+    _of_fits(
         "uncertainty",
         "Displacement's error bar, r.m.s., as a share of it",
         title="error bars",
-        stores=(FITS,),
         value=_uncertainty,
         format=".2%",
     ),
@@ -137,45 +139,36 @@ COLUMNS: tuple[Column, ...] = (
     Column(
         "converged", "Whether the solver converged", kind=bool, value=attrgetter("report.converged")
     ),
-    Column(
+    _of_inversions(
         "flux_residual",
         "Largest relative flux error of a cell",
-        stores=(INVERSIONS, ROWS),
         value=attrgetter("report.residual"),
     ),
-    Column(
+    _of_inversions(
         "iterations",
         "Solver iterations, summed over all levels",
         kind=int,
-        stores=(INVERSIONS, ROWS),
         value=attrgetter("report.iterations"),
     ),
-    Column(
-        "iterations",
-        "Iterations at full size",
-        kind=int,
-        stores=(FITS,),
-        value=attrgetter("report.iterations"),
+    _of_fits(
+        "iterations", "Iterations at full size", kind=int, value=attrgetter("report.iterations")
     ),
-    Column(
+    _of_inversions(
         "image_residual",
         "Image minus re-projection, r.m.s. relative to the mean",
-        stores=(INVERSIONS, ROWS),
         value=attrgetter("report.image_residual"),
         format=".2%",
     ),
-    Column(
+    _of_inversions(
         "noise_error",
         "Standard error of the displacement by noise, r.m.s.",
         unit=PIXEL,
-        stores=(INVERSIONS, ROWS),
         value=_error("noise"),
     ),
-    Column(
+    _of_inversions(
         "discretisation_error",
         "Error of the displacement by too few sites, r.m.s.",
         unit=PIXEL,
-        stores=(INVERSIONS, ROWS),
         value=_error("discretisation"),
     ),
 )

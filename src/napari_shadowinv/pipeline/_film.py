@@ -72,6 +72,7 @@ class Film:
     background: FloatArray
     mask: BoolArray | None
     fiducials: dict[str, FloatArray]
+    turn: tuple[int, bool]  # by which the scan was turned and mirrored, see `to_scan_frame`
     scale: float = 1.0
 
     @property
@@ -132,7 +133,7 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
             for mark in fiducials.get(number, [])
         }
         scan, corners = to_scan_frame(scan, corners, *turn)
-        return Film(number, layer, scan, corners, calibration, background, mask, marks)
+        return Film(number, layer, scan, corners, calibration, background, mask, marks, turn)
 
     films = in_parallel(film, used)
     _check_distinct(films)
@@ -349,7 +350,7 @@ def run_film(
             layers[film.number - 1] = value
         return layers
 
-    corners = by_layer([_corners_on_scan(film, pack) for film in films])
+    corners = by_layer([to_scan_frame(film.scan, film.corners, *film.turn)[1] for film in films])
     # Marks through the pack lie behind each other, the image content lies on rays.
     marked = any(film.fiducials for film in films)
     if not marked:
@@ -402,11 +403,6 @@ def run_film(
         pixel_size=pixel,
         setups=pack.setups(spectra.energies, pixel),
     )
-
-
-def _corners_on_scan(film: Film, pack: Pack) -> FloatArray:
-    turn = film.layer.turned, pack.is_mirrored(film.layer)
-    return to_scan_frame(film.scan, film.corners, *turn)[1]
 
 
 def _scale_about_axis(films: list[Film], pack: Pack) -> list[Film]:
