@@ -1128,7 +1128,8 @@ def test_report_lists_missing_packages(monkeypatch: pytest.MonkeyPatch) -> None:
         assert [name, "not installed"] in entries
     only = {"PySide6_Essentials": "6.11.0"}
     monkeypatch.setattr(_info, "_version", only.get)
-    assert _info._qt_bindings() == ["PySide6_Essentials 6.11.0"]
+    entries = [line.split(maxsplit=1) for line in _info.system_report().splitlines()]
+    assert ["Qt", "PySide6_Essentials 6.11.0"] in entries
 
 
 def test_the_report_hides_the_home_folder(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:

@@ -229,11 +229,12 @@ def _origin_rows(provenance: Provenance | None) -> _summary.Rows:
 def system_report() -> str:
     """List versions and the system, without loading napari or Qt, which may be broken."""
     memory = physical_memory()
+    bindings = [f"{name} {number}" for name in QT_BINDINGS if (number := _version(name))]
     rows = [
         ("napari-shadowinv", __version__),
         ("python", f"{platform.python_version()} ({platform.python_implementation()})"),
         *[(name, _version(name) or "not installed") for name in PACKAGES.split()],
-        ("Qt", ", ".join(_qt_bindings()) or "not installed"),
+        ("Qt", ", ".join(bindings) or "not installed"),
         ("platform", f"{platform.platform()}, {platform.machine()}"),
         ("cores", f"{os.cpu_count() or 'unknown'}, {available_threads(None)} usable"),
         ("memory", "unknown" if memory is None else f"{memory / 2**30:.1f} GiB"),
@@ -248,11 +249,6 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
-
-
-def _qt_bindings() -> list[str]:
-    versions = ((name, _version(name)) for name in QT_BINDINGS)
-    return [f"{name} {number}" for name, number in versions if number]
 
 
 def _compiled_code() -> str:

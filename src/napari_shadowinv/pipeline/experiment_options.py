@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Self
+from functools import partial
+from typing import Literal, Self
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv.options import MaxError
 
-_RARE: Any = {"panel": "Rarely used options of a plan"}
-_DETAILS: Any = {"panel": "Point spread, and the reference in detail"}
+_rare = partial(Field, json_schema_extra={"panel": "Rarely used options of a plan"})
+_detail = partial(Field, json_schema_extra={"panel": "Point spread, and the reference in detail"})
 
 
-class ExperimentOptions(CheckedModel):
+class ExperimentOptions(CheckedModel, allow_inf_nan=False):
     """Choices of a planned experiment, apart from its object, its setups and its instrument.
 
     Raises
@@ -26,8 +27,6 @@ class ExperimentOptions(CheckedModel):
     >>> ExperimentOptions(counts=300, reference="recorded").is_recorded
     True
     """
-
-    model_config = ConfigDict(allow_inf_nan=False)
 
     counts: float = Field(
         default=1000.0,
@@ -42,15 +41,14 @@ class ExperimentOptions(CheckedModel):
             "beam is assumed."
         ),
     )
-    reference_counts: float | None = Field(
+    reference_counts: float | None = _detail(
         default=None,
         gt=0,
         le=1e12,
         title="Counts of the reference",
         description="Mean counts a pixel of the reference. Default: as many as in an image.",
-        json_schema_extra=_DETAILS,
     )
-    beam_structure: float = Field(
+    beam_structure: float = _detail(
         default=0.0,
         ge=0,
         lt=0.5,
@@ -58,17 +56,15 @@ class ExperimentOptions(CheckedModel):
             "Relative r.m.s. structure of the beam that the reference records, over the beam's "
             "length. How far the beam differs from its reference is a number of the instrument."
         ),
-        json_schema_extra=_DETAILS,
     )
-    psf: float | None = Field(
+    psf: float | None = _detail(
         default=None,
         ge=0,
         le=20,
         title="Point spread (px)",
         description="Known standard deviation of the point spread in px. Default: none.",
-        json_schema_extra=_DETAILS,
     )
-    source_size: float | None = Field(
+    source_size: float | None = _detail(
         default=None,
         ge=0,
         title="Source size (m)",
@@ -76,14 +72,12 @@ class ExperimentOptions(CheckedModel):
             "Standard deviation of the beam's source in m (FWHM / 2.355), for the point spread of "
             "each setup."
         ),
-        json_schema_extra=_DETAILS,
     )
-    resolution: float | None = Field(
+    resolution: float | None = _detail(
         default=None,
         ge=0,
         title="Resolution (m)",
         description="Standard deviation of the detector's point spread in m, at the detector.",
-        json_schema_extra=_DETAILS,
     )
     draws: int = Field(
         default=20,
@@ -91,15 +85,14 @@ class ExperimentOptions(CheckedModel):
         le=1000,
         description="Number of simulated shots, each with its own imperfections and noise.",
     )
-    method: Literal["automatic", "inversion", "fit"] = Field(
+    method: Literal["automatic", "inversion", "fit"] = _rare(
         default="automatic",
         description=(
             "'inversion' for one image, 'fit' for several or one. Default: an inversion for one "
             "image."
         ),
-        json_schema_extra=_RARE,
     )
-    searched: int = Field(
+    searched: int = _rare(
         default=1,
         ge=1,
         le=1000,
@@ -108,22 +101,19 @@ class ExperimentOptions(CheckedModel):
             "Number of draws whose fit looks for alternative solutions from all starting points "
             "and computes error bars. The other fits start near the true field."
         ),
-        json_schema_extra=_RARE,
     )
     max_error: MaxError = 0.05
-    seed: int = Field(
+    seed: int = _rare(
         default=0,
         ge=0,
         title="Random seed",
         description="Seed of all random choices; the same seed gives the same plan.",
-        json_schema_extra=_RARE,
     )
-    threads: int | None = Field(
+    threads: int | None = _rare(
         default=None,
         ge=1,
         title="Number of threads",
         description="Shots that are computed at once. Default: all cores. The result is the same.",
-        json_schema_extra=_RARE,
     )
 
     @model_validator(mode="after")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from napari_shadowinv._system.tables import read_rows, write_cells
 from napari_shadowinv._system.validation import map_paths, validate
@@ -131,10 +131,9 @@ PACK_FILE = "pack.toml"
 _UNEXPOSED_NAME = re.compile("unexposed|blank|background", re.IGNORECASE)
 
 
-class NewPack(BaseModel):
+class NewPack(BaseModel, frozen=True, extra="forbid"):
     """Facts about a pack that its scans do not show."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     film: Literal["HDV2", "EBT3", "MDV3"] = Field(
         default="HDV2",
         title="Film type",

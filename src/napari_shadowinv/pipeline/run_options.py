@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv.io.formats import TIFF
 
 _RARE: Any = {"panel": "Rarely used options of a run"}
+_rare = partial(Field, json_schema_extra=_RARE)
 
 
-class _StoreOptions(CheckedModel):
+class _StoreOptions(CheckedModel, allow_inf_nan=False):
     """Choices of a store, and of a run that resumes it."""
-
-    model_config = ConfigDict(allow_inf_nan=False)
 
     variables: tuple[str, ...] | None = Field(
         default=None,
@@ -26,11 +26,10 @@ class _StoreOptions(CheckedModel):
         "compression; of a fit, potential, displacement and its error bars.",
         json_schema_extra={"metavar": "NAMES"},
     )
-    dtype: Literal["float32", "float64"] = Field(
+    dtype: Literal["float32", "float64"] = _rare(
         default="float32",
         title="Stored type",
         description="Type of stored images; sites, weights and scalars keep 64 bits.",
-        json_schema_extra=_RARE,
     )
     overwrite: bool = Field(default=False, description="Discard the content of the store.")
     redo_failed: bool = Field(
@@ -152,24 +151,21 @@ class WatchOptions(_StoreOptions):
         "rate and the last warning, replaced at least once a second, for another program to show.",
         json_schema_extra={"metavar": "FILE"},
     )
-    skip_existing: bool = Field(
+    skip_existing: bool = _rare(
         default=False,
         title="Skip existing files",
         description="Skip files that are in the folder at the start.",
-        json_schema_extra=_RARE,
     )
-    settle: float = Field(
+    settle: float = _rare(
         default=1.0,
         gt=0,
         title="Settling time (s)",
         description="Seconds without a change after which a file is complete, where the system "
         "does not report that it was closed (network file systems, macOS, Windows).",
-        json_schema_extra=_RARE,
     )
-    polling: bool = Field(
+    polling: bool = _rare(
         default=False,
         description="Poll the folder once a second instead of relying on file-system events.",
-        json_schema_extra=_RARE,
     )
     idle: float | None = Field(
         default=None,

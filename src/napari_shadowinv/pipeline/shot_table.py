@@ -14,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from napari_shadowinv._system.tables import has_column_names, is_number, read_rows, write_cells
 from napari_shadowinv._system.validation import CheckedModel, suggestion, validate
@@ -37,7 +37,7 @@ def _strength(value: Any) -> Any:
     return strengths
 
 
-class ShotRow(CheckedModel):
+class ShotRow(CheckedModel, extra="allow"):
     """One image and its description.
 
     It also takes the quantity of its beam in place of the setup's, ``energy`` (MeV) of particles or
@@ -45,7 +45,6 @@ class ShotRow(CheckedModel):
     quantity is a label.
     """
 
-    model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, _BeamValue]
     file: Path = Field(title="Image", description="Its file.")
     setup: Path | None = Field(
