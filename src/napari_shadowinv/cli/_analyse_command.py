@@ -163,8 +163,7 @@ def _products(texts: list[str], file: Path | None) -> list[Product]:
         product_from_dict(entry, f"{file}, product {n}") for n, entry in enumerate(entries, 1)
     ]
     if not listed:
-        names = ", ".join(PRODUCTS)
-        raise InputError(f"received no product, expected at least one: {names}")
+        raise InputError(f"received no product, expected at least one: {', '.join(PRODUCTS)}")
     return listed
 
 

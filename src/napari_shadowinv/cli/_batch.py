@@ -336,8 +336,7 @@ def _verdict_rows(store: StackStore) -> Rows:
         if "verdict" in report:
             shots.setdefault(str(report["verdict"]), []).append(name)
     determined = shots.pop(_DETERMINED, [])
-    counts = f"{len(determined)} {_DETERMINED}"
-    rows = [("verdicts", counts)] if determined or shots else []
+    rows = [("verdicts", f"{len(determined)} {_DETERMINED}")] if determined or shots else []
     return rows + [
         ("warning", f"{len(names)} {verdict}: {_list_text(names)}")
         for verdict, names in shots.items()

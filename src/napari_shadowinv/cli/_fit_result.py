@@ -57,8 +57,7 @@ def comparison_table(fits: Sequence[Fit]) -> Table:
     for fit in fits:
         names = ", ".join(field.name for field in fit.fields)
         chi2 = ", ".join(f"{value:.3g}" for value in fit.chi2)
-        difference = fit.report.log_evidence - best
-        evidence = "likeliest" if fit is fits[0] else f"{difference:+.1f}"
+        evidence = "likeliest" if fit is fits[0] else f"{fit.report.log_evidence - best:+.1f}"
         table.add_row(names, chi2, evidence, fit.verdict)
     return table
 
@@ -152,6 +151,5 @@ def short_names(names: Sequence[str], beams: Sequence[str]) -> list[str]:
     ['layer_03', 'layer_04 (8 MeV)']
     """
     stems = [Path(name).stem for name in names]
-    unique = stems if len(set(stems)) == len(stems) else names
-    pairs = zip(unique, beams, strict=True)
+    pairs = zip(stems if len(set(stems)) == len(stems) else names, beams, strict=True)
     return [f"{name} ({beam})" if beam else name for name, beam in pairs]

@@ -184,8 +184,7 @@ def _with_default(option: Any) -> str:
     """Return the help of a flag, and its default if the text does not contain it."""
     text = option.help or ""
     default = option.default
-    is_switch = isinstance(default, bool)
-    if default is None or callable(default) or is_switch or "Default:" in text:
+    if default is None or callable(default) or isinstance(default, bool) or "Default:" in text:
         return text
     return f"{text} Default: {default}."
 

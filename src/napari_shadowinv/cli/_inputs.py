@@ -74,8 +74,7 @@ def protect(outputs: list[Path], inputs: list[Path | None]) -> None:
 
 def protect_files_of(recipe: Recipe, outputs: list[Path]) -> None:
     """Refuse to overwrite a file that a recipe names."""
-    source = getattr(recipe.source, "file", None)
-    protect(outputs, [recipe.mask, recipe.source_mask, source])
+    protect(outputs, [recipe.mask, recipe.source_mask, getattr(recipe.source, "file", None)])
 
 
 def protect_store(store: Path, output: Path) -> None:

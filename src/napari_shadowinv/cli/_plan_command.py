@@ -111,8 +111,7 @@ def plan(
     view = {name: flags.pop(name) for name in GridView.model_fields if name in flags}
     options = _flags.choices_of(ExperimentOptions, flags)
     instrument = _flags.choices_of(Instrument, flags)
-    first = None if setup is None else setup_from(setup)
-    setups = _setups(first, energies)
+    setups = _setups(None if setup is None else setup_from(setup), energies)
     shape = None if size is None else shape_of_text(size, "--size")
     target: Any = _object(object, recorded_with, deflector, setups, view)
     choices: dict[str, Any] = {"shape": shape, "instrument": instrument, "options": options}
@@ -192,9 +191,8 @@ def _setups(setup: Setup | None, energies: str | None) -> list[Setup] | None:
         return None if setup is None else [setup]
     if setup is None:
         raise InputError("received --energies: it needs --setup, the geometry of all images")
-    name = setup.beam_field
     return [
-        validate(type(setup), {**setup.model_dump(), name: value}, "--energies")
+        validate(type(setup), {**setup.model_dump(), setup.beam_field: value}, "--energies")
         for value in _numbers("--energies", energies)
     ]
 

@@ -162,8 +162,7 @@ def _fit_rectangle(film: BoolArray) -> FloatArray:
     """Return the corners of lines along the four sides of a region."""
     from scipy.spatial import ConvexHull
 
-    rim = film & ~ndimage.binary_erosion(film)
-    border = np.argwhere(rim).astype(np.float64)
+    border = np.argwhere(film & ~ndimage.binary_erosion(film)).astype(np.float64)
     hull = border[ConvexHull(border).vertices]
     axes = _axes_of_smallest_box(hull)
     for _ in range(2):  # the second time in the direction of the film, not of its hull
@@ -450,8 +449,7 @@ def _burnt_top(logarithm: FloatArray) -> BoolArray:
     fall = outside - inside
     is_steep = fall > np.maximum(_MIN_FALL, _MIN_FALL_TO_INSIDE * (inside - beyond) / 2)
     is_higher = np.minimum.accumulate(outside, axis=0) > inside + _MIN_RISE
-    burn_ends = is_steep & is_higher
-    ends = np.where(burn_ends, depths[:, None] + 1, 0).max(axis=0)
+    ends = np.where(is_steep & is_higher, depths[:, None] + 1, 0).max(axis=0)
     if (ends > 0).mean() < _MIN_BURNT_SHARE:
         return burnt
     # Under a bright beam the fall is hidden: there the burn is as deep as elsewhere on this side.

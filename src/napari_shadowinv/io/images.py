@@ -72,8 +72,7 @@ def to_grey(array: AnyArray, channel: str | int | None, where: str | Path) -> Fl
 def film_warnings(array: AnyArray, channel: str | int | None) -> tuple[Caution, ...]:
     """Warn of a picture in colour, or with a bright rim: it may be a film, dark with dose."""
     grey = to_grey(array, "mean", "")
-    is_colour = array.ndim == 3 and not np.array_equal(grey, to_grey(array, 0, ""))
-    if is_colour:
+    if array.ndim == 3 and not np.array_equal(grey, to_grey(array, 0, "")):
         sign = f"channel {channel!r} of a colour image was used as the fluence"
     elif array.dtype.kind in "iu" and _is_lit_around(grey):
         sign = (

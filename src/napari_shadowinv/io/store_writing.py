@@ -127,8 +127,7 @@ class ShotWriter:
                 else:  # without its chunk, it is read as the fill value
                     chunk_file(self.path, group[name], index).unlink(missing_ok=True)
             copied = [column.key for column in columns_of_store(attributes)]
-            note = note_shot(layout, group, index, copied)
-            text = json.dumps({**report, **note})
+            text = json.dumps({**report, **note_shot(layout, group, index, copied)})
             group["report"][index : index + 1] = np.array([text], dtype=object)
             group["status"][index : index + 1] = np.int8(status)
 
@@ -378,8 +377,7 @@ def _changing_description(path: Path) -> Iterator[dict[str, Any]]:
 def _write_template(path: Path, contents: Contents) -> None:
     extra = " ".join(name for name in contents.coordinates if name not in contents.sizes)
     identity = {"format": FORMAT, "store_id": secrets.token_hex(8), "coordinates": extra}
-    attributes = {**contents.attributes, **identity}
-    group = zarr.create_group(path, zarr_format=3, attributes=attributes)
+    group = zarr.create_group(path, zarr_format=3, attributes={**contents.attributes, **identity})
     shot_variables = _shot_variables(contents.sizes["shot"], contents.attributes)
     arrays = {**contents.coordinates, **contents.variables, **shot_variables}
     for name, variable in arrays.items():

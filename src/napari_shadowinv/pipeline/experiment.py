@@ -288,8 +288,7 @@ def _with_value(inputs: ExperimentInputs, quantity: str, value: float) -> Experi
     owner, name = SWEPT[quantity].owner, _FIELDS.get(quantity, quantity)
     if owner == "options":
         stated = inputs.options.model_dump(exclude_unset=True)
-        options = validate(ExperimentOptions, {**stated, name: value}, "")
-        changed = replace(inputs, options=options)
+        changed = replace(inputs, options=validate(ExperimentOptions, {**stated, name: value}, ""))
     elif owner == "instrument":
         stated = inputs.instrument.stated
         changed = replace(inputs, instrument=validate(Instrument, {**stated, name: value}, ""))

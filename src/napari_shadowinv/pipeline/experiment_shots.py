@@ -141,16 +141,14 @@ class ShotSimulator:
         exponent = max(1 + instrument.gamma * streams["gamma"].normal(), _LEAST_EXPONENT)
 
         def counts(flux: FloatArray, image: int, mean: float, noise: str) -> FloatArray:
-            blur = math.hypot(inputs.psf[image], width)
-            flux = gaussian_filter(flux, blur, mode="nearest")
+            flux = gaussian_filter(flux, math.hypot(inputs.psf[image], width), mode="nearest")
             level = instrument.background * streams["background"].normal()
             recorded = np.maximum(grid.inner(flux), 0) ** exponent + level
             return streams[noise].poisson(mean * np.maximum(recorded, 0)).astype(np.float64)
 
         images = []
         for image, setup in enumerate(self._setups):
-            between = beam.between if image else 0.0
-            light = common * (1 + self._wave(streams["between"], between))
+            light = common * (1 + self._wave(streams["between"], beam.between if image else 0.0))
             light = np.maximum(light, _DIMMEST) * self._open_share
             scale = self._energy_factor(setup, energy) + admixture * self._other_ratio(setup)
             displacement = self._nominal[image] * scale

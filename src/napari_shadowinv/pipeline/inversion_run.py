@@ -118,8 +118,7 @@ class Cache:
         doubts: list[Caution] = []
         if self._estimated is not None:
             last_key, last_image, last_mask, last_source, last_doubts = self._estimated
-            is_same = same_array(image, last_image) and same_array(mask, last_mask)
-            if key == last_key and is_same:
+            if key == last_key and same_array(image, last_image) and same_array(mask, last_mask):
                 source, doubts = last_source, last_doubts
         if source is None:
             pixels = image.size if most_pixels is None else most_pixels

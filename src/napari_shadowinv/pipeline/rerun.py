@@ -451,8 +451,7 @@ class _Reader:
         """Return a file, and record whether it has changed."""
         path = self._find(origin, f"the {name}")
         self.files.append(path)
-        after = Origin(file=path.name, sha256=sha256(path))
-        self.changes += _file_changes(name, origin, after)
+        self.changes += _file_changes(name, origin, Origin(file=path.name, sha256=sha256(path)))
         return path
 
 
@@ -463,8 +462,7 @@ def _with_dark(recipe: Recipe, path: Path | None) -> Recipe:
 def _image_changes(before: Provenance, after: Provenance) -> list[str]:
     """Report the changes of images, sources and dark frames."""
     changes: list[str] = []
-    pairs = zip(before.images, after.images, strict=False)
-    for number, (old, new) in enumerate(pairs, 1):
+    for number, (old, new) in enumerate(zip(before.images, after.images, strict=False), 1):
         name = "image" if before.kind == "inversion" else f"image {number}"
         of_image = "" if before.kind == "inversion" else f" of image {number}"
         changes += _file_changes(f"film {number}" if before.pack else name, old, new)

@@ -153,8 +153,7 @@ def run_windows(
 
         def on_fit_progress(progress: Progress) -> None:
             if on_progress is not None:
-                stage = f"window {number} of {len(groups)}"  # noqa: B023
-                on_progress(replace(progress, stage=stage))
+                on_progress(replace(progress, stage=f"window {number} of {len(groups)}"))  # noqa: B023
 
         fits.append(inputs.only(group).run(on_fit_progress, should_stop))
     return FitWindows(tuple(map(tuple, groups)), tuple(fits), strengths)
@@ -179,8 +178,7 @@ def _order_by_energy(inputs: FitInputs) -> list[int]:
 
 def _strengths(inputs: FitInputs) -> FloatArray:
     """Displacement of each image by each field, relative to the first image."""
-    values = [shot.strength for shot in inputs.recorded]
-    strengths = common_values(inputs.names, values, "strength")
+    strengths = common_values(inputs.names, [s.strength for s in inputs.recorded], "strength")
     if strengths is None:
         return strengths_of(inputs.setups, inputs.fields, len(inputs.shots), inputs.names)
     matrix = np.array(strengths, dtype=np.float64)

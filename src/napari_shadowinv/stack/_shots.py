@@ -569,10 +569,9 @@ def table_shots(
     if recipe.fit is not None:
         if not isinstance(table, Path):
             raise InputError("received rows of a table to fit, expected its file: write it first")
-        by_name = rows_by_shot(table, {})
         return [
             Shot(name, RowsReference(_with_absolute_paths(rows), recipe, channel, variable))
-            for name, rows in by_name.items()
+            for name, rows in rows_by_shot(table, {}).items()
         ]
     rows, unused = rows_to_invert(table)
     shots = []

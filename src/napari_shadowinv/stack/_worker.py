@@ -251,8 +251,7 @@ class InvertTask(Task):
     ) -> Inputs:
         """Return the image of a row over its brightness, with its own source, mask and setup."""
         common = self.inputs
-        setups = (row.setup, self.recipe.setup)
-        kinds = [None if setup is None else setup.kind for setup in setups]
+        kinds = [setup and setup.kind for setup in (row.setup, self.recipe.setup)]
         if kinds[0] != kinds[1]:
             texts = [f"a setup of kind '{kind}'" if kind else "no setup" for kind in kinds]
             raise InputError(
