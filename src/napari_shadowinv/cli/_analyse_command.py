@@ -151,7 +151,6 @@ def _times(text: str | None, shots: Sequence[int]) -> list[float] | None:
 
 
 def _products(texts: list[str], file: Path | None) -> list[Product]:
-    """Return the products of arguments and of a file."""
     from napari_shadowinv.analysis import PRODUCTS, product_from_dict, product_from_text
     from napari_shadowinv.io import read_toml
 

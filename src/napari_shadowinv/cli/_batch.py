@@ -377,7 +377,6 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
 
 
 def _column_table(store: StackStore, columns: Sequence[StoreColumn]) -> Table:
-    """List columns of each shot."""
     shots = Table(box=box.SIMPLE)
     for heading in ("shot", "name", "status"):
         shots.add_column(heading, overflow="fold")
@@ -470,7 +469,9 @@ class _WatchPrinter:
         # Any other verdict implies its warnings.
         if result.verdict == _DETERMINED and (count := len(result.cautions)):
             summary += f", {count} warning{'s' if count > 1 else ''}"
-        name = _shorten_name(name, _LINE_COLUMNS - len(summary))
+        columns = max(_LINE_COLUMNS - len(summary), _MIN_NAME_COLUMNS)
+        if len(name) > columns:  # its end identifies the file
+            name = f"…{name[1 - columns :]}"
         is_sound = result.headline.level is Level.SOUND
         self._print(self.out, f"{name}{summary}", "" if is_sound else "yellow")
         for warning in result.cautions:
@@ -480,12 +481,6 @@ class _WatchPrinter:
 
     def _print(self, console: Console, text: str, style: str = "") -> None:
         console.print(plain(text, style), soft_wrap=True, highlight=False)
-
-
-def _shorten_name(name: str, columns: int) -> str:
-    """Cut the start of a long name; its end identifies the file."""
-    columns = max(columns, _MIN_NAME_COLUMNS)
-    return name if len(name) <= columns else f"…{name[1 - columns :]}"
 
 
 def run_watch(

@@ -190,7 +190,6 @@ def _with_default(option: Any) -> str:
 
 
 def _first_sentence(text: str | None) -> str:
-    """Return the first sentence of a text."""
     plain = " ".join((text or "").split())
     end = re.search(r"(?<=[a-z0-9)%'])[.](?= [A-Z])", plain)
     return plain if end is None else plain[: end.end()]
@@ -400,7 +399,6 @@ def _field_help(field: FieldInfo) -> str:
 
 
 def _estimates_with(parameter: str) -> dict[str, Any]:
-    """Return the estimates that have a parameter."""
     return {key: method for key, method in ESTIMATES.items() if parameter in method.parameters()}
 
 

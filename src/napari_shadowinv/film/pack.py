@@ -264,7 +264,6 @@ def _split_slabs(value: Any) -> Any:
 
 
 def _from_digits(value: Any) -> Any:
-    """Convert the text of a cell to a number."""
     return int(value) if isinstance(value, str) and value.isdecimal() else value
 
 

@@ -265,7 +265,6 @@ class Layout:
 
 
 def _has_shots(description: Mapping[str, Any]) -> bool:
-    """Return whether a described array has a value for each shot."""
     return bool((description.get("dimension_names") or [None])[0] == "shot")
 
 
@@ -330,7 +329,6 @@ def _read_chunk(file: Path) -> bytes | None:
 
 
 def _is_intact(raw: bytes) -> bool:
-    """Compare the content of a chunk with the checksum at its end."""
     content, checksum = raw[:-_CRC_BYTES], raw[-_CRC_BYTES:]
     return struct.pack("<I", google_crc32c.value(content)) == checksum
 

@@ -394,7 +394,6 @@ def _write_template(path: Path, contents: Contents) -> None:
 
 
 def _shot_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Variable]:
-    """Return the variables that every store has for its shots."""
     status = {
         "units": "1",
         "long_name": "Status of the shot",

@@ -175,7 +175,6 @@ def read_fiducials(table: Path, n_layers: int) -> dict[int, list[_Fiducial]]:
 
 
 def _check_on_scan(marks: Sequence[_Fiducial], scan: Scan, table: Path | None) -> None:
-    """Raise an `InputError` if a mark lies outside its film's scan."""
     height, width = scan.pixels.shape[:2]
     for mark in marks:
         if not (-0.5 <= mark.y <= height - 0.5 and -0.5 <= mark.x <= width - 0.5):
@@ -201,7 +200,6 @@ def _check_distinct(films: list[Film]) -> None:
 def _find_on_shared_scan(
     pack: Pack, numbers: list[int], measured: dict[str, FloatArray]
 ) -> dict[int, tuple[Scan, FloatArray]]:
-    """Locate the films of some layers on the scan that they share."""
     if not numbers:
         return {}
     if pack.scan is None:
@@ -275,7 +273,6 @@ def to_scan_frame(
 
 
 def _turn_places(places: FloatArray, scan: Scan, turned: int, mirrored: bool) -> FloatArray:
-    """Turn and mirror places (y, x) on a scan."""
     last = np.array(scan.pixels.shape[:2]) - 1
     if mirrored:
         places = places * [1, -1] + [0, last[1]]
@@ -406,7 +403,6 @@ def run_film(
 
 
 def _scale_about_axis(films: list[Film], pack: Pack) -> list[Film]:
-    """Move the corners of the films so that they are scaled about the axis."""
     if pack.axis is None:
         return films
     away = np.array(pack.axis) - (upright(films[0].corners)[2] - 1) / 2

@@ -284,7 +284,6 @@ def _refuse_unsuitable(inputs: ExperimentInputs) -> None:
 
 
 def _with_value(inputs: ExperimentInputs, quantity: str, value: float) -> ExperimentInputs:
-    """Return inputs with another value of a quantity."""
     owner, name = SWEPT[quantity].owner, _FIELDS.get(quantity, quantity)
     if owner == "options":
         stated = inputs.options.model_dump(exclude_unset=True)

@@ -196,8 +196,11 @@ def draft_pack(
     films: dict[str, dict[str, str]] = {}
     for kind in sorted({str(layer["film"]) for layer in layer_entries}):
         for part, candidates in (("calibration", calibrations), ("unexposed", unexposed)):
-            if (path := _file_for_type(kind, candidates, types)) is not None:
-                films.setdefault(kind, {})[part] = path.name
+            by_type = {path: _film_type_of(path, types) for path in candidates}
+            named = [path for path, film_type in by_type.items() if film_type == kind]
+            unnamed = [path for path, film_type in by_type.items() if film_type is None]
+            if matching := named or unnamed:
+                films.setdefault(kind, {})[part] = matching[0].name
     entries = facts.model_dump(exclude={"film"}, exclude_none=True)
     names = ("source_object_distance", "object_image_distance")
     distances = {name: entries.pop(name) for name in names if name in entries}
@@ -241,12 +244,6 @@ def write_new_pack(folder: Path, entries: Mapping[str, Any], *, overwrite: bool 
 
 def _film_type_of(path: Path, types: tuple[str, ...]) -> str | None:
     return next((kind for kind in types if kind.lower() in path.stem.lower()), None)
-
-
-def _file_for_type(kind: str, candidates: list[Path], types: tuple[str, ...]) -> Path | None:
-    """Return a file named after a type of film, or else one named after none."""
-    matching = [path for path in candidates if _film_type_of(path, types) == kind]
-    return next(iter(matching or [p for p in candidates if _film_type_of(p, types) is None]), None)
 
 
 def _is_calibration(path: Path) -> bool:

@@ -77,6 +77,10 @@ def run_refinement(
     InversionCancelled
         If `should_stop` returned true.
     """
+    errors, instrument = inversion.errors, inversion.instrument
+    if errors is not None and errors.beam is not None:
+        beam = BeamPrior(rms=errors.beam_variation, length=errors.beam_scale)
+        instrument = instrument.with_beam(beam)
     image = FitShot(
         inversion.image,
         setup=setup,
@@ -89,7 +93,7 @@ def run_refinement(
         fields=choices.fields or usual_fields(None if setup is None else [setup]),
         noise=choices.noise,
         psf=choices.psf or 0.0,
-        instrument=_instrument(inversion),
+        instrument=instrument,
         options=choices.options,
         on_progress=on_progress,
         should_stop=should_stop,
@@ -102,16 +106,6 @@ def run_refinement(
     origin = before.image.model_copy(update={"mask": None, "source_mask": None, "setup": setup})
     provenance = Provenance(kind="fit", recipe=recipe, images=(origin,), start=before)
     return replace(result, provenance=provenance)
-
-
-def _instrument(inversion: Inversion) -> Instrument:
-    """Return the instrument of an inversion, with the beam's difference in its error budget."""
-    errors = inversion.errors
-    if errors is None or errors.beam is None:
-        return inversion.instrument
-    return inversion.instrument.with_beam(
-        BeamPrior(rms=errors.beam_variation, length=errors.beam_scale)
-    )
 
 
 def refinement_choices(inversion: Inversion, setup: Setup | None, psf: float = 0.0) -> FitChoices:

@@ -353,7 +353,12 @@ class _Reader:
         shots = [self._shot(origins, k, images[k], sources[k]) for k in range(count)]
         dark = origins.image.dark
         path = None if dark is None else self._find(dark, "the dark frame")
-        shots[0] = replace(shots[0], fiducials=self._fiducials(provenance))
+        fiducials: FloatArray | Path | None = None
+        if provenance.fiducial_rows is not None:
+            fiducials = np.array(provenance.fiducial_rows)
+        elif provenance.fiducials is not None:
+            fiducials = self._find_changed(provenance.fiducials, "table of fiducials")
+        shots[0] = replace(shots[0], fiducials=fiducials)
         return RerunInputs(
             dataset,
             provenance,
@@ -377,7 +382,6 @@ class _Reader:
                 self.check(file, name)
 
     def _find(self, origin: Origin, name: str) -> Path:
-        """Return the file of an image, source, mask or table."""
         candidates = [folder / origin.file for folder in (self.folder, Path()) if origin.file]
         if candidates:
             self.check(candidates[0], name)
@@ -398,7 +402,6 @@ class _Reader:
         return read_part(Path(argument), channel, origin.variable)
 
     def _shot(self, provenance: Provenance, k: int, image: Radiograph, source_name: str) -> FitShot:
-        """Return an image with its setup, source, masks and numbers."""
         origin, source = provenance.images[k], None
         if origin.source is not None and (
             (origin.source.file, origin.source.variable) != (origin.file, origin.variable)
@@ -439,14 +442,6 @@ class _Reader:
             )
         return image_mask
 
-    def _fiducials(self, provenance: Provenance) -> FloatArray | Path | None:
-        """Return the fiducial displacements, from the result or from their table."""
-        if provenance.fiducial_rows is not None:
-            return np.array(provenance.fiducial_rows)
-        if provenance.fiducials is None:
-            return None
-        return self._find_changed(provenance.fiducials, "table of fiducials")
-
     def _find_changed(self, origin: Origin, name: str) -> Path:
         """Return a file, and record whether it has changed."""
         path = self._find(origin, f"the {name}")
@@ -482,7 +477,6 @@ def _file_changes(name: str, before: Origin | None, after: Origin | None) -> lis
 
 
 def _difference(before: xarray.Dataset, after: xarray.Dataset) -> str:
-    """Describe how a result differs from the first one."""
     shapes = [(dataset.sizes["y"], dataset.sizes["x"]) for dataset in (after, before)]
     if shapes[0] != shapes[1]:
         return f"different size: {shapes[0]}, before {shapes[1]}"

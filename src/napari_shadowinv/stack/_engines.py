@@ -66,7 +66,6 @@ def local_client(count: int) -> Iterator[Any]:
 
 
 def _dask_settings(environment: dict[str, Any]) -> dict[str, Any]:
-    """Return the changes to dask's configuration."""
     return {
         # They show the work to all users of the machine, and nobody needs them.
         "distributed.scheduler.http.routes": [],

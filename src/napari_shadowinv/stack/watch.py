@@ -83,7 +83,6 @@ _POLL_S = 0.25  # between two looks at `should_stop` while nothing arrives
 
 
 def _is_unchanged(file: FileReference, report: dict[str, Any], stamp_now: dict[str, int]) -> bool:
-    """Return whether a file still agrees with its report."""
     # Within the resolution of file times it may have changed at the same time.
     if time.time() - stamp_now["mtime_ns"] / 1e9 < _CLOCK_RESOLUTION_S and "sha256" in report:
         return bool(sha256(file.path) == report["sha256"])
@@ -103,8 +102,6 @@ class _NoImage(ImageReference):
 
 @dataclass(frozen=True, eq=False)
 class _RunningShot:
-    """A shot in work, with its attempt."""
-
     name: str
     stamp_before: dict[str, int]  # of its file, before it was read
     lane: int
@@ -331,7 +328,6 @@ class Watch:
             self._store_outcome(running.name, replace(attempt, origin=origin))
 
     def _store_outcome(self, file: str, attempt: Attempt) -> None:
-        """Write the outcome of an attempt at a file, and report it."""
         name = text_of(file)
         again = self._previous_report(name) is not None
         with defer_interrupts():
