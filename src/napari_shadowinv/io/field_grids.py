@@ -99,18 +99,17 @@ def _read_openpmd(path: Path, content: Any, iteration: str | int | None) -> Fiel
     }
     if not records:
         raise InputError(f"{path} has no mesh E or B: expected fields on a grid")
-    arrays: dict[str, Any] = {"B": None, "E": None}
-    geometries = []
+    fields, geometries = {}, []
     for symbol, record in records.items():
-        arrays[symbol], *geometry = _read_mesh(path, record, symbol)
+        fields[symbol], *geometry = _read_mesh(path, record, symbol)
         geometries.append(geometry)
-    shapes = [np.shape(arrays[symbol]) for symbol in records]
-    if any(shape != shapes[0] for shape in shapes) or not all(
+    if len({field.shape for field in fields.values()}) > 1 or not all(
         np.allclose(geometry, geometries[0], rtol=_SAME_PLACE) for geometry in geometries
     ):
         raise InputError(f"{path} has E and B on different grids: expected one grid for both")
     spacing, centre = geometries[0]
-    return FieldGrid(arrays["B"], arrays["E"], spacing=spacing.tolist(), centre=centre.tolist())
+    magnetic, electric = fields.get("B"), fields.get("E")
+    return FieldGrid(magnetic, electric, spacing=spacing.tolist(), centre=centre.tolist())
 
 
 def _choose_iteration(path: Path, content: Any, iteration: str | int | None) -> Any:

@@ -41,7 +41,7 @@ from napari_shadowinv.preprocessing.image_checks import image_warnings
 from napari_shadowinv.provenance import Origin, Provenance, index_masks
 
 # Numbers of an image, in rows of a table, shots and provenances.
-_NUMBERS = ("strength", "brightness", "psf", "noise")
+NUMBERS = ("strength", "brightness", "psf", "noise")
 
 
 def run_refinement(
@@ -425,7 +425,7 @@ def _image_origins(
     origins, masks = [], []
     for row, inputs, shot in zip(recorded, collected, ready, strict=True):
         before = inputs.provenance
-        entries: dict[str, Any] = {name: getattr(row, name) for name in (*_NUMBERS, "measured")}
+        entries: dict[str, Any] = {name: getattr(row, name) for name in (*NUMBERS, "measured")}
         entries["setup"] = inputs.shot.setup
         entries |= {"notes": shot.notes, "warnings": shot.warnings}
         origins.append(before.image.model_copy(update=entries))
@@ -459,7 +459,7 @@ def read_row_images(
         if isinstance(source, Path):
             source = read_part(source, channel)
         setup = row_setup(row, shot, recipe)
-        numbers = {name: getattr(row, name) for name in _NUMBERS}
+        numbers = {name: getattr(row, name) for name in NUMBERS}
         images.append(FitShot(shot, setup=setup, source=source, mask=row.mask, **numbers))
     return tuple(images)
 

@@ -29,7 +29,7 @@ from napari_shadowinv.io import read_dataset
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.pipeline._film import run_film
 from napari_shadowinv.pipeline.files import read_part
-from napari_shadowinv.pipeline.fit_run import run_fit, run_refinement
+from napari_shadowinv.pipeline.fit_run import NUMBERS, run_fit, run_refinement
 from napari_shadowinv.pipeline.inversion_run import Shot, picture_mask, radiograph_of, run
 from napari_shadowinv.pipeline.static_checks import StaticChecks, run_checks
 from napari_shadowinv.preprocessing import MeasuredSource, Radiograph, Recipe
@@ -414,11 +414,8 @@ class _Reader:
             source=source,
             mask=self._mask(provenance, origin.mask, image.mask),
             source_mask=self._mask(provenance, origin.source_mask, image.source_mask),
-            strength=origin.strength,
-            brightness=origin.brightness,
-            psf=origin.psf,
-            noise=origin.noise,
             measured=origin.measured,
+            **{name: getattr(origin, name) for name in NUMBERS},
         )
 
     def _mask(
