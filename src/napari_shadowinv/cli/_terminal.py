@@ -221,10 +221,7 @@ def cancel_exit_code() -> int:
 
 @contextmanager
 def _handle_interrupts() -> Iterator[None]:
-    """Record Ctrl-C for `is_interrupted`, as compiled code may swallow it, and raise it.
-
-    SIGTERM and SIGHUP count as Ctrl-C, so that no half-written file remains.
-    """
+    """Record Ctrl-C for `is_interrupted`, as compiled code may swallow it, and raise it."""
     global _ending_signal
     _ending_signal = None
     pressed = float("-inf")
@@ -240,5 +237,6 @@ def _handle_interrupts() -> Iterator[None]:
         sys.unraisablehook = lambda _: None
         raise KeyboardInterrupt
 
+    # SIGTERM and SIGHUP count as Ctrl-C, so that no half-written file remains.
     with handling(ENDING_SIGNALS, stop):
         yield

@@ -221,10 +221,8 @@ def _intersections(lines: Sequence[_Line]) -> FloatArray:
 
 
 def _sharpen_corners(scan: AnyArray, corners: FloatArray) -> FloatArray:
-    """Refine corners to a part of a pixel, by the share of film in each pixel at the sides.
-
-    The border of a mask has steps of a pixel, which average out only along a tilted side.
-    """
+    """Refine corners to a part of a pixel, by the share of film in each pixel at the sides."""
+    # The border of a mask has steps of a pixel, which average out only along a tilted side.
     axes, middle, size = upright(corners)
     darkest = scan.min(axis=-1).astype(np.float64)
     lines = []

@@ -308,10 +308,7 @@ def _defect(dataset: xarray.Dataset) -> str:
 
 @dataclass
 class _Reader:
-    """Reads the files of a result: the caller's, or those in its folder or the current one.
-
-    A result may come from anybody: files in other folders are read only if the caller allows it.
-    """
+    """Reads the files of a result: the caller's, or those in its folder or the current one."""
 
     result: str
     folder: Path
