@@ -169,7 +169,7 @@ def classes_by_field() -> dict[str, list[str]]:
                     isinstance(part, ast.AnnAssign)
                     and isinstance(part.target, ast.Name)
                     and isinstance(part.value, ast.Call)
-                    and ast.unparse(part.value.func) == "Field"
+                    and "description" in {keyword.arg for keyword in part.value.keywords}
                 ):
                     classes.setdefault(part.target.id, []).append(node.name)
     return classes
