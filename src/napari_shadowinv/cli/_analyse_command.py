@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from typer import Argument, Option
+from typer import Option
 
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._flags import HelpfulCommand
@@ -61,10 +61,8 @@ class AnalyseCommand(HelpfulCommand):
 
 @notify_errors
 def analyse(
-    result: Annotated[Path, Argument(help=HELP["result"], show_default=False)],
-    product: Annotated[
-        list[str] | None, Argument(help=HELP["products"], show_default=False)
-    ] = None,
+    result: Annotated[Path, _flags.argument(help=HELP["result"])],
+    product: Annotated[list[str] | None, _flags.argument(help=HELP["products"])] = None,
     products: Annotated[Path | None, Option(help=HELP["file"])] = None,
     unit: Annotated[str | None, Option(help=HELP["unit"])] = None,
     deflector: Annotated[str | None, Option(help=HELP["deflector"])] = None,

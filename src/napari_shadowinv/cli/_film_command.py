@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from typer import Argument, Option
+from typer import Option
 
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._summary import fact_rows, two_columns, written_rows
@@ -57,7 +57,7 @@ Known films: EBT3, HDV2, MDV3; materials: Al, Au, Cu, Fe, Kapton, Mylar, Ta, Ti 
 
 @notify_errors
 def film(
-    pack: Annotated[Path | None, Argument(help=HELP["pack"], show_default=False)] = None,
+    pack: Annotated[Path | None, _flags.argument(help=HELP["pack"])] = None,
     layers: Annotated[Path | None, Option(help=HELP["layers"])] = None,
     layers_format: Annotated[
         LayersFormat, Option(metavar="tiff|pradformat", help="Format of the layers' images.")

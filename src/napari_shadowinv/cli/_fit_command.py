@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from typer import Argument, Option
+from typer import Option
 
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._summary import fact_rows, two_columns, written_rows
@@ -73,7 +73,7 @@ Each result states whether its field can be trusted: "determined", "one of sever
 @notify_errors
 @_flags.takes_fit
 def fit(
-    images: Annotated[list[Path], Argument(help=HELP["images"], show_default=False)],
+    images: Annotated[list[Path], _flags.argument(help=HELP["images"])],
     energies: Annotated[str | None, Option(metavar="MEV,MEV,…", help=HELP["energies"])] = None,
     strengths: Annotated[
         str | None, Option(metavar="NUMBER,NUMBER,…", help=HELP["strengths"])

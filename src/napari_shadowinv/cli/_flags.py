@@ -234,12 +234,10 @@ _FIT_OPTIONS = "Options of the fit"
 _TRACE = "A 3-D field (docs/tracing.md)"
 _PARTICLES = ("keep_particles",)  # an image holds none
 
-ImageFile = Annotated[
-    Path, Argument(help=f"{IMAGE_TITLES}; with --variable, any HDF5 file.", show_default=False)
-]
-StoreFolder = Annotated[
-    Path, Argument(help="name.shadowinv.zarr, from shadowinv batch.", show_default=False)
-]
+argument = partial(Argument, show_default=False)
+
+ImageFile = Annotated[Path, argument(help=f"{IMAGE_TITLES}; with --variable, any HDF5 file.")]
+StoreFolder = Annotated[Path, argument(help="name.shadowinv.zarr, from shadowinv batch.")]
 SourceFile = Annotated[Path | None, Option(help="Image of the undisturbed beam. Default: uniform.")]
 MaskFile = Annotated[Path | None, Option(help="Image of the same size, 0 at unusable pixels.")]
 RecipeFile = Annotated[

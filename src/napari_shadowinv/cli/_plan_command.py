@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from typer import Argument, Exit, Option
+from typer import Exit, Option
 
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._terminal import (
@@ -68,7 +68,7 @@ registration, other_field.
 @notify_errors
 @_flags.takes_plan
 def plan(
-    object: Annotated[str, Argument(help=HELP["object"], show_default=False)],
+    object: Annotated[str, _flags.argument(help=HELP["object"])],
     setup: _flags.SetupFile = None,
     energies: Annotated[
         str | None, Option(metavar="NUMBER,NUMBER,…", help=HELP["energies"])

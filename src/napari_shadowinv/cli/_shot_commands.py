@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from typer import Argument, Option, echo
+from typer import Option, echo
 
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cli import _flags, _inputs
@@ -173,10 +173,8 @@ def invert(
 
 @notify_errors
 def rerun(
-    result: Annotated[
-        Path, Argument(help="A .shadowinv result of this program.", show_default=False)
-    ],
-    image: Annotated[list[Path] | None, Argument(help=HELP["image"], show_default=False)] = None,
+    result: Annotated[Path, _flags.argument(help="A .shadowinv result of this program.")],
+    image: Annotated[list[Path] | None, _flags.argument(help=HELP["image"])] = None,
     source: Annotated[Path | None, Option(help="The measured source, if it has moved.")] = None,
     out: Annotated[Path | None, Option(help=HELP["rerun_out"])] = None,
     figure: _flags.Figure = None,
@@ -245,7 +243,7 @@ grid's x = y = z = 0, in its middle.
 @notify_errors
 @_flags.takes_trace
 def forward(
-    field: Annotated[Path, Argument(help=HELP["field"], show_default=False)],
+    field: Annotated[Path, _flags.argument(help=HELP["field"])],
     source: _flags.SourceFile = None,
     setup: Annotated[Path | None, Option(help=HELP["setup"])] = None,
     recorded_with: Annotated[Path | None, Option(help=HELP["recorded_with"])] = None,
@@ -322,7 +320,7 @@ def forward(
 
 @notify_errors
 def info(
-    file: Annotated[Path | None, Argument(help="An image or a result.", show_default=False)] = None,
+    file: Annotated[Path | None, _flags.argument(help="An image or a result.")] = None,
     variable: _flags.Variable = None,
     system: Annotated[bool, Option("--system", help=HELP["system"])] = False,
 ) -> None:

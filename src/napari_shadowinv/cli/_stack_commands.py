@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from typer import Argument, Exit, Option
+from typer import Exit, Option
 
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._summary import two_columns
@@ -127,7 +127,7 @@ def _stack_inputs(
 @notify_errors
 @_flags.takes_run(RunOptions, _stack_inputs)
 def batch(
-    shots: Annotated[list[str], Argument(help=HELP["shots"], show_default=False)],
+    shots: Annotated[list[str], _flags.argument(help=HELP["shots"])],
     out: Annotated[Path, Option(help="Output store: name.shadowinv.zarr.")],
     scheduler: Annotated[str | None, Option(help=HELP["scheduler"])] = None,
     resume: Annotated[
@@ -163,7 +163,7 @@ def merge(store: _flags.StoreFolder, quiet: _flags.Quiet = False) -> None:
 @notify_errors
 @_flags.takes_run(WatchOptions, _stack_inputs)
 def watch(
-    folder: Annotated[Path, Argument(help="Folder in which the shots appear.", show_default=False)],
+    folder: Annotated[Path, _flags.argument(help="Folder in which the shots appear.")],
     out: Annotated[Path, Option(help="Output store: name.shadowinv.zarr.")],
     *,
     run: WatchOptions,
@@ -194,7 +194,7 @@ def status(
 @notify_errors
 def join(
     store: _flags.StoreFolder,
-    table: Annotated[str, Argument(help=HELP["table"], show_default=False)],
+    table: Annotated[str, _flags.argument(help=HELP["table"])],
     quiet: _flags.Quiet = False,
 ) -> None:
     """Join a shot table to a store by the numbers of the shots, such as after a watch."""
