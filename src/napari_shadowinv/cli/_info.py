@@ -14,7 +14,7 @@ from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cli import _summary
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.physics.beam import setup_warnings
-from napari_shadowinv.physics.setup import beam_quantities
+from napari_shadowinv.physics.setup import Setup, beam_quantities
 
 if TYPE_CHECKING:
     import xarray
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv._typing import AnyArray
     from napari_shadowinv.io.formats import Format
-    from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Radiograph
     from napari_shadowinv.provenance import Provenance
 

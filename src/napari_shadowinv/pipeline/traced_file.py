@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.io.field_grids import read_field_grid
 from napari_shadowinv.physics.particle_flight import check_particles
+from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.trace_options import GridView, TraceOptions
-from napari_shadowinv.physics.tracing import trace
+from napari_shadowinv.physics.tracing import TracedImage, trace
 from napari_shadowinv.pipeline.experiment_object import TracedObject, object_of_field
-
-if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.physics.tracing import TracedImage
 
 
 def trace_file(
