@@ -46,6 +46,7 @@ from napari_shadowinv.io.store import (
     StackStore,
     check_store_path,
 )
+from napari_shadowinv.physics.setup import beam_quantities
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -253,8 +254,6 @@ def _shard_rows(store: StackStore) -> Rows:
 
 def _beam_rows(store: StackStore) -> Rows:
     """Return energies or wavelengths of the finished shots, if they come from rows of a table."""
-    from napari_shadowinv.physics.setup import beam_quantities
-
     rows: Rows = []
     for name, quantity in beam_quantities().items():
         values = sorted({report[name] for report in store.reports() if name in report})

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 from typer import Option
 
 from napari_shadowinv.cli import _flags, _inputs
@@ -74,8 +75,6 @@ def film(
     Finds and straightens the films, masks handwriting and damage, aligns the layers, and
     unfolds the proton spectrum in every pixel.
     """
-    import numpy as np
-
     from napari_shadowinv.film import write_corners
     from napari_shadowinv.io import replacing
     from napari_shadowinv.io.formats import SITES

@@ -15,6 +15,7 @@ from napari_shadowinv.cli import _summary
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.physics.beam import setup_warnings
 from napari_shadowinv.physics.setup import Setup, beam_quantities
+from napari_shadowinv.preprocessing import Radiograph
 
 if TYPE_CHECKING:
     import xarray
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv._typing import AnyArray
     from napari_shadowinv.io.formats import Format
-    from napari_shadowinv.preprocessing import Radiograph
     from napari_shadowinv.provenance import Provenance
 
 PACKAGES = (
@@ -46,7 +46,6 @@ def _rows(path: Path, variable: str | None) -> _summary.Rows:
     from napari_shadowinv.io.hdf5 import read_hdf5
     from napari_shadowinv.io.images import read_npy
     from napari_shadowinv.io.store import StackStore
-    from napari_shadowinv.preprocessing import Radiograph
 
     if is_stack(path):
         return store_rows(StackStore(path))
@@ -70,8 +69,6 @@ def _rows(path: Path, variable: str | None) -> _summary.Rows:
 
 def _frame_rows(frames: Radiograph | xarray.Dataset) -> _summary.Rows:
     """Describe many images by their names and the first."""
-    from napari_shadowinv.preprocessing import Radiograph
-
     assert not isinstance(frames, Radiograph)
     names, images = frames["name"].values, frames["image"]
     return [

@@ -12,14 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._system.safety import resolved_path
+from napari_shadowinv.cli._flags import fit_recipe_of, recipe_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, PRADFORMAT, RESULT, suffixes_for
+from napari_shadowinv.options import FitChoices, InversionOptions
+from napari_shadowinv.preprocessing import MeasuredSource, Radiograph, Recipe
 
 if TYPE_CHECKING:
     from napari_shadowinv.facts import ResultKind
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.pipeline.static_checks import StaticChecks
-    from napari_shadowinv.preprocessing import Radiograph, Recipe
     from napari_shadowinv.results import AnyResult
 
 Output = tuple[Path | None, tuple[str, ...]]  # a file and the endings that it may have
@@ -137,9 +139,7 @@ def recipe_from(
     source_mask: Path | None = None,
 ) -> Recipe:
     """Read a recipe, and override it with an options file and flags."""
-    from napari_shadowinv.cli._flags import recipe_of
     from napari_shadowinv.pipeline import read_recipe
-    from napari_shadowinv.preprocessing import MeasuredSource, Recipe
 
     if clip_negative:
         flags = {"negative": "clip", **flags}
@@ -167,9 +167,7 @@ def fit_recipe_from(
     mask: Path | None,
 ) -> Recipe:
     """Read the recipe of a fit, and override it with an options file and flags."""
-    from napari_shadowinv.cli._flags import fit_recipe_of
     from napari_shadowinv.pipeline import read_recipe
-    from napari_shadowinv.preprocessing import MeasuredSource, Recipe
 
     base = Recipe() if recipe is None else read_recipe(recipe)
     choices = {} if brightness is None else {"brightness": brightness}
@@ -185,8 +183,6 @@ def fit_recipe(
     recipe: Recipe, flags: Mapping[str, Any], options: Path | None, *, clip_negative: bool
 ) -> Recipe:
     """Return the recipe for shots to be fitted; refuse flags of an inversion."""
-    from napari_shadowinv.options import FitChoices, InversionOptions
-
     refused = [
         f"--{name.replace('_', '-')}" for name in InversionOptions.model_fields if name in flags
     ]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Exit, Option
 
+from napari_shadowinv._system.validation import validate
 from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
@@ -185,8 +186,6 @@ def _object(
 
 
 def _setups(setup: Setup | None, energies: str | None) -> list[Setup] | None:
-    from napari_shadowinv._system.validation import validate
-
     if energies is None:
         return None if setup is None else [setup]
     if setup is None:

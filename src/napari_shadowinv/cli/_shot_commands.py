@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 from typer import Option, echo
 
 from napari_shadowinv._system.safety import as_file_errors
@@ -32,7 +33,10 @@ from napari_shadowinv.cli._terminal import (
 )
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
+from napari_shadowinv.io.formats import IMAGE_WRITERS, PNG, RESULT, TIFF, kind_of
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.beam import displacement_from_potential
+from napari_shadowinv.preprocessing import MeasuredSource, Radiograph
 
 if TYPE_CHECKING:
     import xarray
@@ -130,7 +134,6 @@ def invert(
     and a figure next to it.
     """
     from napari_shadowinv.pipeline.files import read_part, write_recipe
-    from napari_shadowinv.preprocessing import MeasuredSource
 
     result, figure = _inputs.result_and_figure(image, out, figure)
     files = _inputs.result_outputs(ResultKind.INVERSION, result, figure)
@@ -268,7 +271,6 @@ def forward(
     the source is uniform.
     """
     from napari_shadowinv.io import is_field_grid, read_radiograph, replacing, write
-    from napari_shadowinv.io.formats import IMAGE_WRITERS, TIFF
     from napari_shadowinv.pipeline.files import setup_from
 
     path = Path(f"{field.stem}_image{TIFF.suffix}") if out is None else out
@@ -362,16 +364,11 @@ def demo(
     flags = {} if n_sites is None else {"n_sites": n_sites}
     chosen = _inputs.recipe_from(flags, None, None, clip_negative=True)
     make_folder(out)
-    import numpy as np
-
     from napari_shadowinv.io import write
-    from napari_shadowinv.io.formats import PNG, RESULT
-    from napari_shadowinv.physics.beam import displacement_from_potential
     from napari_shadowinv.physics.forward import synthetic_image
     from napari_shadowinv.physics.phantoms import paper_setup, toroid
     from napari_shadowinv.physics.poisson import poisson_invert
     from napari_shadowinv.plotting import comparison_figure, report_figure, save_figure
-    from napari_shadowinv.preprocessing import Radiograph
 
     setup = paper_setup()
     truth = toroid((200, 200), setup, peak=dm, sigma=30e-6).displacement
@@ -404,8 +401,6 @@ def demo(
 
 
 def _error_text(estimate: FloatArray, truth: FloatArray) -> str:
-    import numpy as np
-
     true_peak, peak = (float(np.hypot(*field).max()) for field in (truth, estimate))
     if not true_peak:
         return f"peak {peak:.3g} px where the truth is zero"
@@ -456,7 +451,6 @@ class Field:
 def field_from(path: Path, variable: str | None = None) -> Field:
     """Read a displacement from a result, or from an array in px or px²."""
     from napari_shadowinv.io import read_dataset, read_radiograph
-    from napari_shadowinv.io.formats import kind_of
     from napari_shadowinv.io.hdf5 import read_hdf5
     from napari_shadowinv.io.images import read_npy
 
@@ -475,8 +469,6 @@ def field_from(path: Path, variable: str | None = None) -> Field:
 @as_file_errors
 def _field_of_result(path: Path, dataset: xarray.Dataset) -> Field:
     """Return the only field in the dataset of a result, with the beam of its first image."""
-    import numpy as np
-
     from napari_shadowinv.inversion.variables import setup_from_dataset
     from napari_shadowinv.results import result_from_dataset
 
@@ -497,8 +489,6 @@ def _field_of_result(path: Path, dataset: xarray.Dataset) -> Field:
 
 
 def _displacement(path: Path, array: AnyArray) -> FloatArray:
-    from napari_shadowinv.physics.beam import displacement_from_potential
-
     if array.ndim == 2:
         return displacement_from_potential(array)
     if array.ndim == 3 and array.shape[0] == 2:

@@ -22,6 +22,7 @@ from pydantic import ValidationError
 from napari_shadowinv._system.machine import ENDING_SIGNALS, handling
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.facts import ResultKind, Verdict
+from napari_shadowinv.physics.beam import setup_warnings
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -99,8 +100,6 @@ def invert_shot(
 
 def warn_of_setups(experiments: Iterable[tuple[Setup | None, tuple[int, int] | None]]) -> None:
     """Print the doubts about setups and the shapes of their images, before the work begins."""
-    from napari_shadowinv.physics.beam import setup_warnings
-
     texts = [
         caution.text
         for setup, shape in experiments

@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
 from collections import Counter
@@ -487,9 +489,6 @@ class ExperimentSweep:
 
 def table_text(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return rows as comma-separated values with a line of names."""
-    import csv
-    import io
-
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
