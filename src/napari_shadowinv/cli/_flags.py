@@ -234,67 +234,37 @@ _FIT_OPTIONS = "Options of the fit"
 _TRACE = "A 3-D field (docs/tracing.md)"
 _PARTICLES = ("keep_particles",)  # an image holds none
 
+# Help of flags, where it is longer than a line.
+_HELP = {
+    "recipe": "TOML file with all steps, files and options; flags override it.",
+    "save_recipe": "Write all steps, files and options to a TOML file for --recipe.",
+    "setup": "TOML file with the experimental geometry, for results in SI units.",
+    "channel": "Channel of a colour image: red, green, blue, mean or an index from 0.",
+    "variable": "Name of the array in an HDF5 file, or in a MATLAB file with several images; for a "
+    "CR-39 scan, the tracks to count, such as 'diameter=4:12 contrast=:40 bin=300'.",
+    "shots": "Shots to use, counted from 0: 3, 3:20, ::10 or 1,4,9. Default: all finished shots.",
+    "source_mask": "Image of the same size, 0 where the object covers the beam.",
+    "figure": "Figure file: .png, .pdf or .svg. Default: a PNG next to the result.",
+}
+
 argument = partial(Argument, show_default=False)
 
 ImageFile = Annotated[Path, argument(help=f"{IMAGE_TITLES}; with --variable, any HDF5 file.")]
 StoreFolder = Annotated[Path, argument(help="name.shadowinv.zarr, from shadowinv batch.")]
 SourceFile = Annotated[Path | None, Option(help="Image of the undisturbed beam. Default: uniform.")]
 MaskFile = Annotated[Path | None, Option(help="Image of the same size, 0 at unusable pixels.")]
-RecipeFile = Annotated[
-    Path | None, Option(help="TOML file with all steps, files and options; flags override it.")
-]
-SaveRecipe = Annotated[
-    Path | None, Option(help="Write all steps, files and options to a TOML file for --recipe.")
-]
-SetupFile = Annotated[
-    Path | None, Option(help="TOML file with the experimental geometry, for results in SI units.")
-]
+RecipeFile = Annotated[Path | None, Option(help=_HELP["recipe"])]
+SaveRecipe = Annotated[Path | None, Option(help=_HELP["save_recipe"])]
+SetupFile = Annotated[Path | None, Option(help=_HELP["setup"])]
 OptionsFile = Annotated[Path | None, Option(help="TOML file with inversion options.")]
-Channel = Annotated[
-    str | None, Option(help="Channel of a colour image: red, green, blue, mean or an index from 0.")
-]
-Variable = Annotated[
-    str | None,
-    Option(
-        metavar="NAME",
-        help="Name of the array in an HDF5 file, or in a MATLAB file with several images; for a "
-        "CR-39 scan, the tracks to count, such as 'diameter=4:12 contrast=:40 bin=300'.",
-    ),
-]
-SourceVariable = Annotated[
-    str | None,
-    Option(
-        metavar="NAME",
-        help="Name of the array with the undisturbed beam, in the --source file or otherwise in "
-        "the image file.",
-    ),
-]
-ChosenShots = Annotated[
-    str | None,
-    Option(
-        help="Shots to use, counted from 0: 3, 3:20, ::10 or 1,4,9. Default: all finished shots."
-    ),
-]
+Channel = Annotated[str | None, Option(help=_HELP["channel"])]
+Variable = Annotated[str | None, Option(metavar="NAME", help=_HELP["variable"])]
+ChosenShots = Annotated[str | None, Option(help=_HELP["shots"])]
 ClipNegative = Annotated[
     bool, Option("--clip-negative", help="Set negative pixels to zero and count them.")
 ]
-SourceMask = Annotated[
-    Path | None,
-    Option(
-        help="Image of the same size, 0 where the object covers the beam.",
-        rich_help_panel=_ESTIMATES,
-    ),
-]
-Result = Annotated[
-    Path | None,
-    Option(
-        help="Result file: .shadowinv (complete), .h5 (pradformat) or .csv (sites). Default: the "
-        "image's name with .shadowinv, in the current folder."
-    ),
-]
-Figure = Annotated[
-    Path | None, Option(help="Figure file: .png, .pdf or .svg. Default: a PNG next to the result.")
-]
+SourceMask = Annotated[Path | None, Option(help=_HELP["source_mask"], rich_help_panel=_ESTIMATES)]
+Figure = Annotated[Path | None, Option(help=_HELP["figure"])]
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Print errors only.")]
 QuietInversion = Annotated[bool, Option("--quiet", "-q", help="Print errors and warnings only.")]

@@ -47,6 +47,10 @@ if TYPE_CHECKING:
 
 # Help of arguments, where it is longer than a line.
 HELP = {
+    "source_variable": "Name of the array with the undisturbed beam, in the --source file or "
+    "otherwise in the image file.",
+    "out": "Result file: .shadowinv (complete), .h5 (pradformat) or .csv (sites). Default: the "
+    "image's name with .shadowinv, in the current folder.",
     "image": "The image, if it has moved or changed; for a fit, all images in their order. "
     "Default: the files named in the result, in its folder or the current one.",
     "rerun_out": "Result file. Default: the result's name with _again, in the current folder.",
@@ -119,9 +123,11 @@ def invert(
     options: _flags.OptionsFile = None,
     channel: _flags.Channel = None,
     variable: _flags.Variable = None,
-    source_variable: _flags.SourceVariable = None,
+    source_variable: Annotated[
+        str | None, Option(metavar="NAME", help=HELP["source_variable"])
+    ] = None,
     clip_negative: _flags.ClipNegative = False,
-    out: _flags.Result = None,
+    out: Annotated[Path | None, Option(help=HELP["out"])] = None,
     figure: _flags.Figure = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.QuietInversion = False,
