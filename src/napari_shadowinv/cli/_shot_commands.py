@@ -69,6 +69,8 @@ HELP = {
     "dispersion": "For a refractive index: ratio of ln η at the new wavelength to ln η at the old "
     "one.",
     "system": "Print the versions and the system instead, for a bug report.",
+    "noise": "Standard deviation of the noise, as a fraction of the mean.",
+    "n_sites": InversionOptions.model_fields["n_sites"].description,
     "predicted_image": "Image file: .tif (float32), .npy or .png (16 bits, scaled to its maximum). "
     "Default: the field's name with _image.tif, in the current folder.",
 }
@@ -349,12 +351,8 @@ def info(
 def demo(
     out: Annotated[Path, Option(help="Output folder.")] = Path("demo"),
     dm: Annotated[float, Option(help="Peak path-integrated field in MG·µm.")] = 97.0,
-    noise: Annotated[
-        float, Option(help="Standard deviation of the noise, as a fraction of the mean.")
-    ] = 0.1,
-    n_sites: Annotated[
-        int | None, Option(help=InversionOptions.model_fields["n_sites"].description)
-    ] = None,
+    noise: Annotated[float, Option(help=HELP["noise"])] = 0.1,
+    n_sites: Annotated[int | None, Option(help=HELP["n_sites"])] = None,
 ) -> None:
     """Simulate a proton radiograph of a toroidal field, invert it and compare with the truth.
 

@@ -29,6 +29,7 @@ HELP = {
     "[fit]; table rows with the same shot are images of one object.",
     "table": "Table with a row for each shot: CSV with the column 'shot' or 'number', or HDF5 as "
     "file.h5::/entry/shots.",
+    "resume": "Resume an interrupted run and append new shots.",
     "verify": "Read all files and compare their checksums; exit code 1 if any is damaged.",
     "variables": "For tiff and ome-zarr: variables to export, separated by commas.",
     "variable": "Variable to show; for vectors, the magnitude. Default: the potential.",
@@ -130,9 +131,7 @@ def batch(
     shots: Annotated[list[str], _flags.argument(help=HELP["shots"])],
     out: Annotated[Path, Option(help="Output store: name.shadowinv.zarr.")],
     scheduler: Annotated[str | None, Option(help=HELP["scheduler"])] = None,
-    resume: Annotated[
-        bool, Option("--resume", help="Resume an interrupted run and append new shots.")
-    ] = False,
+    resume: Annotated[bool, Option("--resume", help=HELP["resume"])] = False,
     *,
     run: RunOptions,
     **inputs: Any,

@@ -36,10 +36,8 @@ class ExperimentOptions(CheckedModel, allow_inf_nan=False):
     )
     reference: Literal["none", "recorded"] = Field(
         default="none",
-        description=(
-            "'recorded': an image of the beam without the object is the source. 'none': a uniform "
-            "beam is assumed."
-        ),
+        description="'recorded': an image of the beam without the object is the source. 'none': a "
+        "uniform beam is assumed.",
     )
     reference_counts: float | None = _detail(
         default=None,
@@ -52,10 +50,8 @@ class ExperimentOptions(CheckedModel, allow_inf_nan=False):
         default=0.0,
         ge=0,
         lt=0.5,
-        description=(
-            "Relative r.m.s. structure of the beam that the reference records, over the beam's "
-            "length. How far the beam differs from its reference is a number of the instrument."
-        ),
+        description="Relative r.m.s. structure of the beam that the reference records, over the "
+        "beam's length. How far the beam differs from its reference is a number of the instrument.",
     )
     psf: float | None = _detail(
         default=None,
@@ -68,10 +64,8 @@ class ExperimentOptions(CheckedModel, allow_inf_nan=False):
         default=None,
         ge=0,
         title="Source size (m)",
-        description=(
-            "Standard deviation of the beam's source in m (FWHM / 2.355), for the point spread of "
-            "each setup."
-        ),
+        description="Standard deviation of the beam's source in m (FWHM / 2.355), for the point "
+        "spread of each setup.",
     )
     resolution: float | None = _detail(
         default=None,
@@ -87,20 +81,16 @@ class ExperimentOptions(CheckedModel, allow_inf_nan=False):
     )
     method: Literal["automatic", "inversion", "fit"] = _rare(
         default="automatic",
-        description=(
-            "'inversion' for one image, 'fit' for several or one. Default: an inversion for one "
-            "image."
-        ),
+        description="'inversion' for one image, 'fit' for several or one. Default: an inversion "
+        "for one image.",
     )
     searched: int = _rare(
         default=1,
         ge=1,
         le=1000,
         title="Draws with a full search",
-        description=(
-            "Number of draws whose fit looks for alternative solutions from all starting points "
-            "and computes error bars. The other fits start near the true field."
-        ),
+        description="Number of draws whose fit looks for alternative solutions from all starting "
+        "points and computes error bars. The other fits start near the true field.",
     )
     max_error: MaxError = 0.05
     seed: int = _rare(
