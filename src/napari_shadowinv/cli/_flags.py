@@ -214,9 +214,7 @@ def _table(rows: Iterable[tuple[str, str]], width: int) -> Iterator[str]:
     """Lay out names and texts side by side, the text below a name that is too long."""
     for name, text in rows:
         indent = " " * (_NAME_COLUMNS + 2)
-        lines = textwrap.wrap(
-            " ".join(text.split()), width - len(indent), break_long_words=False
-        ) or [""]
+        lines = _wrap(text, width - len(indent)) or [""]
         if len(name) < _NAME_COLUMNS:
             yield f"  {name:<{_NAME_COLUMNS}}{lines.pop(0)}".rstrip()
         else:
@@ -232,7 +230,6 @@ _FIT_STEPS = "Steps before the fit, in this order"
 _FIT_CHOICES = "Unknowns and data of the fit"
 _FIT_OPTIONS = "Options of the fit"
 _TRACE = "A 3-D field (docs/tracing.md)"
-_PARTICLES = ("keep_particles",)  # an image holds none
 
 # Help of flags, where it is longer than a line.
 _HELP = {
@@ -445,7 +442,8 @@ _FIT_FLAGS = (
     | _INSTRUMENT_FLAGS
     | _option_flags(FitOptions, _FIT_OPTIONS)
 )
-_TRACE_FLAGS = _option_flags(SizedView, _TRACE) | _option_flags(TraceOptions, _TRACE, _PARTICLES)
+_TRACE_FLAGS = _option_flags(SizedView, _TRACE)
+_TRACE_FLAGS |= _option_flags(TraceOptions, _TRACE, ["keep_particles"])  # an image holds none
 _PLAN_FLAGS = (
     _option_flags(ExperimentOptions, None) | _option_flags(GridView, _TRACE) | _INSTRUMENT_FLAGS
 )

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.tables import Table, read_table
+from napari_shadowinv._system.tables import read_table
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
@@ -398,7 +398,14 @@ def combined_dose(
 def _films_of(path: Path) -> FloatArray:
     """Read dose and red, green and blue pixel of every film, then spreads if all are present."""
     table = read_table(path)
-    columns = _find_columns(table)
+    names = [next((name for name in table.header if "dose" in name and "log" not in name), "dose")]
+    for colour in _CHANNELS:
+        names.append(next((name for name in table.header if name.startswith(colour)), colour))
+    columns = [table.position_of(name) for name in names]
+    spreads = [position + 1 for position in columns[1:]]
+    header = [*table.header, ""]
+    if all(header[position].startswith("std") for position in spreads):
+        columns += spreads
     rows: list[list[float]] = []
     for line, cells in table.rows.items():
         picked = [cells[column] for column in columns]
@@ -415,14 +422,3 @@ def _films_of(path: Path) -> FloatArray:
             )
         rows.append(row)
     return np.array(rows, dtype=np.float64).reshape(-1, len(columns))
-
-
-def _find_columns(table: Table) -> list[int]:
-    names = [next((name for name in table.header if "dose" in name and "log" not in name), "dose")]
-    for colour in _CHANNELS:
-        names.append(next((name for name in table.header if name.startswith(colour)), colour))
-    columns = [table.position_of(name) for name in names]
-    spreads = [position + 1 for position in columns[1:]]
-    header = [*table.header, ""]
-    has_spreads = all(header[position].startswith("std") for position in spreads)
-    return columns + spreads if has_spreads else columns

@@ -141,7 +141,6 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
 
 
 def _check_rectangle(number: int, corners: FloatArray, pixel_size: float | None) -> None:
-    """Raise an `InputError` if measured corners are far from a rectangle."""
     axes, middle, size = upright(corners)
     signs = np.array([(-1, -1), (-1, 1), (1, 1), (1, -1)])
     away = np.hypot(*(corners - middle - signs * size / 2 @ axes).T).max()
@@ -185,7 +184,6 @@ def _check_on_scan(marks: Sequence[_Fiducial], scan: Scan, table: Path | None) -
 
 
 def _check_distinct(films: list[Film]) -> None:
-    """Raise an `InputError` if two layers have the same scan of a single film."""
     by_checksum: dict[str, Film] = {}
     for film in films:
         file = film.layer.file

@@ -421,7 +421,6 @@ def _read_fiducials(fiducials: ArrayLike | Path | None) -> tuple[FloatArray | No
 def _image_origins(
     recorded: Sequence[FitShot], collected: Sequence[Inputs], ready: Sequence[Radiograph]
 ) -> dict[str, Any]:
-    """Return the images and masks of a fit's provenance."""
     origins, masks = [], []
     for row, inputs, shot in zip(recorded, collected, ready, strict=True):
         before = inputs.provenance

@@ -497,9 +497,7 @@ def _mask(values: ArrayLike | None, file: Path | None, name: str, shot: Radiogra
 
 def _without_masked(mask: _Mask, *images: Any) -> _Mask:
     """Remove the masked pixels of arrays from a mask."""
-    arrays = [
-        image for image in images if not isinstance(image, (Radiograph, str, Path, type(None)))
-    ]
+    arrays = [image for image in images if not isinstance(image, Radiograph | str | Path | None)]
     masks = [unpack_array(image, "image")[1] for image in arrays]
     if all(usable is None for usable in masks):
         return mask

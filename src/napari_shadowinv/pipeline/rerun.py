@@ -449,7 +449,6 @@ def _with_dark(recipe: Recipe, path: Path | None) -> Recipe:
 
 
 def _image_changes(before: Provenance, after: Provenance) -> list[str]:
-    """Report the changes of images, sources and dark frames."""
     changes: list[str] = []
     for number, (old, new) in enumerate(zip(before.images, after.images, strict=False), 1):
         name = "image" if before.kind == "inversion" else f"image {number}"

@@ -84,9 +84,8 @@ def stack_statistics(stack: xarray.Dataset) -> xarray.Dataset:
     for name in names:
         field = stack[name]
         done = field.isel(shot=chosen).astype(np.float64)
-        variables[f"{name}_mean"] = _labelled(
-            done.mean("shot", skipna=False), field, "mean of shots"
-        )
+        mean = done.mean("shot", skipna=False)
+        variables[f"{name}_mean"] = _labelled(mean, field, "mean of shots")
         spread = done.std("shot", ddof=1, skipna=False)
         if done.sizes["shot"] < 2:
             spread = spread * np.nan

@@ -370,7 +370,6 @@ class FitTask(Task):
         return self.requested.model_copy(update={"source": self.requested.estimate, **cleared})
 
     def _completed(self, shot: FitShot, source: AnyArray | None) -> FitShot:
-        """Complete an image with setup, source and masks of the stack."""
         assert isinstance(shot.image, Radiograph)
         common = self.inputs.shot
         return replace(
