@@ -86,7 +86,13 @@ def run_batch(
     from napari_shadowinv.stack import run_stack
 
     if run.part is None:
-        _check_store(out, resume, run.overwrite)
+        if resume and run.overwrite:
+            raise InputError("got --resume and --overwrite, expected one of them")
+        if check_store_path(out).exists() and not (resume or run.overwrite):
+            raise InputError(
+                f"{out} exists ({_counts_text(StackStore(out))}): use --resume to continue, "
+                "--overwrite to start again, or another name"
+            )
     try:
         bar = _ProgressBar(quiet)
         with bar.bars:
@@ -137,16 +143,6 @@ def exit_unless_reliable(store: StackStore) -> None:
             is_sound = report.get("converged")
         if status == DONE and not is_sound:
             raise typer.Exit(EXIT_NOT_CONVERGED)
-
-
-def _check_store(out: Path, resume: bool, overwrite: bool) -> None:
-    if resume and overwrite:
-        raise InputError("got --resume and --overwrite, expected one of them")
-    if check_store_path(out).exists() and not (resume or overwrite):
-        raise InputError(
-            f"{out} exists ({_counts_text(StackStore(out))}): use --resume to continue, "
-            "--overwrite to start again, or another name"
-        )
 
 
 def progress_columns() -> tuple[progress.ProgressColumn, ...]:

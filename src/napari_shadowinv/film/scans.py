@@ -457,6 +457,5 @@ def _burnt_top(logarithm: FloatArray) -> BoolArray:
 
 
 def _resample(samples: FloatArray, image: FloatArray) -> FloatArray:
-    """Interpolate samples to the pixels of an image."""
     places = np.mgrid[: image.shape[0], : image.shape[1]] / _SAMPLE_STEP_PX - 0.5
     return np.asarray(ndimage.map_coordinates(samples, places, order=1, mode="nearest"))

@@ -25,13 +25,11 @@ class PublicFile:
     address: str  # URL
 
 
-def _read_list() -> dict[str, PublicFile]:
-    text = files(__package__).joinpath("public_files.csv").read_text(encoding="utf-8")
-    rows = list(csv.reader(text.splitlines()))[1:]
-    return {name: PublicFile(name, int(size), *texts) for name, size, *texts in rows}
-
-
-PUBLIC_FILES = _read_list()
+_LIST = files(__package__).joinpath("public_files.csv").read_text(encoding="utf-8")
+PUBLIC_FILES = {
+    name: PublicFile(name, int(size), *texts)
+    for name, size, *texts in list(csv.reader(_LIST.splitlines()))[1:]
+}
 """By name. The burner's first file is the reference beam, the others are frames."""
 
 

@@ -24,6 +24,7 @@ import os
 import struct
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property, partial
@@ -378,16 +379,11 @@ def _damage_error(layout: Layout, key: str, problem: str) -> FileFormatError:
     name, index = _name_and_index(key)
     advice = "resume its run, or copy the store again"
     if name in layout.of_each_shot:
-        problem = f"{_label(layout, index)}: {problem}"
-        advice = "resume its run to invert it again"
+        label = f"shot {index}"
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            label = f"{label} ({_read_report(layout.root, index)[LABELS]['name']})"
+        problem, advice = f"{label}: {problem}", "resume its run to invert it again"
     return FileFormatError(f"{layout.root} is damaged: {problem}; {advice}")
-
-
-def _label(layout: Layout, index: int) -> str:
-    try:
-        return f"shot {index} ({_read_report(layout.root, index)[LABELS]['name']})"
-    except (OSError, ValueError, KeyError, TypeError):
-        return f"shot {index}"
 
 
 def _check_again(inspect: Callable[[], tuple[str, Report]]) -> tuple[str, Report]:

@@ -364,7 +364,6 @@ def _plan(inputs: ExperimentInputs, report: Reporter) -> ExperimentPlan:
 
 
 def _tally(shots: Sequence[PlannedShot]) -> str:
-    """Return the errors made until now in a few words."""
     determined = sum(shot.is_determined for shot in shots)
     error = percent(float(np.median([shot.error for shot in shots])))
     return f"error made {error}, determined {determined} of {len(shots)}"

@@ -191,13 +191,7 @@ class TracedObject(PlannedObject):
     field: FieldGrid
 
     def displacement(self, setup: Setup | None, grid: Grid) -> FloatArray:
-        """Return the displacement in px of a setup at the samples of a grid, (2, h, w).
-
-        Raises
-        ------
-        InputError
-            If the setup is none of particles, or a particle does not reach the detector.
-        """
+        """Trace particles; an `InputError` if the setup has none, or one misses the detector."""
         particles = check_particles(setup)
         finer = check_particles(finer_setup(particles, grid.factor))
         return traced_displacement(self.field, finer, grid.sizes) / grid.factor
