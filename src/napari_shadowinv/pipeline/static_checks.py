@@ -178,7 +178,7 @@ def _order_by_energy(inputs: FitInputs) -> list[int]:
 
 def _strengths(inputs: FitInputs) -> FloatArray:
     """Displacement of each image by each field, relative to the first image."""
-    strengths = common_values(inputs.names, [s.strength for s in inputs.recorded], "strength")
+    strengths = common_values(inputs.names, [shot.strength for shot in inputs.recorded], "strength")
     if strengths is None:
         return strengths_of(inputs.setups, inputs.fields, len(inputs.shots), inputs.names)
     matrix = np.array(strengths, dtype=np.float64)
