@@ -10,7 +10,7 @@ from functools import partial
 import pytest
 
 from napari_shadowinv._system.machine import available_threads
-from napari_shadowinv._system.progress import run_both, run_in_parallel
+from napari_shadowinv._system.progress import run_in_parallel
 from napari_shadowinv.errors import InversionCancelled
 
 Step = Callable[[int], None]
@@ -100,7 +100,7 @@ def test_cores_are_divided_between_functions_that_still_run() -> None:
         assert counted.wait(10)
         return 0
 
-    assert run_both(shares, end, 2, lambda number: None)[0] == [2, 4, 1, 1, 1, 1, 1]
+    assert run_in_parallel([shares, end], 2, lambda number: None) == [[2, 4, 1, 1, 1, 1, 1], 0]
     assert available_threads(4) == 4
 
 
@@ -122,5 +122,5 @@ def test_a_step_after_the_end_of_all_functions_is_no_request_to_stop() -> None:
 def test_two_functions_return_their_own_results(threads: int) -> None:
     received: list[int] = []
     first, second = partial(step_on, 3, 20), partial(step_on, 5, 10)
-    assert run_both(first, second, threads, received.append) == (9, 25)
+    assert run_in_parallel([first, second], threads, received.append) == [9, 25]
     assert sorted(received) == [3] * 20 + [5] * 10

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from queue import SimpleQueue
 from threading import Event
-from typing import Any, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 from napari_shadowinv._system.machine import Crew
 from napari_shadowinv.errors import InversionCancelled
@@ -41,7 +41,6 @@ ShouldStop = Callable[[], bool]
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
-_U = TypeVar("_U")
 
 
 class Reporter:
@@ -111,15 +110,3 @@ def run_in_parallel(
     for error in sorted(errors, key=lambda each: isinstance(each, InversionCancelled)):
         raise error
     return [future.result() for future in futures]
-
-
-def run_both(
-    first: Callable[[Callable[_P, None]], _T],
-    second: Callable[[Callable[_P, None]], _U],
-    threads: int,
-    on_step: Callable[_P, None],
-) -> tuple[_T, _U]:
-    """Call two functions as `run_in_parallel` does."""
-    works: list[Callable[[Callable[_P, None]], Any]] = [first, second]
-    results = run_in_parallel(works, threads, on_step)
-    return results[0], results[1]

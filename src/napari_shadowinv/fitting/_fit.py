@@ -15,7 +15,13 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._system.machine import available_threads
-from napari_shadowinv._system.progress import OnProgress, OnStep, Reporter, ShouldStop, run_both
+from napari_shadowinv._system.progress import (
+    OnProgress,
+    OnStep,
+    Reporter,
+    ShouldStop,
+    run_in_parallel,
+)
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
@@ -223,7 +229,8 @@ def fit(
         return basins, _find_openness(data, unsure, best, rng, options, on_step)
 
     begun, threads = time.perf_counter(), available_threads(scene.threads)
-    refined, (basins, openness) = run_both(refine, explore, threads, on_step)
+    works: list[Any] = [refine, explore]
+    refined, (basins, openness) = run_in_parallel(works, threads, on_step)
     seconds["samples"] = max(time.perf_counter() - begun - seconds["full size"], 0.0)
     fine, unknowns, value, taken, ended = refined
     with _timed("residual", seconds):
