@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from napari_shadowinv import ProtonSetup, fit
-from napari_shadowinv._napari.jobs import FitProgress, Pace, estimate_fit_time
+from napari_shadowinv._napari.jobs import FitProgress, Pace, TimeEstimate
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
@@ -29,7 +29,7 @@ SETUPS = [
 )
 def test_the_bar_never_goes_back_and_names_the_stages(options: FitOptions, last: str) -> None:
     truth = gaussian_blob((48, 48), 15.0, 8.0).displacement
-    progress = FitProgress(estimate_fit_time((48, 48), 2, 1, None, options))
+    progress = FitProgress(TimeEstimate((48, 48), 2, 1, False, options))
     reports: list[Progress] = []
     fit(
         [synthetic_image(truth), synthetic_image(0.6 * truth)],
@@ -52,14 +52,14 @@ def test_the_bar_never_goes_back_and_names_the_stages(options: FitOptions, last:
 
 
 def test_other_progress_is_passed_on() -> None:
-    progress = FitProgress(estimate_fit_time((48, 48), 2, 1, None, OPTIONS))
+    progress = FitProgress(TimeEstimate((48, 48), 2, 1, False, OPTIONS))
     compiling = Progress("compile", 1, None, "once")
     assert progress.update(compiling) is compiling
     assert progress.history == []
 
 
 def test_samples_beside_the_fit_do_not_change_the_objective_shown() -> None:
-    progress = FitProgress(estimate_fit_time((48, 48), 2, 1, None, OPTIONS))
+    progress = FitProgress(TimeEstimate((48, 48), 2, 1, False, OPTIONS))
     steps = [("smoothness", 20.0), ("samples", 20.0), ("full size", 81.0), ("samples", 20.0)]
     shown = [progress.update(Progress("fit", 1, None, *step)).objective for step in steps]
     assert shown == [20, 20, 81, 81]
@@ -67,25 +67,25 @@ def test_samples_beside_the_fit_do_not_change_the_objective_shown() -> None:
 
 
 def test_a_forecast_grows_with_what_is_asked_for() -> None:
-    def seconds(side: int, count: int, fields: int = 1, source: str | None = None) -> float:
-        return estimate_fit_time((side, side), count, fields, source, FitOptions()).seconds
+    def seconds(side: int, count: int, fields: int = 1, is_unknown: bool = False) -> float:
+        return TimeEstimate((side, side), count, fields, is_unknown, FitOptions()).seconds
 
     assert 1.2 < seconds(200, 2) < 3
     assert 0.4 < seconds(64, 2) < 1.2
     assert seconds(400, 2) > 3 * seconds(200, 2)
     assert seconds(200, 4) > 1.5 * seconds(200, 2)
     assert seconds(200, 2, fields=2) > 1.3 * seconds(200, 2)
-    assert seconds(200, 2, source="unknown") > 1.2 * seconds(200, 2)
-    none = estimate_fit_time((200, 200), 2, 1, None, FitOptions(samples=0)).seconds
+    assert seconds(200, 2, is_unknown=True) > 1.2 * seconds(200, 2)
+    none = TimeEstimate((200, 200), 2, 1, False, FitOptions(samples=0)).seconds
     assert none < seconds(200, 2)
 
 
 def test_the_next_forecast_follows_the_last_fit() -> None:
-    estimate = estimate_fit_time((1000, 1000), 3, 2, None, FitOptions())
+    estimate = TimeEstimate((1000, 1000), 3, 2, False, FitOptions())
     pace = Pace()
     text = estimate.text(pace)
     assert text.startswith("3 images of 1000 × 1000 px, 2 fields: about 80 s, up to 5 min")
     pace.factor = 3.0
     assert "about 4 min, based on the last fit" in estimate.text(pace)
-    single = estimate_fit_time((200, 200), 1, 1, "unknown", FitOptions())
+    single = TimeEstimate((200, 200), 1, 1, True, FitOptions())
     assert single.text(Pace()).startswith("one image of 200 × 200 px, unknown beam: about ")

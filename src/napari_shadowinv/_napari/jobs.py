@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.fit_layers import fit_layers
@@ -23,13 +23,11 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitShot
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import FitChoices, FitOptions
+from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Cache, run_fit, run_refinement
 from napari_shadowinv.pipeline.fit_run import refinement_choices
 from napari_shadowinv.pipeline.inversion_run import run
 from napari_shadowinv.preprocessing import Radiograph, Recipe
-
-if TYPE_CHECKING:
-    from napari_shadowinv.physics.setup import Setup
 
 # Twice what two fast cores take for two to four images of 64² to 400² px without crossing rays.
 # Crossing rays, or a search for the cause of a misfit, multiply the time by 1.9 to 4.
@@ -78,7 +76,13 @@ class TimeEstimate:
     images: int
     fields: int
     beam_is_unknown: bool
-    samples: int
+    options: FitOptions
+
+    @property
+    def samples(self) -> int:
+        """Number of random fields, with as many as the evidence takes time."""
+        samples = self.options.samples if self.options.samples > 1 else 0
+        return samples + (_EVIDENCE_IN_SAMPLES if self.options.evidence else 0)
 
     @property
     def seconds(self) -> float:
@@ -153,15 +157,6 @@ class FitProgress:
         return Progress(progress.stage, done, _BAR_LENGTH, message, self._objective)
 
 
-def estimate_fit_time(
-    shape: tuple[int, ...], images: int, fields: int, source: object, options: FitOptions
-) -> TimeEstimate:
-    """Estimate the time of a fit with the source and options that `fit` takes."""
-    samples = options.samples if options.samples > 1 else 0
-    samples += _EVIDENCE_IN_SAMPLES if options.evidence else 0
-    return TimeEstimate(shape, images, fields, isinstance(source, str), samples)
-
-
 @dataclass(frozen=True, eq=False)
 class Finished:
     """The result of a job, and the layers that show it."""
@@ -224,9 +219,7 @@ class InversionJob(ImageJob):
     cache: Cache | None = None
     preview: bool = False
 
-    def run(
-        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
-    ) -> Inversion:
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Inversion:
         source = None if self.source is None else load_radiograph(self.source, "the source")
         return run(
             self.recipe,
@@ -287,11 +280,9 @@ class FitJob(ImageJob):
 
     @property
     def time_estimate(self) -> TimeEstimate:
-        """Estimate of the fit's time."""
-        choices = self.choices
-        source = choices.beam if choices.beam == "unknown" else None
-        fields = len(choices.fields or ("B",))
-        return estimate_fit_time(self.shape, len(self.names), fields, source, choices.options)
+        choices, images = self.choices, len(self.names)
+        fields, is_unknown = len(choices.fields or ("B",)), choices.beam == "unknown"
+        return TimeEstimate(self.shape, images, fields, is_unknown, choices.options)
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
         fit = self.compute(lambda state: on_progress(self.progress.update(state)), should_stop)

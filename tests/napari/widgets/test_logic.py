@@ -63,6 +63,7 @@ from napari_shadowinv.preprocessing import (
 )
 
 FEW = InversionOptions(n_sites=500)
+UNHEARD = (lambda _: None, lambda: False)  # progress to nobody, and no stop
 Array = np.ndarray[Any, Any]
 
 
@@ -378,8 +379,8 @@ def test_a_shot_is_looked_at_before_the_books_count_it(shot: Array, tmp_path: Pa
 
 
 def test_a_strong_object_warns_of_caustics_and_a_weak_one_does_not() -> None:
-    weak = ForwardJob(BlobRecipe(amplitude=5, sigma=8), shape=(40, 50)).run()
-    strong = ForwardJob(BlobRecipe(amplitude=-200, sigma=8), shape=(40, 50)).run()
+    weak = ForwardJob(BlobRecipe(amplitude=5, sigma=8), shape=(40, 50)).run(*UNHEARD)
+    strong = ForwardJob(BlobRecipe(amplitude=-200, sigma=8), shape=(40, 50)).run(*UNHEARD)
     assert weak.warning == ""
     assert "Caustics" in strong.warning
     assert strong.caustic_share > 0
@@ -388,14 +389,14 @@ def test_a_strong_object_warns_of_caustics_and_a_weak_one_does_not() -> None:
 def test_a_potential_and_its_object_make_the_same_image() -> None:
     blob = BlobRecipe(amplitude=20, sigma=8)
     phantom = blob.phantom((40, 50), None)
-    by_object = ForwardJob(blob, shape=(40, 50)).run()
-    by_potential = ForwardJob(1e9 * phantom.potential, to_px2=1e-9).run()
+    by_object = ForwardJob(blob, shape=(40, 50)).run(*UNHEARD)
+    by_potential = ForwardJob(1e9 * phantom.potential, to_px2=1e-9).run(*UNHEARD)
     assert abs(by_object.image - by_potential.image).max() < 0.02
 
 
 def test_a_magnetic_object_asks_for_particles() -> None:
     with pytest.raises(InputError, match="select the setup"):
-        ForwardJob(ToroidRecipe()).run()
+        ForwardJob(ToroidRecipe()).run(*UNHEARD)
 
 
 def test_forward_model_traces_a_3d_field_from_a_file(tmp_path):
@@ -411,9 +412,9 @@ def test_forward_model_traces_a_3d_field_from_a_file(tmp_path):
     dataset.to_netcdf(path, engine="h5netcdf")
     setup = paper_setup()
     with pytest.raises(InputError, match="there is no setup"):
-        ForwardJob(GridFile(str(path), GridView()), shape=(20, 30)).run()
+        ForwardJob(GridFile(str(path), GridView()), shape=(20, 30)).run(*UNHEARD)
     job = ForwardJob(GridFile(str(path), GridView(right="-x")), shape=(20, 30), setup=setup)
-    prediction = job.run()
+    prediction = job.run(*UNHEARD)
     # Seen with x to the left, y points up.
     expected = setup.displacement_from_path_integrated_b([-0.5 * 4e-4, 0.0])[1]
     np.testing.assert_allclose(prediction.displacement[1], expected, rtol=1e-2)

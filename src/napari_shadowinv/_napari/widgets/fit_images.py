@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.jobs import PACE, Finished, FitJob, estimate_fit_time
+from napari_shadowinv._napari.jobs import PACE, Finished, FitJob, TimeEstimate
 from napari_shadowinv._napari.shots import radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _inputs as inputs
@@ -25,9 +25,6 @@ from napari_shadowinv.fitting import FitShot, point_spread
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.setup import SETUPS, Setup
 from napari_shadowinv.preprocessing import FIT_STEPS, Radiograph, Recipe
-
-if TYPE_CHECKING:
-    import napari
 
 
 def _beam_summary(shot: FitShot) -> str:
@@ -50,10 +47,10 @@ def _warnings_of(rows: list[ImageRow]) -> list[tuple[str, str]]:
 class FitImages(ToolPanel):
     """Choose images of one object at several energies, then press Run."""
 
-    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+    def __init__(self, napari_viewer: Any) -> None:
         tip = "Fit the fields, and an unknown beam, to all images together."
         panel = RunPanel("Fit several images", "Run", tip, patience=0.4)
-        super().__init__(viewer, "fit-images", panel)
+        super().__init__(napari_viewer, "fit-images", panel)
         self._build()
         self._connect()
         self.restore_last()
@@ -77,7 +74,6 @@ class FitImages(ToolPanel):
         self.masks = layers.MaskPicker(
             self.viewer,
             self.chosen_image,
-            ("labels", "shapes"),
             "Labels or shapes on bad detector pixels, for all images. The fit ignores masked "
             "pixels.",
         )
@@ -107,23 +103,13 @@ class FitImages(ToolPanel):
             "Save the selected or last fit: complete with its layers (.shadowinv), or its field "
             "for other programs (.h5).",
         )
-        self.add(
-            self.images,
-            forms.labelled("Fields", self.fields),
-            self.source,
-            self.masks,
-            forms.labelled("Brightness", self.brightness),
-            forms.labelled("Noise", self.noise),
-            self.setup_section,
-            self.steps,
-            forms.section("Instrument", self.instrument),
-            forms.section("Options", self.options),
-            side_by_side((self.keep_earlier, 1), (self.recipes, 0)),
-            self.cost,
-            self.panel,
-            self.view,
-            side_by_side((self.save_result, 1), (self.more_layers, 1)),
-        )
+        instrument = forms.section("Instrument", self.instrument)
+        options = forms.section("Options", self.options)
+        self.add(self.images, forms.labelled("Fields", self.fields), self.source, self.masks)
+        self.add(forms.labelled("Brightness", self.brightness), forms.labelled("Noise", self.noise))
+        self.add(self.setup_section, self.steps, instrument, options)
+        self.add(side_by_side((self.keep_earlier, 1), (self.recipes, 0)), self.cost, self.panel)
+        self.add(self.view, side_by_side((self.save_result, 1), (self.more_layers, 1)))
 
     def _connect(self) -> None:
         while_alive(self, self.viewer.layers.selection, "active", self.view.follow)
@@ -158,10 +144,9 @@ class FitImages(ToolPanel):
     def recipe(self) -> Recipe:
         """Return the recipe of the controls, without table and layers; or raise an `InputError`."""
         fields = tuple(self.fields.state().split(inputs.BOTH))
-        beam = "unknown" if self.source.kind == inputs.UNKNOWN else "known"
         choices = FitChoices(
             fields=fields,
-            beam=beam,
+            beam="unknown" if self.source.kind == inputs.UNKNOWN else "known",
             brightness=self.brightness.state(),
             noise=self.noise.state() or None,
             options=self.options.model(),
@@ -290,9 +275,9 @@ class FitImages(ToolPanel):
         except InputError:
             self.cost.setVisible(False)  # Run reports the problem
             return
-        source = inputs.UNKNOWN if self.source.kind == inputs.UNKNOWN else None
+        is_unknown = self.source.kind == inputs.UNKNOWN
         fields = len(self.fields.state().split(inputs.BOTH))
-        estimate = estimate_fit_time(shape, len(rows), fields, source, options)  # type: ignore[arg-type]
+        estimate = TimeEstimate(shape, len(rows), fields, is_unknown, options)  # type: ignore[arg-type]
         self.cost.show_text(estimate.text(PACE))
 
     def _rows(self) -> list[ImageRow]:
@@ -335,8 +320,7 @@ class FitImages(ToolPanel):
         super().showEvent(event)
         # Another widget may have changed the setup of the reference.
         row = self.images.reference
-        setup = self.setup.complete_setup()
-        if self._ready and row is not None and row.setup not in (None, setup):
+        if self._ready and row is not None and row.setup not in (None, self.setup.complete_setup()):
             self.setup.suggest(row.setup, about.setup_origin_of(row.layer))
 
     def _on_reference(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,14 +31,10 @@ from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
 from napari_shadowinv.physics.projection import default_deflector, transferred_displacement
-from napari_shadowinv.physics.setup import deflector_titles
+from napari_shadowinv.physics.setup import Setup, deflector_titles
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.inversion_run import plane_of
 from napari_shadowinv.pipeline.traced_file import trace_file
-
-if TYPE_CHECKING:
-    import napari
-    from napari_shadowinv.physics.setup import Setup
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +79,7 @@ class ForwardJob(Job):
     setup_origin: str = ""
     subject: Any = None  # the layer of the field, or the name of an object
 
-    def run(
-        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
-    ) -> Prediction:
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Prediction:
         Reporter(on_progress, should_stop)("field", 0, None)
         keywords: dict[str, Any] = {"on_progress": on_progress, "should_stop": should_stop}
         if isinstance(self.field, GridFile):
@@ -225,13 +219,13 @@ def input_field(layer: Any | None, point: Any, setup: Any) -> InputField:
 class ForwardModel(ObjectPanel):
     """Choose an object or a potential, and predict its image."""
 
-    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+    def __init__(self, napari_viewer: Any) -> None:
         panel = RunPanel(
             "Forward model", "Simulate", "Trace the beam through the object and show the image."
         )
-        super().__init__(viewer, "forward-model", panel, "a result or potential")
+        super().__init__(napari_viewer, "forward-model", panel, "a result or potential")
         self.potential = LayerPicker(
-            viewer,
+            self.viewer,
             "<qt>The field or potential of a result, or a potential in px² from a file; for a "
             "stack, the shot in view.</qt>",
             suits=may_be_field,
@@ -247,7 +241,7 @@ class ForwardModel(ObjectPanel):
             for side in ("Height", "Width")
         )
         tip = "Image layer of the undisturbed beam."
-        self.source = LayerPicker(viewer, tip, "uniform", about.may_be_source)
+        self.source = LayerPicker(self.viewer, tip, "uniform", about.may_be_source)
         self.warning = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
         self.save_result = SaveButton(
             self,
@@ -287,8 +281,7 @@ class ForwardModel(ObjectPanel):
         self.potential.layer = layer
 
     def state(self) -> dict[str, Any]:
-        size = [self.height_px.value(), self.width_px.value()]
-        return {**super().state(), "size": size}
+        return {**super().state(), "size": [self.height_px.value(), self.width_px.value()]}
 
     def restore(self, state: Any) -> None:
         super().restore(state)
@@ -352,8 +345,8 @@ class ForwardModel(ObjectPanel):
 
     def _follow_potential(self) -> None:
         """Show the setup of a potential's result, or the user's setup for an object."""
-        layer = self.potential.layer if self.object.kind == LAYER else None
-        self.setup.follow(layer, store=False)
+        is_layer = self.object.kind == LAYER
+        self.setup.follow(self.potential.layer if is_layer else None, store=False)
         if self._ready:
             self._on_change()
 

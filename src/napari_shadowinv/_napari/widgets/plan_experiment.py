@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -37,9 +37,6 @@ from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep
 from napari_shadowinv.pipeline.traced_file import object_of_file
 
-if TYPE_CHECKING:
-    import napari
-
 _NOTHING = ""
 _PLOT_HEIGHT_PX = 260
 _LOG_RANGE = 8.0
@@ -58,7 +55,7 @@ class PlanJob(Job):
     values: tuple[float, ...] = ()
 
     def run(
-        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
+        self, on_progress: OnProgress, should_stop: ShouldStop
     ) -> ExperimentPlan | ExperimentSweep:
         choices: dict[str, Any] = {
             "shape": self.shape,
@@ -92,20 +89,30 @@ class PlanPlot(Plot):
         self.setFixedHeight(_PLOT_HEIGHT_PX)
         self.setVisible(False)
 
-    def show_plan(self, plan: ExperimentPlan) -> None:
-        """Draw the errors made and reported in each draw."""
+    def show_errors(self, content: ExperimentPlan | ExperimentSweep) -> None:
+        """Draw the errors made and reported."""
         self.setVisible(True)
         (axis,) = self.fresh_axes()
+        if isinstance(content, ExperimentSweep):
+            name = self._draw_sweep(axis, content)
+        else:
+            name = self._draw_plan(axis, content)
+        axis.set_ylim(bottom=0)
+        axis.set_xlabel(name, color=self.ink, fontsize=8)
+        axis.set_ylabel("error of the field (%)", color=self.ink, fontsize=8)
+        self.add_legend(axis)
+        self.draw()
+
+    def _draw_plan(self, axis: Any, plan: ExperimentPlan) -> str:
+        """Draw the errors of each draw; return the label of the axis."""
         numbers = [shot.number for shot in plan.shots]
         axis.bar(numbers, [100 * shot.error for shot in plan.shots], color=COLOURS[0], label="made")
         totals = [100 * shot.total for shot in plan.shots]
         axis.plot(numbers, totals, "_", color=self.ink, markersize=8, label="reported")
-        self._finish(axis, "draw")
+        return "draw"
 
-    def show_sweep(self, sweep: ExperimentSweep) -> None:
-        """Draw the error made with the band of 68 % of the draws, and the error reported."""
-        self.setVisible(True)
-        (axis,) = self.fresh_axes()
+    def _draw_sweep(self, axis: Any, sweep: ExperimentSweep) -> str:
+        """Draw the median errors, with the band of 68 % of the draws."""
         order = np.argsort(sweep.values)
         values = np.array(sweep.values)[order]
         chosen = [sweep.plans[k] for k in order]
@@ -118,30 +125,22 @@ class PlanPlot(Plot):
         axis.plot(values, totals, "--", color=self.ink, label="reported")
         if values[0] > 0 and values[-1] / values[0] > _LOG_RANGE:
             axis.set_xscale("log")
-        unit = f" ({sweep.unit})" if sweep.unit else ""
-        self._finish(axis, f"{sweep.title}{unit}")
-
-    def _finish(self, axis: Any, name: str) -> None:
-        axis.set_ylim(bottom=0)
-        axis.set_xlabel(name, color=self.ink, fontsize=8)
-        axis.set_ylabel("error of the field (%)", color=self.ink, fontsize=8)
-        self.add_legend(axis)
-        self.draw()
+        return f"{sweep.title} ({sweep.unit})" if sweep.unit else sweep.title
 
 
 class PlanExperiment(ObjectPanel):
     """Choose an object and an experiment, and see whether its field would be determined."""
 
-    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+    def __init__(self, napari_viewer: Any) -> None:
         panel = panels.RunPanel(
             "Plan an experiment",
             "Plan",
             "Simulate shots with random imperfections, retrieve their fields, and compare these "
             "with the object.",
         )
-        super().__init__(viewer, "plan-experiment", panel, "the field of a result")
+        super().__init__(napari_viewer, "plan-experiment", panel, "the field of a result")
         self.field = LayerPicker(
-            viewer,
+            self.viewer,
             "A layer of a result, whose field is the object.",
             suits=lambda layer: about.displacement_of(layer) is not None,
         )
@@ -166,23 +165,13 @@ class PlanExperiment(ObjectPanel):
         self._values_row = forms.labelled("Values", self.values)
         self.verdict, self.report = panels.VerdictLine(), panels.FoldedReport()
         self.plot = PlanPlot()
-        self.add(
-            self.object,
-            self.file_row,
-            self._field_row,
-            forms.labelled("Size (px)", self.side),
-            self.setup,
-            forms.labelled("Energies", self.energies),
-            forms.section("Instrument", self.instrument),
-            forms.section("Simulated shots", self.options),
-            forms.labelled("Vary", self.quantity),
-            self._values_row,
-            self.keep_earlier,
-            self.panel,
-            self.verdict,
-            self.plot,
-            self.report,
-        )
+        instrument = forms.section("Instrument", self.instrument)
+        options = forms.section("Simulated shots", self.options)
+        self.add(self.object, self.file_row, self._field_row)
+        self.add(forms.labelled("Size (px)", self.side), self.setup)
+        self.add(forms.labelled("Energies", self.energies), instrument, options)
+        self.add(forms.labelled("Vary", self.quantity), self._values_row, self.keep_earlier)
+        self.add(self.panel, self.verdict, self.plot, self.report)
         self.object.choice.currentIndexChanged.connect(lambda _: self.choose_setup())
         self.quantity.currentIndexChanged.connect(lambda _: self._on_change())
         for part in (self.object, self.setup, self.instrument, self.options):
@@ -233,10 +222,7 @@ class PlanExperiment(ObjectPanel):
         self.results.show(finished.layer_data)
         content = finished.content
         self.verdict.show_headline(content.headline)
-        if isinstance(content, ExperimentSweep):
-            self.plot.show_sweep(content)
-        else:
-            self.plot.show_plan(content)
+        self.plot.show_errors(content)
         rows, details = (panels.fact_rows(content.facts, details=flag) for flag in (False, True))
         self.report.show_rows(rows, details)
         self.reveal(self.report)
