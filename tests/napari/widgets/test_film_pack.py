@@ -16,6 +16,7 @@ from napari.components import ViewerModel
 from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QFileDialog
 
+from helpers.reports import texts_of
 from napari_shadowinv import read, write
 from napari_shadowinv._napari import packs
 from napari_shadowinv._napari.layer_metadata import Frame, role_of, setup_of, usable_of
@@ -85,7 +86,7 @@ def test_a_run_shows_the_fluences_of_the_films(
     assert window.layers.selection.active is fluence
     assert tool.packs.layer is fluence
     first, _, last = (f"{energy:.3g}" for energy in pack_doses.energies)
-    assert tool.report.texts()["Films"] == f"3, {first} to {last} MeV"
+    assert texts_of(tool.report)["Films"] == f"3, {first} to {last} MeV"
     used = pack_doses.usable
     means = [
         plane[mask].astype(float).mean() for plane, mask in zip(fluence.data, used, strict=True)

@@ -18,6 +18,7 @@ from scipy.ndimage import zoom
 
 from helpers.command_line import undrawn
 from helpers.fit_images import of_each
+from helpers.reports import texts_of
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read, write
 from napari_shadowinv._napari.fit_layers import fit_layers
 from napari_shadowinv._napari.jobs import Finished
@@ -207,7 +208,7 @@ def test_the_field_is_recovered_in_si_units(window: Any, tool: Any, run: Any, qt
     assert tuple(window.layers["6.0 MeV"].scale) == pytest.approx((1.5, 1.5))
     # It can be messages, projected and saved like the result of an inversion.
     assert result_of(field).setup == SETUPS[0]
-    report = tool.view.report.texts()
+    report = texts_of(tool.view.report)
     assert "6 MeV proton" in report["Image 2"]
     assert report["Setup"].startswith("particles")
 
@@ -734,7 +735,7 @@ def test_the_menu_refines_an_inversion_of_a_file(
     qtbot.waitUntil(lambda: "Verdict" in tool.fit_view.verdict.text(), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool.fit_view.results.busy, timeout=PATIENCE)
     assert layer_of(window, "field", "shot refined").visible
-    assert tool.fit_view.report.texts()["Start"] == "the inversion of 'shot'"
+    assert texts_of(tool.fit_view.report)["Start"] == "the inversion of 'shot'"
     window.layers.selection.active = layer_of(window, "field", "refined")
     in_loop(refine)
     assert "shows a fit: select a layer of an inversion" in messages[-1]
@@ -956,7 +957,7 @@ def test_what_a_file_holds_and_was_not_used_is_not_used_again(
     single.source.layers.layer = window.layers["a source"]
     assert single.request().source.path is None
     single.source.set_kind("uniform")
-    inversion = single.request().run()
+    inversion = single.request().run(lambda _: None, lambda: False)
     write(tmp_path / "b.shadowinv", inversion)
     assert "bit for bit" in command("rerun", "b.shadowinv", "--out", "again2.shadowinv")
 

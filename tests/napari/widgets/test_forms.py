@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tomli_w
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 from qtpy.QtWidgets import QFileDialog, QLineEdit
@@ -21,9 +22,9 @@ from napari_shadowinv import (
 from napari_shadowinv._napari.widgets._forms import (
     ModelForm,
     ModelPicker,
-    dump_toml,
     kinds_of,
     labels_of,
+    save_text,
 )
 from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
 from napari_shadowinv._napari.widgets._qt import StateKeeper
@@ -164,7 +165,7 @@ def test_the_command_line_reads_a_saved_setup(
     picker = SetupPicker()
     qtbot.addWidget(picker)
     picker.show_setup(setup.model_dump())
-    path = dump_toml(picker._to_save(), tmp_path / "setup")
+    path = save_text(tomli_w.dumps(picker._to_save()), tmp_path / "setup", ".toml")
     assert path.suffix == ".toml"
     assert setup_from(path) == setup
     picker.picker.set_kind("none")
@@ -177,15 +178,15 @@ def test_the_command_line_reads_a_saved_setup(
 def test_the_command_line_reads_saved_options(qtbot: Any, tmp_path: Path) -> None:
     form = the_form(qtbot, InversionOptions)
     form.set_values(CHANGED)
-    path = dump_toml(form.values(), tmp_path / "options.toml")
+    path = save_text(tomli_w.dumps(form.values()), tmp_path / "options.toml", ".toml")
     assert recipe_from({}, None, path, clip_negative=False).options == InversionOptions(**CHANGED)
 
 
 def test_a_file_that_the_dialog_did_not_name_is_not_replaced(tmp_path: Path) -> None:
-    dump_toml({"seed": 1}, tmp_path / "options.toml")
+    save_text(tomli_w.dumps({"seed": 1}), tmp_path / "options.toml", ".toml")
     with pytest.raises(OSError, match="exists"):
-        dump_toml({"seed": 2}, tmp_path / "options")
-    dump_toml({"seed": 3}, tmp_path / "options.toml")
+        save_text(tomli_w.dumps({"seed": 2}), tmp_path / "options", ".toml")
+    save_text(tomli_w.dumps({"seed": 3}), tmp_path / "options.toml", ".toml")
     assert read_toml(tmp_path / "options.toml") == {"seed": 3}
 
 

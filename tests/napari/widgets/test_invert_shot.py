@@ -17,6 +17,7 @@ import pytest
 from napari.utils import progress
 from qtpy.QtWidgets import QComboBox
 
+from helpers.reports import texts_of
 from napari_shadowinv import Instrument, InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari import jobs
 from napari_shadowinv._napari.layer_metadata import (
@@ -82,7 +83,7 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 
 def computed(tool: Any) -> Any:
     """Return the inversion of the controls, without its layers."""
-    return tool.request().run()
+    return tool.request().run(lambda _: None, lambda: False)
 
 
 def settled(tool: Any) -> bool:
@@ -167,7 +168,7 @@ def test_one_click_inverts_the_image_in_si_units(
     for layer in (window.layers["shot"], field):
         assert tuple(layer.scale) == pytest.approx((1.5, 1.5))
         assert str(layer.units[0]) == "micrometer"
-    report = tool.report.texts()
+    report = texts_of(tool.report)
     assert report["Flux residual"].endswith(": converged")
     assert report["Sites"] == "500; as requested"
     assert "sites" in report["Time"]
@@ -590,7 +591,7 @@ def test_doubts_stand_under_run_with_a_notification(
     verdict = result_of(layer_of(window, "field")).content.verdict
     assert verdict.upper() in tool.verdict.text()
     assert layer_of(window, "field").name.endswith(f"({verdict})")
-    assert "Iterations" in tool.report.texts()
+    assert "Iterations" in texts_of(tool.report)
     assert not tool.report.details.isExpanded()
 
 

@@ -12,6 +12,7 @@ import dask.array as da
 import numpy as np
 import pytest
 
+from helpers.reports import texts_of
 from napari_shadowinv import InversionOptions, ProtonSetup, invert
 from napari_shadowinv._napari.layer_metadata import role_of
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
@@ -170,7 +171,7 @@ def test_a_corrupt_file_is_listed_and_the_others_are_done(
     run(tool)
     assert messages == []
     assert StackStore(out).statuses().tolist() == [DONE, FAILED, DONE, DONE]
-    (name, reason), *further = tool.failures.texts().items()
+    (name, reason), *further = texts_of(tool.failures).items()
     assert name == "shot_1.npy"
     assert reason == StackStore(out).report(1)["reason"]
     assert further == []
@@ -184,7 +185,7 @@ def test_a_corrupt_file_is_listed_and_the_others_are_done(
     (tmp_path / "shot_1.npy").write_bytes(content)
     before = written(out)
     run(tool)
-    assert list(tool.failures.texts()) == ["shot_1.npy"]
+    assert list(texts_of(tool.failures)) == ["shot_1.npy"]
     tool.redo_failed.setChecked(True)
     run(tool)
     assert not tool.failures.isVisible()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from helpers.reports import texts_of
 from napari_shadowinv import Instrument
 from napari_shadowinv._napari.layer_metadata import role_of
 from napari_shadowinv.io import read_field_grid
@@ -40,7 +41,7 @@ def test_a_plan_shows_its_verdict_and_the_first_image(tool: Any, window: Any, qt
     assert tool.setup.setup() == paper_setup()
     finished(tool, qtbot)
     assert "would be determined: 3 of 3" in tool.verdict.text()
-    assert "Error made" in tool.report.texts()
+    assert "Error made" in texts_of(tool.report)
     qtbot.waitUntil(lambda: len(window.layers) == 1, timeout=PATIENCE)
     (layer,) = window.layers
     assert role_of(layer) == "shot"
@@ -113,7 +114,7 @@ def test_a_3d_field_is_planned_as_in_python(
     (layer,) = window.layers
     np.testing.assert_array_equal(layer.data, expected.images[0])
     assert layer.name == "cube.nc, planned"
-    texts = traced.report.texts()
+    texts = texts_of(traced.report)
     assert texts["Error made"] == next(f.text for f in expected.facts if f.title == "Error made")
     traced.object.set_kind("toroid")
     assert not traced.file.isVisibleTo(traced)

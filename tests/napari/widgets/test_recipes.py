@@ -374,7 +374,7 @@ def test_the_window_does_what_the_command_saves(
     assert tool.steps.steps() == (Bin(factor=2), LowPassFilter(width=1.5))
     assert tool.setup.setup().pixel_size == 2e-6
     assert setup_origin_of(image) == "loaded from how.toml for 'shot'"
-    mine = tool.request().run()
+    mine = tool.request().run(lambda _: None, lambda: False)
     np.testing.assert_array_equal(mine.displacement, reloaded.displacement)
     assert mine.provenance.recipe.steps[0] == Crop(y=(4, 44), x=(10, 60))
     assert mine.provenance.image.source.file == "beam.npy"
@@ -418,7 +418,8 @@ def test_a_source_that_is_no_file_is_written_beside_the_recipe(
     out = tmp_path / "a.shadowinv"
     by_command("invert", shot_file, "--recipe", tmp_path / "how.toml", "--out", out)
     reloaded = Inversion.from_dataset(read(out))
-    np.testing.assert_array_equal(tool.request().run().displacement, reloaded.displacement)
+    inversion = tool.request().run(lambda _: None, lambda: False)
+    np.testing.assert_array_equal(inversion.displacement, reloaded.displacement)
 
 
 def test_a_stack_is_inverted_by_a_saved_recipe(

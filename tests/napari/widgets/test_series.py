@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from qtpy.QtWidgets import QFileDialog
 
+from helpers.reports import texts_of
 from napari_shadowinv import run_stack
 from napari_shadowinv._napari.layers import add_inversion
 from napari_shadowinv._napari.widgets import _products
@@ -70,7 +71,7 @@ def test_series_of_a_store_is_that_of_python(form: Any, qtbot: Any, store: Path)
     (expected,) = analyse_shots(read_stack(store), region, times)
     for name, quantity in expected.quantities.items():
         np.testing.assert_allclose(measured[name].value, quantity.value, rtol=1e-12)
-    rows = form.report.texts()
+    rows = texts_of(form.report)
     for fact in expected.result.facts:
         assert rows[fact.title] == fact.text
     assert float(rows["Growth of rms"].split()[0]) == pytest.approx(RATE, rel=0.05)
@@ -95,7 +96,7 @@ def test_shots_are_chosen_and_numbered_without_times(form: Any, qtbot: Any) -> N
     form.shots.setText("1:4:2")
     press(form, qtbot)
     np.testing.assert_array_equal(form.results[0].coordinates["shot"].values, [1, 3])
-    assert "per shot" in form.report.texts()["Growth of rms"]
+    assert "per shot" in texts_of(form.report)["Growth of rms"]
     ticks = form.plot.figure.axes[-1].get_xticks()
     np.testing.assert_array_equal(ticks, np.round(ticks))
 

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tomli_w
 from napari.components import ViewerModel
 
+from helpers.reports import texts_of
 from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
 from napari_shadowinv._napari import commands, jobs
 from napari_shadowinv._napari.layer_metadata import (
@@ -21,7 +23,7 @@ from napari_shadowinv._napari.layer_metadata import (
     source_of,
 )
 from napari_shadowinv._napari.layers import add_inversion
-from napari_shadowinv._napari.widgets._forms import dump_toml
+from napari_shadowinv._napari.widgets._forms import save_text
 from napari_shadowinv._napari.widgets._qt import StateKeeper
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
 from napari_shadowinv._napari.widgets.fit_images import FitImages
@@ -174,7 +176,8 @@ def test_a_setup_from_a_toml_file_says_so(
 ) -> None:
     from qtpy.QtWidgets import QFileDialog
 
-    path = dump_toml(proton_setup.model_dump(exclude_none=True), tmp_path / "tcc.toml")
+    text = tomli_w.dumps(proton_setup.model_dump(exclude_none=True))
+    path = save_text(text, tmp_path / "tcc.toml", ".toml")
     monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_, **__: (str(path), ""))
     tool = opened(InvertShot)
     tool.setup.files.load_button.click()
@@ -432,7 +435,7 @@ def test_a_result_says_where_everything_came_from(
     tool.source_masks.paint()
     tool.source_masks.layer.data[10:30, 20:45] = 1
     run(tool)
-    rows = tool.report.texts()
+    rows = texts_of(tool.report)
     assert rows["Image"] == "measured"
     assert rows["Source"].startswith("estimate: fitted polynomial")
     assert rows["Source mask"] == "layer 'measured source mask', excludes 17.4% of the pixels"
@@ -457,24 +460,24 @@ def test_the_report_of_one_run_does_not_stand_beside_another(
 
     def rerun() -> None:
         run(tool)
-        assert tool.report.texts()["Flux residual"].endswith("converged")
+        assert texts_of(tool.report)["Flux residual"].endswith("converged")
 
     rerun()
     tool.panel.button.click()
-    assert tool.report.texts() == {}
+    assert texts_of(tool.report) == {}
     tool.panel.button.click()
     qtbot.waitUntil(lambda: tool.panel.status.text() == "Cancelled.", timeout=PATIENCE)
-    assert tool.report.texts() == {}
+    assert texts_of(tool.report) == {}
     rerun()
     tool.image.layer = plain
-    assert tool.report.texts() == {}
+    assert texts_of(tool.report) == {}
     rerun()
     plain.data = plain.data + 1
-    assert tool.report.texts() == {}
+    assert texts_of(tool.report) == {}
     rerun()
     tool.source.set_kind("file")
     tool.panel.button.click()
-    assert tool.report.texts() == {}
+    assert texts_of(tool.report) == {}
     # The notification goes; the sentence stays until something else happens.
     *verdicts, message = messages
     assert message == tool.panel.status.text()

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from helpers.reports import texts_of
 from napari_shadowinv._napari.layer_metadata import metadata_of, role_of
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE
 from napari_shadowinv.io.store import DONE, StackStore
@@ -88,7 +89,7 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
     assert window.dims.current_step[0] == 0
     assert field.contrast_limits[1] > limits
     assert np.isfinite(np.asarray(layer_of(window, "field").data[3])).all()
-    assert list(tool.failures.texts()) == ["shot_2.npy"]
+    assert list(texts_of(tool.failures)) == ["shot_2.npy"]
     assert metadata_of(field)["shots"] == [f"shot_{index}.npy" for index in range(4)]
     status = tool.panel.status
     qtbot.waitUntil(lambda: "3 done, 1 failed" in status.text(), timeout=PATIENCE)

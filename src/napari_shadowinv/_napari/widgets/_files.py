@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from napari.utils.notifications import show_info
 from qtpy.QtWidgets import QFileDialog, QMenu, QPushButton, QSizePolicy
@@ -23,7 +23,7 @@ from napari_shadowinv._napari.stores import shot_of_store
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets._forms import TOML
 from napari_shadowinv._napari.widgets._layers import new_crop, new_mask
-from napari_shadowinv._napari.widgets._panels import Outcome
+from napari_shadowinv._napari.widgets._panels import Outcome, ToolPanel
 from napari_shadowinv._napari.widgets._qt import may_replace, notify_errors
 from napari_shadowinv._napari.widgets._results import ResultLayers
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
@@ -43,16 +43,13 @@ from napari_shadowinv.io.formats import (
     formats_for,
 )
 from napari_shadowinv.options import FitChoices
+from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import read_recipe, write_recipe
 from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.pipeline.inversion_run import picture_mask, plane_of
 from napari_shadowinv.pipeline.rerun import Rerun, collect_rerun
 from napari_shadowinv.preprocessing import Crop, MeasuredSource, Radiograph, Recipe, UniformEstimate
-
-if TYPE_CHECKING:
-    from napari_shadowinv._napari.widgets._panels import ToolPanel
-    from napari_shadowinv.physics.setup import Setup
 
 
 @dataclass(eq=False)
@@ -403,8 +400,7 @@ class SaveButton(QPushButton):
         if not text:
             return None
         path = Path(text).expanduser()
-        suffixes = [suffix for form in content.formats for suffix in form.suffixes]
-        if path.suffix.lower() in suffixes:
+        if any(path.suffix.lower() in form.suffixes for form in content.formats):
             return path
         return path.with_name(path.name + filters.get(selected_filter, content.formats[0]).suffix)
 

@@ -94,8 +94,7 @@ class FitView(QWidget):
         self._job, self._result = job, finished.result
         self._list_solutions(fit)
         self.results = last.layers_for_next((job.image, job.name))
-        layer_data = main_layers(finished.layer_data, also=self.results.layer_keys)
-        self.results.show(layer_data, fit=moved)
+        self.results.show(main_layers(finished.layer_data, also=self.results.layer_keys), fit=moved)
 
     def follow(self, _: Any = None) -> bool:
         """Show the verdict on the fit whose layer is selected; return False without a fit."""

@@ -156,8 +156,7 @@ class ModelForm(QtWidgets.QWidget):
             if get_origin(field.annotation) is Literal and len(get_args(field.annotation)) == 1:
                 self._fixed[name] = get_args(field.annotation)[0]
                 continue
-            initial_value = (initial or {}).get(name)
-            editor = editor_for(field, initial_value, leave_empty=self.leaves_empty)
+            editor = editor_for(field, (initial or {}).get(name), leave_empty=self.leaves_empty)
             title = field.title or name
             unit = unit_in_title(title) if editor.shows_unit else ""
             label = QtWidgets.QLabel(title.removesuffix(f" ({unit})"))
@@ -309,10 +308,6 @@ def save_text(text: str, name: str | Path, suffix: str) -> Path:
     return path
 
 
-def dump_toml(values: dict[str, object], path: str | Path) -> Path:
-    return save_text(tomli_w.dumps(values), path, ".toml")
-
-
 class TomlButtons(QtWidgets.QWidget):
     """Buttons for TOML files; `load` gets entries and path, `values` returns entries to save."""
 
@@ -346,7 +341,7 @@ class TomlButtons(QtWidgets.QWidget):
             self, f"Save {self._subject}", f"{self._subject}.toml", TOML
         )
         if path:
-            dump_toml(values, path)
+            save_text(tomli_w.dumps(values), path, ".toml")
 
 
 class StepForm(QWidget):

@@ -339,8 +339,7 @@ class SourcePicker(forms.ModelPicker):
             shot = preprocessing.Radiograph(data)
             if image_layer is not None:
                 shot = radiograph_of(image_layer, image_layer.data)
-            beam = source_of_shot(layer, data, shot)
-            return replace(beam, warnings=layers.warnings_of(layer))
+            return replace(source_of_shot(layer, data, shot), warnings=layers.warnings_of(layer))
         if not self.is_supplied:
             return None
         supplied = about.source_of(image_layer)
@@ -491,9 +490,9 @@ class InversionInputs:
             "The beam without the object: ideally a measured reference image, otherwise uniform "
             "or estimated from the shot.",
         )
-        self.masks = layers.MaskPicker(self.viewer, image, kinds, mask_tip)
+        self.masks = layers.MaskPicker(self.viewer, image, mask_tip, kinds=kinds)
         self.source_masks = layers.MaskPicker(
-            self.viewer, image, kinds, source_mask_tip, "Source mask"
+            self.viewer, image, source_mask_tip, "Source mask", kinds
         )
         self.setup = SetupPicker()
         self.steps = forms.StepsSection()

@@ -259,8 +259,7 @@ class ShotPicker(LayerPicker):
 
     def __init__(self, viewer: Any) -> None:
         self.is_chosen = False
-        tip = "Layer of the shot, a greyscale image."
-        super().__init__(viewer, tip, suits=about.may_be_shot)
+        super().__init__(viewer, "Layer of the shot, a greyscale image.", suits=about.may_be_shot)
         self.activated.connect(self._choose)
         qt.while_alive(self, viewer.layers, "inserted", self._on_insertion)
 
@@ -308,21 +307,19 @@ _PAINT = {
 class MaskPicker(QWidget):
     """A layer of painted pixels, and their meaning, for the image that `image` returns."""
 
-    picked = Signal()
     changed = Signal()
 
     def __init__(
         self,
         viewer: Any,
         image: Callable[[], Any],
-        kinds: tuple[str, ...],
         tip: str,
         title: str = "Mask",
+        kinds: tuple[str, ...] = ("labels", "shapes"),
     ) -> None:
         super().__init__()
         self._viewer, self._image, self.title = viewer, image, title
-        tip = f"<qt>{tip}</qt>"
-        self.layers = LayerPicker(viewer, tip, "none", about.may_be_mask, kinds=kinds)
+        self.layers = LayerPicker(viewer, f"<qt>{tip}</qt>", "none", about.may_be_mask, kinds=kinds)
         target, meaning = _PAINT[title]
         tip = f"<qt>{meaning}</qt>"
         self.painted_is_unusable = QCheckBox(f"painted = {target}", checked=True, toolTip=tip)
@@ -333,7 +330,6 @@ class MaskPicker(QWidget):
             ),
             labelled("", self.painted_is_unusable),
         )
-        self.layers.picked.connect(self.picked)
         self.layers.picked.connect(self.changed)
         self.painted_is_unusable.toggled.connect(self.changed)
 
@@ -386,7 +382,7 @@ class LayerWatch(QObject):
 
     edited = Signal()
 
-    def __init__(self, parent: QObject, pickers: Sequence[LayerPicker | MaskPicker]) -> None:
+    def __init__(self, parent: QObject, pickers: Sequence[LayerPicker]) -> None:
         super().__init__(parent)
         self._pickers = pickers
         self._watched: list[Any] = []

@@ -57,8 +57,7 @@ class ObjectPanel(ToolPanel):
         return {"setup": self.setup, "object": self.object, "file": self.file}
 
     def state(self) -> dict[str, Any]:
-        setup = {**self.setup.state(), "kind": self.setup.picker.kind}
-        return {**super().state(), "setup": setup}
+        return {**super().state(), "setup": {**self.setup.state(), "kind": self.setup.picker.kind}}
 
     def simulated_object(self) -> PhantomRecipe | GridFile:
         """Return the phantom or the file, or raise an `InputError`."""

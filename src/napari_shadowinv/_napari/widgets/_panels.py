@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from napari.utils import progress as activity
 from napari.utils.notifications import notification_manager
@@ -19,6 +19,7 @@ from qtpy.QtCore import QObject, Qt, Signal
 
 from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import main_layers
+from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.preferences import use_preferred_threads
 from napari_shadowinv._napari.viewer_sync import USER_ERRORS, error_text, show_user_error
 from napari_shadowinv._napari.widgets import _forms as forms
@@ -28,9 +29,6 @@ from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.cautions import CAUTION_CODES
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.facts import Fact, Headline, Level
-
-if TYPE_CHECKING:
-    from napari_shadowinv._napari.layers import FullLayerData
 
 # The thread leaves progress and outcome in a mailbox that a timer of the window polls: no signal
 # crosses threads, nothing reaches a closed window, and all Qt bindings behave alike.
@@ -378,10 +376,6 @@ class ReportTable(QtWidgets.QTableWidget):
         self.setRowCount(0)
         self.setVisible(False)
 
-    def texts(self) -> dict[str, str]:
-        rows = range(self.rowCount())
-        return {self.item(row, 0).text().strip(): self.item(row, 1).text() for row in rows}
-
     def resizeEvent(self, event: object) -> None:
         super().resizeEvent(event)
         self._fit()
@@ -414,9 +408,6 @@ class FoldedReport(QtWidgets.QWidget):
         self.table.empty()
         self._details.empty()
         self.setVisible(False)
-
-    def texts(self) -> dict[str, str]:
-        return self.table.texts() | self._details.texts()
 
 
 class VerdictLine(forms.WrappingLabel):

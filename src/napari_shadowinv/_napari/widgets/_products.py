@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from napari.utils.notifications import show_info
@@ -42,9 +42,6 @@ from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, RESULT, SITES
 from napari_shadowinv.io.store_shots import open_shots
 from napari_shadowinv.physics.units import prefix_for
 from napari_shadowinv.plotting import make_logarithmic, products_figure, save_figure
-
-if TYPE_CHECKING:
-    import napari
 
 _ELLIPSE_CORNERS = 90
 _ROUND = 0.02  # largest difference of the axes of a circle
@@ -115,7 +112,7 @@ class ProductForm(QtWidgets.QWidget):
     Of a store, the product is followed through its shots.
     """
 
-    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+    def __init__(self, viewer: Any) -> None:
         super().__init__()
         self.viewer = viewer
         self.results: list[ProductResult] = []

@@ -154,7 +154,7 @@ class Docked(QWidget):
     """A widget that opens as a tab of the docks on its side, where napari would squeeze it below.
 
     Choosing a tab in the background again in the menu brings it to the front, where napari would
-    hide it.
+    hide it. napari gives its viewer to a parameter `napari_viewer`.
     """
 
     _dock: QDockWidget | None = None

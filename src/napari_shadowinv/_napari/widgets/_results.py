@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from napari.utils.notifications import show_warning
@@ -12,13 +12,11 @@ from qtpy.QtCore import QObject, Signal
 from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.jobs import ImageJob
 from napari_shadowinv._napari.layers import FullLayerData, add_layers
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import timer
-
-if TYPE_CHECKING:
-    from napari_shadowinv._napari.jobs import ImageJob
-    from napari_shadowinv.preprocessing import Recipe
+from napari_shadowinv.preprocessing import Recipe
 
 _MIN_LIMITS_CHANGE = 0.02  # relative to their range
 
@@ -180,7 +178,7 @@ class LastResults:
 
     def __init__(self, viewer: Any, parent: QObject) -> None:
         self._viewer, self._parent = viewer, parent
-        self._last: list[tuple[Any, ResultLayers]] = []
+        self._last: dict[Any, ResultLayers] = {}  # by image layer or name
         tip = (
             "<qt>Keep the layers of earlier runs. Otherwise each new result replaces the previous "
             "result of the same shot.</qt>"
@@ -189,21 +187,20 @@ class LastResults:
 
     def layers_of(self, shot: Any) -> list[Any]:
         """Return the layers of a shot's last result that are still in the viewer."""
-        return [layer for image, last in self._last if image == shot for layer in last.layers]
+        return self._last[shot].layers if shot in self._last else []
 
     def shot_of(self, layer: Any) -> Any | None:
         """Return the shot to whose last result a layer belongs, or None."""
-        shots = (shot for shot, last in self._last if layer in last.layers)
+        shots = (shot for shot, last in self._last.items() if layer in last.layers)
         return next((shot for shot in shots if shot in self._viewer.layers), None)
 
     def layers_for_next(self, shot: Any) -> ResultLayers:
         """Return the layers for the next result of a shot, which is an image layer or a name."""
         results = ResultLayers(self._viewer, self._parent)
-        for image, last in self._last:
-            if image == shot and not self.keep_earlier.isChecked():
-                results.take_over(last)
-        self._last = [(image, last) for image, last in self._last if image != shot]
-        self._last.append((shot, results))
+        last = self._last.pop(shot, None)
+        if last is not None and not self.keep_earlier.isChecked():
+            results.take_over(last)
+        self._last[shot] = results
         return results
 
 
@@ -211,12 +208,13 @@ class LastResults:
 class Origins:
     """Origins of the inputs of an inversion or fit, in words; empty without a mask or setup."""
 
+    # In the order of the report.
+    image: str = ""  # none for several images
     source: str
+    source_mask: str = ""
     mask: str
     setup: str
-    setup_origin: str
-    image: str = ""  # none for several images
-    source_mask: str = ""
+    setup_origin: str  # part of `setup`
     steps: str = ""  # of a fit
 
     def attributes(self) -> dict[str, str]:
@@ -232,15 +230,8 @@ class Origins:
 
     def rows(self) -> list[tuple[str, str]]:
         """Return the origins as rows of a report."""
-        rows = [
-            ("Image", self.image),
-            ("Source", self.source),
-            ("Source mask", self.source_mask),
-            ("Mask", self.mask),
-            ("Setup", self.setup),
-            ("Steps", self.steps),
-        ]
-        return [(name, text) for name, text in rows if text]
+        texts = {name: text for name, text in asdict(self).items() if name != "setup_origin"}
+        return [(name.replace("_", " ").capitalize(), text) for name, text in texts.items() if text]
 
 
 def _can_be_updated(layer: Any, keywords: dict[str, Any]) -> bool:

@@ -176,8 +176,7 @@ def beam_column(kind: str) -> Column:
 
 
 def _quantity_column(quantity: BeamQuantity, tip: str) -> Column:
-    title = quantity.noun.capitalize()
-    return Column(quantity.name, title, quantity.unit, tip, _BEAM_WIDTH_PX)
+    return Column(quantity.name, quantity.noun.capitalize(), quantity.unit, tip, _BEAM_WIDTH_PX)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from qtpy import QtWidgets
@@ -25,9 +25,6 @@ from napari_shadowinv.analysis.paths import (
     table_text,
 )
 from napari_shadowinv.errors import InputError
-
-if TYPE_CHECKING:
-    import napari
 
 _REDRAW_MS = 40  # while the line moves
 _LAYER_ROLE = Qt.ItemDataRole.UserRole
@@ -68,13 +65,13 @@ class Analyse(qt.Docked):
 
     spare_width = 50
 
-    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+    def __init__(self, napari_viewer: Any) -> None:
         super().__init__()
-        self.viewer = viewer
+        self.viewer = napari_viewer
         self._distance, self._unit = np.zeros(0), "px"
         self.profiles: list[Profile] = []
         tip = "<qt>Shapes layer with the line. Of several lines, the selected one is used.</qt>"
-        self.lines = LayerPicker(viewer, tip, "none yet", kinds=("shapes",))
+        self.lines = LayerPicker(self.viewer, tip, "none yet", kinds=("shapes",))
         self.layers = QtWidgets.QListWidget(toolTip="Layers to plot.", maximumHeight=110)
         self.layers.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         tip = "Width of the strip, perpendicular to the line, over which values are averaged."
@@ -96,7 +93,7 @@ class Analyse(qt.Docked):
         width = qt.side_by_side((self.width_edit, 2), (self.width_unit, 1))
         controls = (forms.labelled("Line", lines), self.layers, forms.labelled("Width", width))
         results = (self.hint, self.plot, self.measures, self.export, self.problem)
-        page, self.products = QtWidgets.QWidget(), products.ProductForm(viewer)
+        page, self.products = QtWidgets.QWidget(), products.ProductForm(self.viewer)
         self.tabs = QtWidgets.QTabWidget()
         self.tabs.addTab(page, "Layers along a line")
         self.tabs.addTab(self.products, "Products of a result")
@@ -107,8 +104,7 @@ class Analyse(qt.Docked):
 
     def _connect(self) -> None:
         self._timer = qt.timer(self, _REDRAW_MS, self.update_plot, once=True)
-        changes = ("inserted", "removed", "reordered")
-        qt.while_alive(self, self.viewer.layers, changes, self._fill)
+        qt.while_alive(self, self.viewer.layers, ("inserted", "removed", "reordered"), self._fill)
         qt.while_alive(self, self.viewer.dims, "current_step", self._schedule_plot)
         qt.layers_while_alive(self, self.viewer.layers, "set_data", self._on_layer)
         self.lines.picked.connect(self._schedule_plot)

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from functools import lru_cache, partial
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from napari.utils.notifications import show_info
@@ -29,14 +29,11 @@ from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.pack import FILM_TYPES
 from napari_shadowinv.film.scans import checked_corners
+from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import write
 from napari_shadowinv.io.formats import RESULT
 from napari_shadowinv.io.images import read_scan
 from napari_shadowinv.pipeline import film_files, read_pack, write_layers
-
-if TYPE_CHECKING:
-    import napari
-    from napari_shadowinv.film_doses import FilmDoses
 
 _COLUMNS = ("Scan", "Film", "Filters in front of the film")
 _MIN_SIZE_PX = (620, 560)
@@ -307,14 +304,14 @@ class SpectrumPlot(qt.Plot):
 class FilmPack(panels.ToolPanel):
     """Choose a pack file, then press Run; correct corners and masks, and run again."""
 
-    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+    def __init__(self, napari_viewer: Any) -> None:
         tip = "Compute dose and fluence of each film of the pack."
-        super().__init__(viewer, "film-pack", panels.RunPanel("Film pack", "Run", tip))
+        super().__init__(napari_viewer, "film-pack", panels.RunPanel("Film pack", "Run", tip))
         resources = ExitStack()
         self._scratch = resources.enter_context(temporary_folder("film-pack"))
         qt.when_destroyed(self, resources.close)
         self._folders = count(1)
-        self.fit_images = ResultLayers(viewer, self)
+        self.fit_images = ResultLayers(self.viewer, self)
         self._build()
         self._timer = qt.timer(self, _REDRAW_MS, self.update_plot, once=True)
         edits = LayerWatch(self, (self.regions,))

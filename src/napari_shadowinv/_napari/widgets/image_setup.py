@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.widgets import _forms as forms
@@ -12,14 +12,11 @@ from napari_shadowinv._napari.widgets._layers import LayerPicker
 from napari_shadowinv._napari.widgets._results import place_together
 from napari_shadowinv.errors import InputError
 
-if TYPE_CHECKING:
-    import napari
-
 
 class ImageSetup(qt.Docked):
     """Choose an image, enter its setup, and press Apply: all widgets then use the setup."""
 
-    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+    def __init__(self, viewer: Any) -> None:
         super().__init__()
         self.viewer = viewer
         self.image = LayerPicker(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from napari_shadowinv._napari import jobs
 from napari_shadowinv._napari import layer_metadata as about
@@ -26,13 +26,10 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
+from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Cache
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_PIXELS, PREVIEW_SITES
 from napari_shadowinv.preprocessing import ESTIMATES, Estimate, Radiograph, Recipe, estimate_source
-
-if TYPE_CHECKING:
-    import napari
-    from napari_shadowinv.physics.setup import Setup
 
 # Measured on two cores with images of 0.25 to 4 Mpx and 5,000 to 1,000,000 sites, including the
 # layers of the result.
@@ -89,10 +86,9 @@ def estimate_cost(
 class InvertShot(InversionInputs, panels.LivePanel):
     """Choose an image, then press Run; everything else has a default."""
 
-    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+    def __init__(self, napari_viewer: Any) -> None:
         tip = "Invert the image and show the result as layers."
-        panel = panels.RunPanel("Invert shot", "Run", tip)
-        super().__init__(viewer, "invert-shot", panel)
+        super().__init__(napari_viewer, "invert-shot", panels.RunPanel("Invert shot", "Run", tip))
         self._cache = Cache()
         self._build()
         self._connect()
@@ -135,9 +131,8 @@ class InvertShot(InversionInputs, panels.LivePanel):
 
     def _connect(self) -> None:
         self.image.picked.connect(self._on_image)
-        edits = layers.LayerWatch(
-            self, (self.image, self.masks, self.source_masks, self.crop, self.source.layers)
-        )
+        masks = self.masks.layers, self.source_masks.layers
+        edits = layers.LayerWatch(self, (self.image, *masks, self.crop, self.source.layers))
         layers.LayerWatch(self, (self.image,)).edited.connect(self._forget_report)
         # Also for runs that are cancelled, or refused before they start.
         self.panel.button.clicked.connect(self._empty_report)
@@ -344,19 +339,19 @@ class SourceJob(jobs.Job):
 class EstimateSource(panels.LivePanel):
     """Choose a shot and a method, and add the estimated source as an image layer."""
 
-    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+    def __init__(self, napari_viewer: Any) -> None:
         tip = "Estimate the beam and add it as an image layer."
         panel = panels.RunPanel("Estimate source", "Estimate", tip)
-        super().__init__(viewer, "estimate-source", panel)
-        self.image = layers.ShotPicker(viewer)
+        super().__init__(napari_viewer, "estimate-source", panel)
+        self.image = layers.ShotPicker(self.viewer)
         tip = "Labels or shapes on pixels that the estimate ignores."
-        self.masks = layers.MaskPicker(viewer, lambda: self.image.layer, ("labels", "shapes"), tip)
+        self.masks = layers.MaskPicker(self.viewer, lambda: self.image.layer, tip)
         self.method = forms.ModelPicker("Method", forms.kinds_of(ESTIMATES))
         self.method.set_kind("total-variation")
         self.live.setToolTip("Update the estimate after each change.")
         self.add(forms.labelled("Image", self.image), self.masks, self.method)
         self.add(self.live, self.keep_earlier, self.panel)
-        edits = layers.LayerWatch(self, (self.image, self.masks))
+        edits = layers.LayerWatch(self, (self.image, self.masks.layers))
         for signal in (self.image.picked, self.masks.changed, self.method.changed, edits.edited):
             signal.connect(self.on_change)
         self.restore_last()

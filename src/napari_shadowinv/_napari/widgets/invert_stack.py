@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from numpy.typing import ArrayLike
 from qtpy.QtCore import Qt
@@ -28,9 +28,6 @@ from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.store import STORE_SUFFIX
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
-
-if TYPE_CHECKING:
-    import napari
 
 _REFRESH_INTERVAL_MS = 200  # many small shots may finish within a second
 _MAX_FAILURES = 100
@@ -201,11 +198,11 @@ class FailureTable(ReportTable):
 class InvertStack(InversionInputs, ToolPanel):
     """Choose shots and a store, then press Run; press it again to resume after an interruption."""
 
-    def __init__(self, viewer: napari.viewer.Viewer) -> None:
+    def __init__(self, napari_viewer: Any) -> None:
         tip = "Invert all shots that are not in the store yet."
         # A cancelled run may take as long as it needs to finish writing to the store.
         panel = RunPanel("Invert stack", "Run", tip, patience=math.inf)
-        super().__init__(viewer, "invert-stack", panel)
+        super().__init__(napari_viewer, "invert-stack", panel)
         self._shown: stack_jobs.StackJob | None = None
         self._ended, self._resets_view = 0, False
         self._arrows: Any = None
