@@ -228,9 +228,9 @@ def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
     tool.setup.show_setup(slow.model_dump())
 
     def image() -> Any:
-        before = tool._last._last
+        before = tool.results
         tool.panel.button.click()
-        qtbot.waitUntil(lambda: tool._last._last is not before, timeout=PATIENCE)
+        qtbot.waitUntil(lambda: tool.results is not before, timeout=PATIENCE)
         qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
         (layer,) = tool.results.layers
         assert layer.name.startswith("solved image")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import weakref
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from napari.layers import Layer, Shapes
-from qtpy.QtCore import QObject, QSignalBlocker, Signal
+from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QCheckBox, QWidget
 
 from napari_shadowinv._napari import layer_metadata as about
@@ -196,6 +197,7 @@ class LayerPicker(SteadyComboBox):
     """A combo box of layers; `none` is the entry for no layer, else the latest is selected."""
 
     picked = Signal()
+    edited = Signal()  # the data of the selected layer have changed
 
     def __init__(
         self,
@@ -209,7 +211,9 @@ class LayerPicker(SteadyComboBox):
         super().__init__()
         self._viewer, self._kinds, self._none, self._suits = viewer, kinds, none, suits
         self.offered: list[Any] = []
+        self._watched: weakref.WeakSet[Any] = weakref.WeakSet()
         self.setToolTip(tip)
+        self.picked.connect(self._watch)
         self.fill()
         self.currentIndexChanged.connect(lambda _: self.picked.emit())
         qt.while_alive(self, viewer.layers, ("inserted", "removed"), self.fill)
@@ -248,6 +252,16 @@ class LayerPicker(SteadyComboBox):
                 self.layer = offered[-1]
         if self.layer is not before:
             self.picked.emit()
+
+    def _watch(self) -> None:
+        layer = self.layer
+        if layer is not None and layer not in self._watched:
+            self._watched.add(layer)
+            qt.while_alive(self, layer, ("data", "paint"), self._on_edit)
+
+    def _on_edit(self, layer: Any) -> None:
+        if layer is self.layer:
+            self.edited.emit()
 
 
 class ShotPicker(LayerPicker):
@@ -375,28 +389,3 @@ class MaskPicker(QWidget):
     @qt.notify_errors
     def paint(self) -> None:
         self.layer = new_mask(self._viewer, self._image(), self.title.lower())
-
-
-class LayerWatch(QObject):
-    """Emit a signal when the data of the selected layers change."""
-
-    edited = Signal()
-
-    def __init__(self, parent: QObject, pickers: Sequence[LayerPicker]) -> None:
-        super().__init__(parent)
-        self._pickers = pickers
-        self._watched: list[Any] = []
-        for picker in pickers:
-            picker.picked.connect(self._watch)
-        self._watch()
-
-    def _watch(self) -> None:
-        for layer in [picker.layer for picker in self._pickers]:
-            if layer is None or any(layer is watched for watched in self._watched):
-                continue
-            self._watched.append(layer)
-            qt.while_alive(self, layer, ("data", "paint"), self._on_edit)
-
-    def _on_edit(self, layer: Any) -> None:
-        if any(layer is picker.layer for picker in self._pickers):
-            self.edited.emit()

@@ -22,7 +22,7 @@ from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._layers import LayerPicker, LayerWatch, mask_of, new_shapes
+from napari_shadowinv._napari.widgets._layers import LayerPicker, mask_of, new_shapes
 from napari_shadowinv._napari.widgets._results import ResultLayers
 from napari_shadowinv._system.hidden_files import temporary_folder
 from napari_shadowinv._typing import AnyArray, FloatArray
@@ -68,7 +68,6 @@ class NewPackDialog(QtWidgets.QDialog):
         self.form.editors["film"].changed.connect(self._on_film)
 
     def entries(self) -> dict[str, Any]:
-        """Return the entries of the pack file."""
         facts = self.form.model()
         assert isinstance(facts, film_files.NewPack)
         layers = [
@@ -314,8 +313,7 @@ class FilmPack(panels.ToolPanel):
         self.fit_images = ResultLayers(self.viewer, self)
         self._build()
         self._timer = qt.timer(self, _REDRAW_MS, self.update_plot, once=True)
-        edits = LayerWatch(self, (self.regions,))
-        for signal in (self.regions.picked, edits.edited):
+        for signal in (self.regions.picked, self.regions.edited):
             signal.connect(self._schedule_plot)
         self.packs.picked.connect(self._on_pack)
         self._on_pack()
@@ -414,7 +412,6 @@ class FilmPack(panels.ToolPanel):
         self.panel.say("")
 
     def _corrected_job(self) -> PackJob:
-        """Return the job for the selected pack with the user's corrections."""
         layer, doses = self._selected()
         metadata = about.metadata_of(layer)
         labels = self._partner(layer, packs.UNUSABLE)

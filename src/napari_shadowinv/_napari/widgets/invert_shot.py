@@ -131,15 +131,15 @@ class InvertShot(InversionInputs, panels.LivePanel):
 
     def _connect(self) -> None:
         self.image.picked.connect(self._on_image)
-        masks = self.masks.layers, self.source_masks.layers
-        edits = layers.LayerWatch(self, (self.image, *masks, self.crop, self.source.layers))
-        layers.LayerWatch(self, (self.image,)).edited.connect(self._forget_report)
+        self.image.edited.connect(self._forget_report)
         # Also for runs that are cancelled, or refused before they start.
         self.panel.button.clicked.connect(self._empty_report)
         self.panel.runner.started.connect(self._on_start)
         qt.while_alive(self, self.viewer.layers.selection, "active", self._follow_result)
         changes = [control.changed for control in self.parts().values()]
-        for signal in (*changes, self.crop.picked, edits.edited):
+        masks = self.masks.layers, self.source_masks.layers
+        edits = [each.edited for each in (self.image, *masks, self.crop, self.source.layers)]
+        for signal in (*changes, self.crop.picked, *edits):
             signal.connect(self.on_change)
 
     def request(self, preview: bool = False) -> jobs.InversionJob:
@@ -351,8 +351,8 @@ class EstimateSource(panels.LivePanel):
         self.live.setToolTip("Update the estimate after each change.")
         self.add(forms.labelled("Image", self.image), self.masks, self.method)
         self.add(self.live, self.keep_earlier, self.panel)
-        edits = layers.LayerWatch(self, (self.image, self.masks.layers))
-        for signal in (self.image.picked, self.masks.changed, self.method.changed, edits.edited):
+        edits = self.image.edited, self.masks.layers.edited
+        for signal in (self.image.picked, self.masks.changed, self.method.changed, *edits):
             signal.connect(self.on_change)
         self.restore_last()
         self._ready = True
