@@ -127,8 +127,7 @@ def estimate_source(selection: _Selection, should_stop: ShouldStop) -> list[resu
     source = preprocessing.total_variation_source(selection.image, should_stop=should_stop)
     made_from = {"image": selection.name, "estimate": "total variation"}
     selection = replace(selection, role=about.SOURCE)
-    title = "source by total variation"
-    return [_filtered_layer(selection, source, title, made_from=made_from)]
+    return [_filtered_layer(selection, source, "source by total variation", made_from=made_from)]
 
 
 @viewer_sync.notify_errors(otherwise=list)

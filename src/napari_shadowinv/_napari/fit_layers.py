@@ -146,8 +146,7 @@ def _image_layers(
 
 def _full_size(displacement: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     """Interpolate values at every second pixel, between pixel pairs, to all pixels."""
-    grid = np.mgrid[: shape[0], : shape[1]]
-    points = (grid - 0.5) / 2
+    points = (np.mgrid[: shape[0], : shape[1]] - 0.5) / 2
     return np.stack(
         [map_coordinates(plane, points, order=1, mode="nearest") for plane in displacement]
     )

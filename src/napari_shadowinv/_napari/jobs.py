@@ -104,7 +104,6 @@ class TimeEstimate:
         return self.samples * steps_per_sample
 
     def text(self, pace: Pace) -> str:
-        """Return the estimate as a sentence."""
         count = "one image" if self.images == 1 else f"{self.images} images"
         subject = f"{count} of {self.shape[0]} × {self.shape[1]} px"
         if self.fields > 1:
@@ -166,7 +165,6 @@ class Finished:
 
     @property
     def result(self) -> Result[Any]:
-        """The result behind the layers."""
         result = result_of(self.layer_data[0][1])
         assert result is not None
         return result
@@ -176,7 +174,6 @@ class Job:
     """Something to compute in a thread, and the layers that come of it."""
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
-        """Compute the result."""
         raise NotImplementedError
 
     def layers(self, content: Any) -> list[FullLayerData]:

@@ -195,7 +195,6 @@ class PackJob(Job):
     plane: int = 0  # the film in view
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> EvaluatedPack:
-        """Write the corrections and evaluate the pack."""
         try:
             pack, by_hand = self._write_corrections()
             doses = run_film(pack, on_progress=on_progress, should_stop=should_stop)

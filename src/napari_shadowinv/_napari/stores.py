@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -171,13 +171,11 @@ def follow_shots(viewer: Any, layer: Any) -> Callable[[], None]:
 
     def leave(removed: Any) -> None:
         if removed is layer:
-            for disconnect in connections:
-                disconnect()
+            connections.close()
 
-    connections = (
-        connect(viewer.dims, "current_step", follow),
-        connect(viewer.layers, "removed", leave),
-    )
+    connections = ExitStack()
+    connections.callback(connect(viewer.dims, "current_step", follow))
+    connections.callback(connect(viewer.layers, "removed", leave))
     connect(layer, "visible", follow)
     follow()
     return reload

@@ -184,5 +184,4 @@ def _is_file_name(cell: str, annotation: Any) -> bool:
 
 
 def _without_empty_end(cells: list[str]) -> list[str]:
-    count = max((k for k, cell in enumerate(cells, 1) if cell), default=0)
-    return cells[:count]
+    return cells[: max((k for k, cell in enumerate(cells, 1) if cell), default=0)]

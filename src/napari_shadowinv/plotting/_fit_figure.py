@@ -248,8 +248,7 @@ def _page(
 def _draw_left_out(
     panels: list[Panel], left_out: LeaveOneOut, k: int, name: str, fact: Fact
 ) -> None:
-    used = left_out.mask[k]
-    mean = float(left_out.images[k][used].mean())
+    mean = float(left_out.images[k][left_out.mask[k]].mean())
     limits = intensity_limits(left_out.images[k] / mean)
     residual = left_out.normalised_residual[k]
     panels[0].draw_intensity(left_out.images[k] / mean, name, limits, label="Intensity / mean")

@@ -77,8 +77,7 @@ def stack_frames(
     if not high > low:
         raise InputError(f"limits are {low:g} and {high:g}: the second must be larger")
     unit = str(field.attrs.get("units", ""))
-    largest = max(abs(low), abs(high))
-    factor, prefix = prefix_for(largest) if takes_prefix(unit) else (1.0, "")
+    factor, prefix = prefix_for(max(abs(low), abs(high))) if takes_prefix(unit) else (1.0, "")
     label = f"{field.attrs.get('long_name', variable)} ({prefix}{display_unit(unit)})"
     shape = field.sizes["y"], field.sizes["x"]
     draw = _Frame(shape, _common_setup(stack), label, (factor * low, factor * high))
@@ -234,7 +233,10 @@ def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> 
                 ffmpeg.wait()
         if ffmpeg.returncode:
             messages.seek(0)
-            raise _FFmpegError(_reason(messages.read(), ffmpeg.returncode))
+            lines = messages.read().decode(errors="replace").splitlines()
+            reason = lines[-1] if lines else f"exit code {ffmpeg.returncode}"
+            # Without which of its parts speaks: "[out#0/mp4 @ 0x560c9438a4c0] ".
+            raise _FFmpegError(re.sub(r"^\[[^]]*\] ", "", reason))
     try:
         n_readable = count_frames_and_secs(str(path))[0]
     except RuntimeError:
@@ -258,12 +260,6 @@ def _start_ffmpeg(path: Path, shape: tuple[int, ...], rate: float, messages: Any
         # Ctrl-C is for this process, which then ends the other.
         start_new_session=True,
     )
-
-
-def _reason(messages: bytes, code: int) -> str:
-    lines = messages.decode(errors="replace").splitlines()
-    # Without which of its parts speaks: "[out#0/mp4 @ 0x560c9438a4c0] ".
-    return re.sub(r"^\[[^]]*\] ", "", lines[-1]) if lines else f"exit code {code}"
 
 
 def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> int:

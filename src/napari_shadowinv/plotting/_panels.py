@@ -13,18 +13,14 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import CAUTION_CODES
-from napari_shadowinv.facts import Level
-from napari_shadowinv.physics.significance import LEVEL
+from napari_shadowinv.facts import Fact, Headline, Level
+from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.physics.significance import LEVEL, Structures
 from napari_shadowinv.physics.units import ShownField, prefix_for, shown_potential
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from napari_shadowinv.facts import Fact, Headline
-    from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.physics.significance import Structures
-
 
 _CUT_COLOURS = ("#1f9bff", "#18b368")
 _REFERENCE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 2.4, "alpha": 0.45}

@@ -125,7 +125,6 @@ class PathEdit(QtWidgets.QWidget):
         return str(path)
 
     def choose(self) -> None:
-        """Ask for the path."""
         path = self.ask()
         if path:
             self.edit.setText(path)

@@ -235,8 +235,7 @@ class ProductForm(QtWidgets.QWidget):
                 stack = open_shots(origin, shots)
                 seconds = _seconds(times, stack["index"].values.tolist())
                 return [each.result for each in analyse_shots(stack, product, seconds, **common)]
-            setup = origin.setup
-            return analyse(origin.content, product, samples=samples, setup=setup, **common)
+            return analyse(origin.content, product, samples=samples, setup=origin.setup, **common)
 
         return _Request(origin, layer, work)
 

@@ -176,7 +176,6 @@ class StackJob(Job):
 
 
 def is_image(layer: Any) -> bool:
-    """Return whether a layer is an image."""
     return kind_of(layer) == "image"
 
 

@@ -248,7 +248,6 @@ class ImageTable(QWidget):
         return [row for number, row in enumerate(self.rows) if self.table.is_checked(number)]
 
     def fill(self, _: Any = None) -> None:
-        """Show the viewer's current images."""
         stack = self.stacks.layer
         if stack is not None:
             self.rows = [ImageRow(stack, plane) for plane in range(stack.data.shape[0])]

@@ -107,7 +107,6 @@ class ShotsPicker(ModelPicker):
 
     @property
     def is_watched(self) -> bool:
-        """Whether the shots come from a watched folder."""
         return self.kind == _FOLDER
 
     @property
