@@ -173,13 +173,6 @@ def _limits(plane: AnyArray, used: BoolArray) -> Limits:
     return (low, bright) if bright > low else (low, low + 1.0)
 
 
-class EvaluatedPack(NamedTuple):
-    """The doses of a film pack, and the painted pixels on its grid."""
-
-    doses: FilmDoses
-    by_hand: BoolArray | None
-
-
 @dataclass(frozen=True, eq=False)
 class PackJob(Job):
     """Arguments of `run_film`; corrections are written to a folder, which a failed run removes."""
@@ -194,22 +187,24 @@ class PackJob(Job):
     scales: FloatArray | None = None
     plane: int = 0  # the film in view
 
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> EvaluatedPack:
+    def run(
+        self, on_progress: OnProgress, should_stop: ShouldStop
+    ) -> tuple[FilmDoses, BoolArray | None]:
+        """Return the doses of the corrected pack, and the painted pixels on its grid."""
         try:
             pack, by_hand = self._write_corrections()
-            doses = run_film(pack, on_progress=on_progress, should_stop=should_stop)
-            return EvaluatedPack(doses, by_hand)
+            return run_film(pack, on_progress=on_progress, should_stop=should_stop), by_hand
         except BaseException:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise
 
-    def layers(self, content: EvaluatedPack) -> list[FullLayerData]:
-        doses = content.doses
+    def layers(self, content: tuple[FilmDoses, BoolArray | None]) -> list[FullLayerData]:
+        doses, by_hand = content
         return pack_layers(
             Result(doses, doses.setup),
             frame_for(doses.dose.shape, doses.setup, pixel_size=doses.pixel_size),
             self.name,
-            by_hand=content.by_hand,
+            by_hand=by_hand,
             plane=self.plane,
             path=self.path,
             pack=self.pack,

@@ -102,7 +102,7 @@ def test_a_folder_is_chosen_and_watched(
     )
     stack = opened(InvertStack)
     stack.choose_folder()
-    assert stack.shots.is_watched
+    assert stack.shots.kind == "folder"
     assert stack.shots.folder.path == tmp_path
 
 

@@ -106,10 +106,6 @@ class ShotsPicker(ModelPicker):
         return self.layers.layer if self.kind == _LAYER else None
 
     @property
-    def is_watched(self) -> bool:
-        return self.kind == _FOLDER
-
-    @property
     def name(self) -> str:
         """The name of the shots, such as a path."""
         edits = {_FOLDER: self.folder.folder, _FILES: self.files, _TABLE: self.table.file}
@@ -275,7 +271,7 @@ class InvertStack(InversionInputs, ToolPanel):
             "overwrite": self.overwrite.isChecked(),
             "redo_failed": self.redo_failed.isChecked(),
         }
-        if self.shots.is_watched:
+        if self.shots.kind == _FOLDER:
             folder = self.shots.folder
             watch = WatchOptions(pattern=folder.pattern.text().strip(), **choices)
             return stack_jobs.WatchJob(shots=folder.path, watch_options=watch, **common)
@@ -390,7 +386,7 @@ class InvertStack(InversionInputs, ToolPanel):
         status = job.status
         if not status.total:
             # The panel shows an error.
-            if outcome.error is None and self.shots.is_watched:
+            if outcome.error is None and self.shots.kind == _FOLDER:
                 self.panel.say("Stopped: no shot has arrived.")
             return
         self._show(job)
@@ -404,7 +400,7 @@ class InvertStack(InversionInputs, ToolPanel):
     def _on_layer(self) -> None:
         layer = self.shots.layer
         # Watched shots are inverted one by one, as they arrive.
-        self.engine.setVisible(not self.shots.is_watched)
+        self.engine.setVisible(self.shots.kind != _FOLDER)
         self.source.follow(layer)
         self.setup.follow(layer, "" if layer is not None else self.shots.name)
         if not self.panel.runner.running:
