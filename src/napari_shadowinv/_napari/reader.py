@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from napari_shadowinv._napari.layer_metadata import main_layers, result_of
 from napari_shadowinv._napari.viewer_sync import (
@@ -17,9 +17,6 @@ from napari_shadowinv._napari.viewer_sync import (
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.formats import PRADFORMAT, RADIOGRAPH_SUFFIXES, RESULT, STORE
-
-if TYPE_CHECKING:
-    from napari_shadowinv._napari.layers import FullLayerData
 
 
 def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[Any]] | None:
@@ -86,7 +83,7 @@ def _matches(pattern: str) -> list[Path]:
 
 
 @as_file_errors
-def _read_file(path: Path) -> list[FullLayerData]:
+def _read_file(path: Path) -> list[Any]:
     from napari_shadowinv._napari.result_files import layers_of_dataset
     from napari_shadowinv._napari.shots import frame_layers, radiograph_layers
     from napari_shadowinv.io import read
@@ -108,7 +105,7 @@ def _read_file(path: Path) -> list[FullLayerData]:
     return layers
 
 
-def _show_in_window(layers: Sequence[FullLayerData]) -> None:
+def _show_in_window(layers: Sequence[Any]) -> None:
     """Show colour bar and scale bar of an opened result in a window, and select its field."""
     from napari_shadowinv._napari.stores import viewer_in_window
 

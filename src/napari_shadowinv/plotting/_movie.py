@@ -80,11 +80,11 @@ def stack_frames(
     factor, prefix = prefix_for(max(abs(low), abs(high))) if takes_prefix(unit) else (1.0, "")
     label = f"{field.attrs.get('long_name', variable)} ({prefix}{display_unit(unit)})"
     shape = field.sizes["y"], field.sizes["x"]
-    draw = _Frame(shape, _common_setup(stack), label, (factor * low, factor * high))
-    return (
-        draw(factor * _plane(field, index, used), str(stack["name"].values[index]))
+    planes = (
+        (factor * _plane(field, index, used), str(stack["name"].values[index]))
         for index in range(field.sizes["shot"])
     )
+    return _draw_frames(planes, shape, _common_setup(stack), label, (factor * low, factor * high))
 
 
 def _common_setup(stack: xarray.Dataset) -> Any:
@@ -118,34 +118,33 @@ def _limits(field: xarray.DataArray, used: xarray.DataArray | None) -> tuple[flo
     return low, high if high > low else low + 1.0
 
 
-class _Frame:
-    """A figure that is redrawn with new values."""
+def _draw_frames(
+    planes: Iterable[tuple[FloatArray, str]],
+    shape: tuple[int, int],
+    setup: Any,
+    label: str,
+    limits: tuple[float, float],
+) -> Iterator[NDArray[np.uint8]]:
+    """Redraw a figure with the values and the name of each shot."""
+    from matplotlib import rc_context
 
-    def __init__(
-        self, shape: tuple[int, int], setup: Any, label: str, limits: tuple[float, float]
-    ) -> None:
-        grid = choose_grid(shape, 1, title=False)
-        lines = textwrap.wrap(label, max(12, int(grid.height / _LETTER_WIDTH_IN)))
-        grid = replace(grid, right_margin=grid.right_margin + _LINE_HEIGHT_IN * (len(lines) - 1))
-        with new_page(grid, image_scale(shape, setup), None) as (self._figure, (panel,)):
-            # Without values: the colour bar must not depend on the first shot.
-            panel.show(np.full(shape, limits[0]), "", "\n".join(lines), _COLOUR_MAP, limits)
-        self._panel = panel
-        self._picture = panel.axes.images[0]
-
-    def __call__(self, plane: FloatArray, name: str) -> NDArray[np.uint8]:
-        from matplotlib import rc_context
-
-        self._panel.hatch_gaps(plane)
-        self._picture.set_data(plane)
+    grid = choose_grid(shape, 1, title=False)
+    lines = textwrap.wrap(label, max(12, int(grid.height / _LETTER_WIDTH_IN)))
+    grid = replace(grid, right_margin=grid.right_margin + _LINE_HEIGHT_IN * (len(lines) - 1))
+    with new_page(grid, image_scale(shape, setup), None) as (figure, (panel,)):
+        # Without values: the colour bar must not depend on the first shot.
+        panel.show(np.full(shape, limits[0]), "", "\n".join(lines), _COLOUR_MAP, limits)
+    canvas: Any = figure.canvas
+    for plane, name in planes:
+        panel.hatch_gaps(plane)
+        panel.axes.images[0].set_data(plane)
         with rc_context(STYLE):
-            self._panel.axes.set_title(name)
-            self._figure.set_dpi(_DOTS_PER_INCH)
-            canvas: Any = self._figure.canvas
+            panel.axes.set_title(name)
+            figure.set_dpi(_DOTS_PER_INCH)
             canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())[..., :3]
         rows, columns = (length - length % 2 for length in pixels.shape[:2])
-        return np.ascontiguousarray(pixels[:rows, :columns])
+        yield np.ascontiguousarray(pixels[:rows, :columns])
 
 
 def in_few_colours(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:

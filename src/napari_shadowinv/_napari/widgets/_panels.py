@@ -418,9 +418,6 @@ class VerdictLine(forms.WrappingLabel):
         title = f"{prefix}{headline.level.value.capitalize()}"
         self.show_titled(title, headline.text, _LEVEL_STYLES[headline.level])
 
-    def empty(self) -> None:
-        self.show_text("")
-
 
 class ToolPanel(qt.Docked):
     """A column of controls that scrolls vertically; its button runs the `request`."""

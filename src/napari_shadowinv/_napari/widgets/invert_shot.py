@@ -208,7 +208,7 @@ class InvertShot(InversionInputs, panels.LivePanel):
 
     def _empty_report(self) -> None:
         self._reported = None
-        self.verdict.empty()
+        self.verdict.show_text("")
         self.report.empty()
 
     def _follow_result(self, _: Any = None) -> None:

@@ -213,7 +213,7 @@ class PlanExperiment(ObjectPanel):
         )
 
     def forget(self) -> None:
-        self.verdict.empty()
+        self.verdict.show_text("")
         self.report.empty()
         self.plot.setVisible(False)
 
