@@ -285,8 +285,7 @@ class SourcePicker(forms.ModelPicker):
             return f"file {Path(self.file.path).name}"
         if self.kind in (SUPPLIED, UNKNOWN):
             return "came with the shot" if self.is_supplied else "fitted"
-        model = self.model()
-        assert isinstance(model, preprocessing.Estimate)
+        model: Any = self.model()
         return f"estimate: {model.summary}" if self.is_estimated else model.summary
 
     @property

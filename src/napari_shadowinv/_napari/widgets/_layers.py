@@ -30,10 +30,9 @@ def kind_of(layer: Any) -> str:
     return str(layer.__class__.__name__).lower()
 
 
-def image_of(layer: Any | None, role: str = "image") -> Any:
+def image_of(layer: Any, role: str = "image") -> Any:
     """Return the 2-D array of a grey image, lazy if the layer is; errors mention `role`."""
     data = _grey(layer, role)
-    assert layer is not None
     if data.ndim != 2:
         raise InputError(
             f"'{layer.name}' has shape {tuple(data.shape)}, expected one image (y, x): "
@@ -42,10 +41,9 @@ def image_of(layer: Any | None, role: str = "image") -> Any:
     return data
 
 
-def stack_of(layer: Any | None) -> Any:
+def stack_of(layer: Any) -> Any:
     """Return the 3-D array (shot, y, x) of grey images, lazy if the layer is."""
     data = _grey(layer, "stack of shots")
-    assert layer is not None
     if data.ndim != 3:
         hint = "use 'Invert shot' for a single image, or " if data.ndim == 2 else ""
         raise InputError(

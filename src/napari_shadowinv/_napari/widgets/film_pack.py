@@ -68,8 +68,7 @@ class NewPackDialog(QtWidgets.QDialog):
         self.form.editors["film"].changed.connect(self._on_film)
 
     def entries(self) -> dict[str, Any]:
-        facts = self.form.model()
-        assert isinstance(facts, film_files.NewPack)
+        facts: Any = self.form.model()
         layers = [
             {
                 "film": self.table.cellWidget(row, 1).currentText(),
@@ -83,11 +82,6 @@ class NewPackDialog(QtWidgets.QDialog):
             for row in range(self.table.rowCount())
         ]
         return film_files.draft_pack(self._folder, facts, layers)
-
-    def missing_text(self) -> str:
-        """Return a sentence on entries still missing in the pack file, or the next action."""
-        missing = film_files.missing_entries(self.entries())
-        return f"Add to this file: {'; '.join(missing)}." if missing else "Press Run."
 
     def accept(self) -> None:
         """Write the pack file, or show the problem."""
@@ -406,7 +400,9 @@ class FilmPack(panels.ToolPanel):
         dialog = NewPackDialog(Path(folder), self)
         if dialog.exec() and dialog.written is not None:
             self.path.edit.setText(str(dialog.written))
-            self.panel.say(f"Wrote {dialog.written}. {dialog.missing_text()}")
+            missing = film_files.missing_entries(dialog.entries())
+            action = f"Add to this file: {'; '.join(missing)}." if missing else "Press Run."
+            self.panel.say(f"Wrote {dialog.written}. {action}")
 
     def forget(self) -> None:
         self.panel.say("")
@@ -554,8 +550,7 @@ class FilmPack(panels.ToolPanel):
             return
         has_suffix = name.lower().endswith(RESULT.suffix)
         path = Path(name if has_suffix else name + RESULT.suffix)
-        result = about.result_of(layer)
-        assert result is not None
+        result: Any = about.result_of(layer)
         doses = packs.copy_edits(doses, self._scratch, path)
         saved = about.Result(doses, result.setup, result.attributes)
         layers = [each for each in self.viewer.layers if about.result_of(each) is result]

@@ -208,8 +208,7 @@ class FitImages(ToolPanel):
         if setup is None or (choices.source_size is None and choices.resolution is None):
             return choices.psf
         shot = Radiograph(np.zeros(row.data.shape), setup=self._base_setup(row, setup))
-        processed = Recipe(steps=self.steps.steps()).move(shot).setup
-        assert processed is not None
+        processed: Any = Recipe(steps=self.steps.steps()).move(shot).setup
         return point_spread(processed, choices.source_size or 0.0, choices.resolution or 0.0)
 
     def request(self) -> FitJob:
