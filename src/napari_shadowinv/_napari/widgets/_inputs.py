@@ -21,7 +21,7 @@ from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, format_number
 from napari_shadowinv._napari.widgets._files import RecipeButton
 from napari_shadowinv._napari.widgets._qt import column
-from napari_shadowinv._napari.widgets._results import Origins
+from napari_shadowinv._napari.widgets._results import describe_inputs
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
@@ -555,24 +555,9 @@ class InversionInputs:
 
         Its companions are the chosen masks, source and other layers that lie on the image.
         """
-        origins = Origins(
-            source=self.source.summary,
-            mask=self.masks.summary(image),
-            setup=self.setup.summary,
-            setup_origin=self.setup.origin,
-            image=name,
-            source_mask=self.source_masks.summary(image) if self.source.is_estimated else "",
-        )
         chosen = (self.masks.layer, self.source_masks.layer, *others, self.source.layers.layer)
-        return {
-            "recipe": recipe,
-            "inputs": origins.rows(),
-            "attributes": origins.attributes(),
-            "image": image,
-            "companions": tuple(
-                layer for layer in chosen if layer is not None and layer is not image
-            ),
-        }
+        source_mask = self.source_masks.summary(image) if self.source.is_estimated else ""
+        return describe_inputs(self, image, recipe, chosen, name=name, source_mask=source_mask)
 
 
 BOTH = " and "

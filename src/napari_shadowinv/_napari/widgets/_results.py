@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -204,34 +204,45 @@ class LastResults:
         return results
 
 
-@dataclass(frozen=True, kw_only=True)
-class Origins:
-    """Origins of the inputs of an inversion or fit, in words; empty without a mask or setup."""
+def describe_inputs(
+    tool: Any,
+    image: Any,
+    recipe: Recipe,
+    on_image: Sequence[Any],
+    *,
+    name: str = "",
+    source_mask: str = "",
+    steps: str = "",
+) -> dict[str, Any]:
+    """Return the fields of a tool's job about its inputs, with their origins in words.
 
-    # In the order of the report.
-    image: str = ""  # none for several images
-    source: str
-    source_mask: str = ""
-    mask: str
-    setup: str
-    setup_origin: str  # part of `setup`
-    steps: str = ""  # of a fit
-
-    def attributes(self) -> dict[str, str]:
-        """Return the origins that are saved with a result, without the names of files."""
-        texts = {
-            "source_origin": self.source,
-            "mask_origin": self.mask,
-            "source_mask_origin": self.source_mask,
-            "setup_origin": self.setup_origin,
-            "steps": self.steps,
-        }
-        return {name: text for name, text in texts.items() if text}
-
-    def rows(self) -> list[tuple[str, str]]:
-        """Return the origins as rows of a report."""
-        texts = {name: text for name, text in asdict(self).items() if name != "setup_origin"}
-        return [(name.replace("_", " ").capitalize(), text) for name, text in texts.items() if text]
+    `on_image` are the job's companions, or None. `name` is the image's, empty for several images;
+    `steps` are those of a fit.
+    """
+    rows = {
+        "Image": name,
+        "Source": tool.source.summary,
+        "Source mask": source_mask,
+        "Mask": tool.masks.summary(image),
+        "Setup": tool.setup.summary,
+        "Steps": steps,
+    }
+    saved = {
+        "source_origin": rows["Source"],
+        "mask_origin": rows["Mask"],
+        "source_mask_origin": source_mask,
+        "setup_origin": tool.setup.origin,
+        "steps": steps,
+    }
+    return {
+        "recipe": recipe,
+        "inputs": [(title, text) for title, text in rows.items() if text],
+        "attributes": {key: text for key, text in saved.items() if text},
+        "image": image,
+        "companions": tuple(
+            layer for layer in on_image if layer is not None and layer is not image
+        ),
+    }
 
 
 def _can_be_updated(layer: Any, keywords: dict[str, Any]) -> bool:

@@ -17,7 +17,7 @@ from napari_shadowinv._napari.widgets._files import FitRecipeButton, result_butt
 from napari_shadowinv._napari.widgets._fitting import FitView
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._qt import side_by_side, while_alive
-from napari_shadowinv._napari.widgets._results import Origins, result_frame
+from napari_shadowinv._napari.widgets._results import describe_inputs, result_frame
 from napari_shadowinv._napari.widgets._tables import ImageRow, ImageTable, beam_column
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
@@ -219,26 +219,17 @@ class FitImages(ToolPanel):
         images = [
             f"{row.name}: {_beam_summary(shot)}" for row, shot in zip(rows, shots, strict=True)
         ]
-        origins = Origins(
-            source=self.source.summary,
-            mask=self.masks.summary(first.layer),
-            setup=self.setup.summary,
-            setup_origin=self.setup.origin,
-            steps="; ".join(step.summary for step in recipe.steps),
-        )
+        steps = "; ".join(step.summary for step in recipe.steps)
         used_layers = (*(row.layer for row in rows), self.masks.layer, self.source.layer)
+        described = describe_inputs(self, first.layer, recipe, used_layers, steps=steps)
+        described["inputs"] += _warnings_of(rows)
+        described["attributes"] = {"images": "; ".join(images), **described["attributes"]}
         return FitJob(
-            recipe=recipe,
             shots=shots,
             names=tuple(row.name for row in rows),
             name=f"{first.layer.name} fit",
             frame=result_frame(first.layer, recipe),
-            inputs=[*origins.rows(), *_warnings_of(rows)],
-            attributes={"images": "; ".join(images), **origins.attributes()},
-            image=first.layer,
-            companions=tuple(
-                layer for layer in used_layers if layer is not None and layer is not first.layer
-            ),
+            **described,
         )
 
     def _shots(self, rows: list[ImageRow], setup: Setup | None) -> tuple[FitShot, ...]:
