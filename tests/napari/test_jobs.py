@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from napari_shadowinv import ProtonSetup, fit
-from napari_shadowinv._napari.jobs import FitProgress, Pace, TimeEstimate
+from napari_shadowinv._napari.jobs import FitProgress, TimeEstimate
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
@@ -82,10 +82,8 @@ def test_a_forecast_grows_with_what_is_asked_for() -> None:
 
 def test_the_next_forecast_follows_the_last_fit() -> None:
     estimate = TimeEstimate((1000, 1000), 3, 2, False, FitOptions())
-    pace = Pace()
-    text = estimate.text(pace)
+    text = estimate.text(None)
     assert text.startswith("3 images of 1000 × 1000 px, 2 fields: about 80 s, up to 5 min")
-    pace.factor = 3.0
-    assert "about 4 min, based on the last fit" in estimate.text(pace)
+    assert "about 4 min, based on the last fit" in estimate.text(3.0)
     single = TimeEstimate((200, 200), 1, 1, True, FitOptions())
-    assert single.text(Pace()).startswith("one image of 200 × 200 px, unknown beam: about ")
+    assert single.text(None).startswith("one image of 200 × 200 px, unknown beam: about ")

@@ -2,7 +2,7 @@
 
 - the pattern of all jobs: `Job`, `Finished`, `ImageJob`
 - an inversion: `InversionJob`; a fit: `FitJob`; the fit that refines an inversion: `refinement`
-- time and progress of a fit: `TimeEstimate`, `FitProgress`, `PACE`
+- time and progress of a fit: `TimeEstimate`, `FitProgress`
 """
 
 from __future__ import annotations
@@ -61,13 +61,6 @@ def duration_in_words(seconds: float) -> str:
     return f"{seconds / _HOUR_S:.1f} h"
 
 
-@dataclass
-class Pace:
-    """Time of the last fit on this machine relative to its estimate."""
-
-    factor: float | None = None
-
-
 @dataclass(frozen=True)
 class TimeEstimate:
     """Properties of a fit that determine its time."""
@@ -103,21 +96,19 @@ class TimeEstimate:
         steps_per_sample = _STEPS_PER_BEAM_SAMPLE if self.beam_is_unknown else _STEPS_PER_SAMPLE
         return self.samples * steps_per_sample
 
-    def text(self, pace: Pace) -> str:
+    def text(self, pace: float | None) -> str:
+        """Return the estimate as a sentence, for a `FitJob.pace`."""
         count = "one image" if self.images == 1 else f"{self.images} images"
         subject = f"{count} of {self.shape[0]} × {self.shape[1]} px"
         if self.fields > 1:
             subject += f", {self.fields} fields"
         if self.beam_is_unknown:
             subject += ", unknown beam"
-        time = duration_in_words((pace.factor or 1) * self.seconds)
-        if pace.factor is None:
+        time = duration_in_words((pace or 1) * self.seconds)
+        if pace is None:
             longest = duration_in_words(_CROSSING_RAYS_FACTOR * self.seconds)
             return f"{subject}: about {time}, up to {longest} if rays cross."
         return f"{subject}: about {time}, based on the last fit."
-
-
-PACE = Pace()
 
 
 class FitProgress:
@@ -251,6 +242,7 @@ class FitJob(ImageJob):
     """
 
     task = "fit"
+    pace: ClassVar[float | None] = None  # time of the last fit relative to its estimate
 
     shots: tuple[FitShot, ...]
     names: tuple[str, ...]  # of the images
@@ -283,7 +275,7 @@ class FitJob(ImageJob):
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
         fit = self.compute(lambda state: on_progress(self.progress.update(state)), should_stop)
-        PACE.factor = sum(fit.report.seconds.values()) / self.time_estimate.seconds
+        FitJob.pace = sum(fit.report.seconds.values()) / self.time_estimate.seconds
         return fit
 
     def layers(self, content: Fit) -> list[FullLayerData]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.jobs import PACE, Finished, FitJob, TimeEstimate
+from napari_shadowinv._napari.jobs import Finished, FitJob, TimeEstimate
 from napari_shadowinv._napari.shots import radiograph_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _inputs as inputs
@@ -268,7 +268,7 @@ class FitImages(ToolPanel):
         is_unknown = self.source.kind == inputs.UNKNOWN
         fields = len(self.fields.state().split(inputs.BOTH))
         estimate = TimeEstimate(shape, len(rows), fields, is_unknown, options)  # type: ignore[arg-type]
-        self.cost.show_text(estimate.text(PACE))
+        self.cost.show_text(estimate.text(FitJob.pace))
 
     def _rows(self) -> list[ImageRow]:
         rows = self.images.used
