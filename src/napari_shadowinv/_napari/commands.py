@@ -49,7 +49,7 @@ class _Selection:
         return self.shot.image
 
 
-Work = Callable[[_Selection, ShouldStop], list[results.FullLayerData]]
+Work = Callable[[_Selection, ShouldStop], results.LayerData]
 
 
 def _in_thread(
@@ -70,7 +70,7 @@ def _in_thread(
 
 
 @_in_thread("Inverting")
-def invert_uniform(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
+def invert_uniform(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
     """Invert the selected image against a uniform source, with the default options."""
     from napari_shadowinv._napari.jobs import InversionJob
 
@@ -104,9 +104,7 @@ def refine(
 
 
 @_in_thread("Removing hot pixels from", about.may_be_source)
-def remove_hot_pixels(
-    selection: _Selection, should_stop: ShouldStop
-) -> list[results.FullLayerData]:
+def remove_hot_pixels(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
     """Replace pixels that stand out of the noise by the median of their neighbours."""
     image, hot, dead = preprocessing.remove_hot_pixels(selection.image, should_stop=should_stop)
     title = f"without {int((hot | dead).sum())} hot or dead pixels"
@@ -114,7 +112,7 @@ def remove_hot_pixels(
 
 
 @_in_thread("Filtering", about.may_be_source)
-def high_pass(selection: _Selection, _: ShouldStop) -> list[results.FullLayerData]:
+def high_pass(selection: _Selection, _: ShouldStop) -> results.LayerData:
     """Remove structures larger than about 0.15 of the image's shorter side; keep the mean."""
     width = 0.15 * min(selection.image.shape)
     image = preprocessing.high_pass(selection.image, width)
@@ -122,7 +120,7 @@ def high_pass(selection: _Selection, _: ShouldStop) -> list[results.FullLayerDat
 
 
 @_in_thread("Estimating the source of")
-def estimate_source(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
+def estimate_source(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
     """Estimate the undisturbed beam as the image of least total variation near the selected one."""
     source = preprocessing.total_variation_source(selection.image, should_stop=should_stop)
     made_from = {"image": selection.name, "estimate": "total variation"}
@@ -177,7 +175,7 @@ def align_source(
     selection = _select_image(layer, viewer)
     source, name = _source_for(selection, layer, viewer)
 
-    def align(selection: _Selection, should_stop: ShouldStop) -> list[results.FullLayerData]:
+    def align(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
         aligned = preprocessing.align_source(selection.image, source, about.usable_of(layer))
         (y, x), (y_error, x_error) = aligned.shift, aligned.error
         shift = f"y {y:+.2f} ± {y_error:.2f}, x {x:+.2f} ± {x_error:.2f} px"
@@ -310,7 +308,7 @@ def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> lis
     use_preferred_threads()
     bar = cancelable_progress(total=0, desc=f"{activity} {selection.name}")
 
-    def finish(outcome: tuple[list[results.FullLayerData], Exception | None]) -> None:
+    def finish(outcome: tuple[results.LayerData, Exception | None]) -> None:
         layers, error = outcome
         bar.close()
         if error is None:
@@ -321,7 +319,7 @@ def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> lis
             raise error
 
     # Errors stay in the worker: versions of napari differ in their handling.
-    def run() -> tuple[list[results.FullLayerData], Exception | None]:
+    def run() -> tuple[results.LayerData, Exception | None]:
         # A closing window asks its workers to stop; the cross only marks the bar.
         try:
             return work(selection, lambda: bar.is_canceled or worker.abort_requested), None

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import Frame, Result, layer_name, metadata_for, role_of
 from napari_shadowinv._napari.layers import (
-    FullLayerData,
+    LayerData,
     View,
     dataset_layers,
     shared_metadata,
@@ -32,9 +32,7 @@ _KINDS = {kind.role: kind for kind in about.KINDS if kind.shown_of != "stack"}
 _MAX_BEAM_DIFFERENCE = 1e-6  # relative to the mean
 
 
-def fit_layers(
-    result: Result[Fit], frame: Frame, name: str, *, alone: bool = False
-) -> list[FullLayerData]:
+def fit_layers(result: Result[Fit], frame: Frame, name: str, *, alone: bool = False) -> LayerData:
     """Describe the layers of a fit, the lowest first; the first of several fields is visible.
 
     With `alone`, as for a file, they include the images and all alternative solutions.
@@ -64,13 +62,11 @@ def fit_layers(
     return layers
 
 
-def alternative_layers(
-    result: Result[Fit], number: int, frame: Frame, name: str
-) -> list[FullLayerData]:
+def alternative_layers(result: Result[Fit], number: int, frame: Frame, name: str) -> LayerData:
     """Describe the fields of an alternative solution, the fit's basin `number`."""
     fit, facts = result.content, _facts(result, name)
     basin = fit.basins[number]
-    layers: list[FullLayerData] = []
+    layers: LayerData = []
     for m, field in reversed(list(enumerate(fit.fields))):
         displacement = _full_size(basin.displacement[m], field.potential.shape)
         variables = {"displacement": (("component", "y", "x"), displacement)}
@@ -99,7 +95,7 @@ def _field_title(name: str, fit: Fit, field: FittedField) -> str:
 
 def _field_layers(
     variables: dict[str, Any], fit: Fit, m: int, frame: Frame, title: str, facts: dict[str, Any]
-) -> list[FullLayerData]:
+) -> LayerData:
     """Describe the layers of the field number `m`; only the layers of the first are visible."""
     import xarray as xr
 
@@ -114,7 +110,7 @@ def _field_layers(
 
 def _image_layers(
     fit: Fit, frame: Frame, name: str, facts: dict[str, Any], *, with_images: bool
-) -> list[FullLayerData]:
+) -> LayerData:
     """Describe hidden layers of the re-projections, the residuals and a non-uniform beam."""
     setup = fit.setup
     grey = intensity_limits(fit.images[0])
@@ -128,7 +124,7 @@ def _image_layers(
         content = {"source": (fit.source[:1] if is_common else fit.source, grey), **content}
     if with_images:
         content = {"image": (fit.images, grey), **content}
-    layers: list[FullLayerData] = []
+    layers: LayerData = []
     for role, (planes, limits) in content.items():
         kind = _KINDS[role]
         data = planes[0] if len(planes) == 1 else planes

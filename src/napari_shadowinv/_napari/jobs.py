@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.fit_layers import fit_layers
 from napari_shadowinv._napari.layer_metadata import KEY, Frame, Result, frame_of, result_of, role_of
-from napari_shadowinv._napari.layers import FullLayerData, result_layers
+from napari_shadowinv._napari.layers import LayerData, result_layers
 from napari_shadowinv._napari.shots import load_radiograph
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InputError
@@ -152,7 +152,7 @@ class Finished:
     """The result of a job, and the layers that show it."""
 
     content: Any
-    layer_data: list[FullLayerData]
+    layer_data: LayerData
 
     @property
     def result(self) -> Result[Any]:
@@ -167,7 +167,7 @@ class Job:
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
         raise NotImplementedError
 
-    def layers(self, content: Any) -> list[FullLayerData]:
+    def layers(self, content: Any) -> LayerData:
         """Describe the layers of the result, the lowest first."""
         raise NotImplementedError
 
@@ -219,7 +219,7 @@ class InversionJob(ImageJob):
             preview=self.preview,
         )
 
-    def layers(self, content: Inversion) -> list[FullLayerData]:
+    def layers(self, content: Inversion) -> LayerData:
         """Describe the layers of the inversion; of a preview only the field and its caustics."""
         name = f"{self.name} preview" if self.preview else self.name
         result = Result(content, content.setup, dict(self.attributes))
@@ -278,7 +278,7 @@ class FitJob(ImageJob):
         FitJob.pace = sum(fit.report.seconds.values()) / self.time_estimate.seconds
         return fit
 
-    def layers(self, content: Fit) -> list[FullLayerData]:
+    def layers(self, content: Fit) -> LayerData:
         result = Result(content, content.setup, dict(self.attributes))
         return fit_layers(result, self.frame, self.name)
 

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.results import AnyResult
 
 FullLayerData = tuple[Any, dict[str, Any], str]
+LayerData = list[FullLayerData]
 Limits = tuple[float, float]
 
 # Both stand out from all colours of the field's map.
@@ -60,7 +61,7 @@ def inversion_layers(
     cells: bool = False,
     attributes: Mapping[str, str] | None = None,
     **placement: Any,
-) -> list[FullLayerData]:
+) -> LayerData:
     """Describe the layers of a result, with the keywords of `add_inversion`."""
     setup = inversion.setup if setup is None else setup
     frame = frame_for(inversion.potential.shape, setup, **placement)
@@ -143,9 +144,7 @@ def add_layers(
     return added
 
 
-def field_layers(
-    result: Result[RetrievedField], frame: Frame, name: str = ""
-) -> list[FullLayerData]:
+def field_layers(result: Result[RetrievedField], frame: Frame, name: str = "") -> LayerData:
     """Describe the layers of a field without images."""
     content, dataset = result.content, result.content.dataset
     field = dataset[[variable for variable in _FIELD_VARIABLES if variable in dataset]].assign(
@@ -174,7 +173,7 @@ def shared_metadata(result: Result[AnyResult], name: str) -> dict[str, Any]:
 
 def result_layers(
     result: Result[Inversion], frame: Frame, name: str = "", *, cells: bool = False
-) -> list[FullLayerData]:
+) -> LayerData:
     """Describe the layers of an inversion; with `cells`, its power cells."""
     import xarray as xr
 
@@ -197,7 +196,7 @@ def result_layers(
 
 def dataset_layers(
     view: View, frame: Frame, name: str, facts: Mapping[str, Any], suffix: str = ""
-) -> list[FullLayerData]:
+) -> LayerData:
     """Describe the layers of a result or of a stack; all names end with `suffix`."""
     layers = []
     for kind in about.KINDS:

@@ -20,7 +20,7 @@ import numpy as np
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import Frame, Kind, Result, frame_for, metadata_for
-from napari_shadowinv._napari.layers import FullLayerData, Limits, label_colours
+from napari_shadowinv._napari.layers import LayerData, Limits, label_colours
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
@@ -72,7 +72,7 @@ def pack_layers(
     by_hand: BoolArray | None = None,
     plane: int = 0,
     **facts: Any,
-) -> list[FullLayerData]:
+) -> LayerData:
     """Describe the layers of a pack, the lowest first; their names start with the pack's.
 
     Painted pixels, `by_hand`, shape (n, H, W), are not usable. The displayed film, `plane`, sets
@@ -109,14 +109,14 @@ def pack_layers(
     return layers
 
 
-def film_layers(doses: FilmDoses, frame: Frame, name: str) -> list[FullLayerData]:
+def film_layers(doses: FilmDoses, frame: Frame, name: str) -> LayerData:
     """Describe an image of each film's fluence, with the metadata that an inversion needs.
 
     Films without usable pixels are omitted; in others, unusable pixels are zero. Without setups,
     the metadata contain the displacements in a magnetic field relative to each other. Only the
     first image is visible.
     """
-    layers: list[FullLayerData] = []
+    layers: LayerData = []
     for k, used in enumerate(doses.usable):
         if not used.any():
             continue
@@ -198,7 +198,7 @@ class PackJob(Job):
             shutil.rmtree(self.folder, ignore_errors=True)
             raise
 
-    def layers(self, content: tuple[FilmDoses, BoolArray | None]) -> list[FullLayerData]:
+    def layers(self, content: tuple[FilmDoses, BoolArray | None]) -> LayerData:
         doses, by_hand = content
         return pack_layers(
             Result(doses, doses.setup),

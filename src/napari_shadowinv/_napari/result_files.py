@@ -17,7 +17,7 @@ import numpy as np
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.fit_layers import fit_layers
 from napari_shadowinv._napari.layer_metadata import Frame, Result, frame_for, frame_of, main_layers
-from napari_shadowinv._napari.layers import FullLayerData, field_layers, result_layers
+from napari_shadowinv._napari.layers import FullLayerData, LayerData, field_layers, result_layers
 from napari_shadowinv._napari.packs import pack_layers
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
@@ -54,9 +54,9 @@ _COMMON_KEYWORDS = ("name", "visible", "opacity", "blending", *_PLACEMENT, *_TRA
 
 def layers_of_result(
     result: Result[AnyResult], frame: Frame, name: str = "", *, cells: bool = False
-) -> list[FullLayerData]:
+) -> LayerData:
     """Describe the layers of any result, the lowest first; with `cells`, also its power cells."""
-    functions: dict[ResultKind, Callable[..., list[FullLayerData]]] = {
+    functions: dict[ResultKind, Callable[..., LayerData]] = {
         ResultKind.INVERSION: partial(result_layers, cells=cells),
         ResultKind.FIT: partial(fit_layers, alone=True),
         ResultKind.FILM_DOSES: pack_layers,
@@ -65,7 +65,7 @@ def layers_of_result(
     return functions[result.content.kind](result, frame, name)
 
 
-def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]:
+def layers_of_dataset(dataset: xarray.Dataset, name: str) -> LayerData:
     """Describe the saved layers of a result, the main layers, and its image."""
     name = dataset.attrs.get(_NAME, name)
     looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
@@ -94,7 +94,7 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> list[FullLayerData]
     ]
 
 
-def missing_layers(viewer: Any, layer: Any) -> list[FullLayerData]:
+def missing_layers(viewer: Any, layer: Any) -> LayerData:
     """Describe the layers of a result or store that are missing in a viewer.
 
     `layer` belongs to it. An image that no step changed counts as present.
@@ -223,7 +223,7 @@ def dataset_to_save(layers: Sequence[FullLayerData]) -> xarray.Dataset:
 
 def _common_result(
     layers: Sequence[FullLayerData],
-) -> tuple[list[FullLayerData], Result[AnyResult]]:
+) -> tuple[LayerData, Result[AnyResult]]:
     results = {
         id(result): result for layer in layers if (result := about.result_of(layer[1])) is not None
     }

@@ -9,7 +9,7 @@ import numpy as np
 
 from napari_shadowinv import io
 from napari_shadowinv._napari.layer_metadata import CAME_WITH
-from napari_shadowinv._napari.layers import FullLayerData
+from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.shots import lazy_stack, radiograph_layers, shot_layer
 from napari_shadowinv._napari.viewer_sync import notify_errors
 from napari_shadowinv._typing import AnyArray, FloatArray
@@ -30,19 +30,19 @@ _RUN_SHAPE = (120, 320)
 _RUN_LENGTH = 20
 
 
-def toroid() -> list[FullLayerData]:
+def toroid() -> LayerData:
     """Toroidal field of 97 MG µm, too weak for caustics, under a Gaussian beam."""
     y, x = _coordinates()
     beam = 0.25 + np.exp(-((y - 0.1) ** 2 + (x + 0.15) ** 2) / 1.4)
     return _proton_shot("toroid", _toroid_of(97.0), beam)
 
 
-def toroid_with_caustics() -> list[FullLayerData]:
+def toroid_with_caustics() -> LayerData:
     """Toroidal field of 194 MG µm, at which caustics form, under a uniform beam."""
     return _proton_shot("toroid with caustics", _toroid_of(194.0))
 
 
-def four_toroids() -> list[FullLayerData]:
+def four_toroids() -> LayerData:
     """Four toroids of different strength and size under an uneven beam."""
     phantom = phantoms.four_toroids(_SHAPE, phantoms.paper_setup(), 0.8)
     y, x = _coordinates()
@@ -50,13 +50,13 @@ def four_toroids() -> list[FullLayerData]:
     return _proton_shot("four toroids", phantom, beam)
 
 
-def coaxial_line() -> list[FullLayerData]:
+def coaxial_line() -> LayerData:
     """Field between two conductors that stop the beam; the source holds their shadow."""
     phantom, obstructed = phantoms.coaxial_line(_SHAPE, phantoms.paper_setup())
     return _proton_shot("coaxial line", phantom, np.where(obstructed, 0.0, 1.0))
 
 
-def two_energies() -> list[FullLayerData]:
+def two_energies() -> LayerData:
     """Two opposite toroidal fields at 14.7 and 3 MeV; the beam varies by 10 % and has no image."""
     lengths = {"source_object_distance": 0.01, "object_image_distance": 0.28, "pixel_size": 5e-6}
     films = [{"kind": "proton", "energy": energy, **lengths} for energy in _FILMS]
@@ -76,7 +76,7 @@ def two_energies() -> list[FullLayerData]:
     return layers
 
 
-def wakefield_run() -> list[FullLayerData]:
+def wakefield_run() -> LayerData:
     """Twenty optical shots of a plasma wave that moves, grows and fades, computed when shown."""
     stack = lazy_stack(_wakefield_shot, range(_RUN_LENGTH), _RUN_SHAPE)
     limits = intensity_limits(_wakefield_shot(_RUN_LENGTH // 2))
@@ -87,7 +87,7 @@ def wakefield_run() -> list[FullLayerData]:
 
 # For an image without channels napari adds no layer; it refuses an empty list.
 @notify_errors(otherwise=lambda: [(np.empty((0, 1, 1)), {"channel_axis": 0}, "image")])
-def burner() -> list[FullLayerData]:
+def burner() -> LayerData:
     """Shadowgram of an alcohol burner's plume with its reference beam, downloaded once."""
     reference, frame = (io.read_radiograph(path) for path in fetch_burner())
     return radiograph_layers(replace(frame, source=reference.image), "burner")
@@ -97,9 +97,7 @@ def _toroid_of(peak: float) -> phantoms.Phantom:
     return phantoms.toroid(_SHAPE, phantoms.paper_setup(), peak, 30e-6)
 
 
-def _proton_shot(
-    name: str, phantom: phantoms.Phantom, beam: FloatArray | None = None
-) -> list[FullLayerData]:
+def _proton_shot(name: str, phantom: phantoms.Phantom, beam: FloatArray | None = None) -> LayerData:
     source = None if beam is None else _COUNTS * beam
     undisturbed = np.full(_SHAPE, _COUNTS) if source is None else source
     image = _counts_image(phantom.displacement, undisturbed, seed=1)

@@ -14,7 +14,7 @@ import numpy as np
 from napari_shadowinv import io
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import Frame, frame_for, metadata_for, metadata_of
-from napari_shadowinv._napari.layers import FullLayerData
+from napari_shadowinv._napari.layers import FullLayerData, LayerData
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import show_caution
 from napari_shadowinv._typing import FloatArray
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 
-def radiograph_layers(shot: Radiograph, name: str = "") -> list[FullLayerData]:
+def radiograph_layers(shot: Radiograph, name: str = "") -> LayerData:
     """Describe an image, above its undisturbed beam and its mask of unusable pixels."""
     name = name or ("shot" if shot.path is None else shot.path.stem)
     limits = intensity_limits(shot.image)
     frame = _frame(shot)
-    layers: list[FullLayerData] = []
+    layers: LayerData = []
     facts = _facts(shot, f"the sample '{name}'" if shot.path is None else shot.path.name)
     if shot.source is not None:
         data, keywords, kind = shot_layer(
@@ -132,7 +132,7 @@ def load_radiograph(shot: Radiograph, name: str) -> Radiograph:
     return replace(shot, image=plane_of(shot.image, name), metadata=metadata)
 
 
-def stack_layers(paths: Sequence[Path], name: str = "") -> list[FullLayerData]:
+def stack_layers(paths: Sequence[Path], name: str = "") -> LayerData:
     """Describe a run of shots as a lazy stack; only the first readable shot is read now."""
     # Unreadable shots, or shots of another shape, are zero and give a warning when shown.
     first, index = _first_readable(paths)
@@ -154,7 +154,7 @@ def stack_layers(paths: Sequence[Path], name: str = "") -> list[FullLayerData]:
     return [layer]
 
 
-def frame_layers(frames: xarray.Dataset, name: str) -> list[FullLayerData]:
+def frame_layers(frames: xarray.Dataset, name: str) -> LayerData:
     """Describe the frames of one file as a lazy stack."""
     images = frames["image"].data
     return [shot_layer(images, name, None, intensity_limits(np.asarray(images[0])))]

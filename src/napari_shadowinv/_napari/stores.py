@@ -15,6 +15,7 @@ from napari_shadowinv._napari.events import connect
 from napari_shadowinv._napari.layer_metadata import frame_for, main_layers, metadata_of, role_of
 from napari_shadowinv._napari.layers import (
     FullLayerData,
+    LayerData,
     View,
     arrows_in_shot,
     dataset_layers,
@@ -42,7 +43,7 @@ _CONTRAST_SHOTS = 16
 
 
 @as_file_errors
-def store_layers(path: Path, name: str = "", shot: int | None = None) -> list[FullLayerData]:
+def store_layers(path: Path, name: str = "", shot: int | None = None) -> LayerData:
     """Describe the layers of a ``.shadowinv.zarr`` folder, with the arrows of one shot.
 
     `shot` also sets the units and the contrast. By default, units are those of the first finished

@@ -13,7 +13,7 @@ from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import ImageJob
-from napari_shadowinv._napari.layers import FullLayerData, add_layers
+from napari_shadowinv._napari.layers import FullLayerData, LayerData, add_layers
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import timer
 from napari_shadowinv.preprocessing import Recipe
@@ -78,7 +78,7 @@ class ResultLayers(QObject):
         self._viewer = viewer
         self._layers: dict[str, Any] = {}
         self._order: list[str] = []
-        self._waiting: list[FullLayerData] = []
+        self._waiting: LayerData = []
         self._select, self._before, self._fit = True, None, False
         self._timer = timer(self, 0, self._add_next)
 

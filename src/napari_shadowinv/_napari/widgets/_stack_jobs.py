@@ -16,7 +16,7 @@ from qtpy.QtCore import Signal
 
 from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import KEY, role_of
-from napari_shadowinv._napari.layers import FullLayerData, widen_limits
+from napari_shadowinv._napari.layers import FullLayerData, LayerData, widen_limits
 from napari_shadowinv._napari.stores import first_shot, store_layers
 from napari_shadowinv._napari.widgets._forms import PathEdit, labelled
 from napari_shadowinv._napari.widgets._layers import kind_of
@@ -58,7 +58,7 @@ class StackJob(Job):
     status: RunStatus = field(default_factory=_empty_status)  # the window reads it at any time
     waiting: int = 0  # shots that have not ended, or files that have arrived
     note: str = ""
-    layer_data: list[FullLayerData] = field(default_factory=list)  # empty until a shot is finished
+    layer_data: LayerData = field(default_factory=list)  # empty until a shot is finished
     # Written by the run's thread; the window only reads them.
     _limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     _earlier: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -104,7 +104,7 @@ class StackJob(Job):
     def _progress(self, status: RunStatus) -> Progress:
         return Progress("shots", status.done + status.failed, status.total, status.text)
 
-    def layers(self, content: RunStatus) -> list[FullLayerData]:
+    def layers(self, content: RunStatus) -> LayerData:
         """Return the layers described by the run, which grow with it."""
         return self.layer_data
 
@@ -151,7 +151,7 @@ class StackJob(Job):
                 role = str(role_of(keywords))
                 self._limits[role] = widen_limits(self._limits[role], np.asarray(data[index]))
 
-    def _store_layers(self, shot: int | None) -> list[FullLayerData]:
+    def _store_layers(self, shot: int | None) -> LayerData:
         """Describe the layers of the store; none if that has to wait for the next shot."""
         try:
             layers = store_layers(self.out, shot=shot)
@@ -230,7 +230,7 @@ class WatchJob(StackJob):
     _new_shots: list[int] = field(default_factory=list)  # not in the limits yet
     _updated_at: float = 0.0  # s
     # With shots that the layers do not show yet; the window takes it from the run's thread.
-    _longer_data: list[FullLayerData] | None = None
+    _longer_data: LayerData | None = None
 
     def _start(self, *args: Any, **keywords: Any) -> None:
         from napari_shadowinv.stack import watch_stack

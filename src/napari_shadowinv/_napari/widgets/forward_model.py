@@ -12,7 +12,7 @@ from qtpy.QtWidgets import QLabel, QSpinBox
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
-from napari_shadowinv._napari.layers import FullLayerData
+from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets import _forms as forms
@@ -103,7 +103,7 @@ class ForwardJob(Job):
             image, displacement, source, float(caustic.mean()), flux_inside, assumption
         )
 
-    def layers(self, content: Prediction) -> list[FullLayerData]:
+    def layers(self, content: Prediction) -> LayerData:
         origin = f"{about.CAME_WITH} the forward model, {self.setup_origin}"
         # In another experiment the object may have other pixels.
         frame = self.frame

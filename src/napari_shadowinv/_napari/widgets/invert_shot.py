@@ -8,7 +8,7 @@ from typing import Any
 
 from napari_shadowinv._napari import jobs
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.layers import FullLayerData
+from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.shots import load_radiograph, radiograph_of
 from napari_shadowinv._napari.viewer_sync import show_caution
 from napari_shadowinv._napari.widgets import _forms as forms
@@ -316,7 +316,7 @@ class SourceJob(jobs.Job):
         report("source", 1, 1)
         return source
 
-    def layers(self, content: FloatArray) -> list[FullLayerData]:
+    def layers(self, content: FloatArray) -> LayerData:
         layer: Any = self.image
         metadata = about.metadata_for(
             about.SOURCE,

@@ -11,7 +11,7 @@ import numpy as np
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
-from napari_shadowinv._napari.layers import FullLayerData
+from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _panels as panels
@@ -73,7 +73,7 @@ class PlanJob(Job):
             return sweep_experiment(target, setups, **choices)
         return plan_experiment(target, setups, **choices)
 
-    def layers(self, content: ExperimentPlan | ExperimentSweep) -> list[FullLayerData]:
+    def layers(self, content: ExperimentPlan | ExperimentSweep) -> LayerData:
         """Describe the image of the first draw."""
         plan = content.plans[content.best] if isinstance(content, ExperimentSweep) else content
         setup = plan.setups[0] if plan.setups else None
