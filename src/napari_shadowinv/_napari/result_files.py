@@ -221,9 +221,7 @@ def dataset_to_save(layers: Sequence[FullLayerData]) -> xarray.Dataset:
     return dataset_of_layers(parts, result)
 
 
-def _common_result(
-    layers: Sequence[FullLayerData],
-) -> tuple[LayerData, Result[AnyResult]]:
+def _common_result(layers: Sequence[FullLayerData]) -> tuple[LayerData, Result[AnyResult]]:
     results = {
         id(result): result for layer in layers if (result := about.result_of(layer[1])) is not None
     }

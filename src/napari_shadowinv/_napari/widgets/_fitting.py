@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from napari.utils.notifications import show_warning
@@ -15,7 +15,7 @@ from napari_shadowinv._napari.jobs import Finished, FitJob
 from napari_shadowinv._napari.layer_metadata import Result, main_layers, result_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
-from napari_shadowinv._napari.widgets._panels import ReportTable, RunPanel, fact_rows
+from napari_shadowinv._napari.widgets._panels import ReportTable, Rows, RunPanel, fact_rows
 from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, push_button, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
 from napari_shadowinv.facts import Fact, Verdict
@@ -108,9 +108,7 @@ class FitView(QWidget):
             self._show_report(result.content, result.content.facts)
         return True
 
-    def _show_report(
-        self, fit: Fit, facts: Iterable[Fact], inputs: Sequence[tuple[str, str]] = ()
-    ) -> None:
+    def _show_report(self, fit: Fit, facts: Iterable[Fact], inputs: Rows = ()) -> None:
         style = "" if fit.verdict is Verdict.DETERMINED else forms.PROBLEM_STYLE
         self.verdict.show_titled(f"Verdict: {fit.verdict.value}", f"{fit.explanation}.", style)
         warnings = [("Warning", caution.text) for caution in fit.warnings]

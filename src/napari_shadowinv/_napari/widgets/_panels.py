@@ -35,6 +35,7 @@ from napari_shadowinv.facts import Fact, Headline, Level
 
 
 Work = Callable[[OnProgress, ShouldStop], Any]
+Rows = Sequence[tuple[str, str]]  # of a report: names and values
 
 _MAILBOX_POLL_MS = 10
 _SWITCH_INTERVAL_S = 1e-3
@@ -359,7 +360,7 @@ class ReportTable(QtWidgets.QTableWidget):
         header.setSectionResizeMode(1, QtWidgets.QHeaderView.ResizeMode.Stretch)
         self.setVisible(False)
 
-    def show_rows(self, rows: list[tuple[str, str]]) -> None:
+    def show_rows(self, rows: Rows) -> None:
         self.setRowCount(len(rows))
         for row, texts in enumerate(rows):
             for column, text in enumerate(texts):
@@ -398,7 +399,7 @@ class FoldedReport(QtWidgets.QWidget):
         qt.column(self, self.table, self.details)
         self.empty()
 
-    def show_rows(self, rows: list[tuple[str, str]], details: list[tuple[str, str]]) -> None:
+    def show_rows(self, rows: Rows, details: Rows) -> None:
         self.table.show_rows(rows)
         self._details.show_rows(details)
         self.details.setVisible(bool(details))

@@ -226,9 +226,7 @@ class InvertShot(InversionInputs, panels.LivePanel):
             self._reported = result
             self.reveal(self.verdict)
 
-    def _report(
-        self, inversion: Inversion, setup: Setup | None, input_rows: list[tuple[str, str]]
-    ) -> None:
+    def _report(self, inversion: Inversion, setup: Setup | None, input_rows: panels.Rows) -> None:
         self.verdict.show_headline(inversion.headline_in(setup))
         facts = inversion.facts_in(setup)
         rows = [*panels.warning_rows(facts), *input_rows, *panels.fact_rows(facts)]
@@ -244,7 +242,7 @@ class InvertShot(InversionInputs, panels.LivePanel):
             residual = next(f for f in inversion.facts if f.key == "image_residual")
             self.panel.say(f"{residual.title} {residual.text}")
         else:
-            self._report(inversion, inversion.setup, list(job.inputs))
+            self._report(inversion, inversion.setup, job.inputs)
             if headline.level is not Level.SOUND:
                 show_caution(f"{headline.level.value.capitalize()}: {headline.text}")
             self.reveal(self.verdict)
