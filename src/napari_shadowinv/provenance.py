@@ -171,9 +171,8 @@ class Provenance(CheckedModel):
         """
         content = attributes.get("provenance", "")
         try:
-            return cls.model_validate_json(
-                content if isinstance(content, str) else json.dumps(content)
-            )
+            text = content if isinstance(content, str) else json.dumps(content)
+            return cls.model_validate_json(text)
         except (ValidationError, RecursionError):
             return None
 

@@ -233,9 +233,8 @@ class PackJob(Job):
                     if mask.shape != usable.shape:
                         continue  # `run_film` reports it
                     usable &= mask
-                file = write(
-                    self._file(f"mask_{k + 1:02d}{TIFF.suffix}"), usable.astype(np.float32)
-                )
+                file = self._file(f"mask_{k + 1:02d}{TIFF.suffix}")
+                write(file, usable.astype(np.float32))
                 layers[k] = layers[k].model_copy(update={"mask": file})
             changes["layers"] = tuple(layers)
         return self.pack.model_copy(update=changes), by_hand

@@ -116,9 +116,7 @@ class Grid:
         )
 
 
-def choose_grid(
-    shape: Sequence[int], panels: int, *, foot: float = 0.0, title: bool = True
-) -> Grid:
+def choose_grid(shape: Sequence[int], panels: int, *, foot: float = 0, title: bool = True) -> Grid:
     """Choose the columns for which the page is closest to a slide's 16:10."""
     width, height = panel_size(shape)
     grids = [

@@ -41,9 +41,8 @@ def plan_figure(plan: ExperimentPlan) -> Figure:
     with _panels.shot_page(plan.shape, setup, plan.title, plan.headline) as (figure, panels):
         image = plan.images[0] / plan.options.counts
         panels[0].draw_intensity(image, "First draw", intensity_limits(image))
-        _panels.draw_side_by_side(
-            panels[1:4], {"object": true, "retrieved in the first draw": retrieved}
-        )
+        fields = {"object": true, "retrieved in the first draw": retrieved}
+        _panels.draw_side_by_side(panels[1:4], fields)
         _draw_errors(panels[4].axes, plan)
         _draw_parts(panels[5].axes, plan)
     return figure

@@ -335,13 +335,8 @@ class MaskPicker(QWidget):
         target, meaning = _PAINT[title]
         tip = f"<qt>{meaning}</qt>"
         self.painted_is_unusable = QCheckBox(f"painted = {target}", checked=True, toolTip=tip)
-        qt.column(
-            self,
-            labelled(
-                title, qt.with_button(self.layers, "✎", f"Paint a {title.lower()}.", self.paint)
-            ),
-            labelled("", self.painted_is_unusable),
-        )
+        row = qt.with_button(self.layers, "✎", f"Paint a {title.lower()}.", self.paint)
+        qt.column(self, labelled(title, row), labelled("", self.painted_is_unusable))
         self.layers.picked.connect(self.changed)
         self.painted_is_unusable.toggled.connect(self.changed)
 

@@ -239,9 +239,7 @@ def describe_inputs(
         "inputs": [(title, text) for title, text in rows.items() if text],
         "attributes": {key: text for key, text in saved.items() if text},
         "image": image,
-        "companions": tuple(
-            layer for layer in on_image if layer is not None and layer is not image
-        ),
+        "companions": tuple(each for each in on_image if each is not None and each is not image),
     }
 
 

@@ -121,9 +121,8 @@ class StackJob(Job):
     def continue_from(self, earlier: StackJob, layers: Sequence[Any]) -> None:
         """Take over the contrast of an earlier run into the same store."""
         self._applied.update(earlier._applied)
-        current = {
-            role_of(layer): tuple(layer.contrast_limits) for layer in filter(is_image, layers)
-        }
+        images = filter(is_image, layers)
+        current = {role_of(layer): tuple(layer.contrast_limits) for layer in images}
         for _, keywords, kind in self.layer_data:
             role = str(role_of(keywords))
             if kind == "image" and role in earlier._limits:
@@ -170,9 +169,7 @@ class StackJob(Job):
                 limits = keywords["contrast_limits"]
                 self._limits[str(role_of(keywords))] = limits
                 self._applied.add(limits)
-        self.layer_data.extend(
-            (data, keywords | placement, kind) for data, keywords, kind in layers
-        )
+        self.layer_data += [(data, keywords | placement, kind) for data, keywords, kind in layers]
 
 
 def is_image(layer: Any) -> bool:

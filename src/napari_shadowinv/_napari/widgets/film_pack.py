@@ -466,10 +466,8 @@ class FilmPack(panels.ToolPanel):
         has_result = self.packs.layer is not None
         self.actions.setVisible(has_result)
         if has_result:
-            _, doses = self._selected()
-            self.report.show_rows(
-                [*panels.fact_rows(doses.facts), *panels.warning_rows(doses.facts)]
-            )
+            facts = self._selected()[1].facts
+            self.report.show_rows([*panels.fact_rows(facts), *panels.warning_rows(facts)])
         self.update_plot()
 
     def _schedule_plot(self) -> None:

@@ -91,9 +91,8 @@ class FitImages(ToolPanel):
         self.setup_section = forms.titled_section(self.setup)
         self.steps = forms.StepsSection(FIT_STEPS)
         self.instrument = inputs.InstrumentForm()
-        self.options = inputs.OptionsForm(
-            FitOptions, {"smoothness": 1.0, "margin": 16, "threads": 1}
-        )
+        initial = {"smoothness": 1.0, "margin": 16, "threads": 1}
+        self.options = inputs.OptionsForm(FitOptions, initial)
         self.recipes = FitRecipeButton(self)
         self.cost = forms.WrappingLabel()
         self.view = FitView(self.viewer, self.panel)

@@ -99,9 +99,8 @@ class ForwardJob(Job):
         if shadow is not None:
             caustic &= ~shadow
         flux_inside = float(image.sum() / flux) if flux else 1.0
-        return Prediction(
-            image, displacement, source, float(caustic.mean()), flux_inside, assumption
-        )
+        share = float(caustic.mean())
+        return Prediction(image, displacement, source, share, flux_inside, assumption)
 
     def layers(self, content: Prediction) -> LayerData:
         origin = f"{about.CAME_WITH} the forward model, {self.setup_origin}"
