@@ -143,6 +143,5 @@ def _image_layers(
 def _full_size(displacement: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     """Interpolate values at every second pixel, between pixel pairs, to all pixels."""
     points = (np.mgrid[: shape[0], : shape[1]] - 0.5) / 2
-    return np.stack(
-        [map_coordinates(plane, points, order=1, mode="nearest") for plane in displacement]
-    )
+    planes = [map_coordinates(plane, points, order=1, mode="nearest") for plane in displacement]
+    return np.stack(planes)

@@ -413,9 +413,8 @@ def sample_arrows(field: FloatArray) -> tuple[FloatArray, float]:
     """Sample long vectors (y, x) on a grid: starts and vectors (n, 2, 2), and the spacing."""
     height, width = field.shape[1:]
     step = max(1, -(-max(height, width) // _MAX_ARROWS_PER_SIDE))
-    rows, columns = (
-        index.ravel() for index in np.mgrid[step // 2 : height : step, step // 2 : width : step]
-    )
+    grid = np.mgrid[step // 2 : height : step, step // 2 : width : step]
+    rows, columns = (index.ravel() for index in grid)
     starts = np.column_stack([rows, columns])
     data = np.stack([starts, field[:, rows, columns].T], axis=1).astype(np.float64)
     lengths = np.hypot(*data[:, 1].T)

@@ -144,9 +144,8 @@ def spectrum_in(doses: FilmDoses, region: BoolArray | None = None) -> Spectrum:
 
     def reduce(planes: FloatArray, statistic: Callable[[AnyArray], Any]) -> FloatArray:
         films = zip(planes, inside, strict=True)
-        return np.array(
-            [statistic(plane[used]) if used.any() else np.nan for plane, used in films], float
-        )
+        values = [statistic(plane[used]) if used.any() else np.nan for plane, used in films]
+        return np.array(values, float)
 
     fluence = reduce(doses.fluence, partial(np.mean, dtype=np.float64))
     error = reduce(doses.fluence_error, np.median)

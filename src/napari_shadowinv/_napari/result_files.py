@@ -222,9 +222,8 @@ def dataset_to_save(layers: Sequence[FullLayerData]) -> xarray.Dataset:
 
 
 def _common_result(layers: Sequence[FullLayerData]) -> tuple[LayerData, Result[AnyResult]]:
-    results = {
-        id(result): result for layer in layers if (result := about.result_of(layer[1])) is not None
-    }
+    owners = [about.result_of(layer[1]) for layer in layers]
+    results = {id(result): result for result in owners if result is not None}
     if len(results) > 1:
         names = [_name(layer) for layer in layers if about.result_of(layer[1]) is not None]
         raise InputError(

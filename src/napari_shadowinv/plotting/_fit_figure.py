@@ -217,13 +217,11 @@ def windows_figure(windows: FitWindows, *, title: str | None = None) -> Figure:
     with _panels.new_page(grid, scale, heading, header, [(text, QUIET_COLOUR)]) as (figure, panels):
         for m, field in enumerate(windows.fits[0].fields):
             block = panels[m * rows * columns : (m + 1) * rows * columns]
-            in_units = shown_fields(
-                list(displacement[:, m]), windows.setup, deflector_titles()[field.name]
-            )
+            deflector = deflector_titles()[field.name]
+            in_units = shown_fields(list(displacement[:, m]), windows.setup, deflector)
             names = [f"{field.name}: " * (fields > 1) + _name(windows, w) for w in range(count)]
-            _panels.draw_side_by_side(
-                block[: count + 1], dict(zip(names, in_units, strict=True)), common=True
-            )
+            by_name = dict(zip(names, in_units, strict=True))
+            _panels.draw_side_by_side(block[: count + 1], by_name, common=True)
             for panel in block[count + 1 :]:
                 panel.axes.remove()
     return figure

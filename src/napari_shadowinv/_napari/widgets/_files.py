@@ -340,9 +340,8 @@ def result_to_save(viewer: Any, layer: Any) -> Savable:
     result = about.result_of(layer)
     if result is None:
         raise InputError(f"'{layer.name}' shows no result: select a layer of a result")
-    layer_data = [
-        each.as_layer_data_tuple() for each in viewer.layers if about.result_of(each) is result
-    ]
+    layers = [each for each in viewer.layers if about.result_of(each) is result]
+    layer_data = [each.as_layer_data_tuple() for each in layers]
     formats = _formats_for(result.content.kind, result.setup)
     return Savable(name_of_result(layer), dataset_to_save(layer_data), formats)
 

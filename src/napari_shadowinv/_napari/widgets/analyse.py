@@ -108,11 +108,8 @@ class Analyse(qt.Docked):
         qt.while_alive(self, self.viewer.dims, "current_step", self._schedule_plot)
         qt.layers_while_alive(self, self.viewer.layers, "set_data", self._on_layer)
         self.lines.picked.connect(self._schedule_plot)
-        for signal in (
-            self.layers.itemChanged,
-            self.width_edit.valueChanged,
-            self.width_unit.currentIndexChanged,
-        ):
+        widths = self.width_edit.valueChanged, self.width_unit.currentIndexChanged
+        for signal in (self.layers.itemChanged, *widths):
             signal.connect(lambda _: self._schedule_plot())
 
     def _items(self) -> list[tuple[Any, Any]]:
@@ -242,9 +239,8 @@ class Analyse(qt.Docked):
 
     @qt.notify_errors
     def _draw(self) -> None:
-        images = self.checked() or [
-            layer for layer in self.viewer.layers if kind_of(layer) == "image"
-        ]
+        layers = self.viewer.layers
+        images = self.checked() or [layer for layer in layers if kind_of(layer) == "image"]
         if not images:
             raise InputError(
                 "there is no image to draw a line on: open one (File → Open) or use a sample "

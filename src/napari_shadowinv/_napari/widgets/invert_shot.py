@@ -184,9 +184,8 @@ class InvertShot(InversionInputs, panels.LivePanel):
         self.refine_section.folded.expand()
         image = self._last.shot_of(layer)
         name = jobs.name_of_result(layer) if image is None else str(image.name)
-        job = jobs.refinement(
-            layer, layer if image is None else image, name, self.refine_section.psf.value()
-        )
+        psf = self.refine_section.psf.value()
+        job = jobs.refinement(layer, layer if image is None else image, name, psf)
         if self.panel.runner.running and not self._running_preview:
             raise InputError(
                 "Invert shot is running: wait until it finishes, or press Cancel, then refine"
