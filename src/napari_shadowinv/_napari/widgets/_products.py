@@ -226,11 +226,7 @@ class ProductForm(QtWidgets.QWidget):
         samples = self.samples.value()
 
         def work(on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
-            common: dict[str, Any] = {
-                "unit": unit,
-                "on_progress": on_progress,
-                "should_stop": should_stop,
-            }
+            common: Any = {"unit": unit, "on_progress": on_progress, "should_stop": should_stop}
             if isinstance(origin, Path):
                 stack = open_shots(origin, shots)
                 seconds = _seconds(times, stack["index"].values.tolist())

@@ -270,15 +270,8 @@ class SpectrumPlot(qt.Plot):
         if spectrum is None:
             return
         (axis,) = self.fresh_axes()
-        axis.errorbar(
-            spectrum.energies,
-            spectrum.fluence,
-            spectrum.error,
-            fmt="o-",
-            color=qt.COLOURS[0],
-            markersize=4,
-            capsize=2,
-        )
+        style = {"fmt": "o-", "color": qt.COLOURS[0], "markersize": 4, "capsize": 2}
+        axis.errorbar(spectrum.energies, spectrum.fluence, spectrum.error, **style)
         layers = zip(spectrum.bands, spectrum.energies, spectrum.is_measured, strict=True)
         for band, energy, is_measured in layers:
             if not is_measured:

@@ -57,21 +57,16 @@ class PlanJob(Job):
     def run(
         self, on_progress: OnProgress, should_stop: ShouldStop
     ) -> ExperimentPlan | ExperimentSweep:
-        choices: dict[str, Any] = {
-            "shape": self.shape,
-            "instrument": self.instrument,
-            "options": self.options,
-            "on_progress": on_progress,
-            "should_stop": should_stop,
-        }
+        choices = {"shape": self.shape, "instrument": self.instrument, "options": self.options}
+        keywords: Any = {**choices, "on_progress": on_progress, "should_stop": should_stop}
         setups, target = self.setups or None, self.object
         if isinstance(target, GridFile):
             Reporter(on_progress, should_stop)("field", 0, None)
             target = object_of_file(Path(target.path), next(iter(self.setups), None), target.view)
         if self.quantity:
-            choices |= {"quantity": self.quantity, "values": self.values}
-            return sweep_experiment(target, setups, **choices)
-        return plan_experiment(target, setups, **choices)
+            keywords |= {"quantity": self.quantity, "values": self.values}
+            return sweep_experiment(target, setups, **keywords)
+        return plan_experiment(target, setups, **keywords)
 
     def layers(self, content: ExperimentPlan | ExperimentSweep) -> LayerData:
         """Describe the image of the first draw."""
