@@ -288,14 +288,9 @@ def _select_image(
         steps = [0] * data.ndim if viewer is None else viewer.dims.current_step
         index = tuple(int(step) for step in steps[-data.ndim : -2])
         data, name = data[index], f"{name} {','.join(map(str, index))}"
-    return _Selection(
-        radiograph_of(layer, np.asarray(data)),
-        name,
-        frame_of(layer),
-        about.setup_of(layer),
-        about.setup_origin_of(layer),
-        about.role_of(layer),
-    )
+    shot, frame = radiograph_of(layer, np.asarray(data)), frame_of(layer)
+    setup, origin = about.setup_of(layer), about.setup_origin_of(layer)
+    return _Selection(shot, name, frame, setup, origin, about.role_of(layer))
 
 
 def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> list[Any]:
@@ -336,12 +331,8 @@ def _moved_layer(
     selection: _Selection, layer: Any, step: Step, title: str
 ) -> results.FullLayerData:
     """Return an image after a step that moves pixels, with its source and usable pixels."""
-    shot = replace(
-        selection.shot,
-        setup=selection.setup,
-        source=about.source_of(layer),
-        mask=about.usable_of(layer),
-    )
+    source, usable = about.source_of(layer), about.usable_of(layer)
+    shot = replace(selection.shot, setup=selection.setup, source=source, mask=usable)
     moved = step.apply(shot)
     frame = selection.frame.beneath(step.matrix(shot.shape))
     selection = replace(selection, shot=moved, frame=frame, setup=moved.setup)

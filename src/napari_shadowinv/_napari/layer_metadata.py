@@ -49,12 +49,9 @@ class Frame:
         # napari's order: first the scale, which alone may mirror, then the shear.
         signs = np.sign(upright[0, 0]) * np.array([1.0, np.round(np.linalg.det(rotate))])
         rotate, upright = rotate * signs, signs[:, None] * upright
-        return replace(
-            translated,
-            scale=(float(upright[0, 0]), float(upright[1, 1])),
-            shear=float(upright[0, 1] / upright[1, 1]),
-            rotate=matrix_of(rotate),
-        )
+        scale = float(upright[0, 0]), float(upright[1, 1])
+        shear = float(upright[0, 1] / upright[1, 1])
+        return replace(translated, scale=scale, shear=shear, rotate=matrix_of(rotate))
 
     def keywords(self, *, stacked: bool = False, stack_axis: str = "shot") -> dict[str, Any]:
         """Return the keywords that place a layer; `stacked` if an axis of shots comes first."""

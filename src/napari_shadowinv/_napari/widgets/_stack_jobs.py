@@ -80,16 +80,9 @@ class StackJob(Job):
             on_progress(self._progress(status))
 
         on_progress(Progress("prepare", 0, None, "shots and source"))
-        self._start(
-            self.shots,
-            self.out,
-            self.recipe,
-            source=self.source,
-            mask=self.mask,
-            source_mask=self.source_mask,
-            on_progress=update,
-            should_stop=should_stop,
-        )
+        beam = {"source": self.source, "mask": self.mask, "source_mask": self.source_mask}
+        callbacks = {"on_progress": update, "should_stop": should_stop}
+        self._start(self.shots, self.out, self.recipe, **beam, **callbacks)
         return self.status
 
     def _start(self, *args: Any, **keywords: Any) -> None:

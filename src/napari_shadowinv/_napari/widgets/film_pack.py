@@ -87,11 +87,9 @@ class NewPackDialog(QtWidgets.QDialog):
         """Write the pack file, or show the problem."""
         try:
             path = self._folder / film_files.PACK_FILE
-            self.written = film_files.write_new_pack(
-                self._folder,
-                self.entries(),
-                overwrite=path.exists() and qt.may_replace(self, "New film pack", path),
-            )
+            entries = self.entries()
+            overwrite = path.exists() and qt.may_replace(self, "New film pack", path)
+            self.written = film_files.write_new_pack(self._folder, entries, overwrite=overwrite)
         except (InputError, OSError, ValueError) as error:
             self._problem.show_text(str(error))
             return

@@ -75,12 +75,9 @@ def estimate_cost(
     """Estimate an inversion that takes `pace` times the reference time on this machine."""
     pixels = shape[0] * shape[1]
     sites = options.n_sites or min(pixels, MAX_DEFAULT_SITES)
-    return CostEstimate(
-        pixels,
-        sites,
-        pace * (_SECONDS_PER_PIXEL * pixels + _SECONDS_PER_SITE * sites),
-        _BYTES + _BYTES_PER_PIXEL * pixels + _BYTES_PER_SITE * sites,
-    )
+    seconds = pace * (_SECONDS_PER_PIXEL * pixels + _SECONDS_PER_SITE * sites)
+    memory = _BYTES + _BYTES_PER_PIXEL * pixels + _BYTES_PER_SITE * sites
+    return CostEstimate(pixels, sites, seconds, memory)
 
 
 class InvertShot(InversionInputs, panels.LivePanel):
@@ -148,11 +145,9 @@ class InvertShot(InversionInputs, panels.LivePanel):
         recipe = self.recipe()
         mask = self.masks.usable(layer)
         self.source.check(mask)
+        warnings, hidden = layers.warnings_of(layer), self.hidden_from_source(layer)
         shot = replace(
-            radiograph_of(layer, image),
-            warnings=layers.warnings_of(layer),
-            mask=mask,
-            source_mask=self.hidden_from_source(layer),
+            radiograph_of(layer, image), warnings=warnings, mask=mask, source_mask=hidden
         )
         source = self.source.measured(layer)
         return jobs.InversionJob(
