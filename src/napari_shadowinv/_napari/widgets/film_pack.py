@@ -210,15 +210,10 @@ class CornerEditor(QObject):
         from napari.layers import Image, Shapes
 
         self.scan = Image(pixels, rgb=True, name=f"scan of {title}", **placement)
-        self.polygon = Shapes(
-            [corners],
-            shape_type="polygon",
-            name=f"corners of {title}",
-            face_color="transparent",
-            edge_color=_COLOUR,
-            edge_width=max(1.0, max(size) / 200),
-            **placement,
-        )
+        width = max(1.0, max(size) / 200)
+        look: Any = {"face_color": "transparent", "edge_color": _COLOUR, "edge_width": width}
+        self.polygon = Shapes([corners], shape_type="polygon", **look, **placement)
+        self.polygon.name = f"corners of {title}"
         for layer, role in ((self.scan, "scan"), (self.polygon, "corners")):
             layer.metadata = about.metadata_for(role, "")
             self._viewer.layers.append(layer)
