@@ -73,7 +73,7 @@ class TimeEstimate:
 
     @property
     def samples(self) -> int:
-        """Number of random fields, with as many as the evidence takes time."""
+        """Number of random fields, plus as many as take the time of the evidence."""
         samples = self.options.samples if self.options.samples > 1 else 0
         return samples + (_EVIDENCE_IN_SAMPLES if self.options.evidence else 0)
 

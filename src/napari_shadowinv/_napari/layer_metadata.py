@@ -133,7 +133,7 @@ def place_image(layer: Any, setup: Setup) -> None:
     layer.axis_labels = (*layer.axis_labels[:-2], "y", "x")
 
 
-_LayerData = tuple[Any, dict[str, Any], str]
+_LayerTuple = tuple[Any, dict[str, Any], str]
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ MASKED_ROLES = {"reprojection", "residual", "potential", "field y", "field x", "
 MASKED_ROLES |= {"uncertainty", "significance"}
 
 
-def main_layers(layer_data: Sequence[_LayerData], also: Collection[str] = ()) -> list[_LayerData]:
+def main_layers(layer_data: Sequence[_LayerTuple], also: Collection[str] = ()) -> list[_LayerTuple]:
     """Select the layers shown by default, and layers whose keys are in `also`."""
     return [
         layer
