@@ -216,7 +216,9 @@ def source_windows() -> None:
     invert_shot.image.layer = viewer.layers["four toroids"]
     invert_shot.source.set_kind("polynomial")
     press_run(invert_shot)
-    print(invert_shot.report.texts())
+    table = invert_shot.report.table
+    for row in range(table.rowCount()):
+        print(*(table.item(row, column).text() for column in (0, 1)), sep=": ")
     photograph(viewer, "tutorial-source-field.png")
 
 
