@@ -13,6 +13,7 @@ from napari_shadowinv.preprocessing import (
     remove_background,
     remove_hot_pixels,
 )
+from napari_shadowinv.preprocessing.filters import LowPassFilter
 from napari_shadowinv.preprocessing.pixels import nonnegative_fit
 
 SHAPE = (48, 60)
@@ -282,6 +283,18 @@ def test_arrays_that_are_no_images_are_refused(name, image, words):
 def test_options_that_make_no_sense_are_refused(call, words):
     with pytest.raises(InputError, match=words):
         call(random_image())
+
+
+def test_a_function_with_further_keywords_receives_the_mask():
+    """One that does not name it takes it, too, as ``**options``."""
+    mask, received = np.ones((4, 4), bool), {}
+
+    def record(image, **options):
+        received.update(options)
+        return image
+
+    LowPassFilter(width=2.0).call(record, np.ones((4, 4)), mask=mask, should_stop=None)
+    assert received == {"width": 2.0, "mask": mask, "should_stop": None}
 
 
 def test_a_nonnegative_fit_agrees_with_another_program():

@@ -166,9 +166,10 @@ class Choice(CheckedModel):
 
     def call(self, function: Callable[..., FloatArray], *args: Any, **options: Any) -> FloatArray:
         """Call a function with the parameters, and with those of the options that it takes."""
-        names = inspect.signature(function).parameters
-        taken = {name: value for name, value in options.items() if name in names}
-        return function(*args, **self.values(), **taken)
+        parameters = inspect.signature(function).parameters
+        if not any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
+            options = {name: value for name, value in options.items() if name in parameters}
+        return function(*args, **self.values(), **options)
 
     @property
     def summary(self) -> str:
