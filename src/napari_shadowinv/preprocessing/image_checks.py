@@ -487,20 +487,17 @@ def dark_level(planes: Sequence[CheckedImage]) -> float:
     offsets = [_offset(plane.noise_bins / mean, math.inf, _MIN_GAIN) for plane in planes]
     if len(planes) > 1:
         both = np.concatenate([plane.noise_bins for plane in planes], axis=1) / mean
-        offsets.append(_offset(both, _common_pattern(*planes), _MIN_SHARED_GAIN))
+        # Most relative variance that both may have in common, as by uneven pixels
+        product = planes[0].relative_differences * planes[1].relative_differences
+        error = float(product.std()) / math.sqrt(_INDEPENDENT_SHARE * len(product))
+        pattern = max(float(product.mean()), 0.0) + _PATTERN_DEVIATIONS * error
+        offsets.append(_offset(both, pattern, _MIN_SHARED_GAIN))
     return max(offsets)
 
 
 def _clip_limit(sizes: FloatArray) -> float:
     """Return the largest absolute difference that counts."""
     return _CLIP_DEVIATIONS * NORMAL_MAD * float(np.median(sizes))
-
-
-def _common_pattern(first: CheckedImage, second: CheckedImage) -> float:
-    """Most relative variance that two images may have in common, as by uneven pixels."""
-    product = first.relative_differences * second.relative_differences
-    error = float(product.std()) / math.sqrt(_INDEPENDENT_SHARE * len(product))
-    return max(float(product.mean()), 0.0) + _PATTERN_DEVIATIONS * error
 
 
 def _offset(bins: FloatArray, max_pattern: float, min_gain: float) -> float:
