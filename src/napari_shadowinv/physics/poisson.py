@@ -60,7 +60,16 @@ def poisson_invert(image: ArrayLike, *, source: ArrayLike | None = None) -> Floa
     if source is None:
         ratio = target * (target.size / flux)
     else:
-        beam = _checked_source(source, target.shape)
+        beam = _checked("source", source)
+        if beam.shape != target.shape:
+            raise InputError(
+                f"source has shape {beam.shape}, image {target.shape}: they must match"
+            )
+        if dark := np.count_nonzero(beam <= 0):
+            raise InputError(
+                f"source has {dark} pixels that are zero or negative: the linear inversion divides "
+                "by the source, so raise these pixels to a small positive floor"
+            )
         ratio = target * (beam.sum() / flux) / beam
     # The cosines are even about the image's edges, half a pixel outside the outermost centres.
     rows, columns = (np.pi * np.arange(count) / count for count in target.shape)
@@ -131,16 +140,3 @@ def _checked(name: str, values: ArrayLike) -> FloatArray:
     array = np.ascontiguousarray(check_plane(plain, name), dtype=np.float64)
     check_finite(name, array)
     return array
-
-
-def _checked_source(source: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    beam = _checked("source", source)
-    if beam.shape != shape:
-        raise InputError(f"source has shape {beam.shape}, image {shape}: they must match")
-    dark = np.count_nonzero(beam <= 0)
-    if dark:
-        raise InputError(
-            f"source has {dark} pixels that are zero or negative: the linear inversion divides "
-            "by the source, so raise these pixels to a small positive floor"
-        )
-    return beam

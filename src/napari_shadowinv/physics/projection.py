@@ -178,7 +178,16 @@ def transferred_displacement(
     factor = displacement_ratio(recorded_with, setup, deflector=deflector, dispersion=dispersion)
     ratio = setup.object_pixel_size / recorded_with.object_pixel_size
     old = (field.shape[1], field.shape[2])
-    size = _covered_shape(old, ratio) if shape is None else _checked_shape(shape, old, ratio, setup)
+    if shape is None:
+        size = _covered_shape(old, ratio)
+    else:
+        size, most = checked_shape(shape, "the other image"), _covered_shape(old, ratio)
+        if shape[0] > most[0] or shape[1] > most[1]:
+            raise InputError(
+                f"the other image has shape {tuple(shape)} with pixels of "
+                f"{setup.object_pixel_size * 1e6:.4g} µm at the object, but the field is known "
+                f"only on {most} of them: crop the source or reduce the shape to that"
+            )
     if size == old and math.isclose(ratio, 1, rel_tol=_SIZE_TOLERANCE):
         return factor * field
     return factor * _resample(field, size, ratio)
@@ -243,19 +252,6 @@ def _covered_shape(old: tuple[int, int], ratio: float) -> tuple[int, int]:
             f"least {MIN_SIDE_PX} × {MIN_SIDE_PX}; check the pixel sizes"
         )
     return height, width
-
-
-def _checked_shape(
-    shape: tuple[int, int], old: tuple[int, int], ratio: float, setup: Setup
-) -> tuple[int, int]:
-    size, most = checked_shape(shape, "the other image"), _covered_shape(old, ratio)
-    if shape[0] > most[0] or shape[1] > most[1]:
-        raise InputError(
-            f"the other image has shape {tuple(shape)} with pixels of "
-            f"{setup.object_pixel_size * 1e6:.4g} µm at the object, but the field is known only "
-            f"on {most} of them: crop the source or reduce the shape to that"
-        )
-    return size
 
 
 def _resample(field: FloatArray, shape: tuple[int, int], ratio: float) -> FloatArray:

@@ -290,23 +290,17 @@ def trace(
     else:
         exposure = _fluence(flight, reach, profile, threads)
     return TracedImage(
-        image=exposure.image,
-        source=exposure.source,
+        **vars(exposure) | {"steps": int(straight.steps.sum()) + exposure.steps},
         displacement=straight.displacement.reshape(plane),
         deflection=straight.deflection.reshape(plane),
         path_integrated_b=lines[:2],
         path_integrated_e=lines[2:],
-        launched=exposure.launched,
-        landed=exposure.landed,
         outside=exposure.launched - exposure.landed - exposure.lost,
-        lost=exposure.lost,
         setup=setup,
         options=options,
         seed=seed,
         length=grid.length,
         edge_share=grid.edge_share,
-        steps=int(straight.steps.sum()) + exposure.steps,
-        particles=exposure.particles,
     )
 
 
