@@ -253,7 +253,7 @@ def _of_inversion(
     inversion: Inversion, setup: Setup | None, unit: FieldUnit | None, deflector: str | None
 ) -> Iterator[SampledField]:
     frame = make_frame(
-        setup or inversion.setup, inversion.mask, unit, deflector,
+        setup, inversion.mask, unit, deflector,
         image=np.where(inversion.mask, inversion.image * inversion.report.flux_scale, np.nan),
         source=np.where(inversion.mask, inversion.source * inversion.report.flux_scale, np.nan),
     )  # fmt: skip
@@ -267,7 +267,6 @@ def _of_inversion(
 def _of_fit(
     fit: Fit, setup: Setup | None, unit: FieldUnit | None, deflector: str | None
 ) -> Iterator[SampledField]:
-    setup = setup or fit.setup
     for field in fit.fields:
         if deflector not in (None, field.name):
             continue
@@ -301,7 +300,7 @@ def _of_field(
         else potential_from_displacement(displacement)
     )
     mask = np.asarray(np.isfinite(displacement).all(axis=0))
-    frame = make_frame(setup or retrieved.setup, mask, unit, deflector)
+    frame = make_frame(setup, mask, unit, deflector)
     yield SampledField(frame, potential, displacement, Instrument())
 
 

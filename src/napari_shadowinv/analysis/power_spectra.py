@@ -25,7 +25,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.optimize import minimize_scalar
 
-from napari_shadowinv._system.progress import Reporter, ShouldStop
+from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import invert
@@ -249,22 +249,25 @@ def measure_response(
     """
     ratio = np.ones(len(spectrum.k))
     spread, contrast = np.zeros(len(spectrum.k)), 0.0
+    # Means over neighbouring rings, weighted by their modes
+    numbers = np.arange(1, len(spectrum.k) + 1)
+    reach = np.maximum(1.0, _SMOOTHED_SHARE * numbers)[:, None]
+    smooth = np.where(np.abs(numbers[:, None] - numbers) <= reach, spectrum.modes, 0.0)
+    smooth /= smooth.sum(axis=1, keepdims=True)
     total, done = _CORRECTIONS + phantoms, 0
     for count in (*(1,) * _CORRECTIONS, phantoms):
         # The same random numbers in each pass, so that the passes differ by the spectrum alone.
         rng = np.random.default_rng(seed)
         power = spectrum.power / np.maximum(ratio, _SMALLEST_RESPONSE)
-        density = _density_of(spectrum.k, power)
         pairs = []
         for _ in range(count):
             report("response", done, total)
-            pairs.append(_phantom_spectra(density, weights, n_sites, rng, report.should_stop))
+            pairs.append(_phantom_spectra(spectrum.k, power, weights, n_sites, rng, report))
             done += 1
         true = np.array([pair[0].power for pair in pairs])
         retrieved = np.array([pair[1].power for pair in pairs])
         contrast = float(np.mean([pair[2] for pair in pairs]))
         logarithms = np.log(np.maximum(retrieved, 1e-300) / np.maximum(true, 1e-300))
-        smooth = _ring_smoother(spectrum)
         smoothed = logarithms @ smooth.T
         ratio = np.exp(smoothed.mean(axis=0))
         if count > 1:
@@ -273,37 +276,26 @@ def measure_response(
     return Response(ratio, spread, contrast)
 
 
-def _ring_smoother(spectrum: RingSpectrum) -> FloatArray:
-    """Return the matrix of a mean over neighbouring rings, weighted by their modes."""
-    numbers = np.arange(1, len(spectrum.k) + 1)
-    reach = np.maximum(1.0, _SMOOTHED_SHARE * numbers)[:, None]
-    distance = np.abs(numbers[:, None] - numbers)
-    smoother = np.where(distance <= reach, spectrum.modes, 0.0)
-    return np.asarray(smoother / smoother.sum(axis=1, keepdims=True))
-
-
-def _density_of(k: FloatArray, power: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return a ring-averaged spectrum as a function; none beyond the rings."""
-    density = np.maximum(power, 0.0) / (2 * np.pi * k)
-    return lambda at: np.where(at <= k[-1], np.interp(at, k, density), 0.0)
-
-
 def _phantom_spectra(
-    density: Callable[[FloatArray], FloatArray],
+    k: FloatArray,
+    power: FloatArray,
     weights: FloatArray,
     n_sites: int,
     rng: np.random.Generator,
-    should_stop: ShouldStop | None,
+    report: Reporter,
 ) -> tuple[RingSpectrum, RingSpectrum, float]:
     """Return the spectra of a random field and of its inversion, and its r.m.s. divergence."""
     margins = [int(np.ceil(_MARGIN * count)) for count in weights.shape]
     height, width = (count + 2 * m for count, m in zip(weights.shape, margins, strict=True))
     inner = tuple(slice(margin, -margin) for margin in margins)
-    potential, displacement = random_displacement(density, (height, width), rng)
+    density = np.maximum(power, 0.0) / (2 * np.pi * k)  # none beyond the rings
+    potential, displacement = random_displacement(
+        lambda at: np.interp(at, k, density, right=0.0), (height, width), rng
+    )
     image = synthetic_image(displacement)[inner]
     options = InversionOptions(n_sites=n_sites, noise_level=1e-3)
     source = np.ones(weights.shape)
-    inversion = invert(image, source=source, options=options, should_stop=should_stop)
+    inversion = invert(image, source=source, options=options, should_stop=report.should_stop)
     divergence = sum(np.gradient(part, axis=axis) for axis, part in enumerate(displacement))
     contrast = float(np.std(np.asarray(divergence)[inner]))
     true = ring_spectrum(potential[inner], weights)

@@ -443,11 +443,14 @@ class TurbulenceSpectrum(Product):
             power = self._interpolated(window, spectrum)
             slopes.append(fit_exponent(window.k[inside], power[inside], window.modes[inside]))
             modes = float(window.modes[inside].sum())
-        expected = _exponent_error(spectrum.k[rings], spectrum.modes[rings])
+        # Of an exponent by maximum likelihood, for Gaussian modes
+        logarithm, weights = np.log(spectrum.k[rings]), spectrum.modes[rings]
+        mean = np.average(logarithm, weights=weights)
+        expected = float(1 / np.sqrt(np.sum(weights * (logarithm - mean) ** 2)))
         if len(slopes) < _SUBWINDOWS:
             return expected
         # The parts hold fewer modes than the window as a whole.
-        ratio = modes / float(spectrum.modes[rings].sum())
+        ratio = modes / float(weights.sum())
         return max(float(np.std(slopes, ddof=1)) * math.sqrt(ratio), expected)
 
     def _interpolated(self, window: RingSpectrum, spectrum: RingSpectrum) -> FloatArray:
@@ -513,10 +516,3 @@ def _longest_run(rings: BoolArray) -> BoolArray:
         longest = int(np.argmax(stops - starts))
         run[starts[longest] : stops[longest]] = True
     return run
-
-
-def _exponent_error(k: FloatArray, modes: FloatArray) -> float:
-    """Return the standard error of an exponent for a power law with Gaussian modes."""
-    logarithm = np.log(k)
-    mean = np.average(logarithm, weights=modes)
-    return float(1 / np.sqrt(np.sum(modes * (logarithm - mean) ** 2)))
