@@ -156,8 +156,7 @@ def check_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str = "imag
     if mask is None:
         return np.ones(shape, dtype=np.bool_)
     usable = np.asarray(mask)
-    if usable.shape != shape:
-        raise InputError(f"mask has shape {usable.shape}, {name} {shape}: they must match")
+    check_shape("mask", usable.shape, shape, name)
     if usable.dtype != np.bool_:
         raise InputError(
             f"mask has values of type {usable.dtype}, expected booleans, true where a pixel is "
@@ -166,6 +165,14 @@ def check_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str = "imag
     if not usable.any():
         raise InputError("mask is false everywhere, expected true where a pixel is usable")
     return usable
+
+
+def check_shape(
+    name: str, shape: tuple[int, ...], expected: tuple[int, ...], of: str = "image"
+) -> None:
+    """Raise an `InputError` if an array's shape is not that of the image, or of something else."""
+    if shape != expected:
+        raise InputError(f"{name} has shape {shape}, {of} {expected}: they must match")
 
 
 def as_numbers(name: str, values: ArrayLike) -> FloatArray:

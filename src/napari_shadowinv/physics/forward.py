@@ -24,7 +24,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import PIXELS, VECTOR, check_finite, plain_array
+from napari_shadowinv._system.arrays import PIXELS, VECTOR, check_finite, check_shape, plain_array
 from napari_shadowinv._system.machine import available_threads, in_ranges
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
@@ -422,7 +422,8 @@ def synthetic_image(
         return top, window
 
     report = Reporter(on_progress, should_stop)
-    bands = _bands(shape[0])
+    count = min(_MOST_BANDS, max(1, shape[0] // _MIN_BAND_ROWS))
+    bands = list(itertools.pairwise(shape[0] * k // count for k in range(count + 1)))
     image = np.zeros(shape)
     report("image", 0, len(bands))
     pool = ThreadPoolExecutor(available)
@@ -536,10 +537,7 @@ def _checked_source(source: ArrayLike | None, shape: tuple[int, int]) -> FloatAr
     if source is None:
         return np.ones(shape)
     plain = plain_array(source, "source")
-    if plain.shape != shape:
-        raise InputError(
-            f"source has shape {plain.shape}, displacement describes {shape}: they must match"
-        )
+    check_shape("source", plain.shape, shape, "displacement describes")
     flux = np.ascontiguousarray(plain, dtype=np.float64)
     check_finite("source", flux)
     if flux.min() < 0:
@@ -550,12 +548,6 @@ def _checked_source(source: ArrayLike | None, shape: tuple[int, int]) -> FloatAr
     if flux.max() == 0:
         raise InputError("source is zero everywhere: at least one pixel must have flux")
     return flux
-
-
-def _bands(height: int) -> list[tuple[int, int]]:
-    """Cut the rows of the source into bands, always the same ones for a height."""
-    count = min(_MOST_BANDS, max(1, height // _MIN_BAND_ROWS))
-    return list(itertools.pairwise(height * k // count for k in range(count + 1)))
 
 
 def _landing_rows(coefficients: FloatArray, first: int, last: int) -> tuple[int, int]:

@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import dctn, idctn
 
-from napari_shadowinv._system.arrays import SQUARE_PIXELS, check_finite, check_plane, plain_array
+from napari_shadowinv._system.arrays import (
+    SQUARE_PIXELS,
+    check_finite,
+    check_plane,
+    check_shape,
+    plain_array,
+)
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
@@ -61,10 +67,7 @@ def poisson_invert(image: ArrayLike, *, source: ArrayLike | None = None) -> Floa
         ratio = target * (target.size / flux)
     else:
         beam = _checked("source", source)
-        if beam.shape != target.shape:
-            raise InputError(
-                f"source has shape {beam.shape}, image {target.shape}: they must match"
-            )
+        check_shape("source", beam.shape, target.shape)
         if dark := np.count_nonzero(beam <= 0):
             raise InputError(
                 f"source has {dark} pixels that are zero or negative: the linear inversion divides "

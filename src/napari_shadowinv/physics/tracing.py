@@ -21,7 +21,14 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import distance_transform_edt
 
 from napari_shadowinv import __version__
-from napari_shadowinv._system.arrays import PLANE, as_numbers, block_sums, check_finite, plain_array
+from napari_shadowinv._system.arrays import (
+    PLANE,
+    as_numbers,
+    block_sums,
+    check_finite,
+    check_shape,
+    plain_array,
+)
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model
@@ -496,10 +503,7 @@ def _beam(
             )
     else:
         plane = np.asarray(plain_array(profile, "profile"), dtype=np.float64)
-        if plane.shape != flight.shape:
-            raise InputError(
-                f"profile has shape {plane.shape}, image {flight.shape}: they must match"
-            )
+        check_shape("profile", plane.shape, flight.shape)
         padding = [(-low, high - n) for low, high, n in zip(first, last, flight.shape, strict=True)]
         beam = np.kron(np.pad(plane, padding), np.ones((fine, fine)))
     check_finite("profile", beam)

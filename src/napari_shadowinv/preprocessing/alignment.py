@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from napari_shadowinv._system.arrays import NORMAL_MAD
+from napari_shadowinv._system.arrays import NORMAL_MAD, check_shape
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing.image_checks import ReferencePair, border_ring
@@ -72,10 +72,7 @@ def align_source(
         If the shapes differ, or the borders determine the shift to no better than 0.5 px.
     """
     image, source = (np.asarray(plane, dtype=np.float64) for plane in (image, source))
-    if image.shape != source.shape:
-        raise InputError(
-            f"the source has shape {source.shape}, the image {image.shape}: they must match"
-        )
+    check_shape("the source", source.shape, image.shape, "the image")
     usable = np.ones(image.shape, dtype=bool) if mask is None else mask
     border = usable & border_ring(image.shape)
     fit = _fit_shift(image, source, border, ReferencePair(image, source, usable).shift or (0, 0))

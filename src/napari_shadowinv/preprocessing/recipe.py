@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from napari_shadowinv._system.arrays import check_shape
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -158,11 +159,8 @@ class Recipe(CheckedModel):
         """
         for name in ("source", "mask", "source_mask"):
             array = getattr(shot, name)
-            if array is not None and array.shape != shot.shape:
-                raise InputError(
-                    f"{name.replace('_', ' ')} has shape {array.shape}, image {shot.shape}: they "
-                    "must match"
-                )
+            if array is not None:
+                check_shape(name.replace("_", " "), array.shape, shot.shape)
         if shot.source is not None:
             if self.estimate is not None:
                 raise InputError(
