@@ -279,22 +279,19 @@ class AxisymmetricProfile(Product):
         return product
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
-        variables = self._profile_variables(frame)
-        first = next(iter(variables.values()))
-        variables["half_difference"] = replace(
-            first, long_name=f"{first.long_name}, right half minus left half"
-        )
-        variables["asymmetry"] = Variable(
-            (), "1", "Difference of the halves of the deflection, relative (r.m.s.)"
-        )
-        variables["edge"] = Variable((), "1", "Deflection at the edge, relative to the largest")
-        variables["ends"] = Variable(
-            (), "1", "Deflection where the axis meets the edge of the image, relative (r.m.s.)"
-        )
-        variables["axis_offset"] = Variable(
-            (), PIXEL, "Symmetry axis of the field, offset from the axis"
-        )
-        return variables
+        profiles = self._profile_variables(frame)
+        first = next(iter(profiles.values()))
+        difference = f"{first.long_name}, right half minus left half"
+        halves = "Difference of the halves of the deflection, relative (r.m.s.)"
+        ends = "Deflection where the axis meets the edge of the image, relative (r.m.s.)"
+        offset = "Symmetry axis of the field, offset from the axis"
+        return profiles | {
+            "half_difference": replace(first, long_name=difference),
+            "asymmetry": Variable((), "1", halves),
+            "edge": Variable((), "1", "Deflection at the edge, relative to the largest"),
+            "ends": Variable((), "1", ends),
+            "axis_offset": Variable((), PIXEL, offset),
+        }
 
     def _profile_variables(self, frame: FieldFrame) -> dict[str, Variable]:
         dims = ("along", "radius") if self._has_slices else ("radius",)
@@ -324,11 +321,10 @@ class AxisymmetricProfile(Product):
         count = len(self._axis.places())
         edges = np.array([*self._slices, count])
         middles = (edges[:-1] + edges[1:] - 1) / 2
-        unit = frame.length_unit
         radii = np.arange(float(self._radius_px(frame)))
         coordinates = {
-            "along": Coordinate(frame.length(1.0) * middles, unit, "Distance along the axis"),
-            "radius": Coordinate(frame.length(1.0) * radii, unit, "Distance from the axis"),
+            "along": Coordinate.in_plane(middles, frame, "Distance along the axis"),
+            "radius": Coordinate.in_plane(radii, frame, "Distance from the axis"),
         }
         if not self._has_slices:
             del coordinates["along"]
@@ -497,6 +493,9 @@ class AzimuthalProfile(Product):
     place = 65
     fields: ClassVar = (_B,)
     curves: ClassVar = ("azimuthal_field", "variation")
+    reading: ClassVar = (
+        "A positive current flows along the beam, and its field runs clockwise in the image.",
+    )
     product: Literal["azimuthal"] = "azimuthal"
     center: tuple[float, float] = Field(
         title="Centre (px)",
@@ -534,8 +533,7 @@ class AzimuthalProfile(Product):
         }
 
     def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
-        radii = frame.length(1.0) * self._radii(frame)
-        return {"radius": Coordinate(radii, frame.length_unit, "Distance from the axis")}
+        return {"radius": Coordinate.in_plane(self._radii(frame), frame, "Distance from the axis")}
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         radii = self._radii(frame)
@@ -554,11 +552,6 @@ class AzimuthalProfile(Product):
             "current": -2 * np.pi * frame.length(1.0) * radii * mean / mu_0,
             "variation": azimuthal.std(axis=1),
         }
-
-    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
-        return (
-            "A positive current flows along the beam, and its field runs clockwise in the image.",
-        )
 
 
 def _chosen_radius(radius: float | None, most: float, middle: str) -> int:

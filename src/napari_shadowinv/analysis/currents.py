@@ -38,6 +38,10 @@ class Flux(Product):
     primary = "path"
     place = 30
     fields = (_B,)
+    reading = (
+        "The flux is that of the field integrated along the beam, across the line; a flux of "
+        "it through an area of the image has no meaning.",
+    )
     product: Literal["flux"] = "flux"
     path: Path = path_field("Corners of the line or path, (y, x) in px; only its ends count.")
 
@@ -58,12 +62,6 @@ class Flux(Product):
         start, end = interpolate_cubic(potential, np.array([self.path[0], self.path[-1]]))
         # A displacement along the line belongs to a field across it.
         return {"flux": np.asarray((start - end) * unit_field(frame)[0] * frame.pixel)}
-
-    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
-        return (
-            "The flux is that of the field integrated along the beam, across the line; a flux of "
-            "it through an area of the image has no meaning.",
-        )
 
 
 class _Enclosed(Outlined):
@@ -97,13 +95,11 @@ class EnclosedCurrent(_Enclosed):
     fields = (_B,)
     unit = "A m"
     long_name = "Current inside the outline, integrated along z"
+    reading = (
+        "The current is integrated over the thickness of the object: divide by its length "
+        "along the beam for a mean current in A.",
+    )
     product: Literal["current"] = "current"
-
-    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
-        return (
-            "The current is integrated over the thickness of the object: divide by its length "
-            "along the beam for a mean current in A.",
-        )
 
 
 class EnclosedCharge(_Enclosed):
@@ -114,13 +110,11 @@ class EnclosedCharge(_Enclosed):
     fields = (_E,)
     unit = "C"
     long_name = "Charge inside the outline"
+    reading = (
+        "This is Gauss's law in the column behind the outline: it holds if the electric field "
+        "along the beam vanishes before and behind the object.",
+    )
     product: Literal["charge"] = "charge"
-
-    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
-        return (
-            "This is Gauss's law in the column behind the outline: it holds if the electric field "
-            "along the beam vanishes before and behind the object.",
-        )
 
 
 def unit_field(frame: FieldFrame) -> FloatArray:

@@ -89,6 +89,12 @@ class Filaments(Product):
     reference: ClassVar = "J. Levesque et al., arXiv:1910.04070"
     curves: ClassVar = ("autocorrelation", "along")
     lengths: ClassVar = ("radius", "width", "spacing")
+    reading: ClassVar = (
+        "Size and spacing are those of the field; the bright lines of the image are spaced by "
+        "the size of filaments (Levesque et al.), and their number along the beam is unknown.",
+        "No spacing is stated (NaN) where the autocorrelation has no further maximum above "
+        "the scatter of structures at random places.",
+    )
     product: Literal["filaments"] = "filaments"
     angle: float | None = Field(
         default=None,
@@ -131,8 +137,7 @@ class Filaments(Product):
         }
 
     def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
-        lags = frame.length(1.0) * self._lags(frame)
-        return {"lag": Coordinate(lags, frame.length_unit, "Lag")}
+        return {"lag": Coordinate.in_plane(self._lags(frame), frame, "Lag")}
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         potential, displacement = frame.at_points(potential, displacement)
@@ -200,14 +205,6 @@ class Filaments(Product):
                 "the filaments nearly merge into a wave, whose first zero does not depend on their "
                 "size: the radius is a lower limit",
             )
-
-    def remarks(self, frame: FieldFrame) -> tuple[str, ...]:
-        return (
-            "Size and spacing are those of the field; the bright lines of the image are spaced by "
-            "the size of filaments (Levesque et al.), and their number along the beam is unknown.",
-            "No spacing is stated (NaN) where the autocorrelation has no further maximum above "
-            "the scatter of structures at random places.",
-        )
 
 
 def _direction(displacement: FloatArray, weights: FloatArray) -> float:

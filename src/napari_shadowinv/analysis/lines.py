@@ -97,8 +97,7 @@ class LineProfile(Product):
         return variables
 
     def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
-        values = frame.length(1.0) * self._distance
-        return {"distance": Coordinate(values, frame.length_unit, "Distance along the line")}
+        return {"distance": Coordinate.in_plane(self._distance, frame, "Distance along the line")}
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         field = frame.field(potential, displacement)

@@ -157,11 +157,7 @@ class _SourceMap(Smoothed):
 
     def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
         return {
-            axis: Coordinate(
-                frame.length(1.0) * np.arange(count),
-                frame.length_unit,
-                f"{axis} in the object plane",
-            )
+            axis: Coordinate.in_plane(np.arange(count), frame, f"{axis} in the object plane")
             for axis, count in zip("yx", frame.shape, strict=True)
         }
 

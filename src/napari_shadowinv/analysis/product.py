@@ -68,6 +68,11 @@ class Coordinate:
     unit: str
     long_name: str
 
+    @classmethod
+    def in_plane(cls, pixels: AnyArray, frame: FieldFrame, long_name: str) -> Coordinate:
+        """Return places in the object plane, from px."""
+        return cls(frame.length(1.0) * pixels, frame.length_unit, long_name)
+
 
 @dataclass(frozen=True, eq=False)
 class FieldNoise:
@@ -110,6 +115,7 @@ class Product(Choice):
     is_logarithmic: ClassVar[bool] = False  # whether their axes are
     # Variables that are places or lengths in the object plane and do not grow with the field.
     lengths: ClassVar[tuple[str, ...]] = ()
+    reading: ClassVar[tuple[str, ...]] = ()  # how it always has to be read, in sentences
 
     label: str = Field(
         default="",
@@ -211,8 +217,8 @@ class Product(Choice):
         return ()
 
     def remarks(self, frame: FieldFrame) -> Iterable[str]:
-        """Return how the product has to be read, in sentences."""
-        return ()
+        """Return how the product has to be read, in sentences. Default: `reading`."""
+        return self.reading
 
 
 def at_peak(quantity: Quantity) -> Quantity:
