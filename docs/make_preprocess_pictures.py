@@ -39,7 +39,7 @@ from napari_shadowinv.preprocessing import (
     uniform_source,
 )
 from napari_shadowinv.preprocessing.estimates import point_distance
-from napari_shadowinv.preprocessing.kriging import kriged_beam
+from napari_shadowinv.preprocessing.kriging import kriged_prior, kriged_source
 
 SHOT = "Image_20241017221829851.bmp"
 SHAPE = (160, 200)
@@ -217,8 +217,8 @@ def source_pictures() -> None:
         mask,
     )
     uneven = scene(patchy_beam(22, seed=9), big_object())
-    source, prior = kriged_beam(uneven.shot, mask)
-    source_picture("kriged", "kriged_source", uneven, source, mask, on_pixels(prior))
+    source, error = kriged_source(uneven.shot, mask), on_pixels(kriged_prior(uneven.shot, mask))
+    source_picture("kriged", "kriged_source", uneven, source, mask, error)
 
 
 def on_pixels(prior: BeamPrior) -> FloatArray:

@@ -47,7 +47,7 @@ from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics.setup import Setup, bin_setup
 from napari_shadowinv.preprocessing import pixels
 from napari_shadowinv.preprocessing.filters import low_pass
-from napari_shadowinv.preprocessing.kriging import kriged_beam, kriged_source
+from napari_shadowinv.preprocessing.kriging import kriged_prior, kriged_source
 from napari_shadowinv.preprocessing.steps import Choice, degree_field, width_field
 
 _MIN_SUPPORT = 1e-6
@@ -342,7 +342,7 @@ class KrigedEstimate(Estimate):
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
     ) -> BeamPrior:
         assert mask is not None
-        return kriged_beam(image, mask, should_stop=should_stop)[1]
+        return kriged_prior(image, mask, should_stop=should_stop)
 
 
 _MAX_FITTED_PIXELS = 2**16

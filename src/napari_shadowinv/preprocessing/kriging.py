@@ -1,4 +1,4 @@
-"""The beam behind an object, predicted from the image around it: `kriged_source`, `kriged_beam`.
+"""The beam behind an object, predicted from the image around it: `kriged_source`, `kriged_prior`.
 
 The logarithm of the beam is a Gaussian process: smooth, random, correlated by exp(-r²/2L²). Blocks
 of pixels without the object give its r.m.s., its length L and the noise by their marginal
@@ -76,26 +76,41 @@ def kriged_source(
     with _one_thread():
         fits = blocks.fits(Reporter(None, should_stop))
         caution = _halo_caution(blocks, max(fits, key=lambda fit: fit.evidence))
-        beam, _, _, _ = _joint(fits)
+        weighted = zip(_weights(fits), fits, strict=True)
+        beam = np.asarray(sum(weight * fit.at_pixels for weight, fit in weighted if weight))
     if caution is not None:
         (on_caution or warn_of)(caution)
-    return blocks.source(beam)
+    return with_flux_of(blocks.level * np.exp(beam), blocks.values, blocks.usable)
 
 
-def kriged_beam(
+def kriged_prior(
     image: ArrayLike, mask: ArrayLike, *, should_stop: ShouldStop | None = None
-) -> tuple[FloatArray, BeamPrior]:
-    """Return the beam of `kriged_source`, and the prior of its error."""
+) -> BeamPrior:
+    """Return the prior of the error of `kriged_source`."""
     blocks = _Blocks.of(image, mask)
     with _one_thread():
-        beam, light, patterns, weights = _joint(blocks.fits(Reporter(None, should_stop)))
-    variance = (patterns**2).sum(axis=0)
+        fits = blocks.fits(Reporter(None, should_stop))
+        weights = _weights(fits)
+        likely = [(weight, fit) for weight, fit in zip(weights, fits, strict=True) if weight]
+        mean = np.asarray(sum(weight * fit.mean for weight, fit in likely))
+        columns = [
+            math.sqrt(weight)
+            * np.concatenate([fit.deviations, (fit.mean - mean)[..., None]], axis=2)
+            for weight, fit in likely
+        ]
+        flat = np.concatenate(columns, axis=2).reshape(mean.size, -1)
+        # Few of the many columns matter.
+        powers, turned = scipy.linalg.eigh(flat.T @ flat)
+        beyond = np.cumsum(powers) < _LEFT_OUT * powers.sum()
+        chosen = turned[:, ~beyond][:, -_MAX_COMPONENTS:]
+        # The sum of their squares is the variance of the beam in each block.
+        patterns = np.ascontiguousarray((flat @ chosen).T.reshape(-1, *mean.shape))
+    light, variance = np.exp(mean), (patterns**2).sum(axis=0)
     rms = math.sqrt(float((light * variance).sum() / light.sum()))
     height, width = blocks.values.shape
     components = BeamComponents(patterns, blocks.block, (height, width), 0.0, "outside")
     length = float(np.exp(weights @ np.log(np.repeat(_LENGTHS, 2))))
-    prior = BeamPrior(rms=min(rms, 0.99), length=min(length, 1.0)).with_components(components)
-    return blocks.source(beam), prior
+    return BeamPrior(rms=min(rms, 0.99), length=min(length, 1.0)).with_components(components)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,10 +169,6 @@ class _Blocks:
                 waves = _Waves(self.values.shape, self.block, length, terms)
                 fits.append(_Fit.to(waves, self.bare, self.logs[self.bare], self.counts[self.bare]))
         return fits
-
-    def source(self, beam: FloatArray) -> FloatArray:
-        """Return the source of a beam's logarithm."""
-        return with_flux_of(self.level * np.exp(beam), self.values, self.usable)
 
 
 def _least_blocks(bare: BoolArray) -> float:
@@ -345,29 +356,12 @@ def _evidence_of_trend(terms: FloatArray, trend: FloatArray) -> float:
     return float(-0.5 * (log_volume + count * _LOG_2PI + square))
 
 
-def _joint(fits: list[_Fit]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the logarithm of the beam, the beam in blocks, its components, and the weights.
-
-    The squares of the components, shape (k, h, w), sum to the variance of the beam in each block.
-    """
+def _weights(fits: list[_Fit]) -> FloatArray:
+    """Return the weights of processes by their evidence, 0 for those that do not count."""
     evidence = np.array([fit.evidence for fit in fits])
     weights = np.exp(evidence - evidence.max())
     weights[weights < _MIN_WEIGHT * weights.sum()] = 0.0
-    weights /= weights.sum()
-    likely = [(weight, fit) for weight, fit in zip(weights, fits, strict=True) if weight]
-    beam = np.asarray(sum(weight * fit.at_pixels for weight, fit in likely))
-    mean = np.asarray(sum(weight * fit.mean for weight, fit in likely))
-    columns = [
-        math.sqrt(weight) * np.concatenate([fit.deviations, (fit.mean - mean)[..., None]], axis=2)
-        for weight, fit in likely
-    ]
-    flat = np.concatenate(columns, axis=2).reshape(mean.size, -1)
-    # Few of the many columns matter.
-    powers, turned = scipy.linalg.eigh(flat.T @ flat)
-    beyond = np.cumsum(powers) < _LEFT_OUT * powers.sum()
-    chosen = turned[:, ~beyond][:, -_MAX_COMPONENTS:]
-    components = np.ascontiguousarray((flat @ chosen).T.reshape(-1, *mean.shape))
-    return beam, np.exp(mean), components, weights
+    return np.asarray(weights / weights.sum())
 
 
 def _one_thread() -> threadpool_limits:
