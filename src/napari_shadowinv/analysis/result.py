@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 
 _ATTRIBUTE = "products"
 SERIES_AXES: tuple[str, str] = ("time", "shot")
-_COLUMNS = ("product", "quantity", "place", "place_unit", "value", "unit", "bias", "std")
+_STATISTICS = ("bias", "std", "low_68", "high_68", "low_95", "high_95")
+_COLUMNS = ("product", "quantity", "place", "place_unit", "value", "unit", *_STATISTICS)
 
 Band = tuple[FloatArray, FloatArray]
 
@@ -148,8 +149,8 @@ class ProductResult:
                 f"share is {share!r}, and files have bands of {' and '.join(map(str, BANDS))}: "
                 "expected one of them, or analyse the result again"
             )
-        low, high = (self.stored[name][each] for each in _band_names(share))
-        return low, high
+        stored = self.stored[name]
+        return stored[f"low_{100 * share:.0f}"], stored[f"high_{100 * share:.0f}"]
 
     def statistics(self, name: str) -> dict[str, FloatArray]:
         """Return bias, standard deviation and ends of the bands of a variable, in SI units.
@@ -159,10 +160,8 @@ class ProductResult:
         quantity = self.quantities[name]
         if not has_bands(quantity):
             return self.stored.get(name, {})
-        numbers = {"bias": quantity.bias, "std": quantity.std}
-        for share in BANDS:
-            numbers |= dict(zip(_band_names(share), quantity.band(share), strict=True))
-        return numbers
+        ends = (end for share in BANDS for end in quantity.band(share))
+        return dict(zip(_STATISTICS, (quantity.bias, quantity.std, *ends), strict=True))
 
     def scale_of(self, name: str) -> tuple[float, str]:
         """Return the factor from SI to the unit in which a variable is shown, and that unit."""
@@ -189,10 +188,6 @@ class ProductResult:
             factor, prefix = prefix_for(float(np.max(np.abs(places), initial=0.0)))
             places, unit = factor * places, f"{prefix}{unit}"
         return places, f"{coordinate.long_name} ({unit})" if unit else coordinate.long_name
-
-
-def _band_names(share: float) -> tuple[str, str]:
-    return f"low_{100 * share:.0f}", f"high_{100 * share:.0f}"
 
 
 def add_products(dataset: xarray.Dataset, results: Sequence[ProductResult]) -> xarray.Dataset:
@@ -284,7 +279,7 @@ def _from_entry(dataset: xarray.Dataset, entry: dict[str, Any]) -> ProductResult
         if f"{name}_{variable}_std" in dataset:
             stored[variable] = {
                 statistic: np.asarray(dataset[f"{name}_{variable}_{statistic}"].values)
-                for statistic in ("bias", "std", *(n for s in BANDS for n in _band_names(s)))
+                for statistic in _STATISTICS
             }
     coordinates = {}
     for axis in entry["axes"]:
@@ -313,21 +308,20 @@ def products_table(results: Sequence[ProductResult]) -> str:
     standard deviation and the ends of the bands, all in the unit of the row. Fields are in the
     unit that they are shown in.
     """
-    bands = [each for share in BANDS for each in _band_names(share)]
-    rows = [[*_COLUMNS, *bands]]
+    rows = [list(_COLUMNS)]
     for result in results:
         for name, variable in result.variables.items():
             if len(variable.dims) <= 1:
-                rows += _rows(result, name, ("bias", "std", *bands))
+                rows += _rows(result, name)
     return csv_text(rows)
 
 
-def _rows(result: ProductResult, name: str, statistics: Sequence[str]) -> Iterator[list[str]]:
+def _rows(result: ProductResult, name: str) -> Iterator[list[str]]:
     factor, unit = result.scale_of(name)
     values = np.atleast_1d(result.quantities[name].value)
     numbers = result.statistics(name)
     unknown = np.full(values.shape, np.nan)
-    columns = [np.atleast_1d(numbers.get(each, unknown)) for each in statistics]
+    columns = [np.atleast_1d(numbers.get(each, unknown)) for each in _STATISTICS]
     places, place_unit = [""] * len(values), ""
     for axis in result.variables[name].dims:
         coordinate = result.coordinates[axis]
