@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -156,7 +155,7 @@ class _Task:
 
     field: SampledField
     products: list[Product]
-    _shapes: list[dict[str, tuple[int, ...]]] = dataclasses.field(default_factory=list)
+    _shapes: Sequence[dict[str, tuple[int, ...]]] = ()
 
     def choose(self, noise: FieldNoise | None) -> Any:
         """Choose what follows from the noise, and return the function that measures everything."""

@@ -28,6 +28,7 @@ from napari_shadowinv.analysis.axis import (
     sample_sides,
 )
 from napari_shadowinv.analysis.frame import FieldFrame
+from napari_shadowinv.analysis.outlines import Point
 from napari_shadowinv.analysis.paths import interpolate_cubic
 from napari_shadowinv.analysis.product import (
     Coordinate,
@@ -68,8 +69,6 @@ _AZIMUTHAL = (
     "axis (product 'azimuthal'), or choose the component 'axial' for the field of a coil"
 )
 
-AxisPoints = tuple[tuple[float, float], tuple[float, float]]
-
 
 class AxisymmetricProfile(Product):
     """Radial profiles of an object with an axis across the beam, by Abel inversion.
@@ -84,7 +83,7 @@ class AxisymmetricProfile(Product):
     fields: ClassVar = (*_LENGTHS, _N, _E, _B)
     reference: ClassVar = "Daun et al., Appl. Opt. 45, 4638 (2006)"
     product: Literal["axisymmetric"] = "axisymmetric"
-    axis: AxisPoints | None = Field(
+    axis: tuple[Point, Point] | None = Field(
         default=None,
         title="Axis (px)",
         description=(
@@ -497,7 +496,7 @@ class AzimuthalProfile(Product):
         "A positive current flows along the beam, and its field runs clockwise in the image.",
     )
     product: Literal["azimuthal"] = "azimuthal"
-    center: tuple[float, float] = Field(
+    center: Point = Field(
         title="Centre (px)",
         description="Centre (y, x) of the circles in px.",
         json_schema_extra={"metavar": "Y,X"},

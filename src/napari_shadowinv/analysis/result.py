@@ -34,8 +34,6 @@ SERIES_AXES: tuple[str, str] = ("time", "shot")
 _STATISTICS = ("bias", "std", "low_68", "high_68", "low_95", "high_95")
 _COLUMNS = ("product", "quantity", "place", "place_unit", "value", "unit", *_STATISTICS)
 
-Band = tuple[FloatArray, FloatArray]
-
 
 @dataclass(frozen=True, eq=False)
 class ProductResult:
@@ -131,7 +129,7 @@ class ProductResult:
     def __getitem__(self, name: str) -> Quantity:
         return self.quantities[name]
 
-    def band(self, name: str, share: float = 0.68) -> Band | None:
+    def band(self, name: str, share: float = 0.68) -> tuple[FloatArray, FloatArray] | None:
         """Return lower and upper end of a variable's interval; None if it has none.
 
         Raises

@@ -512,58 +512,6 @@ def _gaussian_slopes(parameters: FloatArray, y: FloatArray, x: FloatArray) -> Fl
 _NOTABLE_FALL = 0.01  # of the fluence, from the brightest pixel to the dimmest
 
 
-def _centre_field(axis: str, line: str) -> Any:
-    return Field(
-        default=None,
-        allow_inf_nan=False,
-        title=f"Centre {axis} (px)",
-        description=(
-            f"{line} of the recorded image at which the detector faces the source. Default: its "
-            "centre."
-        ),
-    )
-
-
-class IsotropicEstimate(Estimate):
-    """A point that shines evenly in all directions, on a flat detector."""
-
-    title = "isotropic point source"
-    uses_mask = False
-    place = 20
-    method: Literal["isotropic"] = "isotropic"
-    centre_y: float | None = _centre_field("y", "Row")
-    centre_x: float | None = _centre_field("x", "Column")
-    # Not a parameter: the user gives the setup elsewhere.
-    _setup: Any = PrivateAttr(default=None)
-
-    def adapt_to(
-        self, setup: Setup | None, shape: tuple[int, int], matrix: FloatArray | None = None
-    ) -> Estimate:
-        point_distance(setup)  # refuses a collimated beam before any work
-        return self._at(*centre_within(shape, matrix, self.centre_y, self.centre_x), setup)
-
-    def coarsen(self, factor: int) -> Estimate:
-        if self._setup is None or self.centre_y is None or self.centre_x is None:
-            return self
-        y, x = ((c + 0.5) / factor - 0.5 for c in (self.centre_y, self.centre_x))
-        return self._at(y, x, bin_setup(self._setup, factor))
-
-    def source(
-        self,
-        image: FloatArray,
-        mask: BoolArray | None,
-        should_stop: ShouldStop | None = None,
-        on_caution: OnCaution | None = None,
-    ) -> FloatArray:
-        point_distance(self._setup)  # refuses a missing setup before a wrong image
-        return isotropic_source(image, self._setup, mask=mask, **self.values())
-
-    def _at(self, y: float, x: float, setup: Setup | None) -> Self:
-        estimate = self.model_copy(update={"centre_y": y, "centre_x": x})
-        estimate._setup = setup
-        return estimate
-
-
 def centre_within(
     shape: tuple[int, ...],
     matrix: FloatArray | None = None,
@@ -663,6 +611,53 @@ def isotropic_source(
     angles = np.arctan2(y * x, np.sqrt(1 + y**2 + x**2))
     beam = np.diff(np.diff(angles, axis=0), axis=1)
     return np.asarray(beam * (values[usable].mean() / beam[usable].mean()))
+
+
+def _centre_field(axis: str, line: str) -> Any:
+    return Field(
+        default=None,
+        allow_inf_nan=False,
+        title=f"Centre {axis} (px)",
+        description=(
+            f"{line} of the recorded image at which the detector faces the source. Default: its "
+            "centre."
+        ),
+    )
+
+
+class IsotropicEstimate(Estimate):
+    """A point that shines evenly in all directions, on a flat detector."""
+
+    title = "isotropic point source"
+    function = staticmethod(isotropic_source)
+    uses_mask = False
+    place = 20
+    method: Literal["isotropic"] = "isotropic"
+    centre_y: float | None = _centre_field("y", "Row")
+    centre_x: float | None = _centre_field("x", "Column")
+    # Not a parameter: the user gives the setup elsewhere.
+    _setup: Any = PrivateAttr(default=None)
+
+    def adapt_to(
+        self, setup: Setup | None, shape: tuple[int, int], matrix: FloatArray | None = None
+    ) -> Estimate:
+        point_distance(setup)  # refuses a collimated beam before any work
+        return self._at(*centre_within(shape, matrix, self.centre_y, self.centre_x), setup)
+
+    def coarsen(self, factor: int) -> Estimate:
+        if self._setup is None or self.centre_y is None or self.centre_x is None:
+            return self
+        y, x = ((c + 0.5) / factor - 0.5 for c in (self.centre_y, self.centre_x))
+        return self._at(y, x, bin_setup(self._setup, factor))
+
+    def call(self, function: Callable[..., FloatArray], *args: Any, **options: Any) -> FloatArray:
+        point_distance(self._setup)  # refuses a missing setup before a wrong image
+        return super().call(function, *args, setup=self._setup, **options)
+
+    def _at(self, y: float, x: float, setup: Setup | None) -> Self:
+        estimate = self.model_copy(update={"centre_y": y, "centre_x": x})
+        estimate._setup = setup
+        return estimate
 
 
 def point_distance(setup: Setup | None) -> float:
