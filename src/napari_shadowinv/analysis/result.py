@@ -93,10 +93,9 @@ class ProductResult:
     def curve_names(self) -> tuple[str, ...]:
         """Variables along an axis that figures draw together, in one unit."""
         drawn = [name for name in self.product.curves if name in self.variables]
-        chosen = drawn or list(self.variables)
         names = [
             name
-            for name in chosen
+            for name in drawn or self.variables
             if len(self.variables[name].dims) == 1 and name not in self.product.recorded
         ]
         units = {self.variables[name].unit for name in names[:1]}

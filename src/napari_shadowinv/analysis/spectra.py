@@ -31,6 +31,7 @@ from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
+from scipy.ndimage import label
 
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._system.validation import CombinationError
@@ -509,10 +510,6 @@ class TurbulenceSpectrum(Product):
 
 def _longest_run(rings: BoolArray) -> BoolArray:
     """Return the longest run of true values alone."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[0], rings.astype(int), [0]])))
-    run = np.zeros_like(rings)
-    if len(ends):
-        starts, stops = ends[::2], ends[1::2]
-        longest = int(np.argmax(stops - starts))
-        run[starts[longest] : stops[longest]] = True
-    return run
+    runs, count = label(rings)
+    longest = 1 + int(np.bincount(runs)[1:].argmax()) if count else -1
+    return np.asarray(runs == longest)
