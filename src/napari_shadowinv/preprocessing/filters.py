@@ -53,7 +53,12 @@ class Filter(Step):
         if mask is not None and mask.any() and not mask.all():
             filled = pixels.interpolated_source(values, mask, should_stop=should_stop)
             values = np.where(mask, values, filled)
-        return self.call(self.function, values, mask=mask, should_stop=should_stop)
+        return self._filter(values, mask, should_stop)
+
+    def _filter(
+        self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
+    ) -> FloatArray:
+        return self.call(self.function, image, mask=mask, should_stop=should_stop)
 
     def note(self, before: FloatArray, after: FloatArray, mask: BoolArray | None) -> str:
         """Return a note on the changes by the filter."""
@@ -342,9 +347,10 @@ class HotPixelFilter(Filter):
         json_schema_extra={"slider": [2.0, 20.0]},
     )
 
-    @staticmethod
-    def function(image: ArrayLike, threshold: float, should_stop: ShouldStop | None) -> FloatArray:
-        return remove_hot_pixels(image, threshold=threshold, should_stop=should_stop)[0]
+    def _filter(
+        self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
+    ) -> FloatArray:
+        return remove_hot_pixels(image, threshold=self.threshold, should_stop=should_stop)[0]
 
     def note(self, before: FloatArray, after: FloatArray, mask: BoolArray | None) -> str:
         usable = True if mask is None else mask
