@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -30,7 +30,7 @@ from napari_shadowinv.facts import (
     verdict_fact,
 )
 from napari_shadowinv.inversion.budget import Errors
-from napari_shadowinv.inversion.solution_checks import Assessment, assess_verdict
+from napari_shadowinv.inversion.solution_checks import DECISIVE
 from napari_shadowinv.inversion.variables import (
     DISPLACEMENT_STD,
     VARIABLES,
@@ -51,6 +51,9 @@ if TYPE_CHECKING:
     import xarray
 
     from napari_shadowinv.physics.setup import Setup
+
+# Fields with other beams against the linear response: 5 to 20 % of the change up to this error.
+_MAX_LINEAR = 0.5  # of the displacement, r.m.s.
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,14 @@ class Report:
     image_residual: float
     sites_reason: str = ""
     errors: Errors | None = None
+
+
+class Assessment(NamedTuple):
+    """Verdict on an inversion, its reason, and the caution that decided it, if one did."""
+
+    verdict: Verdict
+    reason: str
+    caution: Caution | None = None
 
 
 @dataclass(frozen=True)
@@ -232,16 +243,14 @@ class Inversion:
             return None
         return structures_of(self.displacement, errors, self.mask, element=element)
 
-    @property
-    def error_rows(self) -> list[tuple[str, str]]:
-        """Error budget of the displacement in words: names and texts."""
-        return self._error_rows(self.errors)
+    def _subject(self, errors: Errors) -> str:
+        return "displacement" if errors is self.errors else "field"
 
     def _error_rows(self, errors: Errors | None) -> list[tuple[str, str]]:
         """Describe an error budget in words: names and texts."""
         if errors is None:
             return []
-        rows = errors.rows("displacement" if errors is self.errors else "field")
+        rows = errors.rows(self._subject(errors))
         steps = () if self.provenance is None else self.provenance.recipe.steps
         smoothing = [step.title for step in steps if step.smooths]
         is_stated = (self.options.noise_level, self.options.units_per_quantum) != (None, None)
@@ -272,11 +281,27 @@ class Inversion:
         setup : Setup or None
             None: the verdict on the displacement.
         """
-        errors, report = self.errors_in(setup), self.report
-        subject = "displacement" if errors is self.errors else "field"
-        return assess_verdict(
-            report.warnings, errors, self.options.max_error, subject, converged=report.converged
-        )
+        by_code = {caution.code: caution for caution in reversed(self.report.warnings)}
+        if not self.report.converged:
+            reason = "not converged: do not trust the field"
+            return Assessment(Verdict.UNCERTAIN, reason, by_code.get("not-converged"))
+        for code, verdict in DECISIVE.items():
+            if code in by_code:
+                return Assessment(verdict, by_code[code].short, by_code[code])
+        errors, max_error = self.errors_in(setup), self.options.max_error
+        if errors is None:
+            return Assessment(Verdict.UNCERTAIN, "errors were not worked out")
+        if not errors.rms > 0:
+            return Assessment(Verdict.UNCERTAIN, "there is no displacement to compare errors with")
+        text = f"errors of {errors.share_text} of the {self._subject(errors)} (r.m.s.)"
+        if errors.share <= max_error:
+            return Assessment(Verdict.DETERMINED, f"{text}, the largest by {errors.limited_by}")
+        parts = [f"{text}: {errors.largest_part}", errors.measure_next(max_error)]
+        if errors.share > _MAX_LINEAR:
+            parts.append(
+                "errors this large are not proportional to their causes, so they are rough"
+            )
+        return Assessment(Verdict.UNCERTAIN, "; ".join(filter(None, parts)))
 
     @property
     def headline(self) -> Headline:
@@ -322,6 +347,12 @@ class Inversion:
             "flux_left": ("Flux left", report.flux_left),
             "flux_entered": ("Flux entered", report.flux_entered),
         }
+        details = {
+            "sites": f"{report.n_sites:,}; {report.sites_reason}".removesuffix("; "),
+            "iterations": f"{report.iterations} on {len(report.levels)} levels",
+            "floor": f"{report.floor:g} of the mean: {report.floored_pixels} pixels raised, "
+            f"{report.clipped_pixels} clipped",
+        }
         convergence = Level.SOUND if report.converged else Level.FAILED
         return (
             verdict_fact(self.assess_in(setup).verdict),
@@ -350,25 +381,7 @@ class Inversion:
                 convergence,
                 short="" if report.converged else "NOT converged",
             ),
-            Fact(
-                "sites",
-                "Sites",
-                f"{report.n_sites:,}; {report.sites_reason}".removesuffix("; "),
-                is_detail=True,
-            ),
-            Fact(
-                "iterations",
-                "Iterations",
-                f"{report.iterations} on {len(report.levels)} levels",
-                is_detail=True,
-            ),
-            Fact(
-                "floor",
-                "Floor",
-                f"{report.floor:g} of the mean: {report.floored_pixels} pixels raised, "
-                f"{report.clipped_pixels} clipped",
-                is_detail=True,
-            ),
+            *(Fact(key, key.capitalize(), text, is_detail=True) for key, text in details.items()),
             time_fact(report.seconds),
         )
 

@@ -3,7 +3,7 @@
 - the difference of re-projection and image: `image_residual`
 - whether more sites would reduce it: `is_coarse`
 - the cautions about a solution: `find_cautions`
-- the verdict that follows from them and from the error budget: `assess_verdict`
+- the verdicts that follow from them: `DECISIVE`
 - signs that a field continues beyond the edge of its image: `inner_sides`, `turning_displacement`
 
 Each sign was chosen to be absent in images whose field is known to be right and to appear where it
@@ -53,7 +53,6 @@ them (200 × 200 px and the reference images):
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -69,7 +68,6 @@ from napari_shadowinv.facts import Verdict
 from napari_shadowinv.geometry.compiler import kernel
 
 if TYPE_CHECKING:
-    from napari_shadowinv.inversion.budget import Errors
     from napari_shadowinv.inversion.noise import ImageNoise
     from napari_shadowinv.inversion.normalise import Prepared
     from napari_shadowinv.options import InversionOptions
@@ -164,8 +162,7 @@ _MIN_SIGN_CONTRAST = 0.03  # of the strongest contrast
 _OPPOSITES = {"top": "bottom", "bottom": "top", "left": "right", "right": "left"}
 _CONTRAST_DEVIATIONS, _BEAM_DEVIATIONS = 7.0, 4.0
 
-# Cautions that decide the verdict, the gravest first.
-_DECISIVE = {
+DECISIVE = {
     "misfit": Verdict.MISFIT,
     "no-deflection": Verdict.UNCERTAIN,
     "folds": Verdict.AMBIGUOUS,
@@ -174,8 +171,7 @@ _DECISIVE = {
     "masked-peak": Verdict.UNCERTAIN,
     "correlated-noise": Verdict.UNCERTAIN,
 }
-# Fields with other beams against the linear response: 5 to 20 % of the change up to this error.
-_MAX_LINEAR = 0.5  # of the displacement, r.m.s.
+"""Cautions that decide the verdict, the gravest first."""
 
 _MIN_HOLE_PX = 3  # side of the smallest masked square that matters
 _NEAR_MASK = 0.02  # of the shorter side
@@ -231,57 +227,6 @@ def find_cautions(
     if is_closed and not closed_edge:
         texts["cut-object"] = cut_at_end()
     return tuple(Caution(code, text) for code, text in texts.items() if text)
-
-
-class Assessment(NamedTuple):
-    """Verdict on an inversion, its reason, and the caution that decided it, if one did."""
-
-    verdict: Verdict
-    reason: str
-    caution: Caution | None = None
-
-
-def assess_verdict(
-    cautions: Sequence[Caution],
-    errors: Errors | None,
-    max_error: float,
-    subject: str,
-    *,
-    converged: bool,
-) -> Assessment:
-    """Return the verdict on an inversion.
-
-    Parameters
-    ----------
-    cautions : sequence of Caution
-        About the solution.
-    errors : Errors or None
-        The error budget.
-    max_error : float
-        Largest error of a determined field, relative r.m.s.
-    subject : str
-        What the errors are a share of: displacement or field.
-    converged : bool
-        Whether the solver did.
-    """
-    by_code = {caution.code: caution for caution in reversed(cautions)}
-    if not converged:
-        reason = "not converged: do not trust the field"
-        return Assessment(Verdict.UNCERTAIN, reason, by_code.get("not-converged"))
-    for code, verdict in _DECISIVE.items():
-        if code in by_code:
-            return Assessment(verdict, by_code[code].short, by_code[code])
-    if errors is None:
-        return Assessment(Verdict.UNCERTAIN, "errors were not worked out")
-    if not errors.rms > 0:
-        return Assessment(Verdict.UNCERTAIN, "there is no displacement to compare errors with")
-    text = f"errors of {errors.share_text} of the {subject} (r.m.s.)"
-    if errors.share <= max_error:
-        return Assessment(Verdict.DETERMINED, f"{text}, the largest by {errors.limited_by}")
-    parts = [f"{text}: {errors.largest_part}", errors.measure_next(max_error)]
-    if errors.share > _MAX_LINEAR:
-        parts.append("errors this large are not proportional to their causes, so they are rough")
-    return Assessment(Verdict.UNCERTAIN, "; ".join(filter(None, parts)))
 
 
 class _Planes(NamedTuple):
