@@ -15,7 +15,7 @@ def integrate(polygon, density):
     corners = polygon + 0.5
     total = np.zeros(5)
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        total += walk_edge(density.image, density.sums, (*start, *end), True)
+        total += walk_edge(density.image, density.sums, (*start, *end), True, True)
     # the walk goes counter-clockwise in (y, x), for which ∮ F dy is minus the mass
     return -total[1:]
 
@@ -50,16 +50,16 @@ def test_moments_in_a_uniform_image_equal_the_shoelace_formulae():
 def test_flux_is_the_intensity_times_the_length_in_each_pixel():
     image = np.array([[1.0, 10.0], [100.0, 1000.0]])
     density = Density.from_image(image)
-    along_row = walk_edge(density.image, density.sums, (0.5, -3.0, 0.5, 1.25), False)
+    along_row = walk_edge(density.image, density.sums, (0.5, -3.0, 0.5, 1.25), False, False)
     assert along_row[0] == pytest.approx(1.0 + 10.0 * 0.25)
-    diagonal = walk_edge(density.image, density.sums, (5.0, 5.0, -5.0, -5.0), False)
+    diagonal = walk_edge(density.image, density.sums, (5.0, 5.0, -5.0, -5.0), False, False)
     assert diagonal[0] == pytest.approx(np.sqrt(2) * (1.0 + 1000.0))
 
 
 def test_beyond_the_image_there_is_no_flux():
     density = Density.from_image(np.ones((4, 5)))
     for ends in [(-2, 1, -1, 4), (4.5, 0, 7, 3), (1, -3, 3, -0.1), (1, 5.1, 3, 9)]:
-        assert walk_edge(density.image, density.sums, tuple(map(float, ends)), False)[0] == 0
+        assert walk_edge(density.image, density.sums, tuple(map(float, ends)), False, False)[0] == 0
 
 
 @given(st.lists(st.integers(0, 12), min_size=4, max_size=4))
@@ -67,8 +67,8 @@ def test_density_edges_through_corners_cancel_in_return(ends):
     """Walking there and back is nothing, and the ways round a pixel grid close."""
     ya, xa, yb, xb = (end / 2 - 1 for end in ends)
     density = Density.from_image(np.arange(1.0, 17.0).reshape(4, 4))
-    forward = np.array(walk_edge(density.image, density.sums, (ya, xa, yb, xb), True))
-    back = np.array(walk_edge(density.image, density.sums, (yb, xb, ya, xa), True))
+    forward = np.array(walk_edge(density.image, density.sums, (ya, xa, yb, xb), True, True))
+    back = np.array(walk_edge(density.image, density.sums, (yb, xb, ya, xa), True, True))
     np.testing.assert_allclose(forward[1:], -back[1:], atol=1e-12)
     detour = np.array([ya, xb])
     triangle = np.array([[ya, xa], detour, [yb, xb]]) - 0.5

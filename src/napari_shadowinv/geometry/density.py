@@ -221,21 +221,13 @@ def _walk_right_of_image(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def walk_edge(
-    image: FloatArray, sums: FloatArray, segment: Segment, with_moments: bool
+    image: FloatArray, sums: FloatArray, segment: Segment, with_moments: bool, with_inertia: bool
 ) -> Integrals:
     """Integrate along a segment, in corner coordinates.
 
-    The moments need all three sums. Returns ∫ I ds, ∫ F dy, and if `with_moments`, else 0,
-    ∫ y F dy, ∫ G dy and ∫ (y² F + K) dy.
+    Returns ∫ I ds, ∫ F dy, and where they are wanted, else 0, the moments ∫ y F dy and ∫ G dy, and
+    the inertia ∫ (y² F + K) dy, which alone needs the third of the sums.
     """
-    return walk_clipped(image, sums, segment, with_moments, with_moments)
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def walk_clipped(
-    image: FloatArray, sums: FloatArray, segment: Segment, with_moments: bool, with_inertia: bool
-) -> Integrals:
-    """Integrate as `walk_edge` does; only the inertia, else 0, needs the third of the sums."""
     ya, xa, yb, xb = segment
     height, width = image.shape
     if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:

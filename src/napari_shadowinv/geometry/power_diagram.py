@@ -33,7 +33,6 @@ from napari_shadowinv.geometry.compiler import kernel, njit
 from napari_shadowinv.geometry.density import (
     Density,
     Integrals,
-    walk_clipped,
     walk_edge,
     walk_inside,
 )
@@ -88,7 +87,7 @@ class _Borders(NamedTuple):
 def _walk_border(
     a: int, b: int, centres: FloatArray, image: FloatArray, sums: FloatArray, with_moments: bool
 ) -> Integrals:
-    """Walk a border as `walk_clipped` does, without inertia; most lie inside the image."""
+    """Walk a border as `walk_edge` does, without inertia; most lie inside the image."""
     height, width = float(image.shape[0]), float(image.shape[1])
     first, last = np.uint32(a), np.uint32(b)
     ya, xa = centres[first, 0] + 0.5, centres[first, 1] + 0.5
@@ -96,7 +95,7 @@ def _walk_border(
     if min(ya, yb, xa, xb) >= 0 and max(ya, yb) < height and max(xa, xb) < width:
         walk = walk_inside(image, sums, (ya, xa, yb, xb), with_moments, False)
     else:
-        walk = walk_clipped(image, sums, (ya, xa, yb, xb), with_moments, False)
+        walk = walk_edge(image, sums, (ya, xa, yb, xb), with_moments, False)
     return walk
 
 
@@ -126,7 +125,7 @@ def _integrate_inertia(start: int, stop: int, borders: _Borders, integrals: Floa
     for e in range(start, stop):
         ya, xa = centres[sides[e, 0], 0] + 0.5, centres[sides[e, 0], 1] + 0.5
         yb, xb = centres[sides[e, 1], 0] + 0.5, centres[sides[e, 1], 1] + 0.5
-        integrals[e, 0] = walk_edge(image, sums, (ya, xa, yb, xb), True)[4]
+        integrals[e, 0] = walk_edge(image, sums, (ya, xa, yb, xb), True, True)[4]
 
 
 @kernel
@@ -421,7 +420,7 @@ def _list_shares(
                 for k in range(around[i], around[i + 1]):
                     ya, xa, yb, xb, sense = borders[k]
                     segment = ya - row, xa - column, yb - row, xb - column
-                    share += sense * walk_edge(unit_image, sums, segment, False)[1]
+                    share += sense * walk_edge(unit_image, sums, segment, False, False)[1]
                 pixels[starts[i] + count] = row * width + column
                 shares[starts[i] + count] = share
                 count += 1
