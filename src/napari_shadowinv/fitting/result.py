@@ -30,13 +30,7 @@ from napari_shadowinv.facts import (
 from napari_shadowinv.fitting.instrument import TITLES, number_text
 from napari_shadowinv.fitting.posterior import BeamError
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
-from napari_shadowinv.inversion.variables import (
-    BEAM_UNCERTAINTY,
-    POTENTIAL_SAMPLES,
-    UNCERTAINTY,
-    belongs,
-    dataset_from_field,
-)
+from napari_shadowinv.inversion.variables import FIT_VARIABLES, belongs, dataset_from_field
 from napari_shadowinv.options import FitOptions, Instrument
 from napari_shadowinv.physics.setup import Setup, deflector_titles, setup_from_dict
 from napari_shadowinv.physics.significance import (
@@ -684,11 +678,8 @@ def field_dataset(field: FittedField, setup: Setup | None) -> xarray.Dataset:
     """Return a field with its errors and samples, in the units of its setup as well."""
     part = dataset_from_field(field.displacement, field.potential, setup)
     part = part.drop_vars([name for name in part.data_vars if not belongs(name, field.name)])
-    for name, values, (dims, *words) in (
-        ("displacement_uncertainty", field.uncertainty, UNCERTAINTY),
-        ("displacement_beam_uncertainty", field.beam_uncertainty, BEAM_UNCERTAINTY),
-        ("potential_samples", field.samples, POTENTIAL_SAMPLES),
-    ):
+    optional = field.uncertainty, field.beam_uncertainty, field.samples
+    for (name, (dims, *words)), values in zip(FIT_VARIABLES.items(), optional, strict=True):
         if values is not None:
             part[name] = dims, values, label(*words)
     return part
@@ -718,13 +709,7 @@ def noise_in(dataset: xarray.Dataset, name: str) -> FloatArray:
 def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArray) -> FittedField:
     potential, displacement, uncertainty, by_beam, samples = (
         numbers_of(dataset, variable + ending) if variable + ending in dataset else None
-        for variable in (
-            "potential",
-            "displacement",
-            "displacement_uncertainty",
-            "displacement_beam_uncertainty",
-            "potential_samples",
-        )
+        for variable in ("potential", "displacement", *FIT_VARIABLES)
     )
     if potential is None or displacement is None:
         raise InputError(

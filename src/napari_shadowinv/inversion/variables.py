@@ -54,18 +54,14 @@ DISPLACEMENT_STD = (
 )
 """Variable of an inversion whose samples have been drawn."""
 
-UNCERTAINTY = (_VECTORS, PIXEL, "Standard deviation of the displacement")
-"""Variable of a fit in addition to potential and displacement."""
-
-BEAM_UNCERTAINTY = (_VECTORS, PIXEL, "Standard deviation of the displacement by the beam")
-"""Another variable of a fit."""
-
-POTENTIAL_SAMPLES = (
-    ("sample", "y", "x"),
-    PIXEL_AREA,
-    "Random changes of the potential as large as its error",
-)
-"""Another variable of a fit."""
+_DEVIATION = "Standard deviation of the displacement"
+_CHANGES = "Random changes of the potential as large as its error"
+FIT_VARIABLES = {
+    "displacement_uncertainty": (_VECTORS, PIXEL, _DEVIATION),
+    "displacement_beam_uncertainty": (_VECTORS, PIXEL, f"{_DEVIATION} by the beam"),
+    "potential_samples": (("sample", "y", "x"), PIXEL_AREA, _CHANGES),
+}
+"""Variables of a fitted field in addition to potential and displacement."""
 
 
 def dataset_from_field(
@@ -117,8 +113,8 @@ def variable_labels(setup: Setup | None = None) -> Labels:
 def fit_labels(field: str, setup: Setup | None = None) -> Labels:
     """Return dimensions, ``units`` and ``long_name`` of every variable of a fitted field."""
     result_labels = variable_labels(setup)
-    dims, *unit_and_name = UNCERTAINTY
     labels = {name: result_labels[name] for name in ("potential", "displacement")}
+    dims, *unit_and_name = FIT_VARIABLES["displacement_uncertainty"]
     labels["displacement_uncertainty"] = dims, label(*unit_and_name)
     in_si = [name for name in result_labels if name not in VARIABLES]
     return labels | {name: result_labels[name] for name in in_si if belongs(name, field)}
