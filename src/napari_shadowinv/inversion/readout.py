@@ -356,17 +356,12 @@ def read_centroids(
 
 def _integrate(displacement: FloatArray, first: Literal["mean", "y", "x"]) -> FloatArray:
     """Integrate minus the displacement along one axis and then the other."""
-    along_y = _cumulative_trapezoids(displacement[0])
-    along_x = _cumulative_trapezoids(displacement[1].T).T
+    from scipy.integrate import cumulative_trapezoid  # slow to import
+
+    along_y = cumulative_trapezoid(displacement[0], axis=0, initial=0)
+    along_x = cumulative_trapezoid(displacement[1], axis=1, initial=0)
     y_first = along_y[:, :1] + along_x
     x_first = along_x[:1, :] + along_y
     share = {"y": 1.0, "x": 0.0, "mean": 0.5}[first]
     potential: FloatArray = -(share * y_first + (1 - share) * x_first)
     return potential
-
-
-def _cumulative_trapezoids(values: FloatArray) -> FloatArray:
-    """Integrate along the first axis, from zero."""
-    integral = np.zeros_like(values)
-    np.cumsum((values[1:] + values[:-1]) / 2, axis=0, out=integral[1:])
-    return integral
