@@ -118,8 +118,17 @@ class _Descent(NamedTuple):
     def run(self, scene: Scene, on_step: OnStep) -> Minimum:
         """Return the minimum at the end of the stages."""
         end = replace(self.minimum, start=self.start.name)
-        for stage in self.stages:
-            end = _descend_stage(scene, end, stage, on_step)
+        for factor, blur in self.stages:
+            spacing = _COARSE_SPACING if blur < _BLURRED else _SPACING_OF_BLURRED
+            now = replace(coarser(scene, factor), blur=blur, spacing=spacing)
+            unknowns, value, _ = descend(
+                now,
+                Preconditioner(now).damp(end.in_pixels(factor)),
+                iterations=_COARSE_STEPS,
+                least_gain=COARSE_GAIN,
+                after_step=partial(on_step, end.start),
+            )
+            end = Minimum(end.start, unknowns, value, now.displacement(unknowns), factor)
         return end
 
 
@@ -182,22 +191,6 @@ def _distinct_minima(minima: list[Minimum]) -> list[Minimum]:
         if all(better.distance(candidate) > _SAME_FIELD for better in distinct):
             distinct.append(candidate)
     return [candidate for candidate in distinct if candidate.value < _HOPELESS * distinct[0].value]
-
-
-def _descend_stage(
-    scene: Scene, minimum: Minimum, stage: tuple[int, float], on_step: OnStep
-) -> Minimum:
-    factor, blur = stage
-    spacing = _COARSE_SPACING if blur < _BLURRED else _SPACING_OF_BLURRED
-    now = replace(coarser(scene, factor), blur=blur, spacing=spacing)
-    unknowns, value, _ = descend(
-        now,
-        Preconditioner(now).damp(minimum.in_pixels(factor)),
-        iterations=_COARSE_STEPS,
-        least_gain=COARSE_GAIN,
-        after_step=lambda now: on_step(minimum.start, now),
-    )
-    return Minimum(minimum.start, unknowns, value, now.displacement(unknowns), factor)
 
 
 def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
