@@ -7,11 +7,11 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting.pattern import Pattern
 from napari_shadowinv.fitting.posterior import BeamError
-from napari_shadowinv.fitting.result import FitReport
+from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.verdict import assess_verdict
 from napari_shadowinv.options import FitOptions
 
@@ -25,7 +25,6 @@ def blob(middle: tuple[int, int]) -> FloatArray:
 
 GOOD: dict[str, Any] = {
     "chi2": np.array([0.97, 1.04]),
-    "names": ["image 1", "image 2"],
     "others": [],
     "single": False,
     "beam_unknown": False,
@@ -48,16 +47,44 @@ def assess(
     ended: bool,
     beam: BeamError | None,
     parts: dict[str, float],
+    chi2: FloatArray,
+    others: list[tuple[float, float]],
+    displacement: FloatArray,
+    used: BoolArray,
+    options: FitOptions,
     **facts: Any,
 ) -> tuple[Verdict, str]:
-    """Return the verdict on a fit with these errors and other facts."""
-    report = FitReport(0.0, 1, ended, {}, uncertainty, beam=beam, parts=parts)
-    return assess_verdict(report, **facts)
+    """Return the verdict on a fit with these errors and other facts.
+
+    `others` are other answers: how much worse their objective is, as a share, and how far away.
+    """
+    solutions = [(0.0, 0.0), *others]
+    mask = np.tile(used, (len(chi2), 1, 1))
+    planes, of_each = np.zeros(mask.shape), np.ones(len(chi2))
+    fit = Fit(
+        images=planes,
+        mask=mask,
+        strengths=of_each[:, None],
+        fields=(FittedField("B", planes[0], displacement, None, (1.0, 1.0)),),
+        source=planes,
+        brightness=of_each,
+        frames=np.zeros((len(chi2), 6)),
+        reprojection=planes,
+        residual=planes,
+        chi2=chi2,
+        noise=of_each,
+        basins=tuple(Basin("", 1 + worse, 1.0, away, planes) for worse, away in solutions),
+        folded=0.0,
+        verdict=Verdict.UNCERTAIN,
+        explanation="",
+        report=FitReport(0.0, 1, ended, {}, uncertainty, beam=beam, parts=parts),
+        options=options,
+    )
+    return assess_verdict(fit, **facts)
 
 
 ALONE = {
     "chi2": np.array([1.0]),
-    "names": ["image 1"],
     "single": True,
     "pattern": Pattern(np.array([-1.0])),
 }

@@ -25,6 +25,7 @@ from napari_shadowinv._system.progress import (
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
 from napari_shadowinv.fitting.forward import Scene
@@ -583,7 +584,6 @@ def _result(
     model = scene.model(unknowns, counts)[:, :height, :width] * units
     brightness = np.exp(unknowns.brightness)
     beams = scene.beam(unknowns)[:, :height, :width] * units * brightness[:, None, None]
-    chi2 = scene.chi2(unknowns, counts)
     displacements = scene.displacement(unknowns)[..., :height, :width].copy()
     potentials = potentials_of(scene, unknowns, data.size)
     fields = [
@@ -616,28 +616,7 @@ def _result(
         for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, displacements)
     ]
     jacobian = max(jacobians, key=lambda each: int((each < 0).sum()))
-    folded = float((jacobian < 0).mean())
-    rivals = [(basin.objective / basins[0].objective - 1, basin.distance) for basin in basins[1:]]
-    names_of_images = [f"image {k + 1}" for k in range(len(images))]
-    if data.setups is not None:
-        pairs = zip(names_of_images, data.setups, strict=True)
-        names_of_images = [f"{name} ({setup.probe})" for name, setup in pairs]
-    verdict, explanation = assess_verdict(
-        report,
-        options,
-        chi2=chi2,
-        names=names_of_images,
-        others=rivals,
-        single=data.single,
-        beam_unknown=scene.beam_modes > 0,
-        jacobian=jacobian,
-        pattern=pattern,
-        displacement=displacements.sum(axis=0),
-        used=np.asarray(used.any(axis=0)),
-        hidden=hidden_contrast(model / np.maximum(beams, _DARKEST * units) - 1, used),
-        searched=data.near is None,
-    )
-    return Fit(
+    unassessed = Fit(
         images=images,
         mask=used,
         strengths=scene.strengths,
@@ -647,14 +626,24 @@ def _result(
         frames=unknowns.frames,
         reprojection=model,
         residual=np.where(used, images - model, 0.0),
-        chi2=chi2,
+        chi2=scene.chi2(unknowns, counts),
         basins=basins,
-        folded=folded,
-        verdict=verdict,
-        explanation=explanation,
+        folded=float((jacobian < 0).mean()),
+        verdict=Verdict.UNCERTAIN,
+        explanation="",
         report=report,
         options=options,
         instrument=data.instrument,
         setups=data.setups or (),
         noise=data.noise_of(scene.weights),
     )
+    verdict, explanation = assess_verdict(
+        unassessed,
+        pattern,
+        jacobian,
+        single=data.single,
+        beam_unknown=scene.beam_modes > 0,
+        hidden=hidden_contrast(model / np.maximum(beams, _DARKEST * units) - 1, used),
+        searched=data.near is None,
+    )
+    return replace(unassessed, verdict=verdict, explanation=explanation)

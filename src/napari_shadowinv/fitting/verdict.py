@@ -16,14 +16,13 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting.instrument import TITLES
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
-from napari_shadowinv.fitting.result import FitReport
+from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.fitting.search import SMALL_PX
 from napari_shadowinv.inversion.solution_checks import (
     TURNED_BACK,
     inner_sides,
     turning_displacement,
 )
-from napari_shadowinv.options import FitOptions
 
 _MIN_HOLE_RADIUS_PX = 6.0
 _RIM_PX = 4
@@ -101,18 +100,12 @@ _SMOOTHED, _FROM_EDGE = 2.0, 2  # px
 
 
 def assess_verdict(
-    report: FitReport,
-    options: FitOptions,
+    fit: Fit,
+    pattern: Pattern,
+    jacobian: FloatArray,
     *,
-    chi2: FloatArray,
-    names: Sequence[str],
-    others: Sequence[tuple[float, float]],
     single: bool,
     beam_unknown: bool,
-    jacobian: FloatArray,
-    pattern: Pattern,
-    displacement: FloatArray,
-    used: BoolArray,
     hidden: float,
     searched: bool = True,
 ) -> tuple[Verdict, str]:
@@ -120,35 +113,29 @@ def assess_verdict(
 
     Parameters
     ----------
-    report : FitReport
-        Errors of the displacement, response to the beam, and convergence.
-    options : FitOptions
-        Boundary and largest total error of a determined fit.
-    chi2 : ndarray, shape (L,)
-        Of each image.
-    names : sequence of str
-        Names of the images.
-    others : sequence of (float, float)
-        Other answers: how much worse their objective is, as a share, and how far away they are.
+    fit : Fit
+        All else about it; its own verdict does not matter.
+    pattern : Pattern
+        Structure in the residuals.
+    jacobian : ndarray, shape (H, W)
+        Determinant of the map to the image where it is folded most.
     single : bool
         Whether there is one image only, or several with the same information.
     beam_unknown : bool
         Whether the beam is fitted, too.
-    jacobian : ndarray, shape (H, W)
-        Determinant of the map to the image where it is folded most.
-    pattern : Pattern
-        Structure in the residuals.
-    displacement : ndarray, shape (2, H, W)
-        Sum over all fields in the first image, px.
-    used : ndarray of bool, shape (H, W)
-        The pixels that were fitted in any image.
     hidden : float
         Contrast around the mask's holes as a share of the strongest; see `hidden_contrast`.
     searched : bool, default True
         Whether the fit has started from several fields.
     """
+    report, chi2, used = fit.report, fit.chi2, fit.used
     uncertainty, parts, beam = report.uncertainty, report.parts, report.beam
-    max_error = options.max_error
+    max_error = fit.options.max_error
+    displacement = np.sum([field.displacement for field in fit.fields], axis=0)
+    names = [f"image {k + 1}" for k in range(len(chi2))]
+    if fit.setups:
+        pairs = zip(names, fit.setups, strict=True)
+        names = [f"{name} ({setup.probe})" for name, setup in pairs]
     if worst := _those(names, chi2, chi2 > _MISFIT):
         causes = "noise, source (uniform, measured or unknown) or point spread may be wrong"
         if len(chi2) > 1:
@@ -186,7 +173,7 @@ def assess_verdict(
             "which came from where: the same bright lines come from fields with other folds; take "
             "another energy"
         )
-    at_edge = _edge_text(displacement, used, options.boundary == "free")
+    at_edge = _edge_text(displacement, used, fit.options.boundary == "free")
     if pattern.is_certain:
         # An object that the edge cuts leaves a pattern, too.
         verdict = Verdict.EDGE if at_edge else Verdict.MISFIT
@@ -200,7 +187,12 @@ def assess_verdict(
             "step 'dark', linearise the images, or, if the counts were averaged, scaled or "
             "smoothed, give their noise"
         )
-    rivals = [away for worse, away in others if worse < _AS_GOOD and away > _OTHER_FIELD]
+    best, *others = fit.basins
+    rivals = [
+        basin.distance
+        for basin in others
+        if basin.objective / best.objective - 1 < _AS_GOOD and basin.distance > _OTHER_FIELD
+    ]
     if rivals:
         return Verdict.SEVERAL, (
             f"{len(rivals) + 1} different fields explain the data about as well; they differ by "
