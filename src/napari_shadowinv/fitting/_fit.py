@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import count
@@ -72,7 +71,7 @@ from napari_shadowinv.fitting.search import (
 from napari_shadowinv.fitting.shots import Images, list_shots
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.fitting.verdict import assess_verdict, hidden_contrast
-from napari_shadowinv.inversion import invert
+from napari_shadowinv.inversion._invert import invert, measure_time
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.inversion.samples import Pairs
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions, KindOfNoise
@@ -194,7 +193,7 @@ def fit(
     ensure_compiled(on_progress, should_stop)
     scene = data.scene
     on_step = report_steps("fit", on_progress, should_stop)
-    with _timed("starts", seconds):
+    with measure_time("starts", seconds):
         rough = replace(scene, held=_HELD_IN_SEARCH)
         if data.single:
             rough = replace(scene, imperfect=EXACT)
@@ -210,7 +209,7 @@ def fit(
             # In pixels of two, λ and the errors of the instrument's numbers come out too small.
             minima[0] = in_recorded_pixels(scene, minima[0])
     is_near = data.near is not None
-    with _timed("smoothness", seconds):
+    with measure_time("smoothness", seconds):
         scene, best = estimate_smoothness(scene, minima[0], rng, on_step, is_near=is_near)
         if data.counted:
             scene = reweight_counts(data, scene, best)
@@ -222,7 +221,7 @@ def fit(
         unsure = replace(scene, imperfect=imperfect, held=imperfect.keys)
 
     def refine(on_step: OnStep) -> tuple[Scene, Unknowns, float, int, bool]:
-        with _timed("full size", seconds):
+        with measure_time("full size", seconds):
             return refine_minimum(scene, best, options, on_step, is_near=is_near)
 
     def explore(on_step: OnStep) -> tuple[tuple[Basin, ...], _Openness]:
@@ -234,7 +233,7 @@ def fit(
     refined, (basins, openness) = run_in_parallel(works, threads, on_step)
     seconds["samples"] = max(time.perf_counter() - begun - seconds["full size"], 0.0)
     fine, unknowns, value, taken, ended = refined
-    with _timed("residual", seconds):
+    with measure_time("residual", seconds):
         # A fit of one image absorbs too much of its noise for the counts to be tested.
         is_counted = data.counted and not data.single
         stated = data.instrument.noise_correlation
@@ -250,7 +249,7 @@ def fit(
         if pattern.is_certain and pattern.chi2 < _MAX_RIVAL_CHI2:
             cause = name_cause(scene, best, fields, data.setups, on_step)
             pattern = replace(pattern, cause=cause)
-    with _timed("samples", seconds):
+    with measure_time("samples", seconds):
         samples, pairs, errors = openness.samples, openness.pairs, openness.errors
         evidence = float("nan")
         if options.evidence:
@@ -344,13 +343,6 @@ def compare(
         return (len(one.fields) if evidence > least else np.inf), -evidence
 
     return tuple(sorted(fits, key=rank))
-
-
-@contextmanager
-def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
-    begun = time.perf_counter()
-    yield
-    seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - begun
 
 
 @dataclass(frozen=True)

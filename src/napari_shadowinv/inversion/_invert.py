@@ -153,7 +153,8 @@ def _site_domain(
 
 
 @contextmanager
-def _measure_time(stage: str, seconds: dict[str, float]) -> Iterator[None]:
+def measure_time(stage: str, seconds: dict[str, float]) -> Iterator[None]:
+    """Add the time of a block to that of a stage."""
     start = time.perf_counter()
     yield
     seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
@@ -238,7 +239,7 @@ def invert(
     check_instance(start, Inversion, "start")
     report = Reporter(on_progress, should_stop)
     seconds: dict[str, float] = {}
-    with _measure_time("prepare", seconds):
+    with measure_time("prepare", seconds):
         report("prepare", 0, 1)
         if plan is not None:
             if source is not None or mask is not None:
@@ -258,11 +259,11 @@ def invert(
             image, source, mask = unpack_shot(image, source, mask)
         prepared = prepare(image, source, options, mask)
         report("prepare", 1, 1)
-    with _measure_time("sites", seconds):
+    with measure_time("sites", seconds):
         if plan is None:
             plan = _plan(prepared.source, options, mask, measured and source is not None)
         levels = plan.levels.with_reporter(report)
-    with _measure_time("transport", seconds):
+    with measure_time("transport", seconds):
         if plan.margin is not None and options.flux == "fit":
             image_flux = fit_flux_factor(
                 levels, prepared.floored_image, plan.margin, options, report
@@ -304,7 +305,7 @@ def invert(
     solutions: list[LevelSolution] = []
     coarse = 0
     while True:
-        with _measure_time("transport", seconds):
+        with measure_time("transport", seconds):
             solutions = solve(
                 levels,
                 prepared.floored_image,
@@ -318,7 +319,7 @@ def invert(
             )
         answer = solutions[-1]
         if answer.converged:
-            with _measure_time("errors", seconds):
+            with measure_time("errors", seconds):
                 budget.free_target(solutions)
         fields, wait_for_errors = _read_fields(plan, prepared, solutions, budget, report, seconds)
         units = prepared.in_units()
@@ -328,7 +329,7 @@ def invert(
         wait_for_errors()  # they use the budget that the next solution changes
         coarse = len(answer.weights)
     quality = _make_report(units, noise(), solutions, fields, seconds, budget)
-    with _measure_time("errors", seconds):
+    with measure_time("errors", seconds):
         errors = wait_for_errors()
     finest = adaptive and len(answer.weights) == levels.counts[-1]
     by_errors: list[Caution | None] = [] if errors is None else [errors.beam_caution()]
@@ -336,7 +337,7 @@ def invert(
     if finest and errors is not None and quality.warnings == prepared.warnings:
         why = "with the most sites placed unless more are given"
         by_accuracy = [errors.accuracy_caution(options.accuracy, why)]
-    with _measure_time("prepare", seconds):
+    with measure_time("prepare", seconds):
         warnings = *by_errors, *quality.warnings, *by_accuracy, *begin_checks()()
     reprojection = fields.reprojection * prepared.unit
     return Inversion(
@@ -457,7 +458,7 @@ def _read_fields(
         report("read-out", round(first + share * (last - first)), _STEPS)
 
     report_share(report, 0, 0, _READ_STEPS)
-    with _measure_time("read-out", seconds):
+    with measure_time("read-out", seconds):
         potential, displacement = read_out(
             solution, options, lambda share: report_share(report, share, 0, _READ_STEPS)
         )
@@ -495,7 +496,7 @@ def _read_fields(
         return budget.errors(solutions, moves) if solution.converged else None
 
     errors_at_end = begin(estimate, options.threads)
-    with _measure_time("read-out", seconds):
+    with measure_time("read-out", seconds):
         image, outflow, inflow = reproject()
     fields = _Fields(
         np.ascontiguousarray(inner - border_mean(inner)),
