@@ -39,28 +39,12 @@ def minimise(
     *,
     iterations: int,
     least_gain: float,
-    after_step: Callable[[int, float], None] | None = None,
+    after_step: Callable[[float], None] | None = None,
 ) -> tuple[FloatArray, float, int]:
-    """Minimise by L-BFGS, starting with the identity as Hessian.
+    """Minimise by L-BFGS, starting with the identity as Hessian; return point, value and steps.
 
-    Parameters
-    ----------
-    objective : callable
-        Returns value and gradient.
-    start : ndarray, shape (n,)
-        Where to start; scaled so that the Hessian is about the identity.
-    iterations : int
-        Most steps.
-    least_gain : float
-        Ends once five steps lower the value by less.
-    after_step : callable, optional
-        Receives the number of steps and the value.
-
-    Returns
-    -------
-    point : ndarray
-    value : float
-    steps : int
+    `start` is scaled so that the Hessian is about the identity. Ends after the most `iterations`,
+    or once five lower the value by less than `least_gain`.
     """
     point = start
     value, gradient = objective(point)
@@ -85,7 +69,7 @@ def minimise(
         point, gradient, step = point + moved, after, 1.0
         values.append(value)
         if after_step is not None:
-            after_step(len(values) - 1, value)
+            after_step(value)
         if len(values) > 5 and values[-6] - value < least_gain:
             break
     return point, value, len(values) - 1
@@ -289,7 +273,7 @@ def descend(
             np.zeros(base.flat().size),
             iterations=iterations - steps,
             least_gain=least_gain,
-            after_step=None if after_step is None else lambda _, now: after_step(now),
+            after_step=after_step,
         )
         unknowns = base.plus(scales.times(base.like(flat)))
         steps += taken
