@@ -607,6 +607,7 @@ class Fit:
         return merged
 
     @classmethod
+    @as_input_errors("the fit")
     def from_dataset(cls, dataset: xarray.Dataset) -> Fit:
         """Rebuild a fit from its dataset.
 
@@ -621,11 +622,6 @@ class Fit:
             raise InputError(
                 f"dataset has no {', '.join(map(repr, missing))}: expected the result of a fit"
             )
-        with as_input_errors("the fit"):
-            return cls._from_parts(dataset)
-
-    @classmethod
-    def _from_parts(cls, dataset: xarray.Dataset) -> Fit:
         arrays = {name: numbers_of(dataset, name) for name in _VARIABLES}
         attributes = dataset.attrs
         entries = {field.name for field in dataclasses.fields(FitReport)}

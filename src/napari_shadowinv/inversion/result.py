@@ -452,6 +452,7 @@ class Inversion:
         )
 
     @classmethod
+    @as_input_errors("the result")
     def from_dataset(cls, dataset: xarray.Dataset) -> Inversion:
         """Rebuild an inversion from the dataset of `to_dataset`.
 
@@ -469,11 +470,6 @@ class Inversion:
                 f"dataset has no {', '.join(map(repr, missing))}: expected the result of an "
                 "inversion"
             )
-        with as_input_errors("the result"):
-            return cls._from_parts(dataset)
-
-    @classmethod
-    def _from_parts(cls, dataset: xarray.Dataset) -> Inversion:
         arrays: dict[str, Any] = {name: numbers_of(dataset, name) for name in VARIABLES}
         content = json.loads(dataset.attrs["report"])
         content["warnings"] = [Caution.from_json(caution) for caution in content["warnings"]]
