@@ -39,6 +39,7 @@ from napari_shadowinv.fitting.shots import (
     value_of_first,
 )
 from napari_shadowinv.fitting.unknowns import Fiducials, additive_blocks
+from napari_shadowinv.inversion.noise import finest_differences
 from napari_shadowinv.options import (
     KINDS_OF_NOISE,
     MAX_STRENGTH,
@@ -322,11 +323,8 @@ def strengths_of(
 
 def estimated_noise(image: FloatArray, used: BoolArray) -> float:
     """Return the standard deviation of an image's noise, from neighbouring pixels' differences."""
-    differences = image[1:, 1:] - image[1:, :-1] - image[:-1, 1:] + image[:-1, :-1]
-    both_used = used[1:, 1:] & used[1:, :-1] & used[:-1, 1:] & used[:-1, :-1]
-    if not both_used.any():
-        return 0.0
-    return float(NORMAL_MAD * np.median(np.abs(differences[both_used])) / 2)
+    all_used = used[1:, 1:] & used[1:, :-1] & used[:-1, 1:] & used[:-1, :-1]
+    return float(NORMAL_MAD * np.median(finest_differences(image, all_used)))
 
 
 def _checked_images(images: ArrayLike) -> FloatArray:

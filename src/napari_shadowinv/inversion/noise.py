@@ -217,7 +217,7 @@ class ImageNoise:
         mean = prepared.source[mask].mean()
         excess = (image - prepared.source) / mean
         used = mask[1:, 1:] & mask[1:, :-1] & mask[:-1, 1:] & mask[:-1, :-1]
-        differences = _finest(excess, used)
+        differences = finest_differences(excess, used)
         self.is_correlated_far = False
         if correlation is not None:
             inflation, self.clumping = _stated_correlation(excess, mask, correlation)
@@ -251,7 +251,8 @@ class ImageNoise:
             bright = (bright + image[rows, columns]) / (4 * mean)
             self.variance_terms = inflation * _terms(bright, differences[::step])
         if (level, counts) != (None, None):  # stated for the image, not for its source
-            self.variance_terms[0] += _clipped_rms(_finest(prepared.source / mean, used)) ** 2
+            of_source = finest_differences(prepared.source / mean, used)
+            self.variance_terms[0] += _clipped_rms(of_source) ** 2
         self.correlation_length = 0.0
         if self.clumping > 1:
             self.correlation_length = math.sqrt(self.clumping / (4 * math.pi))
@@ -275,8 +276,8 @@ class ImageNoise:
         return level * math.sqrt(mean), level * math.sqrt(mean + _DEVIATIONS * deviation)
 
 
-def _finest(values: FloatArray, used: BoolArray) -> FloatArray:
-    """Return absolute differences of neighbouring pixels in which smooth structure cancels."""
+def finest_differences(values: FloatArray, used: BoolArray) -> FloatArray:
+    """Return |a - b - c + d| / 2 of four neighbours each, of those that are all used."""
     if not used.any():
         return np.zeros(1)
     finest = values[1:, 1:] - values[1:, :-1]
