@@ -103,10 +103,9 @@ def leave_one_out(
     ensure_compiled(on_progress, should_stop)
     on_step = report_steps("leave one out", on_progress, should_stop)
     first = search(data.scene, collect_starts(data, on_step, should_stop), on_step)[0]
-    work = _Work(data, options, on_step)
-    agreeing = work.find_agreeing(first)
-    scene, common = work.estimate_smoothness(agreeing, first)
-    predictions = work.predict_all(agreeing, scene, common)
+    work = _Work(data, options, on_step, data.scene, first)
+    agreeing = work.find_agreeing()
+    predictions = work.with_smoothness(agreeing).predict_all(agreeing)
     return _result(data, predictions)
 
 
@@ -147,121 +146,123 @@ class _JointFit(NamedTuple):
     unknowns: Unknowns  # of all images
 
 
+@dataclass(frozen=True)
 class _Work:
-    """Context of all steps: images, options, and the callback for progress."""
+    """Context of all steps: inputs, the callback for progress, and what earlier steps have found.
 
-    def __init__(self, data: FitData, options: FitOptions, on_step: OnStep) -> None:
-        self._data, self._options, self._on_step = data, options, on_step
-        self._all = list(range(len(data.units)))
-        self._scene = data.scene
+    That is the `scene` of all images, the field that they have in `common`, and a `joint` fit.
+    """
+
+    data: FitData
+    options: FitOptions
+    on_step: OnStep
+    scene: Scene
+    common: Minimum
+    joint: _JointFit | None = None
+
+    @property
+    def _all(self) -> list[int]:
+        return list(range(len(self.data.units)))
 
     def _run_for_each(self, numbers: list[int], work: Callable[[_Work, int], _T]) -> dict[int, _T]:
         """Call `work(context, number)` for images, in threads."""
 
         def run(k: int, on_step: OnStep) -> _T:
-            return work(_Work(self._data, self._options, on_step), k)
+            return work(replace(self, on_step=on_step), k)
 
-        threads = available_threads(self._options.threads)
-        results = run_in_parallel([partial(run, k) for k in numbers], threads, self._on_step)
+        threads = available_threads(self.options.threads)
+        results = run_in_parallel([partial(run, k) for k in numbers], threads, self.on_step)
         return dict(zip(numbers, results, strict=True))
 
-    def find_agreeing(self, begun: Minimum) -> list[int]:
+    def find_agreeing(self) -> list[int]:
         """The most images that one field explains, found in pixels of two."""
-        scene = self._scene
-        if self._options.smoothness is None:
-            usual = SMOOTHNESS_RATIO * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1))
-            scene = replace(scene, smoothness=usual)
-        alone = self._run_for_each(
+        work = self
+        if self.options.smoothness is None:
+            usual = SMOOTHNESS_RATIO * np.tile(FIRST_SMOOTHNESS, (len(self.scene.smoothness), 1))
+            work = replace(self, scene=replace(self.scene, smoothness=usual))
+        alone = work._run_for_each(
             self._all,
-            lambda work, k: work._settle_members(scene, begun, [k], f"image {k + 1} alone"),
+            lambda work, k: work._settle_members(work.common, [k], f"image {k + 1} alone"),
         )
         most: list[int] = []
         remaining = self._all
         while len(remaining) > len(most):
-            group = self._find_group(scene, begun, remaining, alone)
+            group = work._find_group(remaining, alone)
             most = max(most, group, key=len)
             remaining = [k for k in remaining if k not in group]
         return most
 
-    def _settle_without(self, k: int, scene: Scene, minimum: Minimum, group: list[int]) -> Minimum:
+    def _settle_without(self, k: int, minimum: Minimum, group: list[int]) -> Minimum:
         """Fit a group but for one image; unknowns of all are kept, so that each can come back."""
         members = [image for image in group if image != k]
-        return self._settle_members(scene, minimum, members, f"without image {k + 1}")
+        return self._settle_members(minimum, members, f"without image {k + 1}")
 
-    def _find_group(
-        self, scene: Scene, begun: Minimum, left: list[int], alone: dict[int, Minimum]
-    ) -> list[int]:
+    def _find_group(self, left: list[int], alone: dict[int, Minimum]) -> list[int]:
         """Images that one field explains, after removing the worst one by one."""
-        least = np.array([self._chi2_in_middle(scene, alone[k], [k])[0] for k in self._all])
-        together = self._settle_members(scene, begun, left, "all images")
+        least = np.array([self._chi2_in_middle(alone[k], [k])[0] for k in self._all])
+        together = self._settle_members(self.common, left, "all images")
         while len(left) > _LEAST_AGREEING:
-            worse = self._chi2_in_middle(scene, together, left) / least[left]
+            worse = self._chi2_in_middle(together, left) / least[left]
             if worse.max() < _WORSE_IN_MIDDLE:
                 break
-            without = partial(_Work._settle_without, scene=scene, minimum=together, group=left)
+            without = partial(_Work._settle_without, minimum=together, group=left)
             tried = self._run_for_each(left, without)
             out = min(left, key=lambda k: tried[k].value + alone[k].value)
             left = [k for k in left if k != out]
             together = tried[out]
         return left
 
-    def estimate_smoothness(self, members: list[int], begun: Minimum) -> tuple[Scene, Minimum]:
-        """All images with the λ and κ of some, and weights of counts; the field of those."""
-        rng = np.random.default_rng(self._options.seed)
-        first = replace(begun, unknowns=begun.unknowns.only(members))
-        part, best = estimate_smoothness(self._scene.only(members), first, rng, self._on_step)
-        scene = replace(self._scene, smoothness=part.smoothness)
-        common = replace(best, unknowns=begun.unknowns.with_images(members, best.unknowns))
-        if self._data.counted:
-            scene = reweight_counts(self._data, scene, common)
-            common = self._settle_members(scene, common, members, "all that agree")
-        return scene, common
+    def with_smoothness(self, members: list[int]) -> _Work:
+        """Return the same with the λ and κ and the field of some images, and weights of counts."""
+        rng, start = np.random.default_rng(self.options.seed), self.common.unknowns
+        first = replace(self.common, unknowns=start.only(members))
+        part, best = estimate_smoothness(self.scene.only(members), first, rng, self.on_step)
+        scene = replace(self.scene, smoothness=part.smoothness)
+        common = replace(best, unknowns=start.with_images(members, best.unknowns))
+        if not self.data.counted:
+            return replace(self, scene=scene, common=common)
+        work = replace(self, scene=reweight_counts(self.data, scene, common))
+        return replace(work, common=work._settle_members(common, members, "all that agree"))
 
-    def predict_all(self, agreeing: list[int], scene: Scene, common: Minimum) -> list[_Prediction]:
+    def predict_all(self, agreeing: list[int]) -> list[_Prediction]:
         """Each image as all others predict it that agree.
 
         Larger pixels may set aside too many: images that the others predict are added again.
         """
-        joint = self._fit_jointly(scene, common, agreeing)
-        alone = self._run_for_each(
-            self._all, lambda work, k: work._fit_alone(k, scene, common, joint)
-        )
+        work = self._with_joint_fit(agreeing)
+        alone = work._run_for_each(self._all, _Work._fit_alone)
         predictions: dict[int, _Prediction] = {}
         while outside := [k for k in self._all if k not in agreeing]:
-            fit = self._sample_fit(scene, common, agreeing, joint)
+            fit = work._sample_fit(agreeing)
             for k in outside:
-                predictions[k] = self._predict(k, agreeing, scene, fit, alone[k], joint)
+                predictions[k] = work._predict(k, agreeing, fit, alone[k])
             back = [k for k in outside if predictions[k].chi2 <= predictions[k].limit]
             if not back:
                 break
             agreeing = sorted([*agreeing, *back])
-            joint = self._fit_jointly(scene, common, agreeing)
+            work = self._with_joint_fit(agreeing)
 
         def predict(work: _Work, k: int) -> _Prediction:
             others = [image for image in agreeing if image != k]
-            fit = work._sample_fit(scene, common, others, joint)
-            return work._predict(k, others, scene, fit, alone[k], joint)
+            return work._predict(k, others, work._sample_fit(others), alone[k])
 
-        predictions |= self._run_for_each(agreeing, predict)
+        predictions |= work._run_for_each(agreeing, predict)
         return [predictions[k] for k in self._all]
 
-    def _fit_jointly(self, scene: Scene, common: Minimum, members: list[int]) -> _JointFit | None:
-        """Fit images with dense rays; None if they are too many for Jacobians."""
-        if scene.only(members).images.size > _MAX_SAMPLED_PIXELS:
-            return None
-        _, fine, unknowns, _ = self._fit_densely(scene, common, members)
-        linear = fine.linear(unknowns)
-        return _JointFit(members, linear, finer(common.unknowns).with_images(members, unknowns))
+    def _with_joint_fit(self, members: list[int]) -> _Work:
+        """Fit images with dense rays, unless they are too many for Jacobians."""
+        if self.scene.only(members).images.size > _MAX_SAMPLED_PIXELS:
+            return self
+        _, fine, unknowns, _ = self._fit_densely(members)
+        of_all = finer(self.common.unknowns).with_images(members, unknowns)
+        return replace(self, joint=_JointFit(members, fine.linear(unknowns), of_all))
 
-    def _fit_densely(
-        self, scene: Scene, common: Minimum, members: list[int]
-    ) -> tuple[Minimum, Scene, Unknowns, float]:
+    def _fit_densely(self, members: list[int]) -> tuple[Minimum, Scene, Unknowns, float]:
         """Fit some images; return where that ends in pixels of two, and with dense rays."""
-        coarse = self._settle_members(scene, common, members, _name(members), _LAST_GAIN)
+        coarse = self._settle_members(self.common, members, _name(members), _LAST_GAIN)
         first = replace(coarse, unknowns=coarse.unknowns.only(members))
-        fine, unknowns, *_ = refine_minimum(
-            scene.only(members), first, self._options, self._on_step
-        )
+        scene = self.scene.only(members)
+        fine, unknowns, *_ = refine_minimum(scene, first, self.options, self.on_step)
         # Folds are deeper in the image that is left out if it is displaced most.
         fine = replace(fine, spacing=_RAY_SPACING_RATIO * fine.spacing)
         return coarse, fine, *self._settle_densely(fine, unknowns, members)
@@ -274,31 +275,28 @@ class _Work:
             unknowns,
             steps=_DENSE_STEPS,
             least_gain=_LAST_GAIN,
-            after_step=lambda now: self._on_step(_name(members), now),
+            after_step=partial(self.on_step, _name(members)),
             linear=linear,
         )
         return unknowns, value
 
-    def _sample_fit(
-        self, scene: Scene, common: Minimum, members: list[int], joint: _JointFit | None
-    ) -> _SampledFit:
+    def _sample_fit(self, members: list[int]) -> _SampledFit:
         """Fit some images, from a joint fit of these and others if there is one."""
-        linear = _linear_of(members, joint)
+        linear = self._linear_of(members)
         large = False
-        if linear is not None and joint is not None:
-            fine, start = linear.scene, joint.unknowns
+        if linear is not None and self.joint is not None:
+            fine, start = linear.scene, self.joint.unknowns
             unknowns, value = self._settle_densely(fine, start.only(members), members, linear)
             sampled = fine, unknowns
         else:
-            coarse, fine, unknowns, value = self._fit_densely(scene, common, members)
+            coarse, fine, unknowns, value = self._fit_densely(members)
             start, sampled = finer(coarse.unknowns), (fine, unknowns)
             large = fine.images.size > _MAX_SAMPLED_PIXELS
             if large:
-                sampled = coarse.coarsen(scene.only(members)), coarse.unknowns.only(members)
-        rng = np.random.default_rng(self._options.seed)
-        posterior = Posterior(
-            *sampled, rng, lambda: self._on_step(_name(members), value), linear=linear
-        )
+                sampled = coarse.coarsen(self.scene.only(members)), coarse.unknowns.only(members)
+        rng = np.random.default_rng(self.options.seed)
+        report = partial(self.on_step, _name(members), value)
+        posterior = Posterior(*sampled, rng, report, linear=linear)
         samples = posterior.draw_samples(_SAMPLES, _SAMPLE_TOLERANCE)
         changes = [sample.change for sample in samples]
         if large:
@@ -306,16 +304,10 @@ class _Work:
         return _SampledFit(fine, start.with_images(members, unknowns), changes)
 
     def _predict(
-        self,
-        k: int,
-        others: list[int],
-        scene: Scene,
-        fit: _SampledFit,
-        alone: tuple[float, float],
-        joint: _JointFit | None,
+        self, k: int, others: list[int], fit: _SampledFit, alone: tuple[float, float]
     ) -> _Prediction:
         """One image, as others predict it."""
-        scene = replace(scene, spacing=fit.scene.spacing)
+        scene = replace(self.scene, spacing=fit.scene.spacing)
         unknowns = fit.unknowns
         if scene.free_frames.any():
             unknowns = _align_image(scene, unknowns, others[0], k)
@@ -326,7 +318,7 @@ class _Work:
         (image,) = scene.model(unknowns)
         brightness, weights = self._match_brightness(k, image, scene)
         chi2 = _chi2(brightness * image, scene.images[0], weights)
-        variance = fit.variance_in(_linear_of([k], joint) or scene.linear(unknowns))
+        variance = fit.variance_in(self._linear_of([k]) or scene.linear(unknowns))
         variance += _RAY_VARIANCE_RATIO * _chi2(brightness * image, brightness * rough, weights)
         limit = _MAX_NOISE_RATIO + _MAX_VARIANCE_RATIO * variance
         own_chi2, noise_chi2 = alone
@@ -334,15 +326,13 @@ class _Work:
             brightness * image, weights, brightness, chi2, own_chi2, limit * noise_chi2
         )
 
-    def _fit_alone(
-        self, k: int, scene: Scene, common: Minimum, joint: _JointFit | None
-    ) -> tuple[float, float]:
+    def _fit_alone(self, k: int) -> tuple[float, float]:
         """χ² of an image with a field of its own, and of the noise in it."""
-        fit = self._sample_fit(scene, common, [k], joint)
+        fit = self._sample_fit([k])
         unknowns = fit.unknowns.only([k])
         chi2 = float(fit.scene.chi2(unknowns)[0])
         # A field of an image's own follows the noise by as much as it is left open.
-        variance = fit.variance_in(_linear_of([k], joint) or fit.scene.linear(unknowns))
+        variance = fit.variance_in(self._linear_of([k]) or fit.scene.linear(unknowns))
         share = min(variance, _MAX_FITTED_SHARE)
         return chi2, chi2 / (1 - share)
 
@@ -350,37 +340,31 @@ class _Work:
         """Brightness with which a prediction is nearest to an image, and the pixels' weights."""
         (weights,), (data,) = one.weights, one.images
         brightness = _brightness(made, data, weights)
-        if self._data.counted:
-            unit = self._data.units[k]
+        if self.data.counted:
+            unit = self.data.units[k]
             expected = np.maximum(brightness * made * unit, 1.0)
             weights = np.where(weights > 0, unit**2 / expected, 0.0)
             brightness = _brightness(made, data, weights)
         return brightness, weights
 
     def _settle_members(
-        self,
-        scene: Scene,
-        minimum: Minimum,
-        members: list[int],
-        name: str,
-        least_gain: float = COARSE_GAIN,
+        self, minimum: Minimum, members: list[int], name: str, least_gain: float = COARSE_GAIN
     ) -> Minimum:
         """Fit some of the images; brightness and frames of the others stay."""
         first = replace(minimum, unknowns=minimum.unknowns.only(members), modes=SoftModes())
-        end = settle_minimum(scene.only(members), first, self._on_step, name, least_gain)
+        end = settle_minimum(self.scene.only(members), first, self.on_step, name, least_gain)
         unknowns = minimum.unknowns.with_images(members, end.unknowns)
         return replace(end, unknowns=unknowns, modes=SoftModes())
 
-    @staticmethod
-    def _chi2_in_middle(scene: Scene, minimum: Minimum, members: list[int]) -> FloatArray:
-        return minimum.coarsen(scene.only(members)).chi2(minimum.unknowns.only(members))
+    def _chi2_in_middle(self, minimum: Minimum, members: list[int]) -> FloatArray:
+        return minimum.coarsen(self.scene.only(members)).chi2(minimum.unknowns.only(members))
 
-
-def _linear_of(members: list[int], joint: _JointFit | None) -> Linear | None:
-    """Some images to first order by a joint fit; None if there is none in which all take part."""
-    if joint is None or not set(members) <= set(joint.members):
-        return None
-    return joint.linear.only([joint.members.index(k) for k in members])
+    def _linear_of(self, members: list[int]) -> Linear | None:
+        """Some images to first order by a joint fit, if there is one in which all take part."""
+        joint = self.joint
+        if joint is None or not set(members) <= set(joint.members):
+            return None
+        return joint.linear.only([joint.members.index(k) for k in members])
 
 
 def _name(members: list[int]) -> str:
