@@ -43,10 +43,21 @@ _MAX_VARIANCE_RATIO = 0.85
 def pattern_strength(residual: FloatArray, used: BoolArray, correlation: float = 0.0) -> float:
     """Return how far a smoothed residual stands out of smoothed noise of its own r.m.s.
 
-    That is the power of the residual smoothed by Gaussians of 2, 4 and 8 px, minus the expected
-    one, in standard deviations of that; the largest. White noise gives about 0 ± 1, and less where
-    the model has absorbed part of it. `correlation` is the standard deviation in px of the Gaussian
-    that has blurred the noise.
+    Parameters
+    ----------
+    residual : ndarray, shape (H, W)
+        Image minus model over the standard deviation of the noise in each pixel.
+    used : ndarray of bool, shape (H, W)
+        The pixels that were fitted.
+    correlation : float, default 0
+        Standard deviation in px of the Gaussian that has blurred the noise; 0 for white noise.
+
+    Returns
+    -------
+    float
+        Power of the residual smoothed by Gaussians of 2, 4 and 8 px, minus the expected one, in
+        standard deviations of that; the largest. White noise gives about 0 ± 1, and less where the
+        model has absorbed part of it.
     """
     values = np.where(used, residual, 0.0)
     variance = float((values**2).sum() / max(used.sum(), 1))
@@ -75,6 +86,11 @@ def correlation_length(residual: FloatArray, used: BoolArray) -> float:
 
     Differences of neighbouring pixels are compared with differences of pixels four apart. Medians
     are taken, so that bright lines that the model misses do not count. 0 if the noise is white.
+
+    Parameters
+    ----------
+    residual, used : ndarray, shape (H, W)
+        As for `pattern_strength`.
     """
     near = _squared_difference(residual, used, _NEAR_PX)
     far = _squared_difference(residual, used, _FAR_PX)
@@ -104,8 +120,16 @@ def blur_score(residuals: FloatArray, roots: FloatArray, made: FloatArray) -> fl
     """Return how much the residuals look like missing blur, in standard deviations of noise.
 
     Blur adds the Laplacian of an image to it. The fit has removed the part that fields can imitate
-    from the residual, so noise gives less than 1. `roots` are one over the standard deviation of
-    the noise, zero where a pixel is not used, and `made` is the model.
+    from the residual, so noise gives less than 1.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (L, H, W)
+        Image minus model over the standard deviation of the noise.
+    roots : ndarray, shape (L, H, W)
+        One over that standard deviation, zero where a pixel is not used.
+    made : ndarray, shape (L, H, W)
+        The model.
     """
     change = roots * np.stack([laplace(image, mode="nearest") for image in made])
     size = float(np.sqrt((change**2).sum()))
@@ -116,6 +140,13 @@ def lack_of_noise(residuals: FloatArray, used: BoolArray) -> tuple[float, float]
     """Return by how much the variance of white residuals is below 1, and its standard deviation.
 
     Structure of more than a few pixels, of which a fit absorbs the noise, is left out.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (L, H, W)
+        Image minus model over the standard deviation of the noise.
+    used : ndarray of bool, shape (L, H, W)
+        The pixels to use.
     """
     inside = used.astype(np.float64)
     near = np.maximum(gaussian_filter(inside, (0, _DETAIL_PX, _DETAIL_PX), mode="nearest"), 1e-9)

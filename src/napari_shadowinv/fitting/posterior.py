@@ -341,7 +341,13 @@ class Posterior:
         return product(slope.flat(), self._change(slope, _ROUGHLY).flat())
 
     def moved_by_beams(self, variations: Sequence[FloatArray]) -> list[Unknowns]:
-        """Return the changes of the unknowns if the beams differ by shares of them, (L, …) each."""
+        """Return the changes of the unknowns if the beams differ from their sources.
+
+        Parameters
+        ----------
+        variations : sequence of ndarray, shape (L, …)
+            Differences as shares of the beams, of the shape of the scene's beams.
+        """
         slopes = [
             self._linear.pull(self.scene.changed_by_beams(self._unknowns, self._counts, each))
             for each in variations
@@ -353,10 +359,23 @@ class Posterior:
     ) -> list[Unknowns]:
         """Return random differences of a common beam that the images leave possible.
 
-        `variation` is their r.m.s. before the images are looked at. Each of the `samples`, which
-        are for the beam as it is, makes one: the beam's difference, as in `Scene.with_free_beam`,
-        with the change of the other unknowns that it causes.
+        Parameters
+        ----------
+        variation : float
+            R.m.s. difference that is possible before the images are looked at.
+        samples : sequence of Sample
+            For the beam as it is; each makes one of the differences.
+        rng : numpy.random.Generator
+            For the beam's prior.
 
+        Returns
+        -------
+        list of Unknowns
+            The beam's difference, `Scene.with_free_beam`'s, with the change of the other unknowns
+            that it causes.
+
+        Notes
+        -----
         With J and B the derivatives of the residuals by the unknowns and by the beam's cosines, H
         and P the Hessian and the beam's prior, a sample x = H⁻¹ (Jᵀη + ξ) becomes one of both,
         (x + δ, θ), by
@@ -504,9 +523,22 @@ class BeamError:
 def draw_variations(
     scene: Scene, length: float, count: int, rng: np.random.Generator
 ) -> FloatArray:
-    """Return random smooth fields with a mean of 0 and an r.m.s. of 1 over the image, (count, …).
+    """Return random smooth fields with a mean of 0 and an r.m.s. of 1 over the image.
 
-    They vary over a length in px of the scene, and reach as far as its beams.
+    Parameters
+    ----------
+    scene : Scene
+        Its beams, of the shape (L, …), reach beyond the image.
+    length : float
+        Distance over which the fields vary, px of the scene.
+    count : int
+        Number of fields.
+    rng : numpy.random.Generator
+        For the waves.
+
+    Returns
+    -------
+    ndarray, shape (count, …)
     """
     height, width = scene.beams.shape[1:]
     inside = np.s_[scene.pad : height - scene.pad, scene.pad : width - scene.pad]
