@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from queue import SimpleQueue
@@ -110,3 +112,11 @@ def run_in_parallel(
     for error in sorted(errors, key=lambda each: isinstance(each, InversionCancelled)):
         raise error
     return [future.result() for future in futures]
+
+
+@contextmanager
+def measure_time(stage: str, seconds: dict[str, float]) -> Iterator[None]:
+    """Add the time of a block to that of a stage."""
+    start = time.perf_counter()
+    yield
+    seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start

@@ -19,6 +19,7 @@ from napari_shadowinv._system.progress import (
     OnStep,
     Reporter,
     ShouldStop,
+    measure_time,
     run_in_parallel,
 )
 from napari_shadowinv._system.validation import as_model
@@ -71,7 +72,7 @@ from napari_shadowinv.fitting.search import (
 from napari_shadowinv.fitting.shots import Images, list_shots
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.fitting.verdict import assess_verdict, hidden_contrast
-from napari_shadowinv.inversion._invert import invert, measure_time
+from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.inversion.samples import Pairs
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions, KindOfNoise

@@ -41,10 +41,26 @@ def minimise(
     least_gain: float,
     after_step: Callable[[float], None] | None = None,
 ) -> tuple[FloatArray, float, int]:
-    """Minimise by L-BFGS, starting with the identity as Hessian; return point, value and steps.
+    """Minimise by L-BFGS, starting with the identity as Hessian.
 
-    `start` is scaled so that the Hessian is about the identity. Ends after the most `iterations`,
-    or once five lower the value by less than `least_gain`.
+    Parameters
+    ----------
+    objective : callable
+        Returns value and gradient.
+    start : ndarray, shape (n,)
+        Where to start; scaled so that the Hessian is about the identity.
+    iterations : int
+        Most steps.
+    least_gain : float
+        Ends once five steps lower the value by less.
+    after_step : callable, optional
+        Receives the value.
+
+    Returns
+    -------
+    point : ndarray
+    value : float
+    steps : int
     """
     point = start
     value, gradient = objective(point)

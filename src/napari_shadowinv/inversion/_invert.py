@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import NamedTuple
@@ -16,7 +14,13 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import check_mask, unpack_array, unpack_shot
 from napari_shadowinv._system.machine import begin
-from napari_shadowinv._system.progress import OnProgress, Progress, Reporter, ShouldStop
+from napari_shadowinv._system.progress import (
+    OnProgress,
+    Progress,
+    Reporter,
+    ShouldStop,
+    measure_time,
+)
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -150,14 +154,6 @@ def _site_domain(
     margin = Margin.around(beam, margin_around(beam.shape, options), usable)
     n_sites = round(n_sites * margin.beam.sum() / beam.sum())
     return _SiteDomain(checked, margin.beam, unit, usable, margin, n_sites)
-
-
-@contextmanager
-def measure_time(stage: str, seconds: dict[str, float]) -> Iterator[None]:
-    """Add the time of a block to that of a stage."""
-    start = time.perf_counter()
-    yield
-    seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
 @loading_kernels()
