@@ -15,6 +15,18 @@ MAX_STRENGTH = 1e4
 """Largest ratio of an image's displacement to the first one's."""
 
 
+def refuse_two_point_spreads(choices: Any) -> None:
+    """Raise a `CombinationError` if a point spread is stated both in px and in m."""
+    in_metres = [
+        name for name in ("source_size", "resolution") if getattr(choices, name) is not None
+    ]
+    if choices.psf is not None and in_metres:
+        raise CombinationError(
+            f"received {{psf}}, a point spread in px, and {{{in_metres[0]}}} in m: expected one or "
+            "the other"
+        )
+
+
 def _any_of(names: Iterable[str]) -> str:
     *most, last = names
     return f"{', '.join(most)} or {last}"
@@ -254,12 +266,5 @@ class FitChoices(CheckedModel, allow_inf_nan=False):
 
     @model_validator(mode="after")
     def _check_point_spread(self) -> Self:
-        in_metres = [
-            name for name in ("source_size", "resolution") if getattr(self, name) is not None
-        ]
-        if self.psf is not None and in_metres:
-            raise CombinationError(
-                f"received {{psf}}, a point spread in px, and {{{in_metres[0]}}} in m: expected "
-                "one or the other"
-            )
+        refuse_two_point_spreads(self)
         return self

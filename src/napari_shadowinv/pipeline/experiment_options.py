@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv.options import MaxError
+from napari_shadowinv.options.fitting import refuse_two_point_spreads
 
 _rare = partial(Field, json_schema_extra={"panel": "Rarely used options of a plan"})
 _detail = partial(Field, json_schema_extra={"panel": "Point spread, and the reference in detail"})
@@ -108,12 +109,7 @@ class ExperimentOptions(CheckedModel, allow_inf_nan=False):
 
     @model_validator(mode="after")
     def _check_combinations(self) -> Self:
-        in_metres = [n for n in ("source_size", "resolution") if getattr(self, n) is not None]
-        if self.psf is not None and in_metres:
-            raise CombinationError(
-                f"received {{psf}}, a point spread in px, and {{{in_metres[0]}}} in m: expected "
-                "one or the other"
-            )
+        refuse_two_point_spreads(self)
         if self.reference == "none":
             for name in ("reference_counts", "beam_structure"):
                 if getattr(self, name):
