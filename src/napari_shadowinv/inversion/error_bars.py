@@ -59,14 +59,13 @@ from napari_shadowinv.inversion.samples import (
 )
 from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.options import BeamPrior, Instrument, InversionOptions
+from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.significance import PixelErrors
 from napari_shadowinv.physics.units import label
 from napari_shadowinv.transport.sites import SitePlan
 
 if TYPE_CHECKING:
     import xarray
-
-    from napari_shadowinv.physics.setup import Setup
 
 Result = TypeVar("Result")
 

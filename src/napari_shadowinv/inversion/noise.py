@@ -21,7 +21,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -29,11 +28,9 @@ from scipy import ndimage
 
 from napari_shadowinv._system.arrays import NORMAL_MAD, order_by_value
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.inversion.normalise import Prepared
+from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing.pixels import nonnegative_fit
-
-if TYPE_CHECKING:
-    from napari_shadowinv.inversion.normalise import Prepared
-    from napari_shadowinv.options import InversionOptions
 
 _TILES = 8  # along the shorter side
 _CELLS = 4  # along each side of a tile

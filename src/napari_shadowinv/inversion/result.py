@@ -38,6 +38,7 @@ from napari_shadowinv.inversion.variables import (
     setup_from_dataset,
 )
 from napari_shadowinv.options import Instrument, InversionOptions
+from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.significance import (
     PixelErrors,
     Structures,
@@ -49,8 +50,6 @@ from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
     import xarray
-
-    from napari_shadowinv.physics.setup import Setup
 
 # Fields with other beams against the linear response: 5 to 20 % of the change up to this error.
 _MAX_LINEAR = 0.5  # of the displacement, r.m.s.

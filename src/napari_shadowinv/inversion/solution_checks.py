@@ -55,7 +55,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -66,11 +66,9 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.geometry.compiler import kernel
-
-if TYPE_CHECKING:
-    from napari_shadowinv.inversion.noise import ImageNoise
-    from napari_shadowinv.inversion.normalise import Prepared
-    from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.inversion.noise import ImageNoise
+from napari_shadowinv.inversion.normalise import Prepared
+from napari_shadowinv.options import InversionOptions
 
 TURNED_BACK = 0.07
 """Mean displacement across the edge over the r.m.s. one: 0.05 if contained, 0.08 if cut."""

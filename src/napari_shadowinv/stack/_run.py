@@ -28,6 +28,8 @@ from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.fitting import Fit
+from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.shot_columns import read_shot_table
@@ -75,9 +77,6 @@ from napari_shadowinv.stack._worker import InvertTask, ShotOutcome, TaskContext,
 
 if TYPE_CHECKING:
     import xarray
-
-    from napari_shadowinv.fitting import Fit
-    from napari_shadowinv.inversion import Inversion
 
 WATCHING = "watching"  # name of the engine of a watched folder
 _POLL_S = 0.25  # between two looks at the engine and at `should_stop`

@@ -24,12 +24,15 @@ from napari_shadowinv._system.machine import clear_up_when_terminated, defer_int
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv.errors import InversionCancelled
+from napari_shadowinv.fitting import Fit
+from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, SKIPPED, StackStore, check_store_path
 from napari_shadowinv.io.store_writing import GrowingStore, create_store, remove_unfinished
 from napari_shadowinv.pipeline.run_options import WatchOptions
+from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._folder_events import Arrivals, checked_folder, observing
 from napari_shadowinv.stack._plan import (
     MAX_TRIED_SHOTS,
@@ -69,11 +72,6 @@ from napari_shadowinv.stack._worker import (
 
 if TYPE_CHECKING:
     import xarray
-
-    from napari_shadowinv.fitting import Fit
-    from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.preprocessing import Recipe
-
 
 # Simultaneous shots. The number is fixed, because each starts from the last one in its lane, and
 # results must not depend on the machine.
