@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, PrivateAttr
 
-from napari_shadowinv._system.arrays import NORMAL_MAD, block_means, check_finite, check_plane
+from napari_shadowinv._system.arrays import (
+    NORMAL_MAD,
+    block_means,
+    check_finite,
+    check_plane,
+    check_shape,
+)
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
@@ -183,10 +189,8 @@ def _normalise(images: Iterable[ArrayLike]) -> list[FloatArray]:
         name = f"reference {number}"
         beam = check_plane(image, name, least=4).astype(np.float64)
         check_finite(name, beam)
-        if beams and beam.shape != beams[0].shape:
-            raise InputError(
-                f"{name} has shape {beam.shape}, the first {beams[0].shape}: they must match"
-            )
+        if beams:
+            check_shape(name, beam.shape, beams[0].shape, "the first")
         if not beam.mean() > 0:
             raise InputError(f"{name} has a mean of {beam.mean():.4g}, expected a positive one")
         beams.append(beam / beam.mean())

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import (
     check_plane,
+    check_shape,
     check_spacing,
     join_masks,
     unpack_array,
@@ -445,10 +446,7 @@ def _dark_frame(recipe: Recipe, shot: Radiograph) -> Radiograph | None:
     if file is None:
         return None
     frame = read_radiograph(file)
-    if frame.shape != shot.shape:
-        raise InputError(
-            f"{file}: the dark frame has shape {frame.shape}, image {shot.shape}: they must match"
-        )
+    check_shape(f"{file}: the dark frame", frame.shape, shot.shape)
     bad = int((~np.isfinite(frame.image)).sum())
     if bad:
         raise InputError(f"{file}: the dark frame has {bad} pixels that are NaN or infinite")
@@ -488,10 +486,7 @@ def _mask(values: ArrayLike | None, file: Path | None, name: str, shot: Radiogra
     if file is None:
         return None
     pixels = picture_mask(file)
-    if pixels.shape != shot.shape:
-        raise InputError(
-            f"{file}: {name} has shape {pixels.shape}, image {shot.shape}: they must match"
-        )
+    check_shape(f"{file}: {name}", pixels.shape, shot.shape)
     return _Mask(pixels, file)
 
 

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import (
     check_mask,
+    check_shape,
     check_spacing,
     join_masks,
     unpack_array,
@@ -376,10 +377,8 @@ def _describe_inputs(
         recipe = recipe.model_copy(update={"setup": first})
     else:
         stack_shots = find_shots(shots, reader=reader, shape=image_shape)
-    if sources is not None and sources.shape != stack_shots.shape:
-        raise InputError(
-            f"source has shape {sources.shape}, shots {stack_shots.shape}: they must match"
-        )
+    if sources is not None:
+        check_shape("source", sources.shape, stack_shots.shape, "shots")
     mask = join_masks(mask, stack_shots.mask, lit)
     usable = None if mask is None else check_mask(mask, stack_shots.shape)
     bare = None if source_mask is None else check_mask(source_mask, stack_shots.shape)
