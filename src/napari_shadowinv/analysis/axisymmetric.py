@@ -86,10 +86,8 @@ class AxisymmetricProfile(Product):
     axis: tuple[Point, Point] | None = Field(
         default=None,
         title="Axis (px)",
-        description=(
-            "Two points (y, x) of the axis, which may be inclined; profiles are computed between "
-            "them. Default: found from the symmetry of the field, from edge to edge."
-        ),
+        description="Two points (y, x) of the axis, which may be inclined; profiles are computed "
+        "between them. Default: found from the symmetry of the field, from edge to edge.",
         json_schema_extra={"metavar": "Y,X Y,X"},
     )
     direction: Literal["vertical", "horizontal"] = Field(
@@ -123,10 +121,8 @@ class AxisymmetricProfile(Product):
     component: Literal["azimuthal", "axial"] = Field(
         default="azimuthal",
         title="Component of B",
-        description=(
-            "Component of a magnetic field: 'axial' of a field without azimuthal component, such "
-            "as that of a coil. An azimuthal field is not visible from the side."
-        ),
+        description="Component of a magnetic field: 'axial' of a field without azimuthal "
+        "component, such as that of a coil. An azimuthal field is not visible from the side.",
     )
     gladstone_dale: float | None = number_field(
         "Gladstone-Dale constant (m³/kg)",

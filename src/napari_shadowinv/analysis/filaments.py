@@ -101,10 +101,8 @@ class Filaments(Product):
         ge=-180,
         le=180,
         title="Angle (°)",
-        description=(
-            "Direction of the filaments in degrees, from the x axis towards y (clockwise in the "
-            "image). Default: the direction along which the field varies least."
-        ),
+        description="Direction of the filaments in degrees, from the x axis towards y (clockwise "
+        "in the image). Default: the direction along which the field varies least.",
     )
 
     def check(self, frame: FieldFrame) -> None:

@@ -100,10 +100,8 @@ class Smoothed(Product):
         ge=0,
         le=100,
         title="Smoothing (px)",
-        description=(
-            "Width of the smoothing in px; 0 for none. Default: the width with the smallest "
-            "expected error, which follows from the noise."
-        ),
+        description="Width of the smoothing in px; 0 for none. Default: the width with the "
+        "smallest expected error, which follows from the noise.",
     )
 
     def check(self, frame: FieldFrame) -> None:

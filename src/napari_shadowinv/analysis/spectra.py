@@ -129,10 +129,8 @@ class TurbulenceSpectrum(Product):
         default=2,
         ge=0,
         le=50,
-        description=(
-            "Number of random fields on which the response of the inversion is measured. 0: no "
-            "correction."
-        ),
+        description="Number of random fields on which the response of the inversion is measured. "
+        "0: no correction.",
     )
     phantom_seed: int = Field(
         default=0, ge=0, title="Seed of the phantoms", description="Seed of the random fields."

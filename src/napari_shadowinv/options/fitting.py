@@ -49,54 +49,42 @@ class FitOptions(CheckedModel, allow_inf_nan=False):
     smoothness: float | None = Field(
         default=None,
         gt=0,
-        description=(
-            "Weight of the squared fourth derivatives of each field's potential (px). Default: "
-            "weights of fourth and sixth derivatives estimated from the data, for each field."
-        ),
+        description="Weight of the squared fourth derivatives of each field's potential (px). "
+        "Default: weights of fourth and sixth derivatives estimated from the data, for each field.",
     )
     boundary: Literal["fading", "free"] = Field(
         default="fading",
-        description=(
-            "'fading': the object lies within the image and its field fades towards the edge. "
-            "'free': the object extends beyond the edge, where its potential decays."
-        ),
+        description="'fading': the object lies within the image and its field fades towards the "
+        "edge. 'free': the object extends beyond the edge, where its potential decays.",
     )
     margin: int | None = Field(
         default=None,
         ge=16,
         multiple_of=8,
         title="Margin (px)",
-        description=(
-            "Width of the strip beyond each edge from which rays may enter. Default: 16, or with a "
-            "free boundary a tenth of the image's shorter side."
-        ),
+        description="Width of the strip beyond each edge from which rays may enter. Default: 16, "
+        "or with a free boundary a tenth of the image's shorter side.",
     )
     decay_length: float | None = Field(
         default=None,
         ge=0.1,
         le=1e6,
         title="Decay length (px)",
-        description=(
-            "Free boundary only: distance over which the potential decays beyond the edge. "
-            "Default: the margin."
-        ),
+        description="Free boundary only: distance over which the potential decays beyond the edge. "
+        "Default: the margin.",
     )
     align: Literal["none", "shift", "affine"] = Field(
         default="none",
         title="Alignment",
-        description=(
-            "Misalignment to fit for all images after the first: 'none', 'shift', or 'affine' "
-            "(also rotation, magnification and shear)."
-        ),
+        description="Misalignment to fit for all images after the first: 'none', 'shift', or "
+        "'affine' (also rotation, magnification and shear).",
     )
     align_spread: float = Field(
         default=5.0,
         gt=0,
         title="Expected shift (px)",
-        description=(
-            "Expected misalignment of later images (standard deviation in px after all steps). A "
-            "small value attributes more of the displacement to the fields."
-        ),
+        description="Expected misalignment of later images (standard deviation in px after all "
+        "steps). A small value attributes more of the displacement to the fields.",
     )
     beam_modes: int = Field(
         default=8,
@@ -113,28 +101,23 @@ class FitOptions(CheckedModel, allow_inf_nan=False):
     )
     sampling: Literal["linear", "resolve"] = Field(
         default="linear",
-        description=(
-            "'linear': random fields respond to noise and instrument to first order. 'resolve': "
-            "each is fitted to images with other noise and another instrument, which takes 2 to 5 "
-            "times as long as a linear one; for strong folds and instruments that are known poorly."
-        ),
+        description="'linear': random fields respond to noise and instrument to first order. "
+        "'resolve': each is fitted to images with other noise and another instrument, which takes "
+        "2 to 5 times as long as a linear one; for strong folds and instruments that are known "
+        "poorly.",
     )
     evidence: bool = Field(
         default=False,
-        description=(
-            "Compute the log evidence, to compare choices of fields; takes as long as a few "
-            "samples."
-        ),
+        description="Compute the log evidence, to compare choices of fields; takes as long as a "
+        "few samples.",
     )
     spacing: float | None = Field(
         default=None,
         ge=0.05,
         le=0.5,
         title="Ray spacing (px)",
-        description=(
-            "Largest distance between the landing points of neighbouring rays. Default: 0.2, or "
-            "0.14 if bright lines need it."
-        ),
+        description="Largest distance between the landing points of neighbouring rays. Default: "
+        "0.2, or 0.14 if bright lines need it.",
     )
     max_iterations: int = Field(
         default=120,
@@ -145,10 +128,8 @@ class FitOptions(CheckedModel, allow_inf_nan=False):
     ambiguous: bool = Field(
         default=False,
         title="Allow an ambiguous fit",
-        description=(
-            "Fit a single image even if its source is unknown, although many beams and fields "
-            "explain it equally well."
-        ),
+        description="Fit a single image even if its source is unknown, although many beams and "
+        "fields explain it equally well.",
     )
     seed: int = Field(
         default=0,
@@ -207,25 +188,19 @@ class FitChoices(CheckedModel, allow_inf_nan=False):
     )
     beam: Literal["known", "unknown"] = Field(
         default="known",
-        description=(
-            "'known': the source is the beam. 'unknown': fit a smooth beam, the same for all "
-            "images apart from its brightness."
-        ),
+        description="'known': the source is the beam. 'unknown': fit a smooth beam, the same for "
+        "all images apart from its brightness.",
     )
     brightness: Literal["known", "free"] = Field(
         default="known",
-        description=(
-            "'known': images are as bright as the source. 'free': fit the brightness of each image "
-            "relative to the source."
-        ),
+        description="'known': images are as bright as the source. 'free': fit the brightness of "
+        "each image relative to the source.",
     )
     noise: Noise | None = Field(
         default=None,
-        description=(
-            "'poisson' for images in counts; 'proportional' if the noise is a fraction of each "
-            "pixel, as on film; or the standard deviation of a pixel after all steps. Default: "
-            "estimated from the images, the same for all pixels."
-        ),
+        description="'poisson' for images in counts; 'proportional' if the noise is a fraction of "
+        "each pixel, as on film; or the standard deviation of a pixel after all steps. Default: "
+        "estimated from the images, the same for all pixels.",
         json_schema_extra={"metavar": "poisson|proportional|NUMBER"},
     )
     psf: float | None = Field(
@@ -238,10 +213,8 @@ class FitChoices(CheckedModel, allow_inf_nan=False):
         default=None,
         ge=0,
         title="Source size (m)",
-        description=(
-            "Standard deviation of the beam's source in m (FWHM / 2.355). Use it with the "
-            "resolution, instead of the point spread in px."
-        ),
+        description="Standard deviation of the beam's source in m (FWHM / 2.355). Use it with the "
+        "resolution, instead of the point spread in px.",
     )
     resolution: float | None = Field(
         default=None,

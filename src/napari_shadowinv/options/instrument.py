@@ -81,41 +81,32 @@ class Instrument(CheckedModel, allow_inf_nan=False):
         ge=0,
         lt=1,
         title="Beam",
-        description=(
-            "Relative r.m.s. difference between the true beam and the source. Default: 0 for a "
-            "recorded source, else 0.05. If image and source differ by more where there is no "
-            "object, that difference counts."
-        ),
+        description="Relative r.m.s. difference between the true beam and the source. Default: 0 "
+        "for a recorded source, else 0.05. If image and source differ by more where there is no "
+        "object, that difference counts.",
     )
     beam_length: float = Field(
         default=0.25,
         gt=0,
         le=1,
-        description=(
-            "Length over which the true beam differs from the source, as a share of the image's "
-            "shorter side."
-        ),
+        description="Length over which the true beam differs from the source, as a share of the "
+        "image's shorter side.",
     )
     beam_between: Share = Field(
         default=0.0,
         title="Beam between energies",
-        description=(
-            "Relative r.m.s. difference between the beams of two energies of one shot, over the "
-            "same length."
-        ),
+        description="Relative r.m.s. difference between the beams of two energies of one shot, "
+        "over the same length.",
     )
     energy: Share = Field(
         default=0.0,
-        description=(
-            "Relative error of the beam's energy, or of its wavelength. It scales the field in SI "
-            "units, not the displacement."
-        ),
+        description="Relative error of the beam's energy, or of its wavelength. It scales the "
+        "field in SI units, not the displacement.",
     )
     background: Share = Field(
         default=0.0,
-        description=(
-            "Stray light, fog or dark level left in image and source, as a share of the mean."
-        ),
+        description="Stray light, fog or dark level left in image and source, as a share of the "
+        "mean.",
     )
     gamma: Share = Field(
         default=0.0,
@@ -137,29 +128,23 @@ class Instrument(CheckedModel, allow_inf_nan=False):
         ge=0,
         le=1000,
         title="Registration (px)",
-        description=(
-            "Shift of the image relative to its source in px; rotation and scale move the corners "
-            "by as much."
-        ),
+        description="Shift of the image relative to its source in px; rotation and scale move the "
+        "corners by as much.",
     )
     other_field: float = Field(
         default=0.0,
         ge=0,
         le=10,
-        description=(
-            "Displacement by a field that is not retrieved, such as E, as a share of the "
-            "displacement by the retrieved one."
-        ),
+        description="Displacement by a field that is not retrieved, such as E, as a share of the "
+        "displacement by the retrieved one.",
     )
     noise_correlation: float | None = Field(
         default=None,
         ge=0,
         le=20,
         title="Noise correlation (px)",
-        description=(
-            "Standard deviation of the Gaussian blur that correlates the noise of neighbouring "
-            "pixels, in px; 0 for white noise. Default: measured in the image."
-        ),
+        description="Standard deviation of the Gaussian blur that correlates the noise of "
+        "neighbouring pixels, in px; 0 for white noise. Default: measured in the image.",
     )
 
     @classmethod

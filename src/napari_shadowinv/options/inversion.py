@@ -52,20 +52,16 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
     )
     accuracy: _Fraction = Field(
         default=0.01,
-        description=(
-            "Target discretisation error of the displacement (relative r.m.s.). Sites are added "
-            "until it is reached or falls below a fifth of the noise error; in a stack, the first "
-            "shots decide for all. Ignored with a number of sites, 'single' stages or a solver "
-            "other than 'newton'."
-        ),
+        description="Target discretisation error of the displacement (relative r.m.s.). Sites are "
+        "added until it is reached or falls below a fifth of the noise error; in a stack, the "
+        "first shots decide for all. Ignored with a number of sites, 'single' stages or a solver "
+        "other than 'newton'.",
     )
     max_error: Annotated[MaxError, Field(json_schema_extra=_BUDGET)] = 0.05
     floor: _Fraction = Field(
         default=1e-3,
-        description=(
-            "Minimum image intensity as a fraction of the mean: darker pixels are raised to it. "
-            "This keeps the transport solvable; values below 1e-3 rarely converge."
-        ),
+        description="Minimum image intensity as a fraction of the mean: darker pixels are raised "
+        "to it. This keeps the transport solvable; values below 1e-3 rarely converge.",
         json_schema_extra=_MOVES_SITES,
     )
     tolerance: _Fraction = Field(
@@ -82,42 +78,31 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
     lloyd_tolerance: float = Field(
         default=0.1,
         ge=0,
-        description=(
-            "Lloyd relaxation stops once the r.m.s. movement of the sites falls below this "
-            "fraction of their mean spacing."
-        ),
+        description="Lloyd relaxation stops once the r.m.s. movement of the sites falls below this "
+        "fraction of their mean spacing.",
         json_schema_extra=_MOVES_SITES,
     )
     readout: Literal["dual", "centroid"] = Field(
         default="dual",
         title="Read-out",
-        description=(
-            "'dual': the potential is half the weight of each site. 'centroid': as in the "
-            "paper, natural-neighbour interpolation of the centroid displacements, then "
-            "integration."
-        ),
+        description="'dual': the potential is half the weight of each site. 'centroid': as in the "
+        "paper, natural-neighbour interpolation of the centroid displacements, then integration.",
     )
     integration: Literal["mean", "y", "x"] = Field(
         default="mean",
-        description=(
-            "Centroid read-out only: integrate along 'y' first, along 'x' first, or take the "
-            "'mean' of both."
-        ),
+        description="Centroid read-out only: integrate along 'y' first, along 'x' first, or take "
+        "the 'mean' of both.",
     )
     solver: Literal["newton", "lbfgs", "quasi-newton"] = Field(
         default="newton",
-        description=(
-            "'newton': damped Newton steps. 'lbfgs': limited-memory BFGS, as in the paper; "
-            "slow, for comparison. 'quasi-newton': BFGS with a dense n × n matrix, for small "
-            "numbers of sites."
-        ),
+        description="'newton': damped Newton steps. 'lbfgs': limited-memory BFGS, as in the paper; "
+        "slow, for comparison. 'quasi-newton': BFGS with a dense n × n matrix, for small numbers "
+        "of sites.",
     )
     stages: Literal["multi", "single"] = Field(
         default="multi",
-        description=(
-            "'multi': solve with few sites first and interpolate the potential to successively "
-            "more. 'single': all sites at once, starting from zero weights."
-        ),
+        description="'multi': solve with few sites first and interpolate the potential to "
+        "successively more. 'single': all sites at once, starting from zero weights.",
     )
     max_iterations: int = Field(
         default=300,
@@ -128,27 +113,21 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
     negative: Literal["refuse", "clip"] = Field(
         default="refuse",
         title="Negative pixels",
-        description=(
-            "'refuse': raise an error if the image has negative values. 'clip': set negative "
-            "values (left by background subtraction) to zero and count them in the report."
-        ),
+        description="'refuse': raise an error if the image has negative values. 'clip': set "
+        "negative values (left by background subtraction) to zero and count them in the report.",
     )
     boundary: Literal["closed", "free"] = Field(
         default="closed",
-        description=(
-            "'closed': no flux crosses the image edge, as in the paper. 'free': flux may leave "
-            "and enter, and the potential of the object decays beyond the edge."
-        ),
+        description="'closed': no flux crosses the image edge, as in the paper. 'free': flux may "
+        "leave and enter, and the potential of the object decays beyond the edge.",
         json_schema_extra={**_MOVES_SITES, **_BOUNDARY},
     )
     margin: int | None = Field(
         default=None,
         ge=2,
         title="Margin (px)",
-        description=(
-            "Free boundary only: width of the strip beyond each edge from which flux may enter; "
-            "it has its own sites. Default: a twentieth of the image's shorter side."
-        ),
+        description="Free boundary only: width of the strip beyond each edge from which flux may "
+        "enter; it has its own sites. Default: a twentieth of the image's shorter side.",
         json_schema_extra={**_MOVES_SITES, **_BOUNDARY},
     )
     decay_length: float | None = Field(
@@ -156,47 +135,38 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
         ge=0.01,
         le=1e6,
         title="Decay length (px)",
-        description=(
-            "Free boundary only: distance over which the potential decays beyond the edge; use "
-            "roughly the size of the object there. Default: the margin."
-        ),
+        description="Free boundary only: distance over which the potential decays beyond the edge; "
+        "use roughly the size of the object there. Default: the margin.",
         json_schema_extra=_BOUNDARY,
     )
     flux: Literal["conserve", "known", "fit"] = Field(
         default="conserve",
-        description=(
-            "Free boundary only. 'conserve': inflow equals outflow, so image and source may "
-            "have different units. 'known': image and source have the same exposure and units. "
-            "'fit': find the exposure that minimises the movement of flux at the edge."
-        ),
+        description="Free boundary only. 'conserve': inflow equals outflow, so image and source "
+        "may have different units. 'known': image and source have the same exposure and units. "
+        "'fit': find the exposure that minimises the movement of flux at the edge.",
         json_schema_extra=_BOUNDARY,
     )
     caustic_jacobian: float = Field(
         default=0.2,
         ge=0,
         title="Caustic threshold",
-        description=(
-            "Regions where the Jacobian determinant of the map is below this are marked as "
-            "caustics: rays cross or nearly cross there, and the field is less certain. Specks "
-            "that vanish when averaged over the site spacing count as noise."
-        ),
+        description="Regions where the Jacobian determinant of the map is below this are marked as "
+        "caustics: rays cross or nearly cross there, and the field is less certain. Specks that "
+        "vanish when averaged over the site spacing count as noise.",
     )
     noise_level: float | None = Field(
         default=None,
         gt=0,
-        description=(
-            "Standard deviation of the noise of one pixel of the inverted image, in its units, for "
-            "the error budget. Default: measured from the differences between neighbouring pixels."
-        ),
+        description="Standard deviation of the noise of one pixel of the inverted image, in its "
+        "units, for the error budget. Default: measured from the differences between neighbouring "
+        "pixels.",
         json_schema_extra=_BUDGET,
     )
     units_per_quantum: float | None = Field(
         default=None,
         gt=0,
-        description=(
-            "Image units per detected quantum, for the error budget: the noise is then Poisson "
-            "noise."
-        ),
+        description="Image units per detected quantum, for the error budget: the noise is then "
+        "Poisson noise.",
         json_schema_extra=_BUDGET,
     )
     seed: int = Field(

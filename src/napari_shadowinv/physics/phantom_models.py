@@ -75,9 +75,8 @@ class FourToroidsRecipe(PhantomRecipe):
     probe = "proton"
     strength: float = Field(
         default=1.0,
-        description=(
-            "Scale factor for the fields, whose highest peak is 135 MG µm at 1; caustics form at 1."
-        ),
+        description="Scale factor for the fields, whose highest peak is 135 MG µm at 1; caustics "
+        "form at 1.",
         json_schema_extra={"slider": [0.05, 3.0]},
     )
 
@@ -127,10 +126,8 @@ class WakefieldRecipe(PhantomRecipe):
     curvature_radius: float = Field(
         default=20e-6,
         title="Wavefront radius of curvature (m)",
-        description=(
-            "Radius of curvature of the wavefronts on the axis: positive if they lag behind "
-            "there, negative if they lead, inf for plane wavefronts."
-        ),
+        description="Radius of curvature of the wavefronts on the axis: positive if they lag "
+        "behind there, negative if they lead, inf for plane wavefronts.",
     )
 
     def _build(self, shape: tuple[int, int], setup: Any) -> Phantom:

@@ -326,9 +326,8 @@ class OpticalSetup(BeamSetup):
         default=math.inf,
         gt=0,
         title="Source to object (m)",
-        description=(
-            "Distance l from the beam source to the object, in m. Default: inf (collimated beam)."
-        ),
+        description="Distance l from the beam source to the object, in m. Default: inf (collimated "
+        "beam).",
     )
     wavelength: float = number_field(
         "Wavelength (m)", "Vacuum wavelength of the light, in m.", gt=0, le=1e-2

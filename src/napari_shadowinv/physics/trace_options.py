@@ -24,19 +24,15 @@ class TraceOptions(CheckedModel):
 
     output: Literal["fluence", "counts"] = Field(
         default="fluence",
-        description=(
-            "fluence: the exact image of regular rays, without noise; counts: particles drawn at "
-            "random, with their counting statistics."
-        ),
+        description="fluence: the exact image of regular rays, without noise; counts: particles "
+        "drawn at random, with their counting statistics.",
     )
     rays_per_pixel: int = Field(
         default=4,
         ge=1,
         le=256,
-        description=(
-            "Rays traced per pixel for a fluence; the next square number is used. Between the rays "
-            "the displacement is interpolated by cubic splines."
-        ),
+        description="Rays traced per pixel for a fluence; the next square number is used. Between "
+        "the rays the displacement is interpolated by cubic splines.",
     )
     counts: float = number_field(
         "Counts per pixel",

@@ -286,9 +286,8 @@ class TotalVariationEstimate(Estimate):
         default=2.0,
         gt=0,
         title="Weight (px)",
-        description=(
-            "Strength of the smoothing, in px: c·r/2 removes a disc of radius r px and contrast c."
-        ),
+        description="Strength of the smoothing, in px: c·r/2 removes a disc of radius r px and "
+        "contrast c.",
         json_schema_extra={"slider": [0.05, 20.0]},
     )
     iterations: int = Field(
@@ -321,11 +320,9 @@ class InterpolatedEstimate(Estimate):
     kind: Literal["biharmonic", "laplace"] = Field(
         default="biharmonic",
         title="Continuation",
-        description=(
-            "'biharmonic' continues the slope and curvature of the beam; use it for gaps inside "
-            "the image. 'laplace' stays within the range of the surrounding values; use it for "
-            "gaps at the edge."
-        ),
+        description="'biharmonic' continues the slope and curvature of the beam; use it for gaps "
+        "inside the image. 'laplace' stays within the range of the surrounding values; use it for "
+        "gaps at the edge.",
     )
 
 

@@ -225,10 +225,8 @@ class ButterworthFilter(Filter):
         default=2,
         ge=1,
         le=20,
-        description=(
-            "Beyond the cutoff the amplitude falls as this power of the wavelength; high orders "
-            "ring."
-        ),
+        description="Beyond the cutoff the amplitude falls as this power of the wavelength; high "
+        "orders ring.",
         json_schema_extra={"slider": [1, 20]},
     )
     kind: Literal["high", "low"] = Field(
@@ -340,10 +338,8 @@ class HotPixelFilter(Filter):
     threshold: float = Field(
         default=6.0,
         gt=0,
-        description=(
-            "Replace pixels that differ from the median of their neighbours by more than this "
-            "many standard deviations of the noise."
-        ),
+        description="Replace pixels that differ from the median of their neighbours by more than "
+        "this many standard deviations of the noise.",
         json_schema_extra={"slider": [2.0, 20.0]},
     )
 

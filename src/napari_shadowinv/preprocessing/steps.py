@@ -276,10 +276,8 @@ class Dark(Step):
     step: Literal["dark"] = "dark"
     level: Level = Field(
         default=0.0,
-        description=(
-            "Counts of the detector without light, or an image of them, which is subtracted from "
-            "image and source."
-        ),
+        description="Counts of the detector without light, or an image of them, which is "
+        "subtracted from image and source.",
         json_schema_extra={"metavar": "COUNTS|FILE"},
     )
 
