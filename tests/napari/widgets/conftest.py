@@ -102,7 +102,7 @@ def assert_it_fits(window: Any, qtbot: Any) -> Callable[[Any], None]:
         for size in ((1280, 800), (2560, 1440)):
             window.window._qt_window.resize(*size)
             qtbot.wait(50)
-            assert tool.area.horizontalScrollBar().maximum() == 0
+            qtbot.waitUntil(lambda: tool.area.horizontalScrollBar().maximum() == 0)
             assert tool.area.widget().minimumSizeHint().width() <= tool.area.viewport().width()
 
     return check

@@ -1012,7 +1012,7 @@ def test_run_is_in_view_at_once_and_the_verdict_at_the_end(
         window.add_image(image, name=setup.probe, metadata=metadata)
     tool = open_widget("Fit several images")
     qtbot.wait(100)
-    assert lies_in_view(tool, tool.panel.button)
+    qtbot.waitUntil(lambda: lies_in_view(tool, tool.panel.button), timeout=PATIENCE)
     assert not tool.setup_section.isExpanded()
     assert tool.setup_section.text() == "Setup: 14.7 MeV proton, came with pack.h5"
     window.window._qt_window.resize(1366, 560)

@@ -408,8 +408,8 @@ def test_film_pack_is_clicked_to_its_end(
     fluence = layer_of(window, "fluence")
     assert fluence.data.shape[0] == len(tool.plot.shown.energies) == 3
     window.dims.set_current_step(0, 1)
-    qtbot.wait(50)
-    assert f"{tool.plot.shown.energies[1]:.3g} MeV" in overlay_text(window)
+    energy = f"{tool.plot.shown.energies[1]:.3g} MeV"
+    qtbot.waitUntil(lambda: energy in overlay_text(window), timeout=PATIENCE_MS)
     whole = np.array(tool.plot.shown.fluence)
     press(tool, "✎")
     tool.regions.layer.add_rectangles([[20, 30], [49, 59]])
