@@ -25,7 +25,7 @@ def blob(middle: tuple[int, int]) -> FloatArray:
 
 GOOD: dict[str, Any] = {
     "chi2": np.array([0.97, 1.04]),
-    "others": [],
+    "rivals": [],
     "single": False,
     "beam_unknown": False,
     "jacobian": np.ones((48, 48)),
@@ -48,7 +48,7 @@ def assess(
     beam: BeamError | None,
     parts: dict[str, float],
     chi2: FloatArray,
-    others: list[tuple[float, float]],
+    rivals: list[tuple[float, float]],
     displacement: FloatArray,
     used: BoolArray,
     options: FitOptions,
@@ -56,9 +56,9 @@ def assess(
 ) -> tuple[Verdict, str]:
     """Return the verdict on a fit with these errors and other facts.
 
-    `others` are other answers: how much worse their objective is, as a share, and how far away.
+    `rivals` are other answers: how much worse their objective is, as a share, and how far away.
     """
-    solutions = [(0.0, 0.0), *others]
+    solutions = [(0.0, 0.0), *rivals]
     mask = np.tile(used, (len(chi2), 1, 1))
     planes, of_each = np.zeros(mask.shape), np.ones(len(chi2))
     fit = Fit(
@@ -319,7 +319,7 @@ def test_one_image_does_not_tell_where_rays_meet_or_cross(
 
 def test_several_fields_that_explain_as_well_are_told() -> None:
     solutions = [(0.01, 0.2), (0.02, 0.31), (0.005, 0.01), (0.5, 0.9)]
-    verdict, why = assess(**GOOD | {"others": solutions})
+    verdict, why = assess(**GOOD | {"rivals": solutions})
     assert verdict is Verdict.SEVERAL
     assert why.startswith("3 different fields")  # one is the same, one explains worse
     assert "31%" in why
@@ -329,7 +329,7 @@ def test_several_fields_that_explain_as_well_are_told() -> None:
 def test_other_fields_do_not_matter_if_they_are_worse_or_the_same(
     other: tuple[float, float],
 ) -> None:
-    assert assess(**GOOD | {"others": [other]})[0] is Verdict.DETERMINED
+    assert assess(**GOOD | {"rivals": [other]})[0] is Verdict.DETERMINED
 
 
 def test_noise_that_leaves_much_open_is_told() -> None:
@@ -340,8 +340,8 @@ def test_noise_that_leaves_much_open_is_told() -> None:
 
 def test_the_gravest_doubt_comes_first() -> None:
     """Images that are not explained, then one image, then other fields, then noise."""
-    all_of_them = GOOD | ALONE | {"beam_unknown": True, "others": [(0.0, 0.5)], "uncertainty": 0.5}
+    all_of_them = GOOD | ALONE | {"beam_unknown": True, "rivals": [(0.0, 0.5)], "uncertainty": 0.5}
     assert assess(**all_of_them | {"chi2": np.array([9.0])})[0] is Verdict.MISFIT
     assert assess(**all_of_them)[0] is Verdict.AMBIGUOUS
     assert assess(**all_of_them | {"beam_unknown": False})[0] is Verdict.SEVERAL
-    assert assess(**all_of_them | {"beam_unknown": False, "others": []})[0] is Verdict.UNCERTAIN
+    assert assess(**all_of_them | {"beam_unknown": False, "rivals": []})[0] is Verdict.UNCERTAIN

@@ -30,6 +30,7 @@ from napari_shadowinv.provenance import Provenance
 
 HERE = Path(__file__).parent
 SOURCES = Path(sys.modules["napari_shadowinv"].__file__ or "").parents[1]
+BATCH = ["batch", "shots/shot_*.npy", "--out", "n.shadowinv.zarr", "--n-sites", "100"]
 OPTICAL = """
 kind = "optical"
 wavelength = 532e-9
@@ -514,9 +515,6 @@ def test_ctrl_c_leaves_a_store_that_is_resumed(make_night, tmp_path, monkeypatch
     resumed = shadowinv(*command, "--resume", "--scheduler", "threads", "--quiet")
     assert resumed.exit_code == 0
     assert (StackStore(out).statuses() == DONE).all()
-
-
-BATCH = ["batch", "shots/shot_*.npy", "--out", "n.shadowinv.zarr", "--n-sites", "100"]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals to a process group")

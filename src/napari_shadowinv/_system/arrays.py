@@ -170,7 +170,7 @@ def check_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str = "imag
 def check_shape(
     name: str, shape: tuple[int, ...], expected: tuple[int, ...], of: str = "image"
 ) -> None:
-    """Raise an `InputError` if an array's shape is not that of the image, or of something else."""
+    """Raise an `InputError` if an array does not have the shape of the image, or of `of`."""
     if shape != expected:
         raise InputError(f"{name} has shape {shape}, {of} {expected}: they must match")
 

@@ -70,7 +70,7 @@ class Coordinate:
 
     @classmethod
     def in_plane(cls, pixels: AnyArray, frame: FieldFrame, long_name: str) -> Coordinate:
-        """Return places in the object plane, from px."""
+        """Return places, given in px, as lengths in the object plane."""
         return cls(frame.length(1.0) * pixels, frame.length_unit, long_name)
 
 

@@ -185,8 +185,8 @@ class _ProgressBar:
         last = "" if outcome is None else f"{status.name}, {outcome.seconds:.1f} s"
         remaining = ""
         if status.remaining is not None:
-            left = timedelta(seconds=round(status.remaining))
-            remaining = f"{left} left" if status.waiting else "finishing"
+            time_left = timedelta(seconds=round(status.remaining))
+            remaining = f"{time_left} left" if status.waiting else "finishing"
         self.bars.update(
             self._task,
             description=status.engine,

@@ -187,10 +187,10 @@ def assess_verdict(
             "step 'dark', linearise the images, or, if the counts were averaged, scaled or "
             "smoothed, give their noise"
         )
-    best, *others = fit.basins
+    best, *alternatives = fit.basins
     rivals = [
         basin.distance
-        for basin in others
+        for basin in alternatives
         if basin.objective / best.objective - 1 < _AS_GOOD and basin.distance > _OTHER_FIELD
     ]
     if rivals:

@@ -197,9 +197,9 @@ def draft_pack(
     for kind in sorted({str(layer["film"]) for layer in layer_entries}):
         for part, candidates in (("calibration", calibrations), ("unexposed", unexposed)):
             by_type = {path: _film_type_of(path, types) for path in candidates}
-            named = [path for path, film_type in by_type.items() if film_type == kind]
-            unnamed = [path for path, film_type in by_type.items() if film_type is None]
-            if matching := named or unnamed:
+            of_kind = [path for path, film_type in by_type.items() if film_type == kind]
+            of_any = [path for path, film_type in by_type.items() if film_type is None]
+            if matching := of_kind or of_any:
                 films.setdefault(kind, {})[part] = matching[0].name
     entries = facts.model_dump(exclude={"film"}, exclude_none=True)
     names = ("source_object_distance", "object_image_distance")

@@ -18,6 +18,7 @@ from scipy.ndimage import zoom
 
 from helpers.command_line import undrawn
 from helpers.fit_images import of_each
+from helpers.jobs import run_job
 from helpers.reports import texts_of
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read, write
 from napari_shadowinv._napari.fit_layers import fit_layers
@@ -957,7 +958,7 @@ def test_what_a_file_holds_and_was_not_used_is_not_used_again(
     single.source.layers.layer = window.layers["a source"]
     assert single.request().source.path is None
     single.source.set_kind("uniform")
-    inversion = single.request().run(lambda _: None, lambda: False)
+    inversion = run_job(single.request())
     write(tmp_path / "b.shadowinv", inversion)
     assert "bit for bit" in command("rerun", "b.shadowinv", "--out", "again2.shadowinv")
 

@@ -47,6 +47,10 @@ CHANGED = {
 }
 
 
+def save_toml(values: dict[str, Any], path: Path) -> Path:
+    return save_text(tomli_w.dumps(values), path, ".toml")
+
+
 def the_form(qtbot: Any, model: Any) -> ModelForm:
     form = ModelForm(model)
     qtbot.addWidget(form)
@@ -165,7 +169,7 @@ def test_the_command_line_reads_a_saved_setup(
     picker = SetupPicker()
     qtbot.addWidget(picker)
     picker.show_setup(setup.model_dump())
-    path = save_text(tomli_w.dumps(picker._to_save()), tmp_path / "setup", ".toml")
+    path = save_toml(picker._to_save(), tmp_path / "setup")
     assert path.suffix == ".toml"
     assert setup_from(path) == setup
     picker.picker.set_kind("none")
@@ -178,15 +182,15 @@ def test_the_command_line_reads_a_saved_setup(
 def test_the_command_line_reads_saved_options(qtbot: Any, tmp_path: Path) -> None:
     form = the_form(qtbot, InversionOptions)
     form.set_values(CHANGED)
-    path = save_text(tomli_w.dumps(form.values()), tmp_path / "options.toml", ".toml")
+    path = save_toml(form.values(), tmp_path / "options.toml")
     assert recipe_from({}, None, path, clip_negative=False).options == InversionOptions(**CHANGED)
 
 
 def test_a_file_that_the_dialog_did_not_name_is_not_replaced(tmp_path: Path) -> None:
-    save_text(tomli_w.dumps({"seed": 1}), tmp_path / "options.toml", ".toml")
+    save_toml({"seed": 1}, tmp_path / "options.toml")
     with pytest.raises(OSError, match="exists"):
-        save_text(tomli_w.dumps({"seed": 2}), tmp_path / "options", ".toml")
-    save_text(tomli_w.dumps({"seed": 3}), tmp_path / "options.toml", ".toml")
+        save_toml({"seed": 2}, tmp_path / "options")
+    save_toml({"seed": 3}, tmp_path / "options.toml")
     assert read_toml(tmp_path / "options.toml") == {"seed": 3}
 
 

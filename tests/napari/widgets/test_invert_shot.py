@@ -17,6 +17,7 @@ import pytest
 from napari.utils import progress
 from qtpy.QtWidgets import QComboBox
 
+from helpers.jobs import run_job
 from helpers.reports import texts_of
 from napari_shadowinv import Instrument, InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari import jobs
@@ -83,7 +84,7 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 
 def computed(tool: Any) -> Any:
     """Return the inversion of the controls, without its layers."""
-    return tool.request().run(lambda _: None, lambda: False)
+    return run_job(tool.request())
 
 
 def settled(tool: Any) -> bool:

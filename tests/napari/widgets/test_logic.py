@@ -13,6 +13,7 @@ import pytest
 import xarray as xr
 from napari.layers import Image, Labels, Shapes
 
+from helpers.jobs import run_job
 from napari_shadowinv import (
     InputError,
     InversionCancelled,
@@ -63,7 +64,6 @@ from napari_shadowinv.preprocessing import (
 )
 
 FEW = InversionOptions(n_sites=500)
-UNHEARD = (lambda _: None, lambda: False)  # progress to nobody, and no stop
 Array = np.ndarray[Any, Any]
 
 
@@ -182,9 +182,7 @@ def test_what_flattens_the_image_fits_no_measured_source(
     with pytest.raises(InputError, match="removes the beam from the image"):
         run(recipe, shot, source=beam)
     with pytest.raises(InputError, match="removes the beam from the image"):
-        StackJob(shot[None], tmp_path / "a.shadowinv.zarr", recipe, beam).run(
-            lambda _: None, lambda: False
-        )
+        run_job(StackJob(shot[None], tmp_path / "a.shadowinv.zarr", recipe, beam))
 
 
 def test_a_stack_tells_that_it_compiles(
@@ -373,14 +371,14 @@ def test_a_shot_is_looked_at_before_the_books_count_it(shot: Array, tmp_path: Pa
             counted.append((index, self.status.ended))
 
     job = CountingJob(stack, out, Recipe(options=FEW), run_options=RunOptions(workers=1))
-    job.run(lambda _: None, lambda: False)
+    run_job(job)
     assert counted == [(0, 0), (1, 1)]
     assert job.status.ended == 2
 
 
 def test_a_strong_object_warns_of_caustics_and_a_weak_one_does_not() -> None:
-    weak = ForwardJob(BlobRecipe(amplitude=5, sigma=8), shape=(40, 50)).run(*UNHEARD)
-    strong = ForwardJob(BlobRecipe(amplitude=-200, sigma=8), shape=(40, 50)).run(*UNHEARD)
+    weak = run_job(ForwardJob(BlobRecipe(amplitude=5, sigma=8), shape=(40, 50)))
+    strong = run_job(ForwardJob(BlobRecipe(amplitude=-200, sigma=8), shape=(40, 50)))
     assert weak.warning == ""
     assert "Caustics" in strong.warning
     assert strong.caustic_share > 0
@@ -389,14 +387,14 @@ def test_a_strong_object_warns_of_caustics_and_a_weak_one_does_not() -> None:
 def test_a_potential_and_its_object_make_the_same_image() -> None:
     blob = BlobRecipe(amplitude=20, sigma=8)
     phantom = blob.phantom((40, 50), None)
-    by_object = ForwardJob(blob, shape=(40, 50)).run(*UNHEARD)
-    by_potential = ForwardJob(1e9 * phantom.potential, to_px2=1e-9).run(*UNHEARD)
+    by_object = run_job(ForwardJob(blob, shape=(40, 50)))
+    by_potential = run_job(ForwardJob(1e9 * phantom.potential, to_px2=1e-9))
     assert abs(by_object.image - by_potential.image).max() < 0.02
 
 
 def test_a_magnetic_object_asks_for_particles() -> None:
     with pytest.raises(InputError, match="select the setup"):
-        ForwardJob(ToroidRecipe()).run(*UNHEARD)
+        run_job(ForwardJob(ToroidRecipe()))
 
 
 def test_forward_model_traces_a_3d_field_from_a_file(tmp_path):
@@ -412,9 +410,9 @@ def test_forward_model_traces_a_3d_field_from_a_file(tmp_path):
     dataset.to_netcdf(path, engine="h5netcdf")
     setup = paper_setup()
     with pytest.raises(InputError, match="there is no setup"):
-        ForwardJob(GridFile(str(path), GridView()), shape=(20, 30)).run(*UNHEARD)
+        run_job(ForwardJob(GridFile(str(path), GridView()), shape=(20, 30)))
     job = ForwardJob(GridFile(str(path), GridView(right="-x")), shape=(20, 30), setup=setup)
-    prediction = job.run(*UNHEARD)
+    prediction = run_job(job)
     # Seen with x to the left, y points up.
     expected = setup.displacement_from_path_integrated_b([-0.5 * 4e-4, 0.0])[1]
     np.testing.assert_allclose(prediction.displacement[1], expected, rtol=1e-2)

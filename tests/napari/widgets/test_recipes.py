@@ -12,6 +12,7 @@ from napari.components import ViewerModel
 from qtpy.QtWidgets import QFileDialog
 
 from helpers.command_line import undrawn
+from helpers.jobs import run_job
 from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
 from napari_shadowinv._napari.layer_metadata import (
     Frame,
@@ -374,7 +375,7 @@ def test_the_window_does_what_the_command_saves(
     assert tool.steps.steps() == (Bin(factor=2), LowPassFilter(width=1.5))
     assert tool.setup.setup().pixel_size == 2e-6
     assert setup_origin_of(image) == "loaded from how.toml for 'shot'"
-    mine = tool.request().run(lambda _: None, lambda: False)
+    mine = run_job(tool.request())
     np.testing.assert_array_equal(mine.displacement, reloaded.displacement)
     assert mine.provenance.recipe.steps[0] == Crop(y=(4, 44), x=(10, 60))
     assert mine.provenance.image.source.file == "beam.npy"
@@ -418,7 +419,7 @@ def test_a_source_that_is_no_file_is_written_beside_the_recipe(
     out = tmp_path / "a.shadowinv"
     by_command("invert", shot_file, "--recipe", tmp_path / "how.toml", "--out", out)
     reloaded = Inversion.from_dataset(read(out))
-    inversion = tool.request().run(lambda _: None, lambda: False)
+    inversion = run_job(tool.request())
     np.testing.assert_array_equal(inversion.displacement, reloaded.displacement)
 
 

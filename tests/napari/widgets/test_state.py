@@ -10,6 +10,7 @@ import pytest
 import tomli_w
 from napari.components import ViewerModel
 
+from helpers.jobs import run_job
 from helpers.reports import texts_of
 from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
 from napari_shadowinv._napari import commands, jobs
@@ -23,7 +24,6 @@ from napari_shadowinv._napari.layer_metadata import (
     source_of,
 )
 from napari_shadowinv._napari.layers import add_inversion
-from napari_shadowinv._napari.widgets._forms import save_text
 from napari_shadowinv._napari.widgets._qt import StateKeeper
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
 from napari_shadowinv._napari.widgets.fit_images import FitImages
@@ -177,7 +177,8 @@ def test_a_setup_from_a_toml_file_says_so(
     from qtpy.QtWidgets import QFileDialog
 
     text = tomli_w.dumps(proton_setup.model_dump(exclude_none=True))
-    path = save_text(text, tmp_path / "tcc.toml", ".toml")
+    path = tmp_path / "tcc.toml"
+    path.write_text(text)
     monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_, **__: (str(path), ""))
     tool = opened(InvertShot)
     tool.setup.files.load_button.click()
@@ -407,7 +408,7 @@ def test_a_stack_is_inverted_with_both_masks(
         source_mask=~is_object,
         scheduler="synchronous",
     )
-    job.run(lambda _: None, lambda: False)
+    run_job(job)
     recovered = np.asarray(read(job.out)["potential"][0])
     assert np.ptp(recovered) == pytest.approx(np.ptp(potential), rel=0.1)
 
