@@ -1355,18 +1355,35 @@ def test_a_second_ctrl_c_does_not_interrupt_the_clean_up(folder: Path, shot: Pat
     assert sorted(content(folder)) == ["shot.npy"]
 
 
-def test_ctrl_c_while_the_command_is_loaded_is_one_word() -> None:
-    script = """
-import sys
+SIGNAL_IN_IMPORT = """
 class Interrupted:
     def find_spec(self, name, path=None, target=None):
         if name == "napari_shadowinv.cli":
-            raise KeyboardInterrupt
+            press()
 sys.meta_path.insert(0, Interrupted())
-from napari_shadowinv.__main__ import main
-main()
 """
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+SIGNAL_IN_FLAGS = """
+import typer.main
+build = typer.main.get_command
+typer.main.get_command = lambda *arguments: press() or build(*arguments)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")
+@pytest.mark.parametrize("when", [SIGNAL_IN_IMPORT, SIGNAL_IN_FLAGS])
+def test_ctrl_c_before_a_command_begins_is_one_word(when: str) -> None:
+    script = """
+import signal, sys
+def press():
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        pass  # as some libraries do
+"""
+    run = "from napari_shadowinv.__main__ import main\nmain()"
+    ended = subprocess.run(
+        [sys.executable, "-c", script + when + run, "--version"], capture_output=True, text=True
+    )
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "Cancelled\n")
 
 
