@@ -1,4 +1,4 @@
-"""Stores exported for other programs: openPMD and OME-Zarr."""
+"""Stores exported for other programs: openPMD."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import zarr
 
 from helpers.command_line import flat, shadowinv
 from napari_shadowinv import ProtonSetup, read
@@ -59,36 +58,3 @@ def test_openpmd_needs_a_setup(any_night, tmp_path):
     assert result.exit_code == 2
     assert "openPMD holds fields in SI units, received no setup" in flat(result.output)
     assert not Path("day").exists()
-
-
-def test_ome_zarr_has_all_shots_in_one_image(store):
-    command = ["export", store, "--format", "ome-zarr", "--variables", "potential,displacement"]
-    assert shadowinv(*command, "--out", "day").exit_code == 0
-    stored = read(store)
-    group = zarr.open_group("day/displacement.ome.zarr", mode="r")
-    np.testing.assert_array_equal(group["0"], stored.displacement.transpose("shot", ...))
-    (image,) = group.attrs["ome"]["multiscales"]
-    assert [axis["name"] for axis in image["axes"]] == ["t", "c", "y", "x"]
-    (transformation,) = image["datasets"][0]["coordinateTransformations"]
-    side = 1e6 * SETUP.object_pixel_size
-    np.testing.assert_allclose(transformation["scale"], [1, 1, side, side])
-    channels = group.attrs["ome"]["omero"]["channels"]
-    assert [channel["label"] for channel in channels] == ["displacement_y", "displacement_x"]
-    largest = float(stored.displacement.sel(component="x").max())
-    assert channels[1]["window"]["end"] == largest
-    assert zarr.open_group("day/potential.ome.zarr", mode="r")["0"].shape == (3, 1, 24, 28)
-    again = shadowinv(*command, "--out", "day")
-    assert again.exit_code == 2
-    assert "potential.ome.zarr exists: choose another name" in flat(again.output)
-
-
-def test_ome_zarr_that_fails_leaves_nothing(store, monkeypatch):
-    from napari_shadowinv.io import ome_zarr
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(ome_zarr, "_metadata", full)
-    result = shadowinv("export", store, "--format", "ome-zarr", "--out", "day")
-    assert result.exit_code == 2
-    assert list(Path("day").iterdir()) == []

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.cli._inputs import protect_store
 from napari_shadowinv.cli._terminal import escape_invisible
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -19,7 +18,6 @@ from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.files import make_folder
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
-from napari_shadowinv.io.ome_zarr import OME_ZARR_SUFFIX, write_ome_zarr
 from napari_shadowinv.io.openpmd import check_openpmd_setup, write_openpmd
 from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.io.store import STATUS_NAMES, StackStore, read_stack
@@ -31,7 +29,7 @@ if TYPE_CHECKING:
     import xarray
 
 _FORMULA_SIGNS = ("=", "+", "-", "@")
-FORMATS = ("tiff", "pradformat", "openpmd", "ome-zarr", "csv")
+FORMATS = ("tiff", "pradformat", "openpmd", "csv")
 
 
 def export_shots(
@@ -51,8 +49,6 @@ def export_shots(
     dataset = open_shots(store, shots)
     if form == "openpmd":
         return _write_openpmd(dataset, out, overwrite)
-    if form == "ome-zarr":
-        return _write_ome_zarr(dataset, out, variables)
     jobs = list(_tiff_jobs(dataset, variables) if form == "tiff" else _pradformat_jobs(dataset))
     make_folder(out)
     for name, *_ in jobs:
@@ -100,32 +96,6 @@ def _write_openpmd(dataset: xarray.Dataset, out: Path, overwrite: bool) -> list[
         with replacing(file, overwrite) as temporary:
             write_openpmd(temporary, shot, setup, series, int(shot["index"]))
     return files
-
-
-def _write_ome_zarr(dataset: xarray.Dataset, out: Path, variables: list[str]) -> list[Path]:
-    """Write each variable of all shots as one image."""
-    _check_images(dataset, variables)
-    make_folder(out)
-    shots = dataset.sizes["shot"]
-    setups = [setup_from_dataset(dataset.isel(shot=shot)) for shot in range(shots)]
-    sizes = {None if setup is None else setup.object_pixel_size for setup in setups}
-    if len(sizes) > 1:
-        raise InputError(
-            "the shots have pixels of different sizes, expected one for an image of all of them: "
-            "choose shots of one size, or use --format tiff"
-        )
-    written = []
-    for variable in variables:
-        field = dataset[variable].transpose("shot", ..., "y", "x")
-        is_vector = "component" in field.dims
-        channels = [f"{variable}_{c}" for c in ("y", "x")] if is_vector else [variable]
-
-        def plane_of(shot: int, channel: int, field: Any = field) -> AnyArray:
-            return np.asarray(field[(shot, channel) if field.ndim > 3 else shot])
-
-        path = out / f"{variable}{OME_ZARR_SUFFIX}"
-        written.append(write_ome_zarr(path, variable, channels, shots, plane_of, *sizes))
-    return written
 
 
 def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[_Job]:

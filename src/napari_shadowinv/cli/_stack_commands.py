@@ -20,8 +20,7 @@ HELP = {
     "scheduler": "Address of a dask scheduler (tcp://host:8786), threads (default with --shard) or "
     "processes (default without).",
     "format": "tiff (float32, one file per shot and component), pradformat or openpmd (one file "
-    "per shot), ome-zarr (one image per variable with all shots), or csv (a table with a row per "
-    "shot).",
+    "per shot), or csv (a table with a row per shot).",
     "shots": "A quoted glob, a folder, a list of files, a multi-page TIFF with one shot per page, "
     "an array of frames in HDF5 (run.h5::/entry/data/data), or a table (.csv) of images with one "
     "row per shot.",
@@ -31,7 +30,7 @@ HELP = {
     "file.h5::/entry/shots.",
     "resume": "Resume an interrupted run and append new shots.",
     "verify": "Read all files and compare their checksums; exit code 1 if any is damaged.",
-    "variables": "For tiff and ome-zarr: variables to export, separated by commas.",
+    "variables": "For tiff: variables to export, separated by commas.",
     "variable": "Variable to show; for vectors, the magnitude. Default: the potential.",
     "limits": "Limits of the colour scale. Default: the range over all shots.",
     "out": "Output folder, or file for csv. Default: the store's name, in the current folder.",
