@@ -731,6 +731,16 @@ def test_field_of_view_of_a_fit_is_in_its_table(
     assert "field of view 96 × 72 µm" in output
 
 
+def test_a_doubtful_setup_is_printed_once_by_a_fit() -> None:
+    text = Path("setup.toml").read_text()
+    near = text.replace("object_image_distance = 0.3", "object_image_distance = 1e-4")
+    Path("setup.toml").write_text(near)
+    result = shadowinv("fit", "a.tif", "--setup", "setup.toml", "--energies", "14.7")
+    assert flat(result.stderr).count("setup: the magnification is") == 1
+    assert "setup: the magnification is" not in flat(result.stdout)
+    assert "setup: the magnification is" in flat(shadowinv("info", "a_fit.shadowinv").stdout)
+
+
 def test_setup_warnings_come_before_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     def fit(**_: Any) -> Fit:
         raise InputError("the work began")

@@ -1233,6 +1233,29 @@ def test_setup_warnings_come_before_the_work(
     assert lines[-1].endswith("the work began")
 
 
+@pytest.mark.parametrize(
+    "command", ["invert shot.npy --setup swapped.toml", "rerun shot.shadowinv"]
+)
+def test_a_doubtful_setup_is_printed_once(command: str, shot: Path) -> None:
+    Path("swapped.toml").write_text(PROTON_TOML.replace("= 0.01", "= 1").replace("0.3", "0.01"))
+    if command.startswith("rerun"):
+        shadowinv("invert", shot, "--setup", "swapped.toml", "--n-sites", 200)
+    result = shadowinv(*command.split())
+    assert flat(result.stderr).count("setup: the magnification is 1.01") == 1
+    assert "setup: the magnification" not in flat(result.stdout)
+    assert "setup: the magnification is 1.01" in flat(shadowinv("info", "shot.shadowinv").stdout)
+
+
+def test_info_lists_the_options_that_have_a_value(shot: Path) -> None:
+    shadowinv("invert", shot, "--out", "chosen.shadowinv", "--n-sites", 200)
+    shadowinv("invert", shot, "--out", "automatic.shadowinv")
+    assert "n_sites = 200" in flat(shadowinv("info", "chosen.shadowinv").stdout)
+    text = flat(shadowinv("info", "automatic.shadowinv").stdout)
+    assert "n_sites" not in text
+    assert "= None" not in text
+    assert "accuracy = 0.01" in text
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="names there are text")
 def test_a_name_that_is_not_text_is_stored_as_bytes(folder: Path, shot: Path) -> None:
     os.rename(shot, b"sh\xf6t.npy")

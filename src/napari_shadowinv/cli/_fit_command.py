@@ -133,7 +133,7 @@ def fit(
     shots = read_row_images(rows, chosen, channel=channel, variable=variable)
     shots = (replace(shots[0], fiducials=fiducials), *shots[1:])
     _inputs.check_setup(result, shots[0].setup, chosen.fit.fields if chosen.fit else None)
-    warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)
+    printed = warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)
     names = [str(row.file) for row in rows]
     beams = ["" if shot.setup else row.beam_text for row, shot in zip(rows, shots, strict=True)]
     short = _fit_result.short_names(names, beams)
@@ -154,5 +154,6 @@ def fit(
         for title, check in (("Left out", static.left_out), ("Windows", static.windows)):
             if check is not None:
                 say(two_columns(title, fact_rows(check.facts)))
-        say(two_columns("Fit", [*_fit_result.fit_rows(result_fit, names), *written_rows(outputs)]))
+        fit_rows = _fit_result.fit_rows(result_fit, names, printed)
+        say(two_columns("Fit", [*fit_rows, *written_rows(outputs)]))
     exit_unless_sound(result_fit, result, static)

@@ -99,10 +99,10 @@ def _provenance_rows(provenance: Provenance) -> Rows:
     return rows
 
 
-def fit_rows(fit: Fit, names: Sequence[str] = ()) -> Rows:
+def fit_rows(fit: Fit, names: Sequence[str] = (), printed: tuple[str, ...] = ()) -> Rows:
     """Return the size and setup of the images, and the facts; `names` are of the images."""
     return [
-        *fact_rows(fit.facts_with_names(names) if names else fit.facts),
+        *fact_rows(fit.facts_with_names(names) if names else fit.facts, printed),
         ("size", size_text(fit.images[0])),
         ("setup", setup_text(fit.setup, shape=fit.images[0].shape)),
     ]

@@ -165,6 +165,7 @@ def invert(
     if isinstance(measured, MeasuredSource) and measured != MeasuredSource():
         # In its own file or in the image's; the channel is that of both.
         beam = read_part(measured.file or image, channel, measured.variable)
+    printed = warn_of_setups([(chosen.setup or shot.setup, shot.shape)])
     inversion = invert_shot(chosen, shot, beam, quiet)
     _inputs.write_result(inversion, [str(image)], result, figure, overwrite)
     if save_recipe is not None:
@@ -175,7 +176,7 @@ def invert(
             ("image", f"{shot.path}, {size_text(inversion.image)}"),
             *provenance_rows(inversion.provenance),
             ("setup", setup_text(inversion.setup, shot, inversion.image.shape)),
-            *fact_rows(inversion.facts),
+            *fact_rows(inversion.facts, printed),
             *written_rows(outputs),
         ]
         say(two_columns("Inversion", rows))
@@ -209,7 +210,8 @@ def rerun(
     files = _inputs.result_outputs(inputs.kind, again_out, *figures)
     _inputs.check_outputs(files, overwrite)
     _inputs.protect([again_out, figure, *figures], [result, *inputs.files])
-    warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in inputs.shots)
+    setups = [(shot.setup, getattr(shot.image, "shape", None)) for shot in inputs.shots]
+    printed = warn_of_setups(setups)
     with work_callbacks(quiet) as callbacks:
         again = inputs.run(**callbacks)
     names = [str(file) for file in inputs.files[: len(inputs.shots)]] or [str(result)]
@@ -221,7 +223,7 @@ def rerun(
             *[("changed", text) for text in again.changes or ("nothing",)],
             ("difference", again.difference),
             headline_row(content.headline),
-            *fact_rows(content.facts),
+            *fact_rows(content.facts, printed),
             *written_rows([again_out, figure]),
         ]
         say(two_columns("Rerun", rows))

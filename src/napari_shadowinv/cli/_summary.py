@@ -62,9 +62,13 @@ def provenance_rows(provenance: Provenance | None) -> Rows:
     return rows
 
 
-def fact_rows(facts: Iterable[Fact]) -> Rows:
-    """Return facts as rows of a table."""
-    return [(fact.title[:1].lower() + fact.title[1:], fact.text) for fact in facts]
+def fact_rows(facts: Iterable[Fact], printed: tuple[str, ...] = ()) -> Rows:
+    """Return facts as rows of a table, without cautions that are already printed."""
+    return [
+        (fact.title[:1].lower() + fact.title[1:], fact.text)
+        for fact in facts
+        if not fact.text.endswith(printed)  # a fit puts the name of the image first
+    ]
 
 
 def written_rows(paths: Iterable[Path]) -> Rows:
@@ -104,8 +108,8 @@ def setup_text(
 
 
 def options_text(options: Mapping[str, Any]) -> str:
-    """Format options as a line that wraps between words."""
-    return ", ".join(f"{name} = {value}" for name, value in options.items())
+    """Format the options that have a value as a line that wraps between words."""
+    return ", ".join(f"{name} = {value}" for name, value in options.items() if value is not None)
 
 
 def size_text(array: AnyArray) -> str:

@@ -88,7 +88,6 @@ def invert_shot(
     """Apply a recipe to a shot; errors name the file."""
     from napari_shadowinv.pipeline import run
 
-    warn_of_setups([(recipe.setup or shot.setup, shot.shape)])
     with work_callbacks(quiet) as callbacks:
         try:
             return run(recipe, shot, source=source, **callbacks)
@@ -98,16 +97,19 @@ def invert_shot(
             raise error.about(shot.path) from error
 
 
-def warn_of_setups(experiments: Iterable[tuple[Setup | None, tuple[int, int] | None]]) -> None:
-    """Print the doubts about setups and the shapes of their images, before the work begins."""
-    texts = [
+def warn_of_setups(
+    experiments: Iterable[tuple[Setup | None, tuple[int, int] | None]],
+) -> tuple[str, ...]:
+    """Print and return the doubts about setups and their images' shapes, before the work begins."""
+    texts = dict.fromkeys(
         caution.text
         for setup, shape in experiments
         if setup is not None
         for caution in setup_warnings(setup, shape)
-    ]
-    for text in dict.fromkeys(texts):
+    )
+    for text in texts:
         say_on_stderr(text, "yellow")
+    return tuple(texts)
 
 
 @contextmanager
