@@ -7,6 +7,7 @@ import shlex
 import shutil
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,14 +37,19 @@ def shot_folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_the_python_example_makes_the_file_it_promises(shot_folder):
-    names: dict[str, object] = {}
-    for block in blocks("python"):
-        exec(compile(block, "README.md", "exec"), names)
+def test_the_python_example_prints_the_field_with_its_error(shot_folder, capsys):
+    names: dict[str, Any] = {}
+    (block,) = blocks("python")
+    exec(compile(block, "README.md", "exec"), names)
+    printed = capsys.readouterr().out
+    (shown,) = re.findall(r"print\(.*# DETERMINED: …; (.*) …", block)
+    assert shown in printed  # a peak with its error, in µT·m
+    field = float(np.hypot(*names["field"]).max())
+    assert float(shown.split()[2]) == pytest.approx(1e6 * field, abs=0.05)
     result = names["result"]
     assert isinstance(result, xarray.Dataset)
     assert result.potential.attrs["units"] == "pixel**2"
-    peak = np.hypot(*names["inversion"].displacement).max()  # type: ignore[attr-defined]
+    peak = np.hypot(*names["inversion"].displacement).max()
     assert peak == pytest.approx(20 / 6 * np.exp(-0.5), rel=0.05)
 
 
