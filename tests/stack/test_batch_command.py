@@ -25,6 +25,7 @@ from typer.testing import Result
 from helpers.command_line import flat, interrupted, shadowinv
 from napari_shadowinv import InversionOptions, invert, read
 from napari_shadowinv.cli._batch import progress_columns
+from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.provenance import Provenance
 
@@ -388,6 +389,21 @@ def test_a_film_that_cannot_be_read_back_is_none(store, monkeypatch):
     assert result.exit_code == 2
     assert "ffmpeg: 5 of 6 frames can be read back" in flat(result.output)
     assert not list(Path().glob("*plume*"))
+
+
+@pytest.mark.parametrize("name", ["plume.gif", "plume.mp4"])
+@pytest.mark.parametrize("error", [FileFormatError("shot 3 is damaged"), KeyboardInterrupt()])
+def test_a_film_that_ends_early_leaves_nothing(tmp_path, name, error):
+    from napari_shadowinv.plotting import write_film
+
+    def frames():
+        yield np.zeros((40, 60, 3), np.uint8)
+        raise error
+
+    with pytest.raises(type(error)) as raised:
+        write_film(tmp_path / name, frames(), 10.0)
+    assert raised.value is error
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_shots_that_find_no_room_are_not_exported_by_half(store, small_disk):

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import re
-import subprocess
 import textwrap
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from functools import lru_cache
-from io import BytesIO
-from itertools import chain
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.variables import setup_from_dataset
@@ -31,7 +25,7 @@ if TYPE_CHECKING:
 _DOTS_PER_INCH = 120
 _OUTLIER_SHARE = 0.02  # share of the shots whose extremes may lie beyond the colour scale
 _COLOUR_MAP = "viridis"
-_RATE_FACTOR = 10  # of H.264: 0 is lossless, 51 the worst
+_H264 = {"quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}  # 10 is lossless
 _RECORDED = ("image", "source", "mask")  # shown under masks, too
 _GREYS = 56  # colours of a GIF that are reserved for text
 _LETTER_WIDTH_IN = 0.075
@@ -155,25 +149,18 @@ def in_few_colours(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     Takes and returns an ndarray of uint8, shape (rows, columns, 3); the colours are the nearest of
     the colour scale, and greys.
     """
-    tree, palette = _palette()
-    rows = frame.reshape(-1, 3)
-    # A frame has few thousand different colours, and most pixels share some.
-    packed = rows @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
-    _, first, which = np.unique(packed, return_index=True, return_inverse=True)
-    nearest: NDArray[np.uint8] = palette[tree.query(rows[first])[1]]
-    return nearest[which].reshape(frame.shape)
-
-
-@lru_cache(maxsize=1)
-def _palette() -> tuple[Any, NDArray[np.uint8]]:
-    """Return a search tree of the palette, and the palette."""
     from matplotlib import colormaps
     from scipy.spatial import cKDTree
 
-    scale = 255 * colormaps[_COLOUR_MAP](np.linspace(0, 1, 256 - _GREYS))[:, :3]
-    greys = np.repeat(np.linspace(0, 255, _GREYS), 3).reshape(-1, 3)
-    colours = np.concatenate([scale, greys]).round().astype(np.uint8)
-    return cKDTree(colours), colours
+    scale = colormaps[_COLOUR_MAP](np.linspace(0, 1, 256 - _GREYS))[:, :3]
+    greys = np.repeat(np.linspace(0, 1, _GREYS), 3).reshape(-1, 3)
+    palette = (255 * np.concatenate([scale, greys])).round().astype(np.uint8)
+    rows = frame.reshape(-1, 3)
+    # A frame has few thousand different colours, and most pixels share some.
+    packed = rows @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
+    _, first, indices = np.unique(packed, return_index=True, return_inverse=True)
+    nearest: NDArray[np.uint8] = palette[cKDTree(palette).query(rows[first])[1]]
+    return nearest[indices].reshape(frame.shape)
 
 
 def write_film(
@@ -195,80 +182,40 @@ def write_film(
     FileFormatError
         If the film exists and `overwrite` does not allow to replace it, or it cannot be written.
     """
-    with replacing(path, overwrite) as temporary:
-        if path.suffix.lower() == ".gif":
-            return _write_gif(temporary, frames, rate)
+    with replacing(path, overwrite) as temporary, TemporaryDirectory() as folder:
+        draft = Path(folder, f"film{path.suffix.lower()}")
         try:
-            return _write_mp4(temporary, frames, rate)
-        except _FFmpegError as error:
+            count = _encode(draft, frames, rate)
+        except FileFormatError:  # of the shots
+            raise
+        except OSError as error:
+            reason = str(error).partition("\n")[0]
             raise FileFormatError(
-                f"{path} cannot be written (ffmpeg: {error}): free some disk space, choose "
-                "another folder, or write a .gif"
+                f"{path} cannot be written ({reason}): free some disk space, or write a .gif"
             ) from None
-
-
-class _FFmpegError(Exception):
-    """Reason for a failure, as reported by ffmpeg."""
-
-
-def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> int:
-    from imageio_ffmpeg import count_frames_and_secs
-
-    remaining = iter(frames)
-    first = next(remaining)
-    count = 0
-    with TemporaryFile() as messages:
-        ffmpeg = _start_ffmpeg(path, first.shape, rate, messages)
-        try:
-            for frame in chain([first], remaining):
-                ffmpeg.stdin.write(frame.tobytes())
-                count += 1
-            ffmpeg.communicate()
-        except BrokenPipeError:
-            ffmpeg.wait()
-        finally:
-            with defer_interrupts():
-                ffmpeg.kill()
-                ffmpeg.wait()
-        if ffmpeg.returncode:
-            messages.seek(0)
-            lines = messages.read().decode(errors="replace").splitlines()
-            reason = lines[-1] if lines else f"exit code {ffmpeg.returncode}"
-            # Without which of its parts speaks: "[out#0/mp4 @ 0x560c9438a4c0] ".
-            raise _FFmpegError(re.sub(r"^\[[^]]*\] ", "", reason))
-    try:
-        n_readable = count_frames_and_secs(str(path))[0]
-    except RuntimeError:
-        n_readable = 0
-    if n_readable != count:
-        raise _FFmpegError(f"{n_readable} of {count} frames can be read back")
+        temporary.write_bytes(draft.read_bytes())
     return count
 
 
-def _start_ffmpeg(path: Path, shape: tuple[int, ...], rate: float, messages: Any) -> Any:
-    from imageio_ffmpeg import get_ffmpeg_exe
-
-    pixels = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{shape[1]}x{shape[0]}"]
-    frames = [*pixels, "-r", str(rate), "-i", "-"]
-    film = ["-an", "-vcodec", "libx264", "-pix_fmt", "yuv420p", "-crf", str(_RATE_FACTOR)]
-    return subprocess.Popen(
-        [get_ffmpeg_exe(), "-v", "error", "-y", *frames, *film, str(path.absolute())],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=messages,
-        # Ctrl-C is for this process, which then ends the other.
-        start_new_session=True,
-    )
-
-
-def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> int:
+def _encode(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> int:
+    """Write frames to a file; return their number, which is that of the frames read back."""
     import imageio.v2 as iio
 
-    content, count = BytesIO(), 0
-    film: Any = iio.get_writer(content, format="GIF", duration=1000 / rate, loop=0)
+    is_gif = path.suffix == ".gif"
+    form = {"duration": 1000 / rate, "loop": 0} if is_gif else {"fps": rate, **_H264}
+    count = 0
+    film: Any = iio.get_writer(path, mode="I", **form)
     with film:
         for frame in frames:
-            film.append_data(in_few_colours(frame))
+            film.append_data(in_few_colours(frame) if is_gif else frame)
             count += 1
-    path.write_bytes(content.getvalue())
+    if not is_gif:
+        from imageio_ffmpeg import count_frames_and_secs
+
+        try:
+            n_readable = count_frames_and_secs(str(path))[0]
+        except RuntimeError:  # nothing of it
+            n_readable = 0
+        if n_readable != count:
+            raise OSError(f"ffmpeg: {n_readable} of {count} frames can be read back")
     return count
