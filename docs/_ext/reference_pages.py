@@ -51,7 +51,6 @@ TASKS: dict[str, tuple[str, ...]] = {
     "Invert many shots": (
         "run_stack",
         "RunOptions",
-        "merge_stack",
         "watch_stack",
         "WatchOptions",
         "invert_stack",

@@ -19,7 +19,7 @@ from .pipeline import run
 from .pipeline.rerun import Rerun, rerun
 from .pipeline.run_options import RunOptions, WatchOptions
 from .preprocessing import Radiograph, Recipe
-from .stack import invert_stack, merge_stack, run_stack, stack_statistics, watch_stack
+from .stack import invert_stack, run_stack, stack_statistics, watch_stack
 
 __version__: str
 
@@ -55,7 +55,6 @@ __all__ = [
     "fit",
     "invert",
     "invert_stack",
-    "merge_stack",
     "plan_sites",
     "poisson_invert",
     "project",

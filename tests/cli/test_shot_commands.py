@@ -120,7 +120,7 @@ def test_version_and_help() -> None:
 
 
 COMMANDS = (
-    "invert", "rerun", "fit", "film", "forward", "info", "demo", "batch", "merge", "watch",
+    "invert", "rerun", "fit", "film", "forward", "info", "demo", "batch", "watch",
     "status", "export", "movie",
 )  # fmt: skip
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from helpers.command_line import flat, shadowinv
-from napari_shadowinv import FileFormatError, InputError, merge_stack, read
+from napari_shadowinv import FileFormatError, InputError, read
 from napari_shadowinv._napari.stores import shot_rows
 from napari_shadowinv.io.shot_columns import read_shot_table
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
@@ -203,22 +203,3 @@ def test_names_without_a_clear_number_are_refused(names, words, tmp_path):
     (tmp_path / "t.csv").write_text("number\n7\n12\n")
     with pytest.raises(InputError, match=words):
         read_shot_table(tmp_path / "t.csv").rows_of(names)
-
-
-def test_table_joins_shards_only_once_they_are_merged(table, make_night, out):
-    night = make_night(3)
-    night.run(out, shard="1/2", scheduler="synchronous")
-    with pytest.raises(InputError, match="is written in 2 shards: merge them before"):
-        join_shot_table(out, table)
-    night.run(out, shard="2/2", scheduler="synchronous")
-    merge_stack(out)
-    check_columns(join_shot_table(out, table))
-
-
-def test_shards_of_arrays_in_one_file_differ(make_night, out, tmp_path):
-    night = make_night(2)
-    with h5py.File(tmp_path / "run.h5", "w") as file:
-        file["first"], file["second"] = night.images, night.images[::-1]
-    night.run(out, shots=f"{tmp_path}/run.h5::first", shard="1/2", scheduler="synchronous")
-    with pytest.raises(InputError, match="with shots of the same names from other files"):
-        night.run(out, shots=f"{tmp_path}/run.h5::second", shard="2/2", scheduler="synchronous")

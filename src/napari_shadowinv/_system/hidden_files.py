@@ -2,7 +2,7 @@
 
 - in the folder of a file that is being written: `hidden_name`; in the system's temporary folder:
   `temporary_folder`
-- remove the leftovers of killed processes: `sweep`; all drafts of a path: `remove_drafts`
+- remove the leftovers of killed processes: `sweep`
 - one writer at a time, by a lock that a dead process cannot hold: `locked`
 
 A temporary name holds the machine and user, the process, its start and a random part. So leftovers
@@ -84,19 +84,6 @@ def sweep(folder: Path) -> None:
         for entry in entries:
             match = _NAME.fullmatch(entry.name)
             if match and match["owner"] == _owner() and _is_dead(int(match["pid"]), match["start"]):
-                _remove(entry)
-
-
-def remove_drafts(path: Path, ending: str = "") -> None:
-    """Remove all drafts of a path under hidden names, also if left by other machines.
-
-    No process may be writing it. The ending is as in `hidden_name`.
-    """
-    stem = f".{path.name.removesuffix(ending)}"
-    with suppress(OSError), os.scandir(path.parent) as entries:
-        for entry in entries:
-            match = _NAME.fullmatch(entry.name)
-            if match and match[1] == stem:
                 _remove(entry)
 
 

@@ -1,6 +1,6 @@
 """Output of the commands for many shots.
 
-- progress and summary of `shadowinv batch`: `run_batch`; the rows of a summary: `summary_rows`
+- progress and summary of `shadowinv batch`: `run_batch`
 - a line for each shot of `shadowinv watch`, and a summary: `run_watch`
 - the tables of `shadowinv status`: `status_tables`
 """
@@ -39,10 +39,8 @@ from napari_shadowinv.io.store import (
     DAMAGED,
     DONE,
     FAILED,
-    SHARDS,
     SKIPPED,
     STATUS_NAMES,
-    UNREAD,
     StackStore,
     check_store_path,
 )
@@ -85,14 +83,13 @@ def run_batch(
     """Invert all shots into a store, and print a summary."""
     from napari_shadowinv.stack import run_stack
 
-    if run.part is None:
-        if resume and run.overwrite:
-            raise InputError("got --resume and --overwrite, expected one of them")
-        if check_store_path(out).exists() and not (resume or run.overwrite):
-            raise InputError(
-                f"{out} exists ({_counts_text(StackStore(out))}): use --resume to continue, "
-                "--overwrite to start again, or another name"
-            )
+    if resume and run.overwrite:
+        raise InputError("got --resume and --overwrite, expected one of them")
+    if check_store_path(out).exists() and not (resume or run.overwrite):
+        raise InputError(
+            f"{out} exists ({_counts_text(StackStore(out))}): use --resume to continue, "
+            "--overwrite to start again, or another name"
+        )
     try:
         bar = _ProgressBar(quiet)
         with bar.bars:
@@ -107,35 +104,32 @@ def run_batch(
                 should_stop=is_interrupted,
             )
     except (KeyboardInterrupt, InversionCancelled):
-        counts = _counts_text(_store_of(run, out)) if out.exists() else "nothing written"
-        flag = " with --resume" if run.part is None else ""
-        say_on_stderr(f"Cancelled: {counts}. Repeat the command{flag} to continue.")
+        counts = _counts_text(StackStore(out)) if out.exists() else "nothing written"
+        say_on_stderr(f"Cancelled: {counts}. Repeat the command with --resume to continue.")
         raise typer.Exit(cancel_exit_code()) from None
-    store, status = _store_of(run, out), bar.status
+    store, status = StackStore(out), bar.status
     text = "nothing to do"
     if status is not None and status.ended:
         text = f"{status.ended} shots in {status.seconds:.1f} s, {_rate_text(status)}"
-    shard = [] if run.shard is None else [("shard", f"{run.shard}; merge the store after the last")]
     if not quiet:
-        say(two_columns("Batch", summary_rows(store, ("this run", text), *shard)))
-    exit_unless_reliable(store)
+        rows = [
+            ("shots", _counts_text(store)),
+            ("this run", text),
+            *_site_rows(store),
+            *_trouble_rows(store),
+            ("written", str(store.path)),
+        ]
+        say(two_columns("Batch", rows))
+    _exit_unless_reliable(store)
 
 
-def _store_of(run: RunOptions, out: Path) -> StackStore:
-    """Open the store of a run, for the shots of its shard."""
-    from napari_shadowinv.stack import numbers_of
-
-    store = StackStore(out)
-    return StackStore(out, numbers=numbers_of(run, len(store.names)))
-
-
-def exit_unless_reliable(store: StackStore) -> None:
+def _exit_unless_reliable(store: StackStore) -> None:
     """Exit with an error code if a shot is not done, or its result is not reliable.
 
-    Shots that were skipped on purpose, or belong to another shard, do not count.
+    Shots that were skipped on purpose do not count.
     """
     statuses = store.statuses()
-    if not np.isin(statuses, (DONE, SKIPPED, UNREAD)).all():
+    if not np.isin(statuses, (DONE, SKIPPED)).all():
         raise typer.Exit(EXIT_FAILED_SHOTS)
     for status, report in zip(statuses, store.reports(), strict=True):
         is_sound = report.get("verdict") == _DETERMINED
@@ -210,17 +204,6 @@ def _counts_text(store: StackStore) -> str:
     return ", ".join(f"{counts[name]} {name}" for name in names)
 
 
-def summary_rows(store: StackStore, *run: tuple[str, str]) -> Rows:
-    """Describe the shots of a store after a run."""
-    return [
-        ("shots", _counts_text(store)),
-        *run,
-        *_site_rows(store),
-        *_trouble_rows(store),
-        ("written", str(store.path)),
-    ]
-
-
 def _recipe_rows(store: StackStore) -> Rows:
     """Return the origin of the source and the steps before the inversion."""
     from napari_shadowinv.provenance import Provenance
@@ -235,17 +218,6 @@ def _recipe_rows(store: StackStore) -> Rows:
     rows = [("source", _list_text(files) or source or str(store.attributes["source_image"]))]
     steps = () if provenance is None else provenance.recipe.steps
     return rows + [("step", step.summary) for step in steps]
-
-
-def _shard_rows(store: StackStore) -> Rows:
-    """Return the state of shards that are not merged yet."""
-    from napari_shadowinv.stack import incomplete_shards
-
-    if SHARDS not in store.attributes:
-        return []
-    incomplete = incomplete_shards(store)
-    text = f"not merged; incomplete: {incomplete}" if incomplete else "all complete: merge them"
-    return [("shards", f"{store.attributes[SHARDS]}, {text}")]
 
 
 def _beam_rows(store: StackStore) -> Rows:
@@ -400,7 +372,6 @@ def store_rows(store: StackStore, *, trouble: bool = True) -> Rows:
         ("kind", f"stack of {len(store.names)} shots, shadowinv {attributes['package_version']}"),
         ("created", str(attributes["created"])),
         ("shots", _counts_text(store)),
-        *_shard_rows(store),
         ("image", str(attributes["image_size"])),
         *_recipe_rows(store),
         *_beam_rows(store),
@@ -517,6 +488,6 @@ def run_watch(
     if not quiet:
         say(text)
     if done:
-        exit_unless_reliable(StackStore(out))
+        _exit_unless_reliable(StackStore(out))
     elif failed:
         raise typer.Exit(EXIT_FAILED_SHOTS)

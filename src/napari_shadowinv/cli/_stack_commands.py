@@ -1,4 +1,4 @@
-"""Commands for many shots: `batch`, `merge`, `watch`, `status`, `join`, `export`, `movie`."""
+"""Commands for many shots: `batch`, `watch`, `status`, `join`, `export`, `movie`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Annotated, Any
 from typer import Exit, Option
 
 from napari_shadowinv.cli import _flags, _inputs
-from napari_shadowinv.cli._summary import two_columns
 from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 
@@ -17,8 +16,7 @@ from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 HELP = {
     "source": "Image of the undisturbed beam; batch also takes a glob matching one image per "
     "shot. Default: uniform.",
-    "scheduler": "Address of a dask scheduler (tcp://host:8786), threads (default with --shard) or "
-    "processes (default without).",
+    "scheduler": "Address of a dask scheduler (tcp://host:8786), threads or processes.",
     "format": "tiff (float32, one file per shot and component), pradformat or openpmd (one file "
     "per shot), or csv (a table with a row per shot).",
     "shots": "A quoted glob, a folder, a list of files, a multi-page TIFF with one shot per page, "
@@ -44,12 +42,6 @@ shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
 shadowinv batch run.h5::/entry/data/data --shot-table shots.csv --out run.shadowinv.zarr
 shadowinv batch pack.csv --setup setup.toml --out pack.shadowinv.zarr
 shadowinv batch shots.csv --fit --recipe recipe.toml --out fits.shadowinv.zarr
-shadowinv batch 'shots/*.tif' --out night.shadowinv.zarr --shard 3/40
-
-[bold]Shards[/bold]
-With --shard 1/40 to --shard 40/40 the command inverts one of 40 parts of the shots. Shards may run
-at the same time, on machines that share a file system. A repeated shard continues, without
---resume. When all have ended, shadowinv merge completes the store.
 
 [bold]pack.csv[/bold] (one inversion per row; flags apply where a cell is empty)
 file, energy, brightness, mask, exclude
@@ -129,7 +121,7 @@ def _stack_inputs(
 def batch(
     shots: Annotated[list[str], _flags.argument(help=HELP["shots"])],
     out: Annotated[Path, Option(help="Output store: name.shadowinv.zarr.")],
-    scheduler: Annotated[str | None, Option(help=HELP["scheduler"])] = None,
+    scheduler: Annotated[str, Option(help=HELP["scheduler"])] = "processes",
     resume: Annotated[bool, Option("--resume", help=HELP["resume"])] = False,
     *,
     run: RunOptions,
@@ -139,23 +131,7 @@ def batch(
     from napari_shadowinv.cli._batch import run_batch
 
     resume = resume or run.redo_failed
-    # A shard has a core or a few: it needs no cluster of processes on its machine.
-    engine = scheduler or ("processes" if run.shard is None else "threads")
-    run_batch(shots, out, run, resume=resume, scheduler=engine, **inputs)
-
-
-@notify_errors
-def merge(store: _flags.StoreFolder, quiet: _flags.Quiet = False) -> None:
-    """Complete a store that batch --shard has written, when all shards have ended."""
-    from napari_shadowinv.cli._batch import exit_unless_reliable, summary_rows
-    from napari_shadowinv.io.store import StackStore
-    from napari_shadowinv.stack import merge_stack
-
-    merge_stack(store)
-    merged = StackStore(store)
-    if not quiet:
-        say(two_columns("Merge", summary_rows(merged)))
-    exit_unless_reliable(merged)
+    run_batch(shots, out, run, resume=resume, scheduler=scheduler, **inputs)
 
 
 @notify_errors

@@ -11,7 +11,7 @@ be written again. So workers can write at the same time, and any of them may die
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
@@ -52,14 +52,11 @@ if TYPE_CHECKING:
 
 FORMAT = "shadowinv stack"
 STORE_SUFFIX = STORE.suffix
-UNREAD = -1  # status of a shot that was not looked at; never stored
 DONE: int  # mypy does not infer it for the default of a parameter
 PENDING, DONE, FAILED, DAMAGED, SKIPPED = map(int, Status)
 STATUS_NAMES = tuple(status.name.lower() for status in Status)
 # Attribute of a store whose shots are rows of a table, each with its own setup in its report.
 OWN_SETUPS = "table_of_shots"
-# Attributes until shards are merged: their number, and the checksum of the names of all files.
-SHARDS, SHOT_FILES = "shards", "shot_files"
 _NO_TEXT = np.array([], object)
 
 
@@ -124,8 +121,6 @@ class StackStore:
     every_byte : bool, optional
         Read all files to find damage. Otherwise damage within a field is noticed when the field is
         read.
-    numbers : collection of int, optional
-        Numbers of the only shots to look at; the others have the status UNREAD and an empty report.
 
     Attributes
     ----------
@@ -135,11 +130,8 @@ class StackStore:
         The quantities that it lists of each shot.
     """
 
-    def __init__(
-        self, path: Path, *, every_byte: bool = False, numbers: Collection[int] | None = None
-    ) -> None:
+    def __init__(self, path: Path, *, every_byte: bool = False) -> None:
         self.path = path
-        self.numbers = numbers
         self._every_byte = every_byte
         if not path.exists():
             raise FileFormatError(
@@ -160,14 +152,13 @@ class StackStore:
             self.statuses()
 
     def statuses(self) -> AnyArray:
-        """Return PENDING, DONE, FAILED, DAMAGED, SKIPPED or UNREAD for each shot."""
+        """Return PENDING, DONE, FAILED, DAMAGED or SKIPPED for each shot."""
         damaged = self.damage.shots
-        if self.numbers is None and not damaged:
+        if not damaged:
             return self._values("status")
-        statuses = np.full(len(self.names), UNREAD, np.int8)
-        for index in range(len(statuses)) if self.numbers is None else self.numbers:
-            statuses[index] = DAMAGED if index in damaged else self._values("status", index)
-        return statuses
+        shots = range(len(self.names))
+        statuses = [DAMAGED if i in damaged else self._values("status", i) for i in shots]
+        return np.array(statuses, np.int8)
 
     def report(self, index: int) -> dict[str, Any]:
         """Return a shot's report; ``reason`` says why it failed, or how it is damaged."""
@@ -177,21 +168,16 @@ class StackStore:
 
     def reports(self) -> Sequence[dict[str, Any]]:
         """Return the report of each shot, as `report` does."""
-        if self.numbers is None and not self.damage.shots:
-            return _parse_reports(self.path, self._values("report").tolist())
-        reports: list[dict[str, Any]] = [{} for _ in self.names]
-        for index in range(len(reports)) if self.numbers is None else self.numbers:
-            reports[index] = self.report(index)
-        return reports
+        if self.damage.shots:
+            return [self.report(index) for index in range(len(self.names))]
+        return _parse_reports(self.path, self._values("report").tolist())
 
     @cached_property
     def damage(self) -> Damage:
         """Return the lost, exchanged or damaged files; none in a store without checksums."""
         if self._layout is None:
             return Damage()
-        damage = find_damage(self._layout, every_byte=self._every_byte, numbers=self.numbers)
-        if self.numbers is not None:
-            return damage
+        damage = find_damage(self._layout, every_byte=self._every_byte)
         return Damage(damage.shots, (*damage.files, *self._exchanged(damage)))
 
     @property
@@ -283,15 +269,13 @@ def open_dataset(path: Path) -> xarray.Dataset:
 
 
 @as_file_errors
-def read_stack(path: Path, *, numbers: Sequence[int] | None = None) -> xarray.Dataset:
+def read_stack(path: Path) -> xarray.Dataset:
     """Open a store of many shots, also while it is written; arrays are read when asked for.
 
     Parameters
     ----------
     path : str or Path
         ``name.shadowinv.zarr``.
-    numbers : sequence of int, optional
-        Numbers of the only shots to open; files of others are not looked at. Default: all.
 
     Returns
     -------
@@ -306,7 +290,7 @@ def read_stack(path: Path, *, numbers: Sequence[int] | None = None) -> xarray.Da
     FileFormatError
         If it is no store, or is damaged.
     """
-    store = StackStore(path, numbers=numbers)
+    store = StackStore(path)
     dataset = open_dataset(path)
     if dataset.sizes["shot"] > len(store.names):  # grown since
         dataset = dataset.isel(shot=slice(len(store.names)))
@@ -319,8 +303,7 @@ def read_stack(path: Path, *, numbers: Sequence[int] | None = None) -> xarray.Da
     columns = (column.key for column in store.columns)
     order = [*_labels(dataset, setup), "status", *columns, "setup", "report"]
     ordered = complete[[name for name in order if name in complete]]
-    stack = ordered.assign(status=ordered["status"].copy(data=store.statuses()))
-    return stack if numbers is None else stack.isel(shot=list(numbers))
+    return ordered.assign(status=ordered["status"].copy(data=store.statuses()))
 
 
 def _labels(dataset: xarray.Dataset, setup: Any) -> dict[str, Any]:

@@ -461,18 +461,15 @@ class Damage:
     noted: dict[int, dict[str, Any]] = field(default_factory=dict)
 
 
-def find_damage(
-    layout: Layout, *, every_byte: bool = False, numbers: Collection[int] | None = None
-) -> Damage:
+def find_damage(layout: Layout, *, every_byte: bool = False) -> Damage:
     """Look for files of a store that are lost, exchanged or damaged.
 
-    With `every_byte` all files are read, otherwise only reports and the checksums of chunks. With
-    `numbers` only the files of these shots are looked at.
+    With `every_byte` all files are read, otherwise only reports and the checksums of chunks.
     """
     names = layout.of_each_shot
     shots: dict[int, str] = {}
     noted: dict[int, dict[str, Any]] = {}
-    for index in range(layout.shots) if numbers is None else numbers:
+    for index in range(layout.shots):
         problem, report = _check_again(partial(_inspect_ended, layout, index, names, every_byte))
         if problem:
             shots[index] = problem
@@ -480,8 +477,6 @@ def find_damage(
             values = {**report, **report.get(LABELS, {})}
             repeated = [k for k in values if k in layout.of_many_shots or k.startswith(PREFIX)]
             noted[index] = {key: values[key] for key in repeated}
-    if numbers is not None:
-        return Damage(shots)
     keys: list[str] = []
     for name, length in layout.of_many_shots.items():
         keys += [layout.key(name, index) for index in range(-(-layout.shots // length))]

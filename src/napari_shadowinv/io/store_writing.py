@@ -3,7 +3,6 @@
 - create a store with all shots pending: `create_store`, from its `Contents`
 - make room for more shots: `grow_store`
 - write a shot, or why it failed, also in a worker: `ShotWriter`; gather numbers: `summarise`
-- end the writing in shards: `finish_shards`
 - a store that grows by one shot at a time while its run goes on: `GrowingStore`
 - columns of a shot table for a store that exists: `join_columns`
 
@@ -29,7 +28,7 @@ import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from napari_shadowinv._system.hidden_files import hidden_name, remove_drafts, sweep
+from napari_shadowinv._system.hidden_files import hidden_name, sweep
 from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -40,13 +39,10 @@ from napari_shadowinv.io.store import (
     FAILED,
     FORMAT,
     PENDING,
-    SHARDS,
-    SHOT_FILES,
     SKIPPED,
     STATUS_NAMES,
     StackStore,
     columns_of_store,
-    is_stack,
     read_attributes,
 )
 from napari_shadowinv.io.store_checksums import (
@@ -99,24 +95,21 @@ class ShotWriter:
     path: Path
     store_id: str  # another store may have taken its place
     shots: int  # it may have had fewer when this process opened it before
-    shards: int | None = None  # None once they are merged
     opened: dict[str, Any] | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def of(cls, store: StackStore) -> ShotWriter:
-        attributes = store.attributes
-        return cls(store.path, attributes["store_id"], len(store.names), attributes.get(SHARDS))
+        return cls(store.path, store.attributes["store_id"], len(store.names))
 
     def write(
         self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any], status: int = DONE
     ) -> None:
         """Write a shot and its report; it has its status when this returns, pending if it fails."""
         attributes = read_attributes(self.path)
-        if [attributes.get("store_id"), attributes.get(SHARDS)] != [self.store_id, self.shards]:
+        if attributes.get("store_id") != self.store_id:
             raise StoreError(
                 f"{self.path} is missing or is not the store the run started with: all workers "
-                "must share one file system, and the store must not be replaced or merged during "
-                "the run"
+                "must share one file system, and the store must not be replaced during the run"
             )
         group = self.arrays()
         with _as_store_errors(self.path):
@@ -275,14 +268,9 @@ class Contents:
     attributes: Mapping[str, Any]
 
 
-def create_store(
-    path: Path, contents: Contents, *, overwrite: bool = False, shared: bool = False
-) -> StackStore:
-    """Create a store with all its shots pending; it appears completely or not at all.
-
-    If several processes create a `shared` store at the same moment, all use the first one's.
-    """
-    if path.exists() and not (overwrite or shared):
+def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> StackStore:
+    """Create a store with all its shots pending; it appears completely or not at all."""
+    if path.exists() and not overwrite:
         raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")
     sweep(path.parent)
     new = hidden_name(path)
@@ -292,14 +280,9 @@ def create_store(
             with defer_interrupts():
                 _write_template(new, contents)
             old = hidden_name(path)
-            if path.exists() and not shared:
+            if path.exists():
                 os.replace(path, old)
-            try:
-                os.replace(new, path)
-            except OSError:
-                # A folder that has content is not replaced: another process was faster.
-                if not (shared and is_stack(path)):
-                    raise
+            os.replace(new, path)
             shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(new, ignore_errors=True)
@@ -316,19 +299,6 @@ def remove_unfinished(path: Path) -> None:
         for name in names:
             if name.endswith(".partial"):
                 Path(folder, name).unlink(missing_ok=True)
-
-
-def finish_shards(path: Path) -> None:
-    """Remove from a store, and from beside it, all traces of its having been written in shards.
-
-    All shards must have ended, on all machines.
-    """
-    remove_unfinished(path)
-    remove_drafts(path)
-    remove_drafts(path / "zarr.json", ".json")
-    with _as_store_errors(path), _changing_description(path) as document:
-        for name in (SHARDS, SHOT_FILES):
-            document["attributes"].pop(name, None)
 
 
 def grow_store(

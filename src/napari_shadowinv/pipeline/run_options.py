@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
-from napari_shadowinv._system.validation import CheckedModel, CombinationError
+from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv.io.formats import TIFF
 
 _RARE: Any = {"panel": "Rarely used options of a run"}
@@ -65,12 +64,6 @@ class RunOptions(_StoreOptions):
         "similar shots with a common source.",
         json_schema_extra={"metavar": "N"},
     )
-    shard: str | None = Field(
-        default=None,
-        description="Part of the shots to process, such as 3/40. All shards write into one store, "
-        "also at the same time and from several machines; merge it when they have ended.",
-        json_schema_extra={"metavar": "K/N"},
-    )
     shot_table: Path | None = Field(
         default=None,
         description="Table with a row for each shot (CSV, or HDF5 as file.h5::/entry/shots) that "
@@ -83,40 +76,6 @@ class RunOptions(_StoreOptions):
         description="Shots that are processed at once on this machine. Default: one per core.",
         json_schema_extra={**_RARE, "metavar": "N"},
     )
-
-    @field_validator("shard")
-    @classmethod
-    def _check_shard(cls, value: str | None) -> str | None:
-        if value is None:
-            return None
-        match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", value)
-        if match is None or not int(match[2]):
-            raise ValueError("expected a shard and the number of shards, such as 3/40")
-        if not 1 <= int(match[1]) <= int(match[2]):
-            raise ValueError(f"expected a shard from 1/{match[2]} to {match[2]}/{match[2]}")
-        return value
-
-    @model_validator(mode="after")
-    def _check_combination(self) -> Self:
-        if self.shard is not None and self.overwrite:
-            raise CombinationError(
-                f"{{shard}} is {self.shard} and {{overwrite}} is set, but a shard cannot overwrite "
-                "the store of the others: remove the store first, or choose another name"
-            )
-        if self.shard is not None and self.shot_table is not None:
-            raise CombinationError(
-                f"{{shard}} is {self.shard} and {{shot_table}} is {self.shot_table}, but shards "
-                "cannot join a table: join it to the merged store with shadowinv join"
-            )
-        return self
-
-    @property
-    def part(self) -> tuple[int, int] | None:
-        """Number of the shard, from 1, and the number of shards; None for all shots."""
-        if self.shard is None:
-            return None
-        number, count = map(int, self.shard.split("/"))
-        return number, count
 
 
 class WatchOptions(_StoreOptions):

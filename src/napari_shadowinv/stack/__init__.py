@@ -3,8 +3,6 @@
 - describe the inversion of many shots for dask: `invert_stack`
 - invert or fit shots one by one into ``name.shadowinv.zarr``, and resume after a crash: `run_stack`
 - read a shot's file, or one of its colour channels: `read_shot`
-- complete a store that several processes have written in shards: `merge_stack`
-  (the shots of a run's shard: `numbers_of`; shards that have not ended: `incomplete_shards`)
 - watch a folder and invert each shot as soon as it arrives: `watch_stack`
 - what a run reports: `RunStatus`
 - join a shot table to a store: `join_shot_table`
@@ -14,7 +12,6 @@
 from napari_shadowinv.stack._lazy import invert_stack, stack_statistics
 from napari_shadowinv.stack._plan import STORED
 from napari_shadowinv.stack._run import RunStatus, join_shot_table, run_stack
-from napari_shadowinv.stack._shards import incomplete_shards, merge_stack, numbers_of
 from napari_shadowinv.stack._shots import read_shot
 from napari_shadowinv.stack._worker import ShotOutcome
 from napari_shadowinv.stack.watch import watch_stack
@@ -23,11 +20,8 @@ __all__ = [
     "STORED",
     "RunStatus",
     "ShotOutcome",
-    "incomplete_shards",
     "invert_stack",
     "join_shot_table",
-    "merge_stack",
-    "numbers_of",
     "read_shot",
     "run_stack",
     "stack_statistics",

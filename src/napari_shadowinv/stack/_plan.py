@@ -51,7 +51,6 @@ from napari_shadowinv.preprocessing import (
     UniformEstimate,
 )
 from napari_shadowinv.provenance import Origin
-from napari_shadowinv.stack._shards import Shard
 from napari_shadowinv.stack._shots import (
     ArrayReference,
     Reader,
@@ -103,7 +102,6 @@ class Stack:
     warm_start: int = 1  # shots in a group, each initialised from the one before
     as_arrived: bool = False  # whether its shots are numbered as they arrive in a folder
     chained: bool = False  # whether each shot starts from an earlier one, without groups
-    shard: Shard | None = None  # the part of the shots that is to be inverted
     dtype: str = "float64"  # of fields in a store
     columns: tuple[Column, ...] = ()  # of a shot table, whose rows the shots have
 

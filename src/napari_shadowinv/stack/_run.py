@@ -11,7 +11,7 @@ import json
 import queue
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -38,10 +38,7 @@ from napari_shadowinv.io.store import (
     FAILED,
     OWN_SETUPS,
     PENDING,
-    SHARDS,
-    SHOT_FILES,
     SKIPPED,
-    UNREAD,
     StackStore,
     check_files,
     check_store_path,
@@ -71,7 +68,6 @@ from napari_shadowinv.stack._plan import (
     dtype_of,
     values_of_beam,
 )
-from napari_shadowinv.stack._shards import Shard, check_shard, check_shots, numbers_of
 from napari_shadowinv.stack._shots import Reader, checksum, differences, read_shot
 from napari_shadowinv.stack._worker import InvertTask, ShotOutcome, TaskContext, run_shots
 
@@ -184,10 +180,6 @@ def run_stack(
     completely, so a run may be interrupted or killed at any time. Shots that have arrived since the
     store was created are appended, whatever their names: a shot keeps its number.
 
-    With a shard, such as ``RunOptions(shard="3/40")``, the call inverts the 3rd of 40 parts of the
-    shots. Other processes, on any machine, may write the other parts into the same store at the
-    same time, without a lock. `merge_stack` completes the store.
-
     Parameters
     ----------
     shots, recipe, source, mask, source_mask, reader
@@ -209,7 +201,7 @@ def run_stack(
     Returns
     -------
     xarray.Dataset
-        The store, opened lazily; `status` has the outcome of each shot. With a shard, its shots.
+        The store, opened lazily; `status` has the outcome of each shot.
 
     Raises
     ------
@@ -228,8 +220,7 @@ def run_stack(
     stack = describe_stack(
         shots, recipe, source, mask, source_mask, reader, variables, run.warm_start
     )
-    stack = replace(stack, shard=Shard.of(run.part, stack.shots, path), dtype=run.dtype)
-    numbers = numbers_of(run, len(stack.shots))
+    stack = replace(stack, dtype=run.dtype)
     if run.shot_table is not None:
         stack = stack.with_table(read_shot_table(run.shot_table))
     again = (PENDING, SKIPPED, *([FAILED] if run.redo_failed else []))
@@ -242,13 +233,12 @@ def run_stack(
     if is_local(scheduler):
         # Once, instead of in all workers during their first shot.
         ensure_compiled(lambda news: prepare(f"compiling, {news.message}"), should_stop)
-    with clear_up_when_terminated(), nullcontext() if stack.shard else locked(path):
-        store = StackStore(path, numbers=numbers) if path.exists() and not run.overwrite else None
+    with clear_up_when_terminated(), locked(path):
+        store = StackStore(path) if path.exists() and not run.overwrite else None
         arrived = False
         if store is not None:
             stack = resume(store, stack)
-            if stack.shard is None:
-                remove_unfinished(path)
+            remove_unfinished(path)
             store = reopen_damaged(store)
             if stack.columns:
                 rows = [shot.entries for shot in stack.shots.items]
@@ -256,22 +246,18 @@ def run_stack(
             arrived = len(stack.shots) > len(store.names)
             if not arrived and not np.isin(store.statuses(), again).any():
                 _Run(stack, store, (), on_progress, should_stop).report("nothing to do")
-                return read_stack(path, numbers=numbers)
+                return read_stack(path)
         # Before the store is created: a scheduler that does not respond must leave nothing behind.
         with engine_for(scheduler, run.workers, should_stop) as engine:
             if store is None:
                 if stack.chooses_sites:
                     prepare("how many sites the first shots need")
-                contents = contents_of(choose_sites(stack, should_stop))
-                is_shared = stack.shard is not None
-                create_store(path, contents, overwrite=run.overwrite, shared=is_shared)
-                store = StackStore(path, numbers=numbers)
-                # It may be that of another shard.
-                stack = resume(store, stack)
+                stack = choose_sites(stack, should_stop)
+                store = create_store(path, contents_of(stack), overwrite=run.overwrite)
             elif arrived:
                 store = append_shots(store, stack)
             _Run(stack, store, again, on_progress, should_stop).run_on(engine)
-    return read_stack(path, numbers=numbers)
+    return read_stack(path)
 
 
 def join_shot_table(store: str | Path, table: str | Path) -> xarray.Dataset:
@@ -307,7 +293,6 @@ def join_shot_table(store: str | Path, table: str | Path) -> xarray.Dataset:
     with clear_up_when_terminated(), locked(path):
         content = StackStore(path)
         check_files(content)
-        check_shard(content, None)
         join_columns(content, columns.columns, columns.rows_of(content.names))
     return read_stack(path)
 
@@ -347,7 +332,7 @@ class _Run:
             if index not in self._todo
         ]
         self._status = RunStatus(
-            total=int((statuses != UNREAD).sum()),
+            total=len(statuses),
             done=int((statuses == DONE).sum()),
             doubtful=sum(
                 status == DONE and bool(report.get("warnings"))
@@ -375,18 +360,14 @@ class _Run:
         )
 
     def run_on(self, engine: Engine) -> None:
-        """Invert all pending shots, and summarise their reports unless other shards do so, too."""
+        """Invert all pending shots, and summarise their reports."""
         try:
             self._work_on(engine)
         except BaseException:
             with suppress(OSError):
-                self._summarise()
+                summarise(self._store)
             raise
-        self._summarise()
-
-    def _summarise(self) -> None:
-        if self._stack.shard is None:
-            summarise(self._store)
+        summarise(self._store)
 
     def _work_on(self, engine: Engine) -> None:
         self.report(engine.name)
@@ -464,8 +445,6 @@ def contents_of(stack: Stack) -> Contents:
     attributes: dict[str, Any] = {**attributes_of(stack), **identity}
     if stack.as_arrived:
         attributes |= NUMBERED_AS_ARRIVED
-    if stack.shard is not None:
-        attributes |= {SHARDS: stack.shard.count, SHOT_FILES: stack.shard.files}
     if isinstance(stack.task, InvertTask) and stack.task.sites_chosen:
         attributes[_CHOSEN_SITES] = stack.task.recipe.options.n_sites
     return Contents(stack.sizes, _variables(stack), _coordinates(stack), attributes)
@@ -538,11 +517,8 @@ def resume(store: StackStore, stack: Stack) -> Stack:
             f"{store.path} was written by watching a folder, where each shot starts from the one "
             "before: continue with shadowinv watch, overwrite the store, or choose another name"
         )
-    check_shard(store, stack.shard)
     shots = stack.shots.reordered(_order(store, stack.shots.names))
     stack = match_store(store, replace(stack, shots=shots))
-    if stack.shard is not None:
-        check_shots(store, stack.shard, len(shots))
     for index in np.flatnonzero(store.statuses() == DONE):
         changed = stack.changed(int(index), store.report(int(index)))
         if changed:
@@ -558,13 +534,12 @@ def reopen_damaged(store: StackStore) -> StackStore:
 
     A `FileFormatError` if there is damage that cannot be repaired from the shots.
     """
-    numbers = store.numbers
-    damage = StackStore(store.path, every_byte=True, numbers=numbers).damage
+    damage = StackStore(store.path, every_byte=True).damage
     for index in damage.shots:
         ShotWriter.of(store).reopen(index)
     if not (damage.shots or damage.files):
         return store
-    store = StackStore(store.path, numbers=numbers)
+    store = StackStore(store.path)
     if damage.files:
         summarise(store)
         check_files(store := StackStore(store.path, every_byte=True))

@@ -49,7 +49,6 @@ from napari_shadowinv.stack._run import (
     match_store,
     stored_variables,
 )
-from napari_shadowinv.stack._shards import check_shard
 from napari_shadowinv.stack._shots import (
     FileReference,
     ImageReference,
@@ -166,7 +165,6 @@ class Watch:
         if self._options.overwrite or not self._path.exists():
             return
         store = StackStore(self._path)
-        check_shard(store, None)
         again = (PENDING, SKIPPED, *([FAILED] if self._options.redo_failed else []))
         self._redo = {store.names[i] for i in np.flatnonzero(np.isin(store.statuses(), again))}
         for name, report in zip(store.names, store.reports(), strict=True):
