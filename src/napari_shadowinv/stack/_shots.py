@@ -11,7 +11,6 @@ import functools
 import hashlib
 import inspect
 import json
-import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -68,10 +67,6 @@ class ImageReference:
         """Return whether the image still agrees with the metadata from `load`."""
         return bool(self.read()[1]["sha256"] == origin.get("sha256"))
 
-    def identity(self, folder: Path) -> str:
-        """Describe the image without reading files, whose paths are relative to a folder."""
-        return ""
-
 
 @dataclass(frozen=True, eq=False)
 class ArrayReference(ImageReference):
@@ -81,9 +76,6 @@ class ArrayReference(ImageReference):
 
     def read(self) -> tuple[AnyArray, dict[str, Any]]:
         return self.image, {"sha256": checksum(self.image)}
-
-    def identity(self, folder: Path) -> str:
-        return checksum(self.image)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +132,6 @@ class FileReference(ImageReference):
         """Compare a file as in a table's rows, and a page by its checksum."""
         return super().unchanged(origin) if self.page is not None else _agrees(self.path, origin)
 
-    def identity(self, folder: Path) -> str:
-        return f"{_relative_text(self.path, folder)} {self.page} {self.variable}"
-
 
 @dataclass(frozen=True, eq=False)
 class RowsReference(ImageReference):
@@ -158,9 +147,11 @@ class RowsReference(ImageReference):
 
     def __dask_tokenize__(self) -> tuple[Any, ...]:
         # A changed file is another input, so dask must not reuse its result.
+        files = {name: text_of(path) for name, path in self._files().items()}
         stamps = [stamp(path) for path in self._files().values() if path.exists()]
-        content = self.identity(Path("/"))
-        return content, json.dumps(stamps), str(self.channel), str(self.variable)
+        setup = None if self.setup is None else self.setup.model_dump_json()
+        content = json.dumps([self._summaries(), files, setup, stamps])
+        return content, str(self.channel), str(self.variable)
 
     def load(self) -> tuple[tuple[FitShot, ...], dict[str, Any]]:
         """Return the images, and the files of their rows."""
@@ -209,11 +200,6 @@ class RowsReference(ImageReference):
         setups = (setup_before, self.setup)
         return differences(*({} if setup is None else setup.model_dump() for setup in setups))
 
-    def identity(self, folder: Path) -> str:
-        files = {name: _relative_text(path, folder) for name, path in self._files().items()}
-        setup = None if self.setup is None else self.setup.model_dump_json()
-        return json.dumps([self._summaries(), files, setup])
-
     def _files(self) -> dict[str, Path]:
         """Return the files by the names of their columns and the numbers of their rows."""
         return {
@@ -224,14 +210,6 @@ class RowsReference(ImageReference):
 
     def _summaries(self) -> list[dict[str, Any]]:
         return [row.summary for row in self.rows]
-
-
-def _relative_text(path: Path, folder: Path) -> str:
-    """Return a path relative to a folder, as a file system may be mounted elsewhere on a host."""
-    try:
-        return text_of(os.path.relpath(path, folder))
-    except ValueError:  # on another drive
-        return text_of(path)
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any], missing: Any = None) -> str:
