@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -24,7 +25,7 @@ from distributed import Client, LocalCluster
 from distributed.client import FuturesCancelledError
 
 from helpers.slow_reading import die, hang_once
-from helpers.store_content import content
+from helpers.store_content import content, whole_content
 from napari_shadowinv import (
     FileFormatError,
     InversionCancelled,
@@ -164,6 +165,64 @@ def test_killed_client_resumes_and_a_second_one_is_refused(night, out, expected,
     assert content(out) == expected
     again = Counter(night.reads) - reads
     assert not {"shot_4", "shot_5"} & set(again)
+
+
+KILLED = """
+    import importlib, json, os, signal, sys
+    import numpy as np
+    from helpers.night import OPTIONS, make_shots
+    from napari_shadowinv import Recipe, invert, run_stack
+
+    folder, out, *changes = sys.argv[1:]
+    count, kill_at = 0, None
+
+    def kill_before(event, arguments):
+        global count
+        is_writing = event == "open" and arguments[2] & (os.O_WRONLY | os.O_RDWR)
+        is_writing |= event in ("os.rename", "os.mkdir", "os.remove", "os.rmdir")
+        if is_writing and ".shadowinv.zarr" in str(arguments[0]):
+            count += 1
+            if count == kill_at:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    # What a forked process needs; a store would start threads, which are not forked.
+    images, source = make_shots(1)
+    invert(images[0], source=source, options=OPTIONS)
+    importlib.import_module("dask.array")
+    importlib.import_module("xarray").backends.list_engines()
+    codes = []
+    for change in [*map(int, changes), None]:
+        if not (pid := os.fork()):
+            kill_at = change
+            sys.addaudithook(kill_before)
+            try:
+                shots, source = f"{folder}/shot_*.npy", np.load(f"{folder}/source.npy")
+                recipe = Recipe(options=OPTIONS)
+                run_stack(shots, out, recipe, source=source, scheduler="synchronous")
+                os._exit(0)
+            finally:
+                os._exit(1)
+        codes.append(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+    print(json.dumps(codes))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the runs are forked")
+def test_a_run_killed_at_any_change_of_a_file_is_resumed_bit_by_bit(night, out, tmp_path):
+    undisturbed = tmp_path / "undisturbed.shadowinv.zarr"
+    night.run(undisturbed)
+    np.save(night.folder / "source.npy", night.source)
+    # While it creates the store, writes its shots, and gathers their columns.
+    changes = [30, 120, 180, 200, 20, 30, 5, 35, 25, 12, 30, 40, 42, 10, 20]
+    code, paths = textwrap.dedent(KILLED), [str(night.folder), str(out)]
+    command = [sys.executable, "-c", code, *paths, *map(str, changes)]
+    output = subprocess.run(command, env=environment(), capture_output=True, check=True).stdout
+    *codes, last = json.loads(output)
+    assert codes.count(-signal.SIGKILL) > 10
+    assert last == 0
+    assert whole_content(out) == whole_content(undisturbed)
+    assert {path.name for path in tmp_path.iterdir()} == {"shots", out.name, undisturbed.name}
+    assert not [path for path in out.rglob("*") if re.search(r"^\.|\.partial$", path.name)]
 
 
 def test_ten_of_a_hundred_files_corrupt(make_night, out, cluster):

@@ -245,6 +245,7 @@ def run_stack(
                 store = join_columns(store, stack.columns, rows)
             arrived = len(stack.shots) > len(store.names)
             if not arrived and not np.isin(store.statuses(), again).any():
+                summarise(store)  # the last run may have been killed before it did
                 _Run(stack, store, (), on_progress, should_stop).report("nothing to do")
                 return read_stack(path)
         # Before the store is created: a scheduler that does not respond must leave nothing behind.
