@@ -16,7 +16,6 @@ from napari_shadowinv._napari.stores import shot_rows
 from napari_shadowinv.io.shot_columns import read_shot_table
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
 from napari_shadowinv.io.store_checksums import Status
-from napari_shadowinv.stack import join_shot_table
 
 TABLE = """Shot; Energy (J); Delay [ns]; Remarks
 # of the day
@@ -107,24 +106,30 @@ def test_resumed_run_joins_a_table_and_its_corrections(table, make_night, out):
     assert len(night.run(out)) == len(corrected)  # without the table it stays
 
 
-def test_table_joins_a_store_later(table, make_night, out):
-    make_night(3).run(out)
-    result = shadowinv("join", out, table)
-    assert "shot number, Energy (J), Delay (ns), Remarks" in flat(result.output)
-    check_columns(read(out))
-    exchanged = out / "energy/c/0", out / "delay/c/0"
-    shutil.copy(*exchanged)
+def test_exchanged_columns_are_noticed_and_written_again(table, make_night, out):
+    night = make_night(3)
+    night.run(out, shot_table=table)
+    shutil.copy(out / "energy/c/0", out / "delay/c/0")
     (problem,) = StackStore(out).damage.files
     assert "delay/c/0 does not belong to shots 0 to 2" in problem
+    check_columns(night.run(out))
+
+
+def test_columns_keep_their_units(table, make_night, out):
+    night = make_night(3)
+    night.run(out, shot_table=table)
     table.write_text(TABLE.replace("Energy (J)", "Energy (mJ)"))
-    with pytest.raises((InputError, FileFormatError), match="damaged"):
-        join_shot_table(out, table)
+    reason = "has 'energy' as numbers in mJ, and .* as numbers in J: correct the table"
+    with pytest.raises(InputError, match=reason):
+        night.run(out, shot_table=table)
+    check_columns(read(out))
 
 
-def test_killed_join_leaves_a_store_that_can_be_joined(table, make_night, out, monkeypatch):
+def test_a_table_joins_though_a_run_was_killed_meanwhile(table, make_night, out, monkeypatch):
     from napari_shadowinv.io import store_writing
 
-    make_night(3).run(out)
+    night = make_night(3)
+    night.run(out)
 
     def killed(*_: object) -> None:
         raise KeyboardInterrupt
@@ -132,10 +137,10 @@ def test_killed_join_leaves_a_store_that_can_be_joined(table, make_night, out, m
     with monkeypatch.context() as patch:
         patch.setattr(store_writing, "reseal", killed)
         with pytest.raises(KeyboardInterrupt):
-            join_shot_table(out, table)
+            night.run(out, shot_table=table)
     assert "energy" not in read(out)
     assert Status.DAMAGED not in StackStore(out, every_byte=True).statuses()
-    check_columns(join_shot_table(out, table))
+    check_columns(night.run(out, shot_table=table))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Commands for many shots: `batch`, `watch`, `status`, `join`, `export`, `movie`."""
+"""Commands for many shots: `batch`, `watch`, `status`, `export`, `movie`."""
 
 from __future__ import annotations
 
@@ -24,8 +24,6 @@ HELP = {
     "row per shot.",
     "fit": "Fit the forward model to each shot instead of inverting it, with the recipe's section "
     "[fit]; table rows with the same shot are images of one object.",
-    "table": "Table with a row for each shot: CSV with the column 'shot' or 'number', or HDF5 as "
-    "file.h5::/entry/shots.",
     "resume": "Resume an interrupted run and append new shots.",
     "verify": "Read all files and compare their checksums; exit code 1 if any is damaged.",
     "variables": "For tiff: variables to export, separated by commas.",
@@ -163,21 +161,6 @@ def status(
         say(table)
     if verify and is_damaged:
         raise Exit(EXIT_FAILED_SHOTS)
-
-
-@notify_errors
-def join(
-    store: _flags.StoreFolder,
-    table: Annotated[str, _flags.argument(help=HELP["table"])],
-    quiet: _flags.Quiet = False,
-) -> None:
-    """Join a shot table to a store by the numbers of the shots, such as after a watch."""
-    from napari_shadowinv.io.shot_columns import joined_columns
-    from napari_shadowinv.stack import join_shot_table
-
-    columns = joined_columns(join_shot_table(store, table).attrs)
-    if not quiet:
-        say(f"Joined to {store}: {', '.join(column.title for column in columns)}")
 
 
 @notify_errors

@@ -17,7 +17,7 @@ import os
 import secrets
 import shutil
 import warnings
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -173,16 +173,6 @@ def _open_arrays(path: Path, store_id: str, shots: int) -> dict[str, Any]:
     return arrays
 
 
-def check_column_keys(columns: Iterable[Column], taken: Collection[str]) -> None:
-    """Refuse columns of a shot table whose names a store uses itself."""
-    for column in columns:
-        if column.key in taken:
-            raise InputError(
-                f"the shot table has the column '{column.key}', a name that the store uses itself: "
-                "rename the column"
-            )
-
-
 def join_columns(
     store: StackStore, columns: Sequence[Column], rows: Sequence[Mapping[str, Any]]
 ) -> StackStore:
@@ -192,8 +182,6 @@ def join_columns(
     meanwhile leaves a store that can be joined again.
     """
     before = {column.key: column for column in joined_columns(store.attributes)}
-    arrays = ShotWriter.of(store).arrays()
-    check_column_keys(columns, {*arrays, *(column.key for column in store.columns)} - before.keys())
     for column in columns:
         existing = before.get(column.key, column)
         if (existing.unit, existing.kind) != (column.unit, column.kind):
@@ -207,12 +195,13 @@ def join_columns(
         if new:
             _create_columns(store, new, describe_columns(joined.values()))
         entries = {column.entry for column in columns}
+        reports = ShotWriter.of(store).arrays()["report"]
         for index in np.flatnonzero(np.isin(store.statuses(), (DONE, FAILED))).tolist():
             report = store.report(index)
             kept = {key: value for key, value in report.items() if key not in entries}
             changed = {**kept, **rows[index]}
             if changed != report:
-                arrays["report"][index : index + 1] = np.array([json.dumps(changed)], dtype=object)
+                reports[index : index + 1] = np.array([json.dumps(changed)], dtype=object)
     joined_store = StackStore(store.path)
     summarise(joined_store)
     return joined_store

@@ -5,13 +5,12 @@
 - read a shot's file, or one of its colour channels: `read_shot`
 - watch a folder and invert each shot as soon as it arrives: `watch_stack`
 - what a run reports: `RunStatus`
-- join a shot table to a store: `join_shot_table`
 - mean, spread and peaks across shots: `stack_statistics`
 """
 
 from napari_shadowinv.stack._lazy import invert_stack, stack_statistics
 from napari_shadowinv.stack._plan import STORED
-from napari_shadowinv.stack._run import RunStatus, join_shot_table, run_stack
+from napari_shadowinv.stack._run import RunStatus, run_stack
 from napari_shadowinv.stack._shots import read_shot
 from napari_shadowinv.stack._worker import ShotOutcome
 from napari_shadowinv.stack.watch import watch_stack
@@ -21,7 +20,6 @@ __all__ = [
     "RunStatus",
     "ShotOutcome",
     "invert_stack",
-    "join_shot_table",
     "read_shot",
     "run_stack",
     "stack_statistics",

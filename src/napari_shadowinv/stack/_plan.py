@@ -37,7 +37,6 @@ from napari_shadowinv.io.shot_columns import JOINED, ShotTable, describe_columns
 from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.io.store_checksums import RECORD
 from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, Column, columns_of
-from napari_shadowinv.io.store_writing import check_column_keys
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Inputs, collect_inputs
@@ -117,7 +116,12 @@ class Stack:
         setup_kind = "proton" if self.task.setup is None else self.task.setup.kind
         own_columns = (column.key for column in columns_of(kind, setup_kind))
         of_store = {*self.task.labels, *coordinates_of(self), *own_columns, *RECORD, "setup"}
-        check_column_keys(table.columns, of_store)
+        for column in table.columns:
+            if column.key in of_store:
+                raise InputError(
+                    f"the shot table has the column '{column.key}', a name that the store uses "
+                    "itself: rename the column"
+                )
         rows = zip(self.shots.items, table.rows_of(self.shots.names), strict=True)
         items = [replace(shot, entries=entries) for shot, entries in rows]
         return replace(self, shots=replace(self.shots, items=items), columns=table.columns)

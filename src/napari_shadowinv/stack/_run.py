@@ -261,43 +261,6 @@ def run_stack(
     return read_stack(path)
 
 
-def join_shot_table(store: str | Path, table: str | Path) -> xarray.Dataset:
-    """Join a shot table to a store that exists, by the numbers in the names of its shots.
-
-    Its columns become variables along ``shot``. A table that was corrected or has more columns
-    can be joined again.
-
-    Parameters
-    ----------
-    store : str or Path
-        ``name.shadowinv.zarr``.
-    table : str or Path
-        Comma-separated values, or HDF5 as ``file.h5::/entry/shots``: a compound dataset, or a
-        group of datasets of one length. The column ``shot`` or ``number`` has the numbers.
-
-    Returns
-    -------
-    xarray.Dataset
-        The store, opened lazily. Values are NaN or empty where a cell is empty, or the shot is
-        not done yet.
-
-    Raises
-    ------
-    InputError
-        If the table lacks a shot, its numbers cannot be used, or a column has the name of
-        something else in the store.
-    FileFormatError
-        If one of the two cannot be read, or another process is writing to the store.
-    """
-    path = check_store_path(store)
-    columns = read_shot_table(table)
-    with clear_up_when_terminated(), locked(path):
-        content = StackStore(path)
-        check_files(content)
-        join_columns(content, columns.columns, columns.rows_of(content.names))
-    return read_stack(path)
-
-
 def stored_variables(
     variables: Collection[str] | None, recipe: Recipe | None, mask: ArrayLike | None
 ) -> Collection[str] | None:
