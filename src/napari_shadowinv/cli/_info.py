@@ -41,10 +41,10 @@ def file_table(path: Path, variable: str | None = None) -> Table:
 def _rows(path: Path, variable: str | None) -> _summary.Rows:
     from napari_shadowinv.cli._batch import store_rows
     from napari_shadowinv.io import is_stack, read
+    from napari_shadowinv.io.arrays import read_npy
     from napari_shadowinv.io.formats import format_of
     from napari_shadowinv.io.frames import find_frames
     from napari_shadowinv.io.hdf5 import read_hdf5
-    from napari_shadowinv.io.images import read_npy
     from napari_shadowinv.io.store import StackStore
 
     if is_stack(path):

@@ -457,8 +457,8 @@ class Field:
 def field_from(path: Path, variable: str | None = None) -> Field:
     """Read a displacement from a result, or from an array in px or px²."""
     from napari_shadowinv.io import read_dataset, read_radiograph
+    from napari_shadowinv.io.arrays import read_npy
     from napari_shadowinv.io.hdf5 import read_hdf5
-    from napari_shadowinv.io.images import read_npy
 
     kind = kind_of(path)
     if variable is not None and kind in ("hdf5", "shadowinv"):

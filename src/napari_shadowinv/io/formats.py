@@ -87,13 +87,13 @@ JPEG = Format(
 )
 NPY = Format(
     "npy", (".npy",), "NPY", ((0, b"\x93NUMPY"),),
-    reader="images:read_npy_plane", image_writer="images:write_npy",
+    reader="arrays:read_npy_plane", image_writer="arrays:write_npy",
 )
 MATLAB = Format(
     "mat", (".mat",), "MATLAB", _HDF5, test="matlab:is_matlab",
     reader="matlab:read_mat", named_reader="matlab:read_mat",
 )
-PCO = Format("b16", (".b16",), "PCO .b16", ((0, b"PCO-"), (0, b"pco-")), reader="images:read_b16")
+PCO = Format("b16", (".b16",), "PCO .b16", ((0, b"PCO-"), (0, b"pco-")), reader="cameras:read_b16")
 RESULT = Format(
     "shadowinv", (".shadowinv",), ".shadowinv", _HDF5, test="pradformat:is_result",
     holds=("result",), reader="read_write:read_result", named_reader="hdf5:read_plane",
@@ -113,7 +113,7 @@ CPSA = Format(
 # The oldest programs left the marks out.
 SPE = Format(
     "spe", (".spe",), "Princeton .spe", ((2996, b"\x67\x45\x23\x01"), (4098, b"\x55\x55")),
-    unmarked="binary", reader="images:read_spe",
+    unmarked="binary", reader="cameras:read_spe",
 )
 SITES = Format(
     "sites", (".csv",), holds=(), result_writer="read_write:write_sites",

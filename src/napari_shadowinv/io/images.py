@@ -1,15 +1,8 @@
-"""Pictures, frames of cameras and numpy's arrays, one plane each.
+"""Pictures, one plane each.
 
-- pictures: TIFF with 8, 16 or 32 bits, PNG, BMP, JPEG
-- raw frames of cameras: PCO's ``.b16``, and ``.spe`` 2.x and 3.0 of Princeton Instruments
+- TIFF with 8, 16 or 32 bits, PNG, BMP, JPEG
 - colour images: reduction to one plane (`to_grey`), signs of a film scan (`film_warnings`)
 - scans of film in colour: `read_scan`
-
-References
-----------
-pco.edge User Manual, appendix A4, Image File Formats.
-
-Teledyne Princeton Instruments, SPE 3.0 File Format Specification, 4411-0140 (2019).
 """
 
 from __future__ import annotations
@@ -17,8 +10,6 @@ from __future__ import annotations
 import logging
 import lzma
 import math
-import re
-import struct
 import threading
 import zlib
 from collections.abc import Callable, Iterator
@@ -324,47 +315,6 @@ def _read_with_pillow(path: Path, index: int = 0) -> AnyArray:
         return np.asarray(picture.read(index=index))
 
 
-@as_file_errors
-def read_npy(path: Path) -> AnyArray:
-    """Read an array of real numbers, of any shape and in its own dtype."""
-    # Mapped first: a header that promises too much then fails before memory is asked for.
-    try:
-        mapped = np.load(path, allow_pickle=False, mmap_mode="r")
-    except ValueError as error:
-        if "Python objects" not in str(error):
-            raise
-        raise FileFormatError(
-            f"{path} contains Python objects: expected an array of numbers; save it again with "
-            "array.astype(float)"
-        ) from error
-    check_size(path, mapped.size * max(8, mapped.dtype.itemsize))
-    array = np.array(mapped)
-    if array.dtype.kind not in "buif":
-        raise FileFormatError(
-            f"{path} holds {array.dtype} values: expected whole or real numbers; convert them"
-        )
-    return array
-
-
-def read_npy_plane(path: Path) -> tuple[AnyArray, dict[str, Any]]:
-    """Read an image; arrays of other shapes are refused."""
-    array = read_npy(path)
-    if array.ndim != 2 or array.size == 0:
-        raise FileFormatError(
-            f"{path} holds an array of shape {array.shape}: expected an image of shape "
-            "(height, width); save one plane of it"
-        )
-    return array, {}
-
-
-def write_npy(path: Path, array: AnyArray, pixel_size: float | None = None) -> None:
-    """Write an array as it is; the format does not keep the size of a pixel."""
-    content = BytesIO()
-    np.save(content, array, allow_pickle=False)
-    # numpy gives no reason when it cannot write to a file.
-    path.write_bytes(content.getvalue())
-
-
 def write_tiff(path: Path, plane: AnyArray, pixel_size: float | None = None) -> None:
     """Write a plane as float32 TIFF, the width of a pixel (m) as its resolution."""
     import tifffile
@@ -386,87 +336,3 @@ def write_png(path: Path, plane: AnyArray, pixel_size: float | None = None) -> N
     Image.fromarray(grey).save(content, "PNG")
     # Only when all of it is there: a full disk then gives one plain error.
     path.write_bytes(content.getvalue())
-
-
-_B16_HEADER, _B16_EXTENDED_HEADER = 24, 128
-_SPE_HEADER = 4100
-_SPE_TYPES = {0: "<f4", 1: "<i4", 2: "<i2", 3: "<u2", 5: "<f8", 6: "u1", 8: "<u4"}
-_SPE_REGION = re.compile(rb'<DataBlock\b[^>]*\btype="Region"[^>]*>')
-_LONGEST_FOOTER = 2_000_000  # that of one frame has some kilobytes
-
-
-def read_b16(path: Path) -> tuple[AnyArray, dict[str, Any]]:
-    """Read a frame of a PCO camera: counts as uint16, shape (H, W), and ``bits``."""
-    with path.open("rb") as file:
-        header = file.read(_B16_EXTENDED_HEADER)
-    check_promise(path, "PCO", _B16_HEADER, len(header))
-    _, start, width, height, extended = struct.unpack("<5i", header[4:_B16_HEADER])
-    if start < _B16_HEADER:
-        raise FileFormatError(
-            f"{path} is damaged: its PCO header gives its length as {start} bytes, expected at "
-            f"least {_B16_HEADER}; copy it again"
-        )
-    is_colour = struct.unpack_from("<i", header, 24)[0] == 1 if len(header) >= 28 else False
-    if extended == -1 and start >= _B16_EXTENDED_HEADER and is_colour:
-        raise FileFormatError(
-            f"{path} comes from a colour camera, whose pixels have different colour filters: "
-            "expected a monochrome frame; convert it to a greyscale TIFF"
-        )
-    return _read_frame(path, "PCO", start, (height, width), np.dtype("<u2")), {"bits": 16}
-
-
-def read_spe(path: Path) -> tuple[AnyArray, dict[str, Any]]:
-    """Read the only frame of a file, in its own dtype, shape (H, W), with ``bits``, ``version``."""
-    with path.open("rb") as file:
-        header = file.read(_SPE_HEADER)
-    check_promise(path, "SPE", _SPE_HEADER, len(header))
-    shape = (_unpack_number(header, "H", 656), _unpack_number(header, "H", 42))
-    frames, version = _unpack_number(header, "i", 1446), _unpack_number(header, "f", 1992)
-    dtype = _SPE_TYPES.get(_unpack_number(header, "h", 108))
-    if dtype is None:
-        raise FileFormatError(
-            f"{path} is not an SPE file or is damaged: its data type is "
-            f"{_unpack_number(header, 'h', 108)}, expected one of "
-            f"{', '.join(map(str, _SPE_TYPES))}; export it as TIFF"
-        )
-    if frames != 1:
-        raise FileFormatError(
-            f"{path} holds {frames} frames: expected one radiograph per file; save the frame you "
-            "need separately"
-        )
-    if version >= 3:
-        _check_footer(path, _unpack_number(header, "Q", 678))
-    array = _read_frame(path, "SPE", _SPE_HEADER, shape, np.dtype(dtype))
-    return array, {"bits": 8 * array.dtype.itemsize, "version": round(version, 2)}
-
-
-def _unpack_number(header: bytes, code: str, offset: int) -> Any:
-    return struct.unpack_from(f"<{code}", header, offset)[0]
-
-
-def _check_footer(path: Path, start: int) -> None:
-    """Refuse a frame of several sensor regions, which do not form one image."""
-    check_promise(path, "SPE", start, path.stat().st_size)
-    with path.open("rb") as file:
-        file.seek(start)
-        regions = len(_SPE_REGION.findall(file.read(_LONGEST_FOOTER)))
-    if regions > 1:
-        raise FileFormatError(
-            f"{path} holds {regions} regions of the sensor: expected one; export the region you "
-            "need as TIFF"
-        )
-
-
-def _read_frame(
-    path: Path, header: str, start: int, shape: tuple[int, int], dtype: np.dtype[Any]
-) -> AnyArray:
-    height, width = shape
-    if min(shape) < 1:
-        raise FileFormatError(
-            f"{path} is damaged: its {header} header gives a frame of {height}×{width} pixels; "
-            "copy or save it again"
-        )
-    count = height * width
-    check_promise(path, header, start + count * dtype.itemsize, path.stat().st_size)
-    check_size(path, 8 * count)
-    return np.fromfile(path, dtype, count=count, offset=start).reshape(shape)
