@@ -42,37 +42,41 @@ def _rows(path: Path, variable: str | None) -> _summary.Rows:
     from napari_shadowinv.cli._batch import store_rows
     from napari_shadowinv.io import is_stack, read
     from napari_shadowinv.io.arrays import read_npy
+    from napari_shadowinv.io.field_grids import describe_field_grid, is_field_grid
     from napari_shadowinv.io.formats import format_of
     from napari_shadowinv.io.frames import find_frames
-    from napari_shadowinv.io.hdf5 import read_hdf5
+    from napari_shadowinv.io.hdf5_arrays import read_hdf5
     from napari_shadowinv.io.store import StackStore
 
     if is_stack(path):
         return store_rows(StackStore(path))
+    if variable is None and is_field_grid(path):
+        return describe_field_grid(path)
     frames = find_frames(path, variable)
     if len(frames) > 1:
-        return _frame_rows(read(path, variable=variable))
+        return _frame_rows(read(path, variable=variable), frames[0].variable)
     path, variable = frames[0].path, frames[0].variable
     form = format_of(path)
     if form.name == "mat":
         return _matlab_rows(path, variable)
-    if variable is not None and form.named_reader and form.name != "cpsa":
+    if variable is not None and form.name in ("pradformat", "shadowinv"):
         array = read_hdf5(path, variable)
         return [("kind", f"array {variable!r} of an HDF5 file"), *_array_rows(array)]
     if variable is None and form.name == "npy":
         return [("kind", "NPY array"), *_array_rows(read_npy(path))]
-    if variable is None and form.name not in ("cpsa", "text") and "result" not in form.holds:
+    if form.name not in ("cpsa", "text", "hdf5") and "result" not in form.holds:
         return _picture_rows(path, form)
     content = read(path, variable=variable)
     return _radiograph_rows(content) if isinstance(content, Radiograph) else _result_rows(content)
 
 
-def _frame_rows(frames: Radiograph | xarray.Dataset) -> _summary.Rows:
+def _frame_rows(frames: Radiograph | xarray.Dataset, array: str | None) -> _summary.Rows:
     """Describe many images by their names and the first."""
     assert not isinstance(frames, Radiograph)
     names, images = frames["name"].values, frames["image"]
     return [
         ("kind", f"{len(names)} frames, {names[0]} to {names[-1]}"),
+        *([] if array is None else [("array", array)]),
         ("shape", f"{images.shape}, [shot, y, x]"),
         *((f"first: {name}", text) for name, text in _array_rows(images[0].values)[2:]),
     ]
@@ -111,6 +115,7 @@ def _radiograph_rows(shot: Radiograph) -> _summary.Rows:
         "cpsa": "CR-39 tracks",
     }
     kind = str(shot.metadata["kind"])
+    names["hdf5"] = f"array {shot.metadata.get('variable')!r} of an HDF5 file"
     rows = [("kind", names.get(kind, kind)), *_array_rows(shot.image)]
     if shot.source is not None:
         rows.append(("source", "in the same file, below the image"))

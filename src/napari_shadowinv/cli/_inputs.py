@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv.cli._flags import fit_recipe_of, recipe_of
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.files import split_address
 from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, PRADFORMAT, RESULT, suffixes_for
 from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.preprocessing import MeasuredSource, Radiograph, Recipe
@@ -64,7 +65,7 @@ def check_outputs(outputs: Iterable[Output], overwrite: bool) -> list[Path]:
 
 def protect(outputs: list[Path], inputs: list[Path | None]) -> None:
     """Refuse to overwrite an input, even with --overwrite."""
-    sources = {resolved_path(file) for file in inputs if file is not None}
+    sources = {resolved_path(split_address(file)[0]) for file in inputs if file is not None}
     for path in outputs:
         if resolved_path(path) in sources:
             raise InputError(f"{path} is both read and written: choose another name for the output")
@@ -107,11 +108,11 @@ def write_result(
     """Write a result and its figures, all or none; the names of its files are the title."""
     from napari_shadowinv.cli._fit_result import static_figures
     from napari_shadowinv.io import replacing, write
-    from napari_shadowinv.io.files import text_of
+    from napari_shadowinv.io.files import name_of
     from napari_shadowinv.plotting import left_out_figure, result_figure, windows_figure
     from napari_shadowinv.plotting.figures import DOTS_PER_INCH
 
-    title = ", ".join(text_of(Path(name).name) for name in names)
+    title = ", ".join(name_of(name) for name in names)
     dataset, figures = result.to_dataset(), {figure: result_figure(result, title=title)}
     if checks is not None:
         dataset = checks.add_to(dataset)

@@ -33,7 +33,7 @@ from napari_shadowinv.cli._terminal import (
 )
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
-from napari_shadowinv.io.formats import IMAGE_WRITERS, PNG, RESULT, TIFF, kind_of
+from napari_shadowinv.io.formats import IMAGE_WRITERS, NETCDF_SUFFIX, PNG, RESULT, TIFF, kind_of
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.preprocessing import MeasuredSource, Radiograph
@@ -284,7 +284,9 @@ def forward(
     from napari_shadowinv.pipeline.files import setup_from
 
     path = Path(f"{field.stem}_image{TIFF.suffix}") if out is None else out
-    outputs = _inputs.check_outputs([(path, tuple(IMAGE_WRITERS)), (truth, (".nc",))], overwrite)
+    outputs = _inputs.check_outputs(
+        [(path, tuple(IMAGE_WRITERS)), (truth, (NETCDF_SUFFIX,))], overwrite
+    )
     _inputs.protect(outputs, [field, source, setup, recorded_with])
     if source_variable is not None and source is None:
         raise InputError("received --source-variable: it needs --source, the file that contains it")
@@ -458,14 +460,16 @@ def field_from(path: Path, variable: str | None = None) -> Field:
     """Read a displacement from a result, or from an array in px or px²."""
     from napari_shadowinv.io import read_dataset, read_radiograph
     from napari_shadowinv.io.arrays import read_npy
-    from napari_shadowinv.io.hdf5 import read_hdf5
+    from napari_shadowinv.io.files import split_address
+    from napari_shadowinv.io.hdf5_arrays import read_hdf5
 
+    path, variable = split_address(path, variable)
     kind = kind_of(path)
-    if variable is not None and kind in ("hdf5", "shadowinv"):
+    if variable is not None and kind in ("hdf5", "pradformat", "shadowinv"):
         return Field(_displacement(path, read_hdf5(path, variable)))
     if variable is not None or kind == "mat":
         return Field(_displacement(path, read_radiograph(path, variable=variable).image))
-    if kind in ("hdf5", "shadowinv"):
+    if kind in ("pradformat", "shadowinv"):
         return _field_of_result(path, read_dataset(path))
     if kind == "npy":
         return Field(_displacement(path, read_npy(path)))

@@ -1,7 +1,12 @@
-"""Arrays of numpy, ``.npy``: `read_npy`, an image `read_npy_plane`, `write_npy`."""
+"""Arrays of numpy, ``.npy``: `read_npy`, an image or frame `read_npy_plane`, `write_npy`.
+
+- lengths of the axes that count the frames of an array in any file: `frame_axes`
+"""
 
 from __future__ import annotations
 
+import math
+import re
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -12,20 +17,43 @@ from napari_shadowinv._system.safety import as_file_errors, check_size
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
 
+FRAME_INDEX = re.compile(r"(?P<name>.*)\[(?P<index>\d+(,\d+)*)\]")  # of an array, as data[3]
+_COLOURS = (3, 4)  # of a picture, on its last axis
+
+
+def frame_axes(path: Path, title: str, shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the lengths of the axes before the last two, which count frames; none for an image."""
+    if len(shape) < 2 or 0 in shape:
+        raise FileFormatError(
+            f"{path} holds {title} with shape {shape}: expected an image of shape "
+            "(height, width), or many with the shots first; choose another array"
+        )
+    if len(shape) > 2 and shape[-1] in _COLOURS:
+        raise FileFormatError(
+            f"{path} holds {title} with shape {shape}, as of pictures in colour: expected images "
+            "of shape (height, width), many with the shots first; save one colour, or turn the axes"
+        )
+    return shape[:-2]
+
+
+def check_one_frame(path: Path, axes: tuple[int, ...], title: str = "") -> None:
+    """Refuse many frames where one image is expected; `title` is the array's, if it has a name."""
+    if math.prod(axes) == 1:
+        return
+    first = ",".join("0" * len(axes))
+    advice = f"choose one, such as '{title}[{first}]', or " if title else ""
+    raise FileFormatError(
+        f"{path} holds {math.prod(axes)} frames{title and f' in {title!r}'}: expected one image; "
+        f"{advice}invert all as a stack of shots"
+    )
+
 
 @as_file_errors
-def read_npy(path: Path) -> AnyArray:
-    """Read an array of real numbers, of any shape and in its own dtype."""
-    # Mapped first: a header that promises too much then fails before memory is asked for.
-    try:
-        mapped = np.load(path, allow_pickle=False, mmap_mode="r")
-    except ValueError as error:
-        if "Python objects" not in str(error):
-            raise
-        raise FileFormatError(
-            f"{path} contains Python objects: expected an array of numbers; save it again with "
-            "array.astype(float)"
-        ) from error
+def read_npy(path: Path, number: int | None = None) -> AnyArray:
+    """Read real numbers in their own dtype: an array of any shape, or frame `number` of it."""
+    mapped = _map_npy(path)
+    if number is not None:
+        mapped = mapped[np.unravel_index(number, mapped.shape[:-2])]
     check_size(path, mapped.size * max(8, mapped.dtype.itemsize))
     array = np.array(mapped)
     if array.dtype.kind not in "buif":
@@ -35,15 +63,29 @@ def read_npy(path: Path) -> AnyArray:
     return array
 
 
-def read_npy_plane(path: Path) -> tuple[AnyArray, dict[str, Any]]:
-    """Read an image; arrays of other shapes are refused."""
-    array = read_npy(path)
-    if array.ndim != 2 or array.size == 0:
+def _map_npy(path: Path) -> AnyArray:
+    # Mapped first: a header that promises too much then fails before memory is asked for.
+    try:
+        return np.asarray(np.load(path, allow_pickle=False, mmap_mode="r"))
+    except ValueError as error:
+        if "Python objects" not in str(error):
+            raise
         raise FileFormatError(
-            f"{path} holds an array of shape {array.shape}: expected an image of shape "
-            "(height, width); save one plane of it"
-        )
-    return array, {}
+            f"{path} contains Python objects: expected an array of numbers; save it again with "
+            "array.astype(float)"
+        ) from error
+
+
+def count_npy(path: Path) -> tuple[int, ...]:
+    """Return the lengths of the axes that count frames; see `frame_axes`."""
+    return frame_axes(path, "an array", _map_npy(path).shape)
+
+
+def read_npy_plane(path: Path, number: int | None = None) -> tuple[AnyArray, dict[str, Any]]:
+    """Read an image, or a frame of many."""
+    if number is None:
+        check_one_frame(path, count_npy(path))
+    return read_npy(path, number or 0), {}
 
 
 def write_npy(path: Path, array: AnyArray, pixel_size: float | None = None) -> None:

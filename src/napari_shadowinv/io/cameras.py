@@ -12,19 +12,21 @@ from __future__ import annotations
 import re
 import struct
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from napari_shadowinv._system.safety import check_size
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.io.arrays import check_one_frame
 from napari_shadowinv.io.files import check_promise
 
 _B16_HEADER, _B16_EXTENDED_HEADER = 24, 128
 _SPE_HEADER = 4100
 _SPE_TYPES = {0: "<f4", 1: "<i4", 2: "<i2", 3: "<u2", 5: "<f8", 6: "u1", 8: "<u4"}
 _SPE_REGION = re.compile(rb'<DataBlock\b[^>]*\btype="Region"[^>]*>')
+_SPE_STRIDE = re.compile(rb'<DataBlock\b(?=[^>]*\btype="Frame")[^>]*\bstride="(\d{1,12})"')
 _LONGEST_FOOTER = 2_000_000  # that of one frame has some kilobytes
 
 
@@ -48,46 +50,72 @@ def read_b16(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     return _read_frame(path, "PCO", start, (height, width), np.dtype("<u2")), {"bits": 16}
 
 
-def read_spe(path: Path) -> tuple[AnyArray, dict[str, Any]]:
-    """Read the only frame of a file, in its own dtype, shape (H, W), with ``bits``, ``version``."""
+class _Spe(NamedTuple):
+    """Layout of the frames of an SPE file."""
+
+    frames: int
+    shape: tuple[int, int]
+    dtype: np.dtype[Any]
+    stride: int  # bytes from one frame to the next, which may hold times after its pixels
+    version: float
+
+
+def read_spe(path: Path, number: int | None = None) -> tuple[AnyArray, dict[str, Any]]:
+    """Read a frame in its own dtype, shape (H, W), with ``bits``, ``version``."""
+    layout = _spe_layout(path)
+    if number is None:
+        check_one_frame(path, (layout.frames,))
+    start = _SPE_HEADER + (number or 0) * layout.stride
+    array = _read_frame(path, "SPE", start, layout.shape, layout.dtype)
+    return array, {"bits": 8 * array.dtype.itemsize, "version": round(layout.version, 2)}
+
+
+def count_spe(path: Path) -> int:
+    """Return the number of frames."""
+    return _spe_layout(path).frames
+
+
+def _spe_layout(path: Path) -> _Spe:
     with path.open("rb") as file:
         header = file.read(_SPE_HEADER)
     check_promise(path, "SPE", _SPE_HEADER, len(header))
-    shape = (_unpack_number(header, "H", 656), _unpack_number(header, "H", 42))
+    height, width = _unpack_number(header, "H", 656), _unpack_number(header, "H", 42)
     frames, version = _unpack_number(header, "i", 1446), _unpack_number(header, "f", 1992)
-    dtype = _SPE_TYPES.get(_unpack_number(header, "h", 108))
-    if dtype is None:
+    code = _unpack_number(header, "h", 108)
+    if code not in _SPE_TYPES:
         raise FileFormatError(
-            f"{path} is not an SPE file or is damaged: its data type is "
-            f"{_unpack_number(header, 'h', 108)}, expected one of "
+            f"{path} is not an SPE file or is damaged: its data type is {code}, expected one of "
             f"{', '.join(map(str, _SPE_TYPES))}; export it as TIFF"
         )
-    if frames != 1:
-        raise FileFormatError(
-            f"{path} holds {frames} frames: expected one radiograph per file; save the frame you "
-            "need separately"
-        )
+    dtype = np.dtype(_SPE_TYPES[code])
+    stride = height * width * dtype.itemsize
+    if frames < 1:
+        raise FileFormatError(f"{path} holds {frames} frames: expected at least one; save it again")
     if version >= 3:
-        _check_footer(path, _unpack_number(header, "Q", 678))
-    array = _read_frame(path, "SPE", _SPE_HEADER, shape, np.dtype(dtype))
-    return array, {"bits": 8 * array.dtype.itemsize, "version": round(version, 2)}
+        stride = max(stride, _footer_stride(path, _unpack_number(header, "Q", 678)))
+    end = _SPE_HEADER + (frames - 1) * stride + height * width * dtype.itemsize
+    check_promise(path, "SPE", end, path.stat().st_size)
+    return _Spe(frames, (height, width), dtype, stride, version)
 
 
 def _unpack_number(header: bytes, code: str, offset: int) -> Any:
     return struct.unpack_from(f"<{code}", header, offset)[0]
 
 
-def _check_footer(path: Path, start: int) -> None:
-    """Refuse a frame of several sensor regions, which do not form one image."""
+def _footer_stride(path: Path, start: int) -> int:
+    """Return the stride of frames by the XML at the end; refuse several sensor regions in each."""
     check_promise(path, "SPE", start, path.stat().st_size)
     with path.open("rb") as file:
         file.seek(start)
-        regions = len(_SPE_REGION.findall(file.read(_LONGEST_FOOTER)))
+        footer = file.read(_LONGEST_FOOTER)
+    regions = len(_SPE_REGION.findall(footer))
     if regions > 1:
         raise FileFormatError(
             f"{path} holds {regions} regions of the sensor: expected one; export the region you "
             "need as TIFF"
         )
+    stride = _SPE_STRIDE.search(footer)
+    return int(stride[1]) if stride else 0
 
 
 def _read_frame(

@@ -1,6 +1,7 @@
 """Electric and magnetic fields on 3-D grids from files.
 
-- whether a file holds them: `is_field_grid`; read them: `read_field_grid`
+- whether a file holds them: `is_field_grid`; read them: `read_field_grid`; list them without
+  reading: `describe_field_grid`
 
 Two layouts of HDF5 files are read: openPMD (https://github.com/openPMD/openPMD-standard, version 1
 and 2), which most particle-in-cell codes write, and NetCDF 4 as xarray writes a dataset with the
@@ -43,6 +44,42 @@ def is_field_grid(path: Path) -> bool:
             _COMPONENT.fullmatch(name) and getattr(item, "ndim", 0) >= len(AXES)
             for name, item in members(content)
         )
+
+
+@as_file_errors
+def describe_field_grid(path: Path) -> list[tuple[str, str]]:
+    """Return title and text of the kind, and of each field with its shape, spacing and unit."""
+    with open_hdf5(path) as content:
+        is_openpmd = "openPMD" in content.attrs
+        standard = f"openPMD {_text(content.attrs['openPMD'])}" if is_openpmd else "NetCDF"
+        rows = [("kind", f"fields on a grid ({standard}): trace particles with shadowinv forward")]
+        if not is_openpmd:
+            fields = [item for name, item in members(content) if _COMPONENT.fullmatch(name)]
+            return rows + [_field_row(item.name.strip("/"), item, []) for item in fields]
+        base = _text(content.attrs.get("basePath", "/data/%T/"))
+        parent = member(path, content, base.partition("%T")[0].strip("/"))
+        for number in sorted(filter(str.isdecimal, parent or ()), key=int)[:_MAX_LISTED]:
+            meshes = _text(content.attrs.get("meshesPath", "fields/"))
+            for name, record in members(member(path, parent[number], meshes) or {}):
+                parts = [("", record)] if hasattr(record, "shape") else members(record)
+                spacing = np.ravel(record.attrs.get("gridSpacing", [])).astype(float)
+                metres = spacing * np.ravel(record.attrs.get("gridUnitSI", 1.0)).astype(float)
+                for key, part in parts:
+                    title = "/".join(filter(None, (number, name, key)))
+                    rows.append(_field_row(title, part, metres.tolist()))
+        return rows
+
+
+def _field_row(title: str, field: Any, spacing: list[float]) -> tuple[str, str]:
+    shape = field.shape if hasattr(field, "shape") else np.ravel(field.attrs["shape"])
+    texts = ["×".join(map(str, shape))]
+    if spacing:
+        texts.append(f"spacing {' × '.join(f'{length:g}' for length in spacing)} m")
+    if unit := _text(field.attrs.get("units", "")):
+        texts.append(unit)
+    if "unitSI" in field.attrs:
+        texts.append(f"{float(np.ravel(field.attrs['unitSI'])[0]):g} of the SI unit")
+    return title, ", ".join(texts)
 
 
 @as_file_errors

@@ -1,5 +1,6 @@
 """Checks, checksums and safe writing of files of any format.
 
+- the file of ``file.h5::/entry/data`` and the name of the array: `split_address`, `join_address`
 - its fingerprint: `sha256`; its name as text: `text_of`; many in order: `in_counting_order`
 - refuse a header that promises more than there is: `check_promise`
 - refuse an output before hours of work: `check_output`, `check_folder_of`
@@ -20,11 +21,44 @@ from typing import Any
 from napari_shadowinv._system.hidden_files import MAX_NAME_BYTES, hidden_name, sweep
 from napari_shadowinv._system.machine import clear_up_when_terminated, defer_interrupts
 from napari_shadowinv._system.safety import check_regular
-from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.errors import FileFormatError, InputError
 
 DEFLATE_RATIO = 1040  # the most that zlib can pack into one byte, a little rounded up
+_ADDRESS = "::"  # between a file and the name of an array in it
+# A path joins its slashes; a scheme of one letter is a drive.
+_LOCATION = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+-]+):/+(?P<place>.+)")
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _CUT_SHORT = re.compile(r"\d+ requested and \d+ written")  # numpy's words where there is no room
+
+
+def split_address(path: str | Path, variable: str | None = None) -> tuple[Path, str | None]:
+    """Return the file of an image, and the name of the array that its path ends with.
+
+    Every path of an image that is opened, compared or checked goes through here.
+
+    Examples
+    --------
+    >>> split_address("run.h5::/entry/data[3]")
+    (PosixPath('run.h5'), '/entry/data[3]')
+    """
+    text = str(path)
+    if not text:
+        raise InputError("received an empty text: expected the path of a file")
+    if os.path.exists(path):
+        return Path(path), variable
+    if location := _LOCATION.match(text):
+        raise InputError(
+            f"{location['scheme']}://{location['place']} is a location on the network: expected a "
+            "file on this machine; download it first"
+        )
+    file, separator, name = text.partition(_ADDRESS)
+    if not separator:
+        return Path(path), variable
+    if variable is not None:
+        raise InputError(f"{text} names an array, as does the variable {variable!r}: name it once")
+    if not file:
+        raise InputError(f"{text} names an array without its file: expected file.h5{text}")
+    return Path(file), name or "/"
 
 
 def check_promise(path: Path, header: str, promised: int, present: int) -> None:
@@ -37,15 +71,27 @@ def check_promise(path: Path, header: str, promised: int, present: int) -> None:
 
 
 def sha256(path: str | Path) -> str:
-    """Return the SHA-256 checksum of a file, in hexadecimal."""
-    check_regular(Path(path), "a file")
-    with Path(path).open("rb") as file:
+    """Return the SHA-256 checksum of a file, in hexadecimal; of an array's, that of its file."""
+    path, _ = split_address(path)
+    check_regular(path, "a file")
+    with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def text_of(path: str | Path) -> str:
     """Return a path as text that a file can store, with undecodable bytes as escapes."""
     return os.fsencode(path).decode("utf-8", errors="backslashreplace")
+
+
+def join_address(file: Path | str, variable: str | None) -> Path:
+    """Return the path of an array in a file, or of the file alone without one."""
+    return Path(file) if variable is None else Path(f"{file}{_ADDRESS}{variable}")
+
+
+def name_of(path: str | Path) -> str:
+    """Return the name of a file as text, with that of the array in it."""
+    file, variable = split_address(path)
+    return text_of(join_address(file.name, variable))
 
 
 def in_counting_order(paths: Iterable[Path]) -> list[Path]:

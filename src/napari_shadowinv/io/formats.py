@@ -20,6 +20,7 @@ from typing import Any, Literal
 from napari_shadowinv._system.safety import as_file_errors, check_regular
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.facts import ResultKind
+from napari_shadowinv.io.files import split_address
 
 _HEAD_BYTES = 4100  # they hold every mark
 _EXCERPT_BYTES = 64  # they show the kind of a file without a mark
@@ -38,6 +39,10 @@ class Format:
     holds: tuple[Literal["image", "result"], ...] = ("image",)
     reader: str = ""  # of a path: image and metadata, which replace those of `read`, or a dataset
     named_reader: str = ""  # the same, of a path and the name of an array, or the tracks to count
+    # Of a path, and the name of an array if it is known: the lengths of the axes that count frames.
+    # The readers then take the number of a frame.
+    counter: str = ""
+    default: str = ""  # of a path: the name of the array that is read without one
     image_writer: str = ""  # of a path, an image and its pixel size (m) or None
     result_writer: str = ""  # of a path and a dataset
     results: tuple[ResultKind, ...] = ()  # kinds of the results that it writes
@@ -48,10 +53,24 @@ class Format:
         """Usual ending."""
         return self.suffixes[0]
 
-    def read(self, path: Path, variable: str | None = None) -> Any:
-        """Return the content of a file, or one of its arrays; see `reader` and `named_reader`."""
-        selection = () if variable is None else (variable,)
-        return function(self.named_reader if selection else self.reader)(path, *selection)
+    def array_name(self, path: Path, variable: str | None) -> str | None:
+        """Return the name of the array that is read, if arrays have names."""
+        named = variable is not None or not self.default
+        return variable if named else function(self.default)(path)
+
+    def read(self, path: Path, variable: str | None = None, number: int | None = None) -> Any:
+        """Return the content of a file, one of its arrays, or one of the frames; see `reader`."""
+        variable = self.array_name(path, variable)
+        names = () if variable is None else (variable,)
+        numbers = {} if number is None else {"number": number}
+        return function(self.named_reader if names else self.reader)(path, *names, **numbers)
+
+    def count_frames(self, path: Path, variable: str | None = None) -> tuple[int, ...]:
+        """Return the lengths of the axes that count frames; none if the file holds one image."""
+        if not self.counter or (variable is not None and not self.named_reader):
+            return ()
+        axes = function(self.counter)(path, *(() if variable is None else (variable,)))
+        return axes if isinstance(axes, tuple) else (axes,)
 
     def fits(self, path: Path, head: bytes) -> bool:
         """Return whether a file that begins with `head` is of this format."""
@@ -74,7 +93,8 @@ _HDF5 = ((0, b"\x89HDF\r\n\x1a\n"), (0, b"MATLAB"))
 TIFF = Format(
     "tiff", (".tif", ".tiff"), "TIFF",
     ((0, b"II*\x00"), (0, b"MM\x00*"), (0, b"II+\x00"), (0, b"MM\x00+")),
-    reader="images:read_tiff", image_writer="images:write_tiff", is_scan=True,
+    reader="images:read_tiff", counter="images:tiff_pages", image_writer="images:write_tiff",
+    is_scan=True,
 )
 PNG = Format(
     "png", (".png",), "PNG", ((0, b"\x89PNG\r\n\x1a\n"),),
@@ -87,24 +107,30 @@ JPEG = Format(
 )
 NPY = Format(
     "npy", (".npy",), "NPY", ((0, b"\x93NUMPY"),),
-    reader="arrays:read_npy_plane", image_writer="arrays:write_npy",
+    reader="arrays:read_npy_plane", counter="arrays:count_npy", image_writer="arrays:write_npy",
 )
 MATLAB = Format(
     "mat", (".mat",), "MATLAB", _HDF5, test="matlab:is_matlab",
-    reader="matlab:read_mat", named_reader="matlab:read_mat",
+    reader="matlab:read_mat", named_reader="matlab:read_mat", counter="matlab:count_mat",
 )
 PCO = Format("b16", (".b16",), "PCO .b16", ((0, b"PCO-"), (0, b"pco-")), reader="cameras:read_b16")
 RESULT = Format(
     "shadowinv", (".shadowinv",), ".shadowinv", _HDF5, test="pradformat:is_result",
-    holds=("result",), reader="read_write:read_result", named_reader="hdf5:read_plane",
-    result_writer="read_write:write_result", results=tuple(ResultKind),
+    holds=("result",), reader="read_write:read_result", named_reader="hdf5_arrays:read_plane",
+    counter="hdf5_arrays:count_frames", result_writer="read_write:write_result",
+    results=tuple(ResultKind),
 )
-# The reader of all other HDF5 files: it says which array can be named.
 PRADFORMAT = Format(
-    "hdf5", (".h5", ".hdf5"), "pradformat HDF5", _HDF5,
+    "pradformat", (".h5", ".hdf5"), "pradformat", _HDF5, test="pradformat:is_pradformat",
     holds=("image", "result"), reader="pradformat:read_pradformat",
-    named_reader="hdf5:read_plane", result_writer="pradformat:write_pradformat",
+    named_reader="hdf5_arrays:read_plane", counter="hdf5_arrays:count_frames",
+    result_writer="pradformat:write_pradformat",
     results=(ResultKind.INVERSION, ResultKind.FIT, ResultKind.FIELD),
+)
+HDF5 = Format(
+    "hdf5", (*PRADFORMAT.suffixes, ".hdf", ".nxs", ".nx5", ".cxi", ".nc"), "HDF5 (NeXus, NetCDF 4)",
+    _HDF5, default="hdf5_arrays:default_array",
+    named_reader="hdf5_arrays:read_plane", counter="hdf5_arrays:count_frames",
 )
 CPSA = Format(
     "cpsa", (".cpsa",), "CR-39 .cpsa", unmarked="binary",
@@ -113,7 +139,7 @@ CPSA = Format(
 # The oldest programs left the marks out.
 SPE = Format(
     "spe", (".spe",), "Princeton .spe", ((2996, b"\x67\x45\x23\x01"), (4098, b"\x55\x55")),
-    unmarked="binary", reader="cameras:read_spe",
+    unmarked="binary", reader="cameras:read_spe", counter="cameras:count_spe",
 )
 SITES = Format(
     "sites", (".csv",), holds=(), result_writer="read_write:write_sites",
@@ -126,7 +152,7 @@ TEXT = Format(
 STORE = Format("store", (".shadowinv.zarr",), holds=("result",))
 
 FORMATS = (
-    TIFF, PNG, BMP, JPEG, NPY, PCO, MATLAB, RESULT, PRADFORMAT, CPSA, SPE, TEXT, SITES, STORE,
+    TIFF, PNG, BMP, JPEG, NPY, PCO, MATLAB, RESULT, PRADFORMAT, HDF5, CPSA, SPE, TEXT, SITES, STORE,
 )
 # fmt: on
 
@@ -160,6 +186,7 @@ OPENED_BY_NAPARI = SCAN_SUFFIXES | {".npy", SITES.suffix}
 IMAGE_WRITERS = {
     suffix: each.image_writer for each in FORMATS if each.image_writer for suffix in each.suffixes
 }
+NETCDF_SUFFIX = HDF5.suffixes[-1]
 FIGURE_SUFFIXES = (PNG.suffix, ".pdf", ".svg")
 
 _FOREIGN_FORMATS = {
@@ -178,6 +205,7 @@ def format_of(path: Path) -> Format:
 
     Numbers as text have no mark, so they also need one of the usual endings.
     """
+    path, _ = split_address(path)
     check_regular(path, f"a file ({READABLE})")
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)

@@ -1,7 +1,6 @@
 """Frames: images of a file that holds many, or of a folder, each read on demand.
 
 - all frames that a path stands for: `find_frames`; the images of a folder: `images_in`
-- an array of an HDF5 file as ``file.h5::/entry/data/data``: `split_address`
 - frames as a lazy dataset: `lazy_frames`
 
 Any axes of an array before the last two count frames. At most one frame is in memory at a time.
@@ -22,12 +21,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.files import in_counting_order, text_of
-from napari_shadowinv.io.formats import PRADFORMAT, RADIOGRAPH_SUFFIXES, RESULT, TIFF, format_of
-from napari_shadowinv.io.hdf5 import count_frames
-from napari_shadowinv.io.images import tiff_pages
+from napari_shadowinv.io.files import in_counting_order, split_address, text_of
+from napari_shadowinv.io.formats import RADIOGRAPH_SUFFIXES, format_of
 
 if TYPE_CHECKING:
     import xarray
@@ -35,7 +33,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.preprocessing import Radiograph
 
 _GLOB = re.compile(r"[*?\[]")
-_ADDRESS = "::"  # between a file and the name of an array in it
 FRAMES_FORMAT = "shadowinv frames"
 
 
@@ -45,17 +42,9 @@ class Frame:
 
     path: Path
     name: str  # for messages and tables
-    # Page of a TIFF, or frame of an array over all its leading axes; None if there is one image.
+    # Page of a TIFF, or frame of an array over all other axes; None if there is one image.
     number: int | None = None
-    variable: str | None = None  # name of the array in an HDF5 file
-
-
-def split_address(path: str | Path, variable: str | None = None) -> tuple[Path, str | None]:
-    """Return the file and the name of the array of ``file.h5::/entry/data/data``."""
-    file, separator, name = str(path).partition(_ADDRESS)
-    if variable is not None or not separator or os.path.exists(path):
-        return Path(path), variable
-    return Path(file), name or "/"
+    variable: str | None = None  # name of the array in its file
 
 
 def images_in(folder: Path) -> list[Path]:
@@ -129,14 +118,12 @@ def _readable_frames(path: Path, variable: str) -> list[Frame]:
         return [Frame(path, text_of(path.name), variable=variable)]
 
 
+@as_file_errors
 def _frames_of_file(path: Path, variable: str | None = None) -> list[Frame]:
     """Return the pages of a TIFF, or the frames of an array."""
     name, file_format = text_of(path.name), format_of(path)
-    axes: tuple[int, ...] = ()
-    if variable is None:
-        axes = (tiff_pages(path),) if file_format is TIFF else ()
-    elif file_format in (PRADFORMAT, RESULT):
-        axes = count_frames(path, variable)
+    variable = file_format.array_name(path, variable)
+    axes = file_format.count_frames(path, variable)
     if math.prod(axes) == 1:
         return [Frame(path, name, variable=variable)]
     return [

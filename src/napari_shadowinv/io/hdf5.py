@@ -1,8 +1,6 @@
-"""Arrays of any HDF5 file, by name.
+"""Structure of HDF5 files; images in them are in `hdf5_arrays`.
 
-- the array that the user names, or one of its frames: `read_hdf5`, as an image `read_plane`; the
-  choice: `list_arrays`; the number of frames: `count_frames`
-- for callers that know the layout: `open_hdf5`; an item, `member`; its values, `load_dataset`
+- `open_hdf5`; an item, `member`, or all of a group, `members`; its values, `load_dataset`
 - refuse a file whose arrays are elsewhere or too large: `check_arrays`
 - a NetCDF4 file, for xarray: `opened_netcdf`
 - write one: `hdf5_in_memory`; compare its checksum: `check_hdf5_seal`
@@ -14,10 +12,7 @@ reader follows them, because the content of another file would pass for the file
 from __future__ import annotations
 
 import hashlib
-import itertools
-import math
 import os
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -28,18 +23,14 @@ from typing import Any
 
 import numpy as np
 
-from napari_shadowinv._system.safety import as_file_errors, check_size
+from napari_shadowinv._system.safety import check_size
 from napari_shadowinv._typing import AnyArray
-from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 
-_MAX_LISTED = 30
-_MAX_DEPTH = 2  # groups within groups that are listed
 _SEAL = b"\nshadowinv sha256 "
 _BLOCK_BYTES = 1 << 20
-_MAX_LINKS = 16
-_INDEX = re.compile(r"(?P<name>.+)\[(?P<index>\d+(,\d+)*)\]")
-_DEFAULTS = ("signal", "default")  # attributes of a NeXus group: its array, or the group to look in
+MAX_LINKS = 16  # that lead to one item
 
 
 def open_hdf5(path: Path) -> Any:
@@ -62,7 +53,7 @@ def member(path: Path, group: Any, name: str, depth: int = 0) -> Any | None:
         if kind == h5py.h5l.TYPE_EXTERNAL:
             _refuse_other_file(path, name, f"links to {item.id.links.get_val(key)[0].decode()!r}")
         if kind == h5py.h5l.TYPE_SOFT:
-            if depth > _MAX_LINKS:
+            if depth > MAX_LINKS:
                 raise ValueError(f"the links of {name!r} form a loop")
             item = member(path, item, item.id.links.get_val(key).decode(), depth + 1)
         else:
@@ -88,10 +79,29 @@ def members(group: Any) -> Iterator[tuple[str, Any]]:
 
 def load_dataset(path: Path, dataset: Any) -> AnyArray:
     """Return the values of an array, refusing missing ones, which HDF5 would replace by zeros."""
-    check_size(path, _memory_bytes(path, dataset, dataset.size))
-    _check_filters(path, dataset)
+    check_size(path, memory_bytes(path, dataset, dataset.size))
+    check_filters(path, dataset)
     _check_promise(path, dataset)
     return np.asarray(dataset[()])
+
+
+def check_filters(path: Path, dataset: Any) -> None:
+    """Refuse an array that is compressed by a filter that HDF5 does not have."""
+    import h5py
+
+    layout = dataset.id.get_create_plist()
+    filters = [layout.get_filter(k) for k in range(layout.get_nfilters())]
+    missing = [each for each in filters if not h5py.h5z.filter_avail(each[0])]
+    if missing:
+        with suppress(ImportError):
+            import_module("hdf5plugin")  # adds its filters
+            missing = [each for each in missing if not h5py.h5z.filter_avail(each[0])]
+    for code, _, _, title in missing:
+        label = f"{code}, {title.decode(errors='replace')}" if title else str(code)
+        raise FileFormatError(
+            f"{path} holds {dataset.name!r} compressed by a filter that is not installed "
+            f"({label}): install the package hdf5plugin, or save it with gzip"
+        )
 
 
 def _check_promise(path: Path, dataset: Any) -> None:
@@ -100,20 +110,26 @@ def _check_promise(path: Path, dataset: Any) -> None:
     check_promise(path, "HDF5", dataset.nbytes, DEFLATE_RATIO * stored if is_packed else stored)
 
 
-def _memory_bytes(path: Path, dataset: Any, count: int) -> int:
+def memory_bytes(path: Path, dataset: Any, count: int) -> int:
     """Return the bytes in memory of values of an array, which must be in the file itself."""
-    layout = dataset.id.get_create_plist()
-    if layout.get_external_count():
-        external_file = layout.get_external(0)[0].decode(errors="replace")
-        _refuse_other_file(path, dataset.name, f"in the raw file {external_file!r}")
-    if dataset.is_virtual:
-        source_files = sorted({source.file_name for source in dataset.virtual_sources()})
-        names = ", ".join(map(repr, source_files))
-        _refuse_other_file(path, dataset.name, f"as a virtual array from {names}")
+    if origin := stored_elsewhere(dataset):
+        _refuse_other_file(path, dataset.name, origin)
     itemsize = int(dataset.dtype.itemsize)
     # One chunk may be far larger than what is used of it.
     chunk_bytes = int(np.prod(dataset.chunks or (0,), dtype=float)) * itemsize
     return int(max(chunk_bytes, count * max(8, itemsize)))
+
+
+def stored_elsewhere(dataset: Any) -> str:
+    """Say in which other files the values of an array are; empty if they are in its own."""
+    layout = dataset.id.get_create_plist()
+    if layout.get_external_count():
+        external_file = layout.get_external(0)[0].decode(errors="replace")
+        return f"in the raw file {external_file!r}"
+    if dataset.is_virtual:
+        source_files = sorted({source.file_name for source in dataset.virtual_sources()})
+        return f"as a virtual array from {', '.join(map(repr, source_files))}"
+    return ""
 
 
 def check_arrays(path: Path) -> None:
@@ -121,7 +137,7 @@ def check_arrays(path: Path) -> None:
     total = 0
     with open_hdf5(path) as file:
         for dataset in _iterate_datasets(path, file):
-            total += _memory_bytes(path, dataset, dataset.size)
+            total += memory_bytes(path, dataset, dataset.size)
             check_size(path, total)
             # The length of a dimension without coordinates is an array without values.
             if dataset.id.get_storage_size() or "CLASS" not in dataset.attrs:
@@ -206,136 +222,3 @@ def check_hdf5_seal(path: Path) -> None:
         raise FileFormatError(
             f"{path} is damaged: its content does not match its checksum; copy it again"
         )
-
-
-@as_file_errors
-def read_hdf5(path: Path, name: str, number: int | None = None) -> AnyArray:
-    """Read an array, ``shots/3/image``, or its frame `number` over the axes before the last two."""
-    with open_hdf5(path) as file:
-        dataset, frame_in_name = _find_array(path, file, name)
-        number = frame_in_name if number is None else number
-        if number is None:
-            return load_dataset(path, dataset)
-        index = tuple(map(int, np.unravel_index(number, dataset.shape[:-2])))
-        check_size(path, _memory_bytes(path, dataset, math.prod(dataset.shape[-2:])))
-        _check_filters(path, dataset)
-        if not _is_written(dataset, index):  # HDF5 would replace it by zeros
-            raise FileFormatError(
-                f"{path} does not hold frame {number} of {dataset.name!r} yet: wait until it is "
-                "written, or copy the file again"
-            )
-        return np.asarray(dataset[index])
-
-
-def read_plane(path: Path, name: str) -> tuple[AnyArray, dict[str, Any]]:
-    """Read one array, or one frame of it as ``entry/data/data[3]``, as an image."""
-    axes = count_frames(path, name)
-    if math.prod(axes) != 1:
-        first = ",".join("0" * len(axes))
-        raise FileFormatError(
-            f"{path} holds {math.prod(axes)} frames in {name!r}: expected one image; choose one, "
-            f"such as '{name}[{first}]', or invert all as a stack of shots"
-        )
-    return read_hdf5(path, name, 0 if axes else None), {"kind": "hdf5", "variable": name}
-
-
-@as_file_errors
-def count_frames(path: Path, name: str) -> tuple[int, ...]:
-    """Return the lengths of the axes before the last two of an array; none if it is one image."""
-    with open_hdf5(path) as file:
-        dataset, number = _find_array(path, file, name)
-        if dataset.ndim < 2 or 0 in dataset.shape:
-            raise FileFormatError(
-                f"{path} holds {name!r} with shape {dataset.shape}: expected an image of shape "
-                "(height, width), or many with the shots first; choose another array"
-            )
-        return dataset.shape[:-2] if number is None else ()
-
-
-def _find_array(path: Path, file: Any, name: str) -> tuple[Any, int | None]:
-    """Return an array by its name, and the number of the frame that the name ends with."""
-    item, index = _member_or_default(path, file, name), None
-    if item is None and (match := _INDEX.fullmatch(name)):
-        item = _member_or_default(path, file, match["name"])
-        index = tuple(map(int, match["index"].split(",")))
-    if item is None or not _is_numeric(item):
-        content = ", ".join(list_arrays(file)) or "none"
-        raise InputError(f"{path} has no array {name!r}: it holds {content}")
-    if index is None:
-        return item, None
-    axes = item.shape[:-2]
-    if len(index) != len(axes) or any(map(int.__ge__, index, axes)):
-        last = ",".join(str(length - 1) for length in axes)
-        frames = f"frames from [{','.join('0' * len(axes))}] to [{last}]" if axes else "one image"
-        raise InputError(f"{path} has no {name!r}: the array holds {frames}; correct the index")
-    return item, int(np.ravel_multi_index(index, axes)) if axes else 0
-
-
-def _member_or_default(path: Path, file: Any, name: str) -> Any | None:
-    """Return an array by its name, or that which a NeXus group of this name shows by default."""
-    import h5py
-
-    item = member(path, file, name)
-    for _ in range(_MAX_LINKS):
-        if not isinstance(item, h5py.Group):
-            break
-        default = next((item.attrs[key] for key in _DEFAULTS if key in item.attrs), None)
-        default = default.decode() if isinstance(default, bytes) else default
-        item = member(path, item, default) if isinstance(default, str) else None
-    return item if isinstance(item, h5py.Dataset) else None
-
-
-def _is_written(dataset: Any, index: tuple[int, ...]) -> bool:
-    """Return whether all chunks of a frame are in the file."""
-    if dataset.chunks is None:
-        return bool(dataset.id.get_storage_size())
-    sides = zip(dataset.shape[-2:], dataset.chunks[-2:], strict=True)
-    places = itertools.product(*(range(0, length, chunk) for length, chunk in sides))
-    chunks = (dataset.id.get_chunk_info_by_coord((*index, *place)) for place in places)
-    return all(chunk.byte_offset is not None for chunk in chunks)
-
-
-def _check_filters(path: Path, dataset: Any) -> None:
-    """Refuse an array that is compressed by a filter that HDF5 does not have."""
-    import h5py
-
-    layout = dataset.id.get_create_plist()
-    filters = [layout.get_filter(k) for k in range(layout.get_nfilters())]
-    missing = [each for each in filters if not h5py.h5z.filter_avail(each[0])]
-    if missing:
-        with suppress(ImportError):
-            import_module("hdf5plugin")  # adds its filters
-            missing = [each for each in missing if not h5py.h5z.filter_avail(each[0])]
-    for code, _, _, title in missing:
-        label = f"{code}, {title.decode(errors='replace')}" if title else str(code)
-        raise FileFormatError(
-            f"{path} holds {dataset.name!r} compressed by a filter that is not installed "
-            f"({label}): install the package hdf5plugin, or save it with gzip"
-        )
-
-
-def list_arrays(file: Any) -> list[str]:
-    """List the first images of an open file and its groups, with shape and type."""
-    arrays = itertools.islice(_iterate_named_datasets(file), 10 * _MAX_LISTED)
-    images = [
-        f"{name!r} ({'×'.join(map(str, item.shape))} {item.dtype})"
-        for name, item in arrays
-        if _is_numeric(item) and item.ndim >= 2
-    ]
-    return images if len(images) <= _MAX_LISTED else [*images[:_MAX_LISTED], "…"]
-
-
-def _iterate_named_datasets(group: Any, depth: int = 0) -> Iterator[tuple[str, Any]]:
-    """Yield the datasets of a group and of groups in it, as deep as files usually go."""
-    import h5py
-
-    for name, item in members(group):
-        if isinstance(item, h5py.Dataset):
-            yield name, item
-        elif isinstance(item, h5py.Group) and depth < _MAX_DEPTH:
-            for path, dataset in _iterate_named_datasets(item, depth + 1):
-                yield f"{name}/{path}", dataset
-
-
-def _is_numeric(item: Any) -> bool:
-    return bool(np.dtype(item.dtype).kind in "buif" and item.shape)

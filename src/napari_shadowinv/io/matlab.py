@@ -1,6 +1,6 @@
 """MATLAB's MAT-files, version 5 to 7 (its own layout) and 7.3 (HDF5).
 
-- the one image of a file, or the variable that the user names: `read_mat`
+- the one image of a file, or the variable that the user names: `read_mat`; its frames: `count_mat`
 - the variables of a file: `mat_variables`; MATLAB 7.3 or other HDF5: `is_matlab`
 
 scipy's reader of MATLAB's own layout asks for the memory that a damaged length names, and a damaged
@@ -28,6 +28,7 @@ import numpy as np
 from napari_shadowinv._system.safety import as_file_errors, check_size
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.arrays import FRAME_INDEX, check_one_frame
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 from napari_shadowinv.io.hdf5 import load_dataset, member, members, open_hdf5
 
@@ -62,8 +63,9 @@ class Variable:
 
     @property
     def is_image(self) -> bool:
-        # Scalars and vectors beside the image do not count.
-        return self.type in _NUMERIC and len(self.shape) == 2 and min(self.shape) >= 2
+        # Scalars and vectors beside the image do not count, nor do pictures in colour.
+        is_colour = self.type == "uint8" and self.shape[2:] == (3,)
+        return self.type in _NUMERIC and min(self.shape[:2], default=0) >= 2 and not is_colour
 
     def __str__(self) -> str:
         return f"'{self.name}' ({'×'.join(map(str, self.shape))} {self.type})"
@@ -84,16 +86,34 @@ def is_matlab(path: Path) -> bool:
         return is_named or any("MATLAB_class" in item.attrs for _, item in members(file))
 
 
-def read_mat(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[str, Any]]:
-    """Read the only image of a MAT-file, or the named one, rows first as MATLAB shows it."""
-    chosen = _choose_image(path, mat_variables(path), variable)
-    array = chosen.load()
+def read_mat(
+    path: Path, variable: str | None = None, number: int | None = None
+) -> tuple[AnyArray, dict[str, Any]]:
+    """Read the only image of a MAT-file, or the named one, rows first as MATLAB shows it.
+
+    Axes after the first two count frames; ``name[3]`` is one of them, and `number` counts over all.
+    """
+    chosen, index = _choose_image(path, variable)
+    array, axes = chosen.load(), chosen.shape[2:]
     if array.dtype.kind not in "buif" or array.shape != chosen.shape:
         raise FileFormatError(
             f"{path} holds {chosen} as {array.dtype} values of shape {array.shape}: expected a "
             "plane of whole or real numbers; take its real part or modulus, and save that"
         )
-    return array, {"variable": chosen.name, "bits": 8 * array.dtype.itemsize, "geometry": {}}
+    if number is not None:
+        index = tuple(map(int, np.unravel_index(number, axes)))
+    if index is None:
+        check_one_frame(path, axes, chosen.name)
+        index = (0,) * len(axes)
+    facts = {"variable": chosen.name, "bits": 8 * array.dtype.itemsize, "geometry": {}}
+    return array[(..., *index)], facts
+
+
+@as_file_errors
+def count_mat(path: Path, variable: str | None = None) -> tuple[int, ...]:
+    """Return the lengths of the axes after the first two of an array; none for one frame of it."""
+    chosen, index = _choose_image(path, variable)
+    return chosen.shape[2:] if index is None else ()
 
 
 @as_file_errors
@@ -110,22 +130,30 @@ def mat_variables(path: Path) -> list[Variable]:
         return [_describe_variable(path, name, member(path, content, name)) for name in names]
 
 
-def _choose_image(path: Path, variables: list[Variable], name: str | None) -> Variable:
+def _choose_image(path: Path, name: str | None) -> tuple[Variable, tuple[int, ...] | None]:
+    """Return the only image or the named one, and the index of a frame that the name ends with."""
+    variables, index = mat_variables(path), None
+    if name is not None and (match := FRAME_INDEX.fullmatch(name)):
+        name, index = match["name"], tuple(map(int, match["index"].split(",")))
+    name = name and name.lstrip("/")
     content = ", ".join(map(str, variables)) or "nothing"
-    images = [item for item in variables if item.is_image and name in (None, item.name)]
-    if name is not None and not images:
+    images = [item for item in variables if item.is_image and name in (None, "", item.name)]
+    if name and not images:
         raise InputError(f"{path} has no numeric plane {name!r}: it holds {content}")
     if not images:
         raise FileFormatError(
             f"{path} holds {content}: expected a numeric array (height, width); save the image as "
             "a variable of its own"
         )
-    if name is None and len(images) > 1:
+    if len(images) > 1:
         raise InputError(
             f"{path} holds {len(images)} images: choose one with variable, of "
             f"{', '.join(map(str, images))}"
         )
-    return images[0]
+    axes = images[0].shape[2:]
+    if index is not None and (len(index) != len(axes) or any(map(int.__ge__, index, axes))):
+        raise InputError(f"{path} has no {name}{list(index)}: it holds {images[0]}")
+    return images[0], index
 
 
 def _describe_variable(path: Path, name: str, item: Any) -> Variable:

@@ -19,12 +19,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._system.safety import as_file_errors, check_regular
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.inversion.variables import dataset_from_field, setup_from_dataset
-from napari_shadowinv.io.hdf5 import hdf5_in_memory, list_arrays, load_dataset, member, open_hdf5
+from napari_shadowinv.io.hdf5 import hdf5_in_memory, load_dataset, member, open_hdf5
 from napari_shadowinv.io.read_write import require
 from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.setup import Setup, Species, setup_from_dict
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     import xarray
 
 _VERSION = "0.2.0"
+_OBJECT_TYPES = ("radiograph", "inversion")
 _EV_PER_MEV = 1e6
 _SYMBOLS: dict[Species, str] = {
     "proton": "p+",
@@ -54,12 +54,11 @@ def is_result(path: Path) -> bool:
     return str(_root_attributes(path).get("format", "")).startswith(tuple(ResultKind))
 
 
-@as_file_errors
-def is_ours(path: Path) -> bool:
-    """Return whether an HDF5 file is a ``.shadowinv`` result or pradformat."""
-    check_regular(path, "an HDF5 file")
-    attributes = _root_attributes(path)
-    return "format" in attributes or attributes.get("object_type") in ("radiograph", "inversion")
+def is_pradformat(path: Path) -> bool:
+    """Return whether a file that begins like HDF5 or a MAT-file is a radiograph or inversion."""
+    import h5py
+
+    return h5py.is_hdf5(path) and _root_attributes(path).get("object_type") in _OBJECT_TYPES
 
 
 # They are looked up by name: walking all attributes of a damaged file may never end.
@@ -89,27 +88,17 @@ def _as_python_value(value: Any) -> Any:
 def read_pradformat(path: Path) -> tuple[AnyArray, dict[str, Any]] | xarray.Dataset:
     """Read a radiograph, with its ``geometry``, or the dataset of an inversion of any code."""
     attributes = _root_attributes(path)
-    kind = attributes.get("object_type")
-    if kind == "radiograph":
-        image = _read_datasets(path, ("image",)).get("image")
-        if image is None or image.ndim != 2:
-            content = "no image" if image is None else f"an image of shape {image.shape}"
-            raise FileFormatError(
-                f"{path} is a pradformat radiograph with {content}: expected a dataset 'image' of "
-                "shape (height, width); export it again"
-            )
-        geometry = _read_geometry(path, attributes, "pixel_width")
-        return image, {**attributes, "kind": "pradformat", "geometry": geometry}
-    if kind == "inversion":
+    if attributes["object_type"] == "inversion":
         return _read_inversion(path, attributes)
-    object_type = f"the object type {kind!r}" if kind else "no attribute 'object_type'"
-    with open_hdf5(path) as file:
-        names = ", ".join(list_arrays(file))
-    advice = f"name one of its arrays with variable, of {names}" if names else "export it as TIFF"
-    raise FileFormatError(
-        f"{path} is an HDF5 file with {object_type}: expected a pradformat radiograph or "
-        f"inversion, or a .shadowinv result; {advice}"
-    )
+    image = _read_datasets(path, ("image",)).get("image")
+    if image is None or image.ndim != 2:
+        content = "no image" if image is None else f"an image of shape {image.shape}"
+        raise FileFormatError(
+            f"{path} is a pradformat radiograph with {content}: expected a dataset 'image' of "
+            "shape (height, width); export it again"
+        )
+    geometry = _read_geometry(path, attributes, "pixel_width")
+    return image, {**attributes, "geometry": geometry}
 
 
 def _read_datasets(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray]:

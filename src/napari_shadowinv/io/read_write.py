@@ -23,22 +23,22 @@ from napari_shadowinv._system.safety import as_file_errors, small_text
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
-from napari_shadowinv.io.files import check_output, replacing, sha256
+from napari_shadowinv.io.files import check_output, replacing, sha256, split_address
 from napari_shadowinv.io.formats import (
     CPSA,
     IMAGE_WRITERS,
+    TIFF,
     format_of,
     formats_for,
     function,
     suffixes_for,
 )
-from napari_shadowinv.io.frames import Frame, find_frames, lazy_frames, split_address
+from napari_shadowinv.io.frames import Frame, find_frames, lazy_frames
 from napari_shadowinv.io.hdf5 import (
     check_arrays,
     check_hdf5_seal,
     hdf5_in_memory,
     opened_netcdf,
-    read_hdf5,
 )
 from napari_shadowinv.io.images import film_warnings, read_tiff_page, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
@@ -108,16 +108,17 @@ def read_frame(frame: Frame, *, channel: str | int | None = None) -> Radiograph:
     """Read one of the frames that a path stands for, with the errors of `read_radiograph`."""
     if frame.number is None:
         return read_radiograph(frame.path, channel=channel, variable=frame.variable)
-    if frame.variable is None:
+    if format_of(frame.path) is TIFF:
         image, warnings = read_tiff_page(frame.path, frame.number, channel=channel)
         return Radiograph(image, warnings=warnings)
-    array = read_hdf5(frame.path, frame.variable, frame.number)
-    return Radiograph(to_grey(array, channel, frame.path))
+    content = _read_file(frame.path, channel, frame.variable, frame.number)
+    assert isinstance(content, Radiograph)
+    return content
 
 
 @as_file_errors
 def _read_file(
-    path: Path, channel: str | int | None, variable: str | None
+    path: Path, channel: str | int | None, variable: str | None, number: int | None = None
 ) -> Radiograph | xarray.Dataset:
     file_format = format_of(path)
     if variable is not None and not file_format.named_reader:
@@ -125,7 +126,9 @@ def _read_file(
             f"{path} is neither a MATLAB nor an HDF5 file nor a CR-39 scan (its kind is "
             f"{file_format.name!r}): variable {variable!r} does not apply; leave it out"
         )
-    content: xarray.Dataset | tuple[AnyArray, dict[str, Any]] = file_format.read(path, variable)
+    content: xarray.Dataset | tuple[AnyArray, dict[str, Any]] = file_format.read(
+        path, variable, number
+    )
     if not isinstance(content, tuple):
         return content
     array, metadata = content
@@ -133,7 +136,8 @@ def _read_file(
         "kind": file_format.name,
         "dtype": str(array.dtype),
         "bits": 8 * array.dtype.itemsize,
-        "sha256": sha256(path),
+        # All frames share their file, and are too many to read it for each.
+        **({"sha256": sha256(path)} if number is None else {}),
         **metadata,
     }
     if array.dtype.kind not in "buif":

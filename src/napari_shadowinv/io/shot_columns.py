@@ -21,7 +21,7 @@ import numpy as np
 from napari_shadowinv._system.safety import as_file_errors, check_regular, check_size
 from napari_shadowinv._system.tables import is_number, read_table
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.frames import split_address
+from napari_shadowinv.io.files import split_address
 from napari_shadowinv.io.hdf5 import load_dataset, member, members, open_hdf5
 from napari_shadowinv.io.store_columns import Column
 

@@ -22,7 +22,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitShot, compare, fit, point_spread
 from napari_shadowinv.fitting.shots import common_values, value_of_first
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.io.files import sha256, text_of
+from napari_shadowinv.io.files import name_of, sha256, text_of
 from napari_shadowinv.options import BeamPrior, FitChoices, FitOptions, Instrument
 from napari_shadowinv.physics.beam import setup_warnings
 from napari_shadowinv.physics.projection import default_deflector
@@ -320,7 +320,7 @@ def collect_fit_inputs(
     cleared = {"source": source, "mask": None, "source_mask": None, "setup": None, "fit": resolved}
     table, origin = _read_fiducials(value_of_first(recorded, "fiducials"))
     if recipe.dark_file is not None:  # by its name only; the images have its checksum
-        recipe = recipe.with_dark_file(Path(text_of(recipe.dark_file.name)))
+        recipe = recipe.with_dark_file(Path(name_of(recipe.dark_file)))
     provenance = Provenance(
         kind="fit",
         recipe=recipe.model_copy(update=cleared),

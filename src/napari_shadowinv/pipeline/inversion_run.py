@@ -35,7 +35,7 @@ from napari_shadowinv.inversion import Inversion, invert, plan_sites
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.inversion.normalise import check_source, prepare
 from napari_shadowinv.io import read_radiograph
-from napari_shadowinv.io.files import sha256, text_of
+from napari_shadowinv.io.files import join_address, sha256, split_address, text_of
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.beam import deflection_warnings, setup_warnings
 from napari_shadowinv.preprocessing import (
@@ -409,6 +409,9 @@ def collect_inputs(
         check_spacing(source, "the source", setup.pixel_sizes)
     usable = _mask(mask, recipe.mask, "mask", radiograph) or _Mask(radiograph.mask, None)
     usable = _without_masked(usable, shot, source)
+    for image in (radiograph, beam):
+        if image is not None and image.mask is not None:  # of its file, beside a mask of the user
+            usable = _Mask(join_masks(usable.pixels, np.isfinite(image.image)), usable.file)
     bare = _mask(source_mask, recipe.source_mask, "source mask", radiograph)
     bare = bare or _Mask(radiograph.source_mask, None)
     if kind is None:
@@ -420,7 +423,8 @@ def collect_inputs(
     )
     dark = _dark_frame(recipe, radiograph)
     if dark is not None:
-        resolved = resolved.with_dark_file(Path(_origin(dark).file))
+        origin = _origin(dark)
+        resolved = resolved.with_dark_file(join_address(origin.file, origin.variable))
     origin = ImageOrigin(
         **dict(_origin(radiograph)),
         source=None if beam is None else _origin(beam),
@@ -470,7 +474,8 @@ class _Mask:
         packed = MaskOrigin.of(self.pixels)
         if self.file is None:
             return packed
-        file_origin = {"file": text_of(self.file.name), "sha256": sha256(self.file)}
+        file, variable = split_address(self.file)
+        file_origin = {"file": text_of(file.name), "variable": variable, "sha256": sha256(file)}
         return packed.model_copy(update=file_origin)
 
 
@@ -499,9 +504,9 @@ def _without_masked(mask: _Mask, *images: Any) -> _Mask:
     return _Mask(join_masks(mask.pixels, *masks), None)
 
 
-def picture_mask(path: Path) -> BoolArray:
+def picture_mask(path: Path, variable: str | None = None) -> BoolArray:
     """Read a mask from a picture that is 0 at unusable pixels."""
-    mask: BoolArray = read_radiograph(path, channel="mean").image != 0
+    mask: BoolArray = read_radiograph(path, channel="mean", variable=variable).image != 0
     return mask
 
 

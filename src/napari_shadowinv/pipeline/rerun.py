@@ -26,7 +26,7 @@ from napari_shadowinv.fitting.windows import PREFIX
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read_dataset
-from napari_shadowinv.io.files import sha256
+from napari_shadowinv.io.files import join_address, sha256, split_address
 from napari_shadowinv.pipeline._film import run_film
 from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import NUMBERS, run_fit, run_refinement
@@ -349,7 +349,9 @@ class _Reader:
         sources = [f"the source of {name}" if is_fit else "the source" for name in names]
         shots = [self._shot(origins, k, images[k], sources[k]) for k in range(count)]
         dark = origins.image.dark
-        path = None if dark is None else self._find(dark, "the dark frame")
+        path = None
+        if dark is not None:
+            path = join_address(self._find(dark, "the dark frame"), dark.variable)
         fiducials: FloatArray | Path | None = None
         if provenance.fiducial_rows is not None:
             fiducials = np.array(provenance.fiducial_rows)
@@ -394,9 +396,10 @@ class _Reader:
             argument = self._find(origin, name)
         if not isinstance(argument, (str, Path)):
             return radiograph_of(argument, name)
-        self.files.append(Path(argument))
+        path, variable = split_address(argument)
+        self.files.append(path)
         channel = None if origin.channel is None else str(origin.channel)
-        return read_part(Path(argument), channel, origin.variable)
+        return read_part(path, channel, variable or origin.variable)
 
     def _shot(self, provenance: Provenance, k: int, image: Radiograph, source_name: str) -> FitShot:
         origin, source = provenance.images[k], None
@@ -428,7 +431,7 @@ class _Reader:
         if origin.file:
             path = self._find_changed(origin, "mask")
             self.masks[index] = origin.model_copy(update={"sha256": sha256(path)})
-            return picture_mask(path)
+            return picture_mask(path, origin.variable)
         if image_mask is None:
             raise InputError(
                 "a mask is too complex to be stored in the result, and was not a file: repeat the "

@@ -19,7 +19,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from napari_shadowinv._system.tables import has_column_names, is_number, read_rows, write_cells
 from napari_shadowinv._system.validation import CheckedModel, suggestion, validate
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io.files import replacing, text_of
+from napari_shadowinv.io.files import name_of, replacing
 from napari_shadowinv.io.formats import SITES
 from napari_shadowinv.options import MAX_STRENGTH, Noise
 from napari_shadowinv.physics.setup import beam_quantities
@@ -115,7 +115,7 @@ class ShotRow(CheckedModel, extra="allow"):
     def summary(self) -> dict[str, Any]:
         """Entries of the row, without folders, which may be moved."""
         entries = self.model_dump(mode="json", exclude_none=True, exclude={"exclude"})
-        return {**entries, **{name: text_of(path.name) for name, path in self.files.items()}}
+        return {**entries, **{name: name_of(path) for name, path in self.files.items()}}
 
 
 class _Fiducial(CheckedModel):

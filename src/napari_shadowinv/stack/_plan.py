@@ -30,9 +30,8 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import count_sites
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, check_source, number_of_sites
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
-from napari_shadowinv.io.files import sha256, text_of
+from napari_shadowinv.io.files import sha256, split_address, text_of
 from napari_shadowinv.io.formats import format_of
-from napari_shadowinv.io.frames import split_address
 from napari_shadowinv.io.shot_columns import JOINED, ShotTable, describe_columns
 from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.io.store_checksums import RECORD
@@ -60,6 +59,7 @@ from napari_shadowinv.stack._shots import (
     find_shots,
     find_source,
     first_image,
+    first_mask,
     read_shot,
     reader_text,
     table_shots,
@@ -381,17 +381,18 @@ def _describe_inputs(
         stack_shots = find_shots(shots, reader=reader, shape=image_shape)
     if sources is not None:
         check_shape("source", sources.shape, stack_shots.shape, "shots")
-    mask = join_masks(mask, stack_shots.mask, lit)
+    mask = join_masks(mask, lit)
     usable = None if mask is None else check_mask(mask, stack_shots.shape)
     bare = None if source_mask is None else check_mask(source_mask, stack_shots.shape)
     if recipe.setup is not None:
         check_spacing(shots, "shots", recipe.setup.pixel_sizes)
     if recipe.fit is None and not recipe.steps:
         check_memory(stack_shots.shape, bytes_per_pixel(recipe.options), "an inversion")
-    blank = np.ones(stack_shots.shape)
+    blank, lit = np.ones(stack_shots.shape), stack_shots.mask
+    shot = Radiograph(blank if lit is None else np.where(lit, blank, np.nan), mask=lit)
     inputs = collect_inputs(
         recipe.model_copy(update={"source": recipe.estimate}),
-        Radiograph(blank),
+        shot,
         source=None if sources is None else blank,
         mask=usable,
         source_mask=bare,
@@ -445,7 +446,8 @@ def _describe_table(
         image = first_image(items)
         assert isinstance(image.image, Radiograph)
         return Shots(items, image.image.shape), image.setup
-    return Shots(items, shape or usual_shape(items)), _row_of(items[0]).setup
+    shots = Shots(items, shape or usual_shape(items), mask=first_mask(items))
+    return shots, _row_of(items[0]).setup
 
 
 def _shared_beam(inputs: Inputs, source: AnyArray | None) -> Beam | None:

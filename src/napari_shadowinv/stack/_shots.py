@@ -13,6 +13,7 @@ import inspect
 import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
@@ -28,9 +29,9 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.fitting import FitShot
-from napari_shadowinv.io.files import sha256, text_of
-from napari_shadowinv.io.formats import PRADFORMAT, TEXT, kind_of
-from napari_shadowinv.io.frames import Frame, find_frames, split_address
+from napari_shadowinv.io.files import name_of, sha256, split_address, text_of
+from napari_shadowinv.io.formats import HDF5, PRADFORMAT, TEXT, format_of
+from napari_shadowinv.io.frames import Frame, find_frames
 from napari_shadowinv.io.read_write import read_frame
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
 from napari_shadowinv.pipeline.files import read_part
@@ -62,6 +63,10 @@ class ImageReference:
     def shape(self) -> tuple[int, ...]:
         """Return the shape of the image, which has to be read."""
         return np.shape(self.read()[0])
+
+    def mask(self) -> BoolArray | None:
+        """Return the pixels that can be used, if the image's file says so."""
+        return None
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Return whether the image still agrees with the metadata from `load`."""
@@ -128,6 +133,13 @@ class FileReference(ImageReference):
             return image, {"sha256": checksum(image), **metadata}
         return image, {**stamp(self.path), "sha256": sha256(self.path), **metadata}
 
+    def mask(self) -> BoolArray | None:
+        is_ours = getattr(self.reader, "func", self.reader) is read_shot
+        if not is_ours or format_of(self.path) is not HDF5:
+            return None
+        variable = self.variable or getattr(self.reader, "keywords", {}).get("variable")
+        return read_frame(Frame(self.path, "", self.page, variable)).mask
+
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare a file as in a table's rows, and a page by its checksum."""
         return super().unchanged(origin) if self.page is not None else _agrees(self.path, origin)
@@ -177,7 +189,13 @@ class RowsReference(ImageReference):
         return (replace(image, setup=self.setup),), metadata
 
     def shape(self) -> tuple[int, ...]:
-        return read_part(self.rows[0].file, self.channel, self.variable).shape
+        return self._first().shape
+
+    def mask(self) -> BoolArray | None:
+        return self._first().mask if format_of(self.rows[0].file) is HDF5 else None
+
+    def _first(self) -> Radiograph:
+        return read_part(self.rows[0].file, self.channel, self.variable)
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare the rows, and existing files by size and time or checksum."""
@@ -195,7 +213,9 @@ class RowsReference(ImageReference):
         entries = origin.get("provenance", {}).get("recipe", {}).get("setup")
         setup_before = None if entries is None else setup_from_dict(entries)
         # The setup of a row may have been in an image that was removed.
-        if setup_before == self.setup or (self.setup is None and not row.file.exists()):
+        if setup_before == self.setup or (
+            self.setup is None and not split_address(row.file)[0].exists()
+        ):
             return ""
         setups = (setup_before, self.setup)
         return differences(*({} if setup is None else setup.model_dump() for setup in setups))
@@ -203,7 +223,7 @@ class RowsReference(ImageReference):
     def _files(self) -> dict[str, Path]:
         """Return the files by the names of their columns and the numbers of their rows."""
         return {
-            f"{name} {number}": path
+            f"{name} {number}": split_address(path)[0]
             for number, row in enumerate(self.rows, 1)
             for name, path in row.files.items()
         }
@@ -283,7 +303,10 @@ def read_shot(
 
 def file_doubts(shot: Radiograph) -> list[Caution]:
     """Return the reasons to doubt the image of a file in a stack."""
-    ignored = [name for name in ("source", "mask") if getattr(shot, name) is not None]
+    is_heeded = {"source": False, "mask": not np.isfinite(shot.image).all()}
+    ignored = [
+        name for name in is_heeded if getattr(shot, name) is not None and not is_heeded[name]
+    ]
     if not ignored:
         return list(shot.warnings)
     text = (
@@ -327,7 +350,7 @@ class Shots:
     shape: tuple[int, int]  # that they should have
     coordinate: Any = None  # values of the coordinate ``shot`` of an xarray object
     array: Any = None  # the same images as one dask array, chunks of one shot, if they came so
-    mask: BoolArray | None = None  # pixels that can be used, if they came as masked arrays
+    mask: BoolArray | None = None  # pixels that can be used, by masked arrays or the first file
 
     def __len__(self) -> int:
         return len(self.items)
@@ -357,15 +380,15 @@ def find_shots(
 ) -> Shots:
     """Return references to the shots of an array, of files or of a list."""
     if isinstance(shots, Shots):
-        return replace(shots, shape=shape or usual_shape(shots.items))
+        return replace(shots, shape=shape or usual_shape(shots.items), mask=first_mask(shots.items))
     if isinstance(shots, (str, Path)):
         items = _shots_at(str(shots), reader)
-        return Shots(items, shape or usual_shape(items))
+        return Shots(items, shape or usual_shape(items), mask=first_mask(items))
     if hasattr(shots, "dims") and hasattr(shots, "coords"):
         return _from_xarray(shots)
     if isinstance(shots, Sequence) and all(isinstance(item, (str, Path)) for item in shots):
         items = _shots_of_files(shots, reader)
-        return Shots(items, shape or usual_shape(items))
+        return Shots(items, shape or usual_shape(items), mask=first_mask(items))
     if isinstance(shots, Sequence) and all(np.ndim(item) == 2 for item in shots):
         shapes = {np.shape(item) for item in shots}
         if len(shapes) > 1:
@@ -440,6 +463,13 @@ def usual_shape(items: Sequence[Shot]) -> tuple[int, int]:
     if len(usual) != 2:
         raise InputError(f"shots have shape {usual}, expected (y, x): choose one channel or plane")
     return usual[0], usual[1]
+
+
+def first_mask(items: Sequence[Shot]) -> BoolArray | None:
+    """Return the mask in the file of the first shot that can be read, None without one."""
+    with suppress(FileFormatError):
+        return _read_first(items, lambda shot: shot.images.mask(), 1)[0]
+    return None
 
 
 def _read_first(items: Sequence[Shot], read: Callable[[Shot], Value], count: int) -> list[Value]:
@@ -553,7 +583,7 @@ def table_shots(
         ]
     rows, unused = rows_to_invert(table)
     shots = []
-    files = [Frame(row.file, text_of(row.file.name)) for row in rows]
+    files = [Frame(row.file, name_of(row.file)) for row in rows]
     for name, row in zip(_distinct_names(files), _with_absolute_paths(rows), strict=True):
         setup = row_setup(row, _read_geometry(row, channel, variable), recipe)
         images = RowsReference((row,), recipe, channel, variable, True, setup, unused)
@@ -569,7 +599,7 @@ def _with_absolute_paths(rows: Sequence[ShotRow]) -> tuple[ShotRow, ...]:
 def _read_geometry(row: ShotRow, channel: str | None, variable: str | None) -> Radiograph:
     """Read an image if its file may contain a geometry; return an empty one otherwise."""
     try:
-        if kind_of(row.file) in (PRADFORMAT.name, TEXT.name):
+        if format_of(row.file) in (PRADFORMAT, HDF5, TEXT):
             return read_part(row.file, channel, variable)
     except (OSError, ValueError):
         pass  # its shot fails, by name

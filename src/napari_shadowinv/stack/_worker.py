@@ -259,7 +259,11 @@ class InvertTask(Task):
                 "units of one kind of setup; give all rows such a setup, or use two tables"
             )
         bare = Radiograph(
-            image.image / (row.brightness or 1.0), path=image.path, metadata=image.metadata
+            image.image / (row.brightness or 1.0),
+            path=image.path,
+            metadata=image.metadata,
+            # The beam of all has the mask of all.
+            mask=None if row.mask is None else image.mask,
         )
         # A common source is already in the beam.
         recipe_source = self.estimate if beam is None else common.recipe.source

@@ -1,0 +1,238 @@
+"""Images in any HDF5 file, by the names of their arrays.
+
+- an array, or one of its frames: `read_hdf5`; as an image with all that the file says of it:
+  `read_plane`
+- the number of frames: `count_frames`; the array to take without a name: `default_array`
+- the choice, for messages: `list_arrays`
+"""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import math
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from napari_shadowinv._system.safety import as_file_errors, check_size
+from napari_shadowinv._typing import AnyArray
+from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.io.arrays import FRAME_INDEX, check_one_frame, frame_axes
+from napari_shadowinv.io.conventions import check_grey, decode_values, read_meaning
+from napari_shadowinv.io.field_grids import is_field_grid
+from napari_shadowinv.io.hdf5 import (
+    MAX_LINKS,
+    check_filters,
+    load_dataset,
+    member,
+    memory_bytes,
+    open_hdf5,
+    stored_elsewhere,
+)
+
+_MAX_LISTED = 8
+_ONE_AXIS = "1 axis"
+_MAX_ITEMS = 10_000  # that a walk through a file visits
+_DEFAULTS = ("signal", "default")  # attributes of a NeXus group: its array, or the group to look in
+_KINDS = {"c": "complex", "S": "text", "U": "text", "O": "text or references", "V": "compound"}
+
+
+@as_file_errors
+def read_hdf5(path: Path, name: str) -> AnyArray:
+    """Read the values of an array of any shape, ``shots/3/image``, NaN where it has none."""
+    with open_hdf5(path) as file:
+        dataset, number = _find_array(path, file, name)
+        stored = load_dataset(path, dataset) if number is None else _frame(path, dataset, number)
+        return decode_values(path, dataset, stored, number)
+
+
+@as_file_errors
+def read_plane(path: Path, name: str, number: int | None = None) -> tuple[AnyArray, dict[str, Any]]:
+    """Read one array as an image, or frame `number` of it over the axes before the last two."""
+    with open_hdf5(path) as file:
+        dataset, frame_in_name = _find_array(path, file, name)
+        axes = frame_axes(path, repr(name), dataset.shape)
+        check_grey(path, dataset)
+        number = frame_in_name if number is None else number
+        if number is None:
+            check_one_frame(path, axes, name)
+        stored = _frame(path, dataset, number or 0)
+        image, metadata = read_meaning(path, dataset, stored, number or 0)
+        return image, {"kind": "hdf5", "variable": name, **metadata}
+
+
+@as_file_errors
+def count_frames(path: Path, name: str | None = None) -> tuple[int, ...]:
+    """Return the lengths of the axes before the last two of an array; none if it is one image."""
+    if name is None:
+        return ()
+    with open_hdf5(path) as file:
+        dataset, number = _find_array(path, file, name)
+        axes = frame_axes(path, repr(name), dataset.shape)
+        return axes if number is None else ()
+
+
+@as_file_errors
+def default_array(path: Path) -> str:
+    """Return the name of the array that NeXus shows by default, or of the only image."""
+    if is_field_grid(path):
+        raise FileFormatError(
+            f"{path} holds fields on a grid, not an image: trace particles through them with "
+            "shadowinv forward, or name one array of it"
+        )
+    with open_hdf5(path) as file:
+        default = _member_or_default(path, file, "/")
+        if default is not None:
+            return str(default.name)
+        entries = [entry for entry in _entries(file) if not entry.reason]
+        images = [entry for entry in entries if not entry.name.endswith("pixel_mask")]
+        if len(images) == 1:
+            return images[0].name
+        count = f"{len(images)} images" if images else "no image"
+        raise FileFormatError(
+            f"{path} is an HDF5 file with {count}: expected one, or the name of one, as "
+            f"{path.name}::/name; it holds {list_arrays(file)}"
+        )
+
+
+def _frame(path: Path, dataset: Any, number: int) -> AnyArray:
+    """Read one frame, refusing one that is not written, which HDF5 would replace by zeros."""
+    index = (
+        tuple(map(int, np.unravel_index(number, dataset.shape[:-2]))) if dataset.ndim > 2 else ()
+    )
+    check_size(path, memory_bytes(path, dataset, math.prod(dataset.shape[-2:])))
+    check_filters(path, dataset)
+    if not index:
+        return load_dataset(path, dataset)
+    if not _is_written(dataset, index):
+        raise FileFormatError(
+            f"{path} does not hold frame {number} of {dataset.name!r} yet: wait until it is "
+            "written, or copy the file again"
+        )
+    return np.asarray(dataset[index])
+
+
+def _find_array(path: Path, file: Any, name: str) -> tuple[Any, int | None]:
+    """Return an array by its name, and the number of the frame that the name ends with."""
+    item, index = _member_or_default(path, file, name), None
+    if item is None and (match := FRAME_INDEX.fullmatch(name)):
+        item = _member_or_default(path, file, match["name"])
+        index = tuple(map(int, match["index"].split(",")))
+    if item is None:
+        raise InputError(f"{path} has no array {name!r}: it holds {list_arrays(file, name)}")
+    if item.dtype.kind not in "buif" or not item.shape:
+        raise InputError(
+            f"{path} holds {name!r} as {_KINDS.get(item.dtype.kind, 'one number')}: expected an "
+            f"array of real numbers; the file holds {list_arrays(file, name)}"
+        )
+    if index is None:
+        return item, None
+    axes = item.shape[:-2]
+    if len(index) != len(axes) or any(map(int.__ge__, index, axes)):
+        last = ",".join(str(length - 1) for length in axes)
+        frames = f"frames from [{','.join('0' * len(axes))}] to [{last}]" if axes else "one image"
+        raise InputError(f"{path} has no {name!r}: the array holds {frames}; correct the index")
+    return item, int(np.ravel_multi_index(index, axes)) if axes else 0
+
+
+def _member_or_default(path: Path, file: Any, name: str) -> Any | None:
+    """Return an array by its name, or that which a NeXus group of this name shows by default."""
+    import h5py
+
+    item = member(path, file, name)
+    for _ in range(MAX_LINKS):
+        if not isinstance(item, h5py.Group):
+            break
+        default = next((item.attrs[key] for key in _DEFAULTS if key in item.attrs), None)
+        default = default.decode() if isinstance(default, bytes) else default
+        item = member(path, item, default) if isinstance(default, str) else None
+    return item if isinstance(item, h5py.Dataset) else None
+
+
+def _is_written(dataset: Any, index: tuple[int, ...]) -> bool:
+    """Return whether all chunks of a frame are in the file."""
+    if dataset.chunks is None:
+        return bool(dataset.id.get_storage_size())
+    sides = zip(dataset.shape[-2:], dataset.chunks[-2:], strict=True)
+    places = itertools.product(*(range(0, length, chunk) for length, chunk in sides))
+    chunks = (dataset.id.get_chunk_info_by_coord((*index, *place)) for place in places)
+    return all(chunk.byte_offset is not None for chunk in chunks)
+
+
+class _Entry(NamedTuple):
+    """An array in a file, and the reason why it is no image; empty if it is one."""
+
+    name: str
+    size: str  # shape and type
+    reason: str
+
+    def __str__(self) -> str:
+        notes = ", ".join(filter(None, (self.size, self.reason)))
+        return f"{self.name!r} ({notes})"
+
+
+def list_arrays(file: Any, name: str = "") -> str:
+    """Describe the first arrays of an open file, or those with a name most like `name`."""
+    entries = list(_entries(file))
+    if name:
+        matcher = difflib.SequenceMatcher(b=name.strip("/").lower())
+
+        def likeness(entry: _Entry) -> float:
+            matcher.set_seq1(entry.name.lower())
+            return matcher.ratio()
+
+        entries.sort(key=likeness, reverse=True)
+    entries.sort(key=lambda entry: (bool(entry.reason), entry.reason == _ONE_AXIS))
+    # Times and names are no choice where there are images.
+    count = sum(entry.reason != _ONE_AXIS for entry in entries) or len(entries)
+    names = [str(entry) for entry in entries[: min(count, _MAX_LISTED)]]
+    more = [f"and {count - _MAX_LISTED} more"] if count > _MAX_LISTED else []
+    return ", ".join([*names, *more]) or "no array"
+
+
+def _entries(file: Any) -> Iterator[_Entry]:
+    """Yield the arrays of a file once each, from the top down; others' files are not followed."""
+    import h5py
+
+    groups, known, visited = deque([("", file)]), set(), 0
+    while groups:
+        prefix, group = groups.popleft()
+        for name in group:
+            visited += 1
+            if visited > _MAX_ITEMS:
+                return
+            link = group.id.links.get_info(name.encode())
+            if link.type == h5py.h5l.TYPE_EXTERNAL:
+                target = group.id.links.get_val(name.encode())[0].decode(errors="replace")
+                yield _Entry(f"{prefix}{name}", "", f"in another file, {target!r}")
+            if link.type != h5py.h5l.TYPE_HARD:
+                continue
+            item = group[name]
+            address = h5py.h5o.get_info(item.id).addr
+            if address in known:
+                continue
+            known.add(address)
+            if isinstance(item, h5py.Group):
+                groups.append((f"{prefix}{name}/", item))
+            elif isinstance(item, h5py.Dataset) and item.shape:
+                yield _Entry(f"{prefix}{name}", _size_text(item), _reason(item))
+
+
+def _size_text(dataset: Any) -> str:
+    shape = "×".join(map(str, dataset.shape))
+    return f"{shape} {dataset.dtype}" if dataset.dtype.kind in "buif" else shape
+
+
+def _reason(dataset: Any) -> str:
+    """Say why an array is no image; empty if it is one."""
+    if dataset.ndim < 2:
+        return _ONE_AXIS
+    if dataset.dtype.kind in _KINDS:
+        return _KINDS[dataset.dtype.kind]
+    if 0 in dataset.shape:
+        return "empty"
+    return "in another file" if stored_elsewhere(dataset) else ""
