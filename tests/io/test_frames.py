@@ -76,7 +76,7 @@ def test_leading_axes_of_length_one_are_one_image(nexus):
 def test_default_that_leads_to_itself_is_no_array(nexus):
     with h5py.File(nexus, "r+") as file:
         file["entry"].attrs["default"] = "/entry"
-    with pytest.raises(InputError, match="has no array '/': it holds 'entry/data/data'"):
+    with pytest.raises(InputError, match=r"has no array '/': it holds .*'entry/data/data'"):
         read(f"{nexus}::/")
 
 

@@ -50,9 +50,9 @@ def test_array_comes_back(tmp_path: Path, layout: str, dtype: str) -> None:
 
 
 @pytest.mark.parametrize("layout", ["5", "7", "7.3"])
-def test_scalars_vectors_and_stacks_are_no_candidates(tmp_path: Path, layout: str) -> None:
+def test_scalars_vectors_and_colours_are_no_candidates(tmp_path: Path, layout: str) -> None:
     path = tmp_path / "shot.mat"
-    arrays = {"a": np.ones((1, 1)), "b": np.ones((1, 9)), "c": np.ones((2, 3, 4))}
+    arrays = {"a": np.ones((1, 1)), "b": np.ones((1, 9)), "c": np.ones((4, 5, 3), np.uint8)}
     arrays["shot"] = RAMP * 0.5
     if layout == "7.3":
         save_73(path, arrays)

@@ -197,23 +197,29 @@ def test_npy_of_objects_or_other_shape_is_refused(tmp_path: Path) -> None:
     np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(FileFormatError, match="Python objects"):
         read(path)
-    np.save(path, np.zeros((2, 6, 9)))
-    with pytest.raises(FileFormatError, match=r"shape \(2, 6, 9\)"):
+    np.save(path, np.zeros((2, 6, 3)))
+    with pytest.raises(FileFormatError, match=r"shape \(2, 6, 3\), as of pictures in colour"):
         read(path)
     np.save(path, np.zeros((6, 9), complex))
     with pytest.raises(FileFormatError, match="complex128"):
         read(path)
 
 
-def test_hdf5_of_another_kind_is_refused(tmp_path: Path) -> None:
+def test_only_image_of_hdf5_needs_no_name(tmp_path: Path) -> None:
     path = tmp_path / "other.h5"
     with h5py.File(path, "w") as file:
-        file["data"] = RAMP
-    with pytest.raises(FileFormatError, match="no attribute 'object_type'"):
+        file["time"], file["data"] = np.arange(6.0), RAMP
+        file["entry/pixel_mask"] = np.zeros((6, 9), np.uint32)
+        file.attrs["object_type"] = "fields"
+    np.testing.assert_array_equal(read(path).image, RAMP)
+    with h5py.File(path, "a") as file:
+        file["beam"] = RAMP
+    with pytest.raises(FileFormatError, match=r"with 2 images: expected one.* as other\.h5::/name"):
         read(path)
     with h5py.File(path, "a") as file:
-        file.attrs["object_type"] = "fields"
-    with pytest.raises(FileFormatError, match="object type 'fields'"):
+        del file["beam"], file["data"]
+        file["data"] = RAMP * 1j
+    with pytest.raises(FileFormatError, match=r"with no image: .*'data' \(6×9, complex\)"):
         read(path)
 
 
@@ -225,15 +231,17 @@ def test_any_hdf5_gives_the_array_that_is_named(tmp_path: Path) -> None:
         file["shots/beam"] = (RAMP + 1).astype(np.uint16)
         file["note"] = "film 3"
         file["stack"] = np.zeros((2, 6, 9))
-    with pytest.raises(FileFormatError, match=r"name one .* 'shots/beam' \(6×9 uint16\)"):
+    with pytest.raises(FileFormatError, match=r"with 3 images: .* 'shots/beam' \(6×9 uint16\)"):
         read(path)
     for name, expected in (("shots/3/image", RAMP), ("shots/beam", RAMP + 1)):
         radiograph = read_radiograph(path, variable=name)
         np.testing.assert_array_equal(radiograph.image, expected)
         assert radiograph.metadata["variable"] == name
-    for wrong in ("shot", "shots", "note"):
-        with pytest.raises(InputError, match=f"no array '{wrong}': it holds 'shots/3/image'"):
+    for wrong, nearest in (("shots/bean", "shots/beam"), ("shots/3/imag", "shots/3/image")):
+        with pytest.raises(InputError, match=f"no array '{wrong}': it holds '{nearest}'"):
             read(path, variable=wrong)
+    with pytest.raises(InputError, match="holds 'note' as text"):
+        read(path, variable="note")
     with pytest.raises(FileFormatError, match=r"holds 2 frames in 'stack': expected one image"):
         read_radiograph(path, variable="stack")
     path.write_bytes(path.read_bytes()[:-2000])

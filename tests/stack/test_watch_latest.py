@@ -237,7 +237,7 @@ def test_status_file_that_cannot_be_written_is_noted_once(folder, out, tmp_path,
 @pytest.mark.parametrize(
     ("name", "pattern", "words"),
     [
-        ("status.json", "*", "would be taken for a shot of the watched folder"),
+        ("status.json", "*.json", "would be taken for a shot of the watched folder"),
         ("nowhere/status.json", "*.npy", "does not exist; create it first"),
     ],
 )

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -81,6 +82,7 @@ def run_batch(
     scheduler: str,
 ) -> None:
     """Invert all shots into a store, and print a summary."""
+    from napari_shadowinv.io.frames import left_out_of
     from napari_shadowinv.stack import run_stack
 
     if resume and run.overwrite:
@@ -107,6 +109,8 @@ def run_batch(
         counts = _counts_text(StackStore(out)) if out.exists() else "nothing written"
         say_on_stderr(f"Cancelled: {counts}. Repeat the command with --resume to continue.")
         raise typer.Exit(cancel_exit_code()) from None
+    folders = [Path(path) for path in shots if os.path.isdir(path)]
+    left_out = filter(None, map(left_out_of, folders))
     store, status = StackStore(out), bar.status
     text = "nothing to do"
     if status is not None and status.ended:
@@ -115,6 +119,7 @@ def run_batch(
         rows = [
             ("shots", _counts_text(store)),
             ("this run", text),
+            *(("left out", f"{text}; name others as a pattern in quotes") for text in left_out),
             *_site_rows(store),
             *_trouble_rows(store),
             ("written", str(store.path)),

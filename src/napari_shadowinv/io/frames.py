@@ -1,6 +1,8 @@
 """Frames: images of a file that holds many, or of a folder, each read on demand.
 
-- all frames that a path stands for: `find_frames`; the images of a folder: `images_in`
+- all frames that a path stands for: `find_frames`
+- the images of a folder: `images_in`, and the others: `left_out_of`; files by a pattern:
+  `matching_files`
 - frames as a lazy dataset: `lazy_frames`
 
 Any axes of an array before the last two count frames. At most one frame is in memory at a time.
@@ -8,12 +10,13 @@ Any axes of an array before the last two count frames. At most one frame is in m
 
 from __future__ import annotations
 
+import fnmatch
 import glob
 import math
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -25,7 +28,7 @@ from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order, split_address, text_of
-from napari_shadowinv.io.formats import RADIOGRAPH_SUFFIXES, format_of
+from napari_shadowinv.io.formats import FORMATS, RADIOGRAPH_SUFFIXES, format_of
 
 if TYPE_CHECKING:
     import xarray
@@ -47,17 +50,70 @@ class Frame:
     variable: str | None = None  # name of the array in its file
 
 
+def spellings(suffix: str) -> tuple[str, ...]:
+    """Return the endings in lower case that mean the same as one, such as .tif and .tiff."""
+    suffix = suffix.lower()
+    pictures = (each.suffixes for each in FORMATS if each.is_scan)
+    return next((suffixes for suffixes in pictures if suffix in suffixes), (suffix,))
+
+
+def name_matches(name: str, pattern: str) -> bool:
+    """Return whether a name fits a pattern, whose ending also stands for its other spellings."""
+    (stem, suffix), (stem_pattern, ending) = map(os.path.splitext, (name, pattern))
+    if not ending or _GLOB.search(ending):
+        return fnmatch.fnmatch(name, pattern)
+    return fnmatch.fnmatch(stem, stem_pattern) and suffix.lower() in spellings(ending)
+
+
+def is_pattern(path: str | Path) -> bool:
+    """Return whether a path stands for the files that match it; brackets may be in a name."""
+    return bool(_GLOB.search(str(path))) and not os.path.exists(path)
+
+
+def matching_files(pattern: str | Path) -> list[Path]:
+    """List the files that match a pattern, in natural order; existing folders are not patterns."""
+    pattern = Path(pattern)
+    folder = pattern.parent
+    exists = next(place for place in (folder, *folder.parents) if place == Path() or place.exists())
+    rest = folder.relative_to(exists)
+    within = os.path.join(glob.escape(str(exists)), rest)
+    every = ".*" if pattern.name.startswith(".") else "*"
+    if pattern.name == "**":
+        names = glob.glob(os.path.join(within, "**"), recursive=True)
+    else:
+        found = glob.glob(os.path.join(within, every), recursive=True)
+        names = [name for name in found if name_matches(os.path.basename(name), pattern.name)]
+    return in_counting_order(map(Path, names))
+
+
 def images_in(folder: Path) -> list[Path]:
-    """List a folder's images with the most frequent suffix, in natural order."""
+    """List a folder's images of the most frequent kind, in natural order."""
     # A table of settings next to a run of TIFFs is not a shot.
-    files = [
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in RADIOGRAPH_SUFFIXES and path.is_file() and path.name[0] != "."
-    ]
-    counts = Counter(path.suffix.lower() for path in files)
-    most_frequent = max(sorted(counts), key=lambda suffix: counts[suffix], default="")
-    return in_counting_order(path for path in files if path.suffix.lower() == most_frequent)
+    files = _files_in(folder)
+    kinds = Counter(spellings(path.suffix) for path in files)
+    images = [kind for kind in kinds if RADIOGRAPH_SUFFIXES.issuperset(kind)]
+    most_frequent = max(sorted(images), key=lambda kind: kinds[kind], default=())
+    return in_counting_order(path for path in files if path.suffix.lower() in most_frequent)
+
+
+def left_out_of(folder: Path) -> str:
+    """Say which files of a folder `images_in` leaves out; empty if none."""
+    images = set(images_in(folder))
+    return counts_text(count_endings(path.name for path in _files_in(folder) if path not in images))
+
+
+def count_endings(names: Iterable[str]) -> Counter[str]:
+    """Count the endings of files."""
+    return Counter(os.path.splitext(name)[1].lower() or "without an ending" for name in names)
+
+
+def counts_text(counts: Mapping[str, int]) -> str:
+    """Return numbers of files by their endings as text; empty without one."""
+    return ", ".join(f"{count} {suffix}" for suffix, count in sorted(counts.items()))
+
+
+def _files_in(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if path.is_file() and path.name[0] != "."]
 
 
 def find_frames(
@@ -93,8 +149,8 @@ def find_frames(
         files = images_in(file)
         if not files:
             raise FileFormatError(f"{file} contains no image: expected a folder of radiographs")
-    elif _GLOB.search(str(file)) and not os.path.exists(file):
-        files = in_counting_order(map(Path, glob.glob(str(file), recursive=True)))
+    elif is_pattern(file):
+        files = matching_files(file)
         if not files:
             raise InputError(
                 f"no file matches {file}: expected shots; check the folder and pattern"

@@ -9,7 +9,6 @@ from typing import Any, Literal
 from pydantic import Field, field_validator
 
 from napari_shadowinv._system.validation import CheckedModel
-from napari_shadowinv.io.formats import TIFF
 
 _RARE: Any = {"panel": "Rarely used options of a run"}
 _rare = partial(Field, json_schema_extra=_RARE)
@@ -88,10 +87,11 @@ class WatchOptions(_StoreOptions):
     """
 
     pattern: str = Field(
-        default=f"*{TIFF.suffix}",
+        default="*",
         title="Names",
-        description="File name pattern of the shots, in quotes on the command line; names that "
-        "begin with a dot are ignored.",
+        description="File name pattern of the shots, in quotes on the command line; without an "
+        "ending, images of the most frequent or first kind. Names that begin with a dot are "
+        "ignored.",
     )
     warm_start: bool = Field(
         default=True,

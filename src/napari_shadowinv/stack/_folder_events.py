@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-import fnmatch
 import os
 import stat
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,6 +18,8 @@ from typing import Any
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order
+from napari_shadowinv.io.formats import RADIOGRAPH_SUFFIXES
+from napari_shadowinv.io.frames import count_endings, images_in, name_matches, spellings
 from napari_shadowinv.stack._shots import stamp
 
 _POLL_S = 1.0  # between two looks at a folder without file-system events
@@ -65,6 +67,8 @@ class Arrivals:
         self._ready: dict[str, None] = {}  # in order
         self._settling: dict[str, tuple[Stamp, float]] = {}  # as last seen, and since when
         self._reports_closing = False
+        self._kind: tuple[str, ...] = ()  # endings of the shots, if the pattern has none
+        self._left_out: set[str] = set()  # names
         self._folder_id = _identity(folder)
         self._gone = self._woken = False
         self._checked = self.last_event = time.monotonic()  # `last_event`: of any file
@@ -84,7 +88,12 @@ class Arrivals:
         self._reports_closing = reports_closing
         try:
             with os.scandir(self.folder) as entries:
-                names = [Path(entry.name) for entry in entries if self.matches(entry.name)]
+                every = [entry.name for entry in entries]
+            images = images_in(self.folder)
+            self._kind = spellings(images[0].suffix) if images else ()
+            names = [Path(name) for name in every if self.matches(name)]
+            for name in set(every).difference(map(str, names)):
+                self._leave_out(name)
         except OSError as error:
             raise self._folder_error(error) from None
         now = time.time()
@@ -145,7 +154,21 @@ class Arrivals:
 
     def matches(self, name: str) -> bool:
         """Return whether a name belongs to a shot."""
-        return not name.startswith(".") and fnmatch.fnmatch(name, self._pattern)
+        if name.startswith("."):
+            return False
+        is_shot = name_matches(name, self._pattern)
+        if is_shot and not os.path.splitext(self._pattern)[1]:
+            kind = spellings(os.path.splitext(name)[1])
+            if not self._kind and RADIOGRAPH_SUFFIXES.issuperset(kind):
+                self._kind = kind
+            is_shot = kind == self._kind
+        return is_shot
+
+    @property
+    def left_out(self) -> Counter[str]:
+        """Numbers of files that are no shots, by their endings."""
+        with self._changed:
+            return count_endings(self._left_out)
 
     def check(self) -> None:
         """Raise an error if the folder no longer exists."""
@@ -181,6 +204,12 @@ class Arrivals:
             self.last_event = time.monotonic()
             handle(name)
             self._changed.notify_all()
+        elif Path(folder) == self.folder:
+            self._leave_out(name)
+
+    def _leave_out(self, name: str) -> None:
+        if not name.startswith(".") and self._stamp(name) is not None:
+            self._left_out.add(name)
 
     def _on_complete(self, name: str) -> None:
         self._settling.pop(name, None)
@@ -197,6 +226,7 @@ class Arrivals:
         name = os.path.basename(path)
         self._ready.pop(name, None)
         self._settling.pop(name, None)
+        self._left_out.discard(name)
 
     # With the lock held
 

@@ -303,10 +303,9 @@ def read_shot(
 
 def file_doubts(shot: Radiograph) -> list[Caution]:
     """Return the reasons to doubt the image of a file in a stack."""
-    is_heeded = {"source": False, "mask": not np.isfinite(shot.image).all()}
-    ignored = [
-        name for name in is_heeded if getattr(shot, name) is not None and not is_heeded[name]
-    ]
+    ignored = ["source"] if shot.source is not None else []
+    if shot.mask is not None and np.isfinite(shot.image).all():  # else the stack has the mask, too
+        ignored.append("mask")
     if not ignored:
         return list(shot.warnings)
     text = (

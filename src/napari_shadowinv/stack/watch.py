@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
@@ -29,6 +29,7 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.files import sha256, text_of
+from napari_shadowinv.io.frames import counts_text
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, SKIPPED, StackStore, check_store_path
 from napari_shadowinv.io.store_writing import GrowingStore, create_store, remove_unfinished
 from napari_shadowinv.pipeline.run_options import WatchOptions
@@ -140,6 +141,7 @@ class Watch:
         self._begun = self._ended = 0
         self._last = self._busy_since = time.monotonic()
         self._busy_s = 0.0
+        self._left_out: Counter[str] = Counter()  # as reported
 
     def report(self, **news: Any) -> None:
         """Report the numbers of shots, and some news."""
@@ -194,7 +196,11 @@ class Watch:
         self.report()
         try:
             while not self._is_over():
+                if self._arrivals.left_out.keys() - self._left_out.keys():
+                    self._report_left_out()
                 self._advance()
+            if self._arrivals.left_out != self._left_out:
+                self._report_left_out()
         except InversionCancelled:
             pass
         finally:
@@ -210,6 +216,12 @@ class Watch:
                 with suppress(OSError):  # the folder's own copy has the length
                     self.store.close()
             self.report()
+
+    def _report_left_out(self) -> None:
+        """Count the files that are no shots in a sentence."""
+        self._left_out = self._arrivals.left_out
+        counts = counts_text(self._left_out) or "none"
+        self.report(note=f"Left out: {counts}; choose others by a pattern of names (--pattern)")
 
     def _is_over(self) -> bool:
         idle, most = self._options.idle, self._options.max_shots
