@@ -42,6 +42,7 @@ CAUTION_CODES: Mapping[str, str] = MappingProxyType(
         "setup": "the setup is unlike any common experiment",
         # files
         "film-scan": "the image may be a scan of film",
+        "gamma": "the pixels are not proportional to the light",
         "tracks": "the tracks of a CR-39 scan need a choice",
         "file": "part of the file was not used",
         "film-range": "a film is darker than its calibration covers",

@@ -144,7 +144,7 @@ def test_truncated_file_is_named(tmp_path: Path, suffix: str) -> None:
         assert "\n" not in str(error.value)
 
 
-def test_compressed_truncated_tiff_is_named(tmp_path: Path) -> None:
+def test_compressed_tiff_with_wrong_bytes_is_named(tmp_path: Path) -> None:
     path = tmp_path / "shot.tif"
     tifffile.imwrite(path, RAMP.astype(np.uint16), compression="zlib")
     content = bytearray(path.read_bytes())
@@ -164,10 +164,10 @@ def test_lzw_tiff_comes_back(tmp_path: Path, dtype: Any) -> None:
     np.testing.assert_array_equal(read_radiograph(path).image, RAMP)
 
 
-def test_several_pages_are_refused(tmp_path: Path) -> None:
+def test_several_frames_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "stack.tif"
     tifffile.imwrite(path, np.zeros((5, 6, 7), np.uint8), photometric="minisblack")
-    with pytest.raises(FileFormatError, match="has 5 pages: expected one"):
+    with pytest.raises(FileFormatError, match="has 5 frames: expected one"):
         read_radiograph(path)
 
 

@@ -93,17 +93,17 @@ _HDF5 = ((0, b"\x89HDF\r\n\x1a\n"), (0, b"MATLAB"))
 TIFF = Format(
     "tiff", (".tif", ".tiff"), "TIFF",
     ((0, b"II*\x00"), (0, b"MM\x00*"), (0, b"II+\x00"), (0, b"MM\x00+")),
-    reader="images:read_tiff", counter="images:tiff_pages", image_writer="images:write_tiff",
+    reader="tiff:read_tiff", counter="tiff:count_tiff_frames", image_writer="tiff:write_tiff",
     is_scan=True,
 )
 PNG = Format(
     "png", (".png",), "PNG", ((0, b"\x89PNG\r\n\x1a\n"),),
     reader="images:read_png", image_writer="images:write_png", is_scan=True,
 )
-BMP = Format("bmp", (".bmp",), "BMP", ((0, b"BM"),), reader="images:read_eight_bits", is_scan=True)
+BMP = Format("bmp", (".bmp",), "BMP", ((0, b"BM"),), reader="images:read_picture", is_scan=True)
 JPEG = Format(
     "jpeg", (".jpg", ".jpeg"), "JPEG", ((0, b"\xff\xd8\xff"),),
-    reader="images:read_eight_bits", is_scan=True,
+    reader="images:read_picture", is_scan=True,
 )
 NPY = Format(
     "npy", (".npy",), "NPY", ((0, b"\x93NUMPY"),),

@@ -1,27 +1,24 @@
 """Pictures, one plane each.
 
-- TIFF with 8, 16 or 32 bits, PNG, BMP, JPEG
+- PNG, BMP and JPEG: `read_picture`
+- what every format of pictures has in common: `check_picture`, `without_pixels`, `geometry_of`,
+  `gamma_warning`
 - colour images: reduction to one plane (`to_grey`), signs of a film scan (`film_warnings`)
 - scans of film in colour: `read_scan`
 """
 
 from __future__ import annotations
 
-import logging
-import lzma
 import math
 import threading
-import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from napari_shadowinv._system.safety import as_file_errors, check_regular, check_size
-from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv._system.safety import as_file_errors, check_size
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise, sha256
@@ -33,15 +30,21 @@ CHANNELS = ("red", "green", "blue", "mean")
 # least brightness over the brightest, and the middle's greatest over the rim's.
 _RIM, _AS_BRIGHT, _DARKER = 0.05, 0.9, 0.8
 
+INCH_M = 0.0254
+_LEAST_PRINTED_M = 80e-6  # picture programs write resolutions up to 300 per inch without knowing it
+_LINEAR_GAMMA = 0.01  # deviation of the exponent
+_ORIENTATION = 274  # number of the tag
+_MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "I", "I;16", "I;16B", "F"}  # pillow's
+TURNED_NOTE = "turned upright as the file says"
+
 
 def to_grey(array: AnyArray, channel: str | int | None, where: str | Path) -> FloatArray:
-    """Reduce an image, which may have channels and alpha last, to one plane of float64."""
+    """Reduce an image, which may have channels last, to one plane of float64."""
     if array.ndim == 2:
         return np.ascontiguousarray(array, dtype=np.float64)
-    colours = array[..., : {2: 1, 4: 3}.get(array.shape[-1], array.shape[-1])]
-    count = colours.shape[-1]
-    if (colours == colours[..., :1]).all():
-        return np.ascontiguousarray(colours[..., 0], dtype=np.float64)
+    count = array.shape[-1]
+    if np.array_equal(array, np.broadcast_to(array[..., :1], array.shape), equal_nan=True):
+        return np.ascontiguousarray(array[..., 0], dtype=np.float64)
     if channel is None:
         raise InputError(
             f"{where} is a colour image with {count} channels: if it is a scan of film, which "
@@ -49,7 +52,7 @@ def to_grey(array: AnyArray, channel: str | int | None, where: str | Path) -> Fl
             'a channel that is linear in fluence, "red", "green", "blue" or "mean", or its number'
         )
     if channel == "mean":
-        return np.ascontiguousarray(colours.mean(axis=-1, dtype=np.float64))
+        return np.ascontiguousarray(array.mean(axis=-1, dtype=np.float64))
     text = str(channel)
     index = CHANNELS.index(text) if text in CHANNELS else int(text) if text.isdecimal() else -1
     if not 0 <= index < count:
@@ -57,7 +60,7 @@ def to_grey(array: AnyArray, channel: str | int | None, where: str | Path) -> Fl
             f"{where} has no channel {text!r}: expected "
             f'"red", "green", "blue", "mean" or a number from 0 to {count - 1}'
         )
-    return np.ascontiguousarray(colours[..., index], dtype=np.float64)
+    return np.ascontiguousarray(array[..., index], dtype=np.float64)
 
 
 def film_warnings(array: AnyArray, channel: str | int | None) -> tuple[Caution, ...]:
@@ -92,9 +95,6 @@ def _is_lit_around(image: FloatArray) -> bool:
     )
 
 
-_TO_METRES = {2: 0.0254, 3: 0.01}  # by TIFF's unit of resolution
-
-
 class Scan(NamedTuple):
     """A colour scan: pixels of shape (H, W, 3), their size in m if it is known, its checksum."""
 
@@ -116,36 +116,14 @@ def read_scan(path: Path) -> Scan:
     """
     file_format = format_of(path)
     content = file_format.read(path) if file_format.is_scan else None
-    if not isinstance(content, tuple) or content[0].ndim != 3 or content[0].shape[-1] not in (3, 4):
+    if not isinstance(content, tuple) or content[0].ndim != 3 or content[0].shape[-1] != 3:
         raise InputError(f"{path} is no picture in colour: expected a scan in red, green and blue")
-    return Scan(content[0][..., :3], _pixel_size(path), sha256(path))
+    pixels, metadata = content
+    return Scan(pixels, metadata.get("stated_pixel_size"), sha256(path))
 
 
-def _pixel_size(path: Path) -> float | None:
-    """Return the pixel size by a TIFF's resolution; scanners set none in other formats."""
-    import tifffile
-
-    try:
-        with tifffile.TiffFile(path) as tiff:
-            tags = tiff.pages[0].aspage().tags
-            count, per = tags["XResolution"].value
-            unit = _TO_METRES[int(tags["ResolutionUnit"].value)]
-    except (tifffile.TiffFileError, KeyError):
-        return None
-    return unit * per / count if count > 0 and count / per > 1 else None
-
-
-_TIFF_RATIO = 3 * DEFLATE_RATIO  # LZW at its best packs two and a half times as well as zlib
-
-
-_SMALL_STRIP = 50_000_000  # bytes, which do not matter
-_UNPACKERS: dict[str, Callable[[], Any]] = {
-    **dict.fromkeys(("ADOBE_DEFLATE", "DEFLATE"), zlib.decompressobj),
-    "LZMA": lzma.LZMADecompressor,
-}
-
-
-def _check_picture(path: Path, name: str, array: AnyArray) -> None:
+def check_picture(path: Path, name: str, array: AnyArray) -> None:
+    """Refuse an array that is no picture of real numbers."""
     is_picture = array.ndim == 2 or (array.ndim == 3 and array.shape[-1] in (2, 3, 4))
     if not is_picture or array.size == 0:
         raise FileFormatError(
@@ -158,135 +136,54 @@ def _check_picture(path: Path, name: str, array: AnyArray) -> None:
         )
 
 
-@contextmanager
-def _open_tiff(path: Path) -> Iterator[Any]:
-    """Open a TIFF with the decoder's log silenced, because the error says it once."""
-    import tifffile
-
-    check_regular(path, "a TIFF")
-    logger = logging.getLogger("tifffile")
-    before = logger.disabled
-    logger.disabled = True
-    try:
-        with tifffile.TiffFile(path) as tiff:
-            yield tiff
-    finally:
-        logger.disabled = before
+def without_pixels(array: AnyArray, missing: BoolArray | None) -> tuple[AnyArray, tuple[str, ...]]:
+    """Return an array with NaN at missing pixels, and a note if there are any."""
+    if missing is None or not missing.any():
+        return array, ()
+    values = array.astype(np.float64)
+    values[missing] = np.nan
+    return values, (f"{missing.sum()} pixels are transparent or without data: left out",)
 
 
-def read_tiff(path: Path) -> tuple[AnyArray, dict[str, Any]]:
-    """Read a TIFF with one page."""
-    with _open_tiff(path) as tiff:
-        if len(tiff.pages) != 1:
-            raise FileFormatError(
-                f"{path} has {len(tiff.pages)} pages: expected one image; invert all of them as a "
-                "stack of shots, or save the page you need separately"
-            )
-        return _read_page(path, tiff.pages[0].aspage())
+def geometry_of(size: tuple[float, bool] | None, is_drawn: bool = False) -> dict[str, Any]:
+    """Return a file's size of a pixel (m) as metadata, and as geometry unless it may be a default.
+
+    `size` says also whether the file means a length and no resolution of printing. `is_drawn` is
+    true of this package's own images, whose pixels are those at the object.
+    """
+    if size is None:
+        return {}
+    metres, is_length = size
+    name = "pixel_size" if is_drawn else "detector_pixel_size"
+    is_measured = is_length or is_drawn or metres < _LEAST_PRINTED_M
+    return {"stated_pixel_size": metres, **({"geometry": {name: metres}} if is_measured else {})}
 
 
-def _read_page(path: Path, page: Any) -> tuple[AnyArray, dict[str, Any]]:
-    _check_complete(path, page)
-    array = _decode(path, page)
-    if page.photometric.name == "PALETTE" and page.colormap is not None:
-        array = np.moveaxis(page.colormap[:, array], 0, -1)
-    if page.photometric.name == "MINISWHITE" and array.dtype.kind == "u":
-        # The format says that 0 is the brightest value here.
-        array = (2**page.bitspersample - 1 - array).astype(array.dtype)
-    if array.ndim == 3 and page.axes in ("SYX", "CYX"):
-        array = np.moveaxis(array, 0, -1)
-    _check_picture(path, "TIFF", array)
-    return array, {"bits": int(page.bitspersample)}
+def gamma_warning(kind: str) -> Caution:
+    """Return the caution for pixels that are a power of the light."""
+    text = (
+        f"the image is {kind}, whose values are not proportional to the light (gamma of about "
+        "2.2): fields come out up to two times too weak; record 16-bit TIFF with gamma 1"
+    )
+    return Caution("gamma", text)
 
 
-@as_file_errors
-def tiff_pages(path: Path) -> int:
-    """Return how many pages a TIFF has."""
-    with _open_tiff(path) as tiff:
-        return len(tiff.pages)
-
-
-@as_file_errors
-def read_tiff_page(
-    path: Path, number: int, *, channel: str | int | None = None
-) -> tuple[FloatArray, tuple[Caution, ...]]:
-    """Read page `number`, from 0, of a TIFF that holds many, with warnings as of a `Radiograph`."""
-    with _open_tiff(path) as tiff:
-        array, _ = _read_page(path, tiff.pages[number].aspage())
-    return to_grey(array, channel, f"page {number} of {path}"), film_warnings(array, channel)
-
-
-def _decode(path: Path, page: Any) -> AnyArray:
-    try:
-        return np.asarray(page.asarray())
-    except ValueError as error:
-        if "imagecodecs" not in str(error):
-            raise
-    # Pillow brings some codecs, LZW among them, but not for every pixel type.
-    array = _read_with_pillow(path, page.index)
-    is_same_type = array.dtype == page.dtype.newbyteorder("=") and array.shape == page.shape
-    if not is_same_type or page.photometric.name not in ("MINISBLACK", "RGB"):
-        raise FileFormatError(
-            f"{path} is compressed with {page.compression.name}, which is not supported: save it "
-            "without compression, or install the package imagecodecs"
-        )
-    return array
-
-
-def _check_complete(path: Path, page: Any) -> None:
-    # tifffile fills missing strips with zeros, which would pass for a void in the beam.
-    size = path.stat().st_size
-    places = zip(page.dataoffsets, page.databytecounts, strict=True)
-    end = max((offset + count for offset, count in places if count), default=0)
-    if not 0 < end <= size:
-        raise FileFormatError(
-            f"{path} is truncated: its TIFF header implies {end} bytes, found {size}; copy it again"
-        )
-    packed_bytes = sum(page.databytecounts)
-    packing = 1 if page.compression.name == "NONE" else _TIFF_RATIO
-    check_promise(path, "TIFF", page.size * page.bitspersample // 8, packing * packed_bytes)
-    # One tile may be far larger than what is used of it.
-    check_size(path, max(page.size, math.prod(page.chunks)) * max(8, page.dtype.itemsize))
-    if page.compression.name in _UNPACKERS:
-        _check_strips(path, page)
-
-
-def _check_strips(path: Path, page: Any) -> None:
-    """Refuse a strip or tile that unpacks to far more than its pixels; the decoder accepts it."""
-    pixels = math.prod(page.chunks) * page.dtype.itemsize
-    most = max(2 * pixels, _SMALL_STRIP)
-    with path.open("rb") as file:
-        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
-            if count * _TIFF_RATIO <= most:
-                continue
-            file.seek(offset)
-            unpacker = _UNPACKERS[page.compression.name]()
-            if len(unpacker.decompress(file.read(count), most + 1)) > most:
-                raise FileFormatError(
-                    f"{path} is damaged: a strip of {count} bytes unpacks to more than {most} "
-                    f"bytes, expected {pixels}; save it again"
-                )
+def is_linear_profile(profile: bytes) -> bool:
+    """Return whether a colour profile calls itself linear."""
+    return b"linear" in profile.replace(b"\0", b"").lower()
 
 
 def read_png(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     """Read a PNG; colours with 16 bits are refused."""
     with path.open("rb") as file:
         bits = file.read(25)[24]
-    array = _read_with_pillow(path)
-    if bits == 16 and array.dtype.itemsize == 1:
+    array, metadata = read_picture(path)
+    if bits == 16 and metadata["bits"] == 8:
         raise FileFormatError(
             f"{path} is a colour PNG with 16 bits per channel, which would be reduced to 8 bits: "
             "expected a greyscale PNG or a TIFF; save it as TIFF"
         )
-    _check_picture(path, "PNG", array)
-    return array, {"bits": bits}
-
-
-def read_eight_bits(path: Path) -> tuple[AnyArray, dict[str, Any]]:
-    """Read a picture whose format has 8 bits per sample."""
-    array = _read_with_pillow(path)
-    _check_picture(path, "picture's", array)
-    return array, {"bits": 8}
+    return array, {**metadata, "bits": max(bits, 8)}
 
 
 _PILLOW_LIMIT = threading.Lock()
@@ -294,36 +191,75 @@ _PILLOW_LIMIT = threading.Lock()
 
 def _open_picture(file: BinaryIO) -> Any:
     """Open a picture without pillow's limit of pixels; ours on memory follows."""
-    import imageio.v3 as iio
     from PIL import Image
 
     with _PILLOW_LIMIT:
         before, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
-            return iio.imopen(file, "r", plugin="pillow")
+            return Image.open(file)
         finally:
             Image.MAX_IMAGE_PIXELS = before
 
 
-def _read_with_pillow(path: Path, index: int = 0) -> AnyArray:
-    # A file object, because imageio would believe the name.
+def read_picture(path: Path) -> tuple[AnyArray, dict[str, Any]]:
+    """Read a PNG, BMP or JPEG: upright, with NaN at transparent pixels."""
+    from PIL import ImageOps
+
+    # A file object, because pillow may believe the name.
     with path.open("rb") as file, _open_picture(file) as picture:
-        shape = picture.properties(index=index).shape
+        area = math.prod(picture.size)
         # A pixel has one bit at least.
-        check_promise(path, "picture", math.prod(shape) // 8, DEFLATE_RATIO * path.stat().st_size)
-        check_size(path, 8 * math.prod(shape))
-        return np.asarray(picture.read(index=index))
+        check_promise(path, "picture", area // 8, DEFLATE_RATIO * path.stat().st_size)
+        check_size(path, 8 * area * len(picture.getbands()))
+        if picture.mode not in _MODES:
+            raise FileFormatError(
+                f"{path} holds pixels of the kind {picture.mode}, which are not proportional to "
+                "the light: expected grey or RGB; export it as 16-bit TIFF"
+            )
+        is_turned = picture.getexif().get(_ORIENTATION, 1) in range(2, 9)
+        array, missing = _pixels_and_gaps(ImageOps.exif_transpose(picture))
+        metadata = {
+            "bits": 8 * max(1, array.dtype.itemsize),
+            "warnings": _light_warnings(picture.format, picture.info),
+            **geometry_of(_printed_size(picture.info)),
+        }
+    check_picture(path, "picture's", array)
+    array, notes = without_pixels(array, missing)
+    return array, {**metadata, "notes": (*(TURNED_NOTE,) * is_turned, *notes)}
 
 
-def write_tiff(path: Path, plane: AnyArray, pixel_size: float | None = None) -> None:
-    """Write a plane as float32 TIFF, the width of a pixel (m) as its resolution."""
-    import tifffile
+def _pixels_and_gaps(picture: Any) -> tuple[AnyArray, BoolArray | None]:
+    """Return grey levels or colours, and where they are transparent."""
+    colour = picture.info.get("transparency")
+    if picture.mode in ("P", "PA") or isinstance(colour, tuple):
+        picture = picture.convert("RGBA")
+    array = np.asarray(picture)
+    if picture.mode == "LA":
+        return array[..., 0], array[..., 1] == 0
+    if picture.mode == "RGBA":
+        return array[..., :3], array[..., 3] == 0
+    return array, None if colour is None else array == colour
 
-    options: dict[str, Any] = {}
-    if pixel_size is not None:
-        per_centimetre = 0.01 / pixel_size
-        options = {"resolution": (per_centimetre, per_centimetre), "resolutionunit": "CENTIMETER"}
-    tifffile.imwrite(path, np.asarray(plane, dtype=np.float32), photometric="minisblack", **options)
+
+def _light_warnings(form: str, info: dict[str, Any]) -> tuple[Caution, ...]:
+    """Warn of pixels that are no linear measure of the light by their format."""
+    profile = info.get("icc_profile")
+    if form in ("JPEG", "MPO"):
+        kind = "a JPEG"
+    elif "srgb" in info or abs(info.get("gamma", 1.0) - 1.0) > _LINEAR_GAMMA:
+        kind = f"a {form} for screens"
+    elif profile and not is_linear_profile(profile):
+        kind = f"a {form} with a colour profile"
+    else:
+        return ()
+    return (gamma_warning(kind),)
+
+
+def _printed_size(info: dict[str, Any]) -> tuple[float, bool] | None:
+    """Return the size of a pixel (m) by the dots per inch of a picture."""
+    across, down = map(float, info.get("dpi", (0, 0)))
+    is_square = min(across, down) > 1 and max(across, down) <= 1.01 * min(across, down)
+    return (INCH_M / across, False) if is_square else None
 
 
 def write_png(path: Path, plane: AnyArray, pixel_size: float | None = None) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +28,6 @@ from napari_shadowinv.io.files import check_output, replacing, sha256, split_add
 from napari_shadowinv.io.formats import (
     CPSA,
     IMAGE_WRITERS,
-    TIFF,
     format_of,
     formats_for,
     function,
@@ -40,7 +40,7 @@ from napari_shadowinv.io.hdf5 import (
     hdf5_in_memory,
     opened_netcdf,
 )
-from napari_shadowinv.io.images import film_warnings, read_tiff_page, to_grey
+from napari_shadowinv.io.images import film_warnings, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
 from napari_shadowinv.preprocessing import Radiograph
 
@@ -108,9 +108,6 @@ def read_frame(frame: Frame, *, channel: str | int | None = None) -> Radiograph:
     """Read one of the frames that a path stands for, with the errors of `read_radiograph`."""
     if frame.number is None:
         return read_radiograph(frame.path, channel=channel, variable=frame.variable)
-    if format_of(frame.path) is TIFF:
-        image, warnings = read_tiff_page(frame.path, frame.number, channel=channel)
-        return Radiograph(image, warnings=warnings)
     content = _read_file(frame.path, channel, frame.variable, frame.number)
     assert isinstance(content, Radiograph)
     return content
@@ -144,23 +141,34 @@ def _read_file(
         raise FileFormatError(
             f"{path} holds {array.dtype} pixels: expected whole or real numbers; convert them"
         )
-    image = to_grey(array, channel, path)
+    shot = _as_radiograph(path, array, facts, channel)
+    warnings = film_warnings(array, channel) if file_format.is_scan else ()
+    return replace(
+        shot,
+        setup=_complete_setup(path, metadata.get("geometry", {})),
+        path=path,
+        warnings=(*warnings, *shot.warnings),
+    )
+
+
+def _as_radiograph(
+    name: str | Path, array: AnyArray, facts: dict[str, Any], channel: str | int | None
+) -> Radiograph:
+    """Return what a reader gave as a radiograph, with one of its channels."""
+    image = to_grey(array, channel, name)
     if not np.isfinite(image).any():
         raise FileFormatError(
-            f"{path} holds no finite pixel: expected an image; check how the file was saved"
+            f"{name} holds no finite pixel: expected an image; check how the file was saved"
         )
     if array.ndim == 3 and channel is not None:
         facts["channel"] = channel
     source, mask = facts.pop("source", None), facts.pop("mask", None)
-    warnings = tuple(facts.pop("warnings", ()))
     return Radiograph(
         image=image,
-        setup=_complete_setup(path, metadata.get("geometry", {})),
-        path=path,
         metadata=facts,
         source=None if source is None else np.ascontiguousarray(source, dtype=np.float64),
         mask=mask,
-        warnings=(*warnings, *(film_warnings(array, channel) if file_format.is_scan else ())),
+        warnings=tuple(facts.pop("warnings", ())),
     )
 
 

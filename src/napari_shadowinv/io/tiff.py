@@ -1,0 +1,455 @@
+"""TIFF: every frame of a file as one picture, with the values that the file states.
+
+- the only frame, or one of as many as `count_tiff_frames`: `read_tiff`
+- a plane as TIFF: `write_tiff`
+
+Thumbnails, pyramids and masks are no frames. Values are turned from white-is-zero, colour tables,
+ImageJ's and GDAL's calibrations and the roots of gel scanners into light; pixels that a file calls
+transparent or without data become NaN.
+"""
+
+from __future__ import annotations
+
+import logging
+import lzma
+import math
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+
+from napari_shadowinv._system.safety import as_file_errors, check_regular, check_size
+from napari_shadowinv._typing import AnyArray, BoolArray
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
+from napari_shadowinv.io.images import (
+    INCH_M,
+    TURNED_NOTE,
+    check_picture,
+    gamma_warning,
+    geometry_of,
+    is_linear_profile,
+    without_pixels,
+)
+
+_TIFF_RATIO = 3 * DEFLATE_RATIO  # LZW at its best packs two and a half times as well as zlib
+_SMALL_STRIP = 50_000_000  # bytes, which do not matter
+_UNPACKERS: dict[int, Callable[[], Any]] = {
+    **dict.fromkeys((8, 32946), zlib.decompressobj),
+    34925: lzma.LZMADecompressor,
+}
+_PICTURE_CODECS = {6, 7, 33003, 33004, 33005, 34712, 34892, 34933, 34934, 50001}
+
+_WHITE_IS_ZERO, _RGB, _PALETTE, _MASK, _YCBCR = 0, 2, 3, 4, 6
+_GREY_OR_RGB = {_WHITE_IS_ZERO, 1, _RGB, _PALETTE}
+_ALPHA = {1, 2}  # of the tag ExtraSamples
+_TO_METRES = {2: INCH_M, 3: 0.01, 4: 1e-3, 5: 1e-6}  # by the unit of resolution
+_POLYNOMIALS, _UNCALIBRATED = range(4), 20  # of ImageJ's calibration functions
+_ROOTS, _PROPORTIONAL = 2, 128  # of gel scanners' values
+
+
+class _Layout(NamedTuple):
+    """Where the frames of a TIFF are."""
+
+    count: int
+    pages: tuple[int, ...]  # numbers of their directories; only one if they follow each other
+    masks: tuple[int, ...] = ()
+    left_out: tuple[str, ...] = ()  # sizes of smaller pictures
+
+
+@contextmanager
+def _open_tiff(path: Path) -> Iterator[Any]:
+    """Open a TIFF with the decoder's log silenced, because the error says it once."""
+    import tifffile
+
+    check_regular(path, "a TIFF")
+    logger = logging.getLogger("tifffile")
+    before = logger.disabled
+    logger.disabled = True
+    try:
+        # Their series may open other files, or take tags for granted.
+        kinds = dict.fromkeys(("is_ome", "is_mmstack", "is_ndtiff", "is_mdgel"), False)
+        with tifffile.TiffFile(path, **kinds) as tiff:
+            yield tiff
+    finally:
+        logger.disabled = before
+
+
+def _layout_of(path: Path) -> _Layout:
+    check_regular(path, "a TIFF")
+    status = path.stat()
+    return _find_frames(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=64)
+def _find_frames(path: Path, _modified_ns: int, size: int) -> _Layout:
+    with _open_tiff(path) as tiff:
+        _check_directories(path, tiff, size)
+        series = [level for each in tiff.series for level in each.levels]
+        pictures = [s for s in series if not (s.keyframe.is_reduced or s.keyframe.is_subifd)]
+        masks = [s for s in pictures if s.keyframe.is_mask or s.keyframe.photometric == _MASK]
+        pictures = [s for s in pictures if s not in masks]
+        if not pictures:
+            raise FileFormatError(
+                f"{path} holds no picture but thumbnails or masks: expected an image; export it "
+                "again as 16-bit TIFF"
+            )
+        largest = max(pictures, key=lambda series: math.prod(_sides(series)))
+        shots = [series for series in pictures if _sides(series) == _sides(largest)]
+        others = {_sides(series) for series in pictures} - {_sides(largest)}
+        sizes = tuple("×".join(map(str, sides)) for sides in sorted(others))
+        if any(2 * math.prod(sides) > math.prod(_sides(largest)) for sides in others):
+            raise FileFormatError(
+                f"{path} holds pictures of {'×'.join(map(str, _sides(largest)))} and of "
+                f"{', '.join(sizes)} pixels: expected shots of one size; save them separately"
+            )
+        count = sum(series.size // series.keyframe.size for series in shots)
+        if count > len(tiff.pages):
+            return _Layout(count, (_first_of_stored_together(path, shots, size),), (), sizes)
+        if count == 1:
+            _check_imagej_promise(path, tiff, shots[0].keyframe, size)
+        indices = (sorted(page.index for s in group for page in s) for group in (shots, masks))
+        return _Layout(count, *map(tuple, indices), sizes)
+
+
+def _sides(series: Any) -> tuple[int, int]:
+    height, width = series.keyframe.shaped[2:4]
+    return height, width
+
+
+def _check_directories(path: Path, tiff: Any, size: int) -> None:
+    """Refuse a file whose last directory names another that the file does not have."""
+    tiff.filehandle.seek(tiff.pages.next_page_offset)
+    following = int.from_bytes(
+        tiff.filehandle.read(tiff.tiff.offsetsize), "little" if tiff.byteorder == "<" else "big"
+    )
+    check_promise(path, "TIFF", following, size)
+
+
+def _first_of_stored_together(path: Path, shots: list[Any], size: int) -> int:
+    """Return the directory of frames that follow each other behind it."""
+    page, start = shots[0].keyframe, shots[0].dataoffset
+    if len(shots) > 1 or start is None or not page.is_final:
+        raise FileFormatError(
+            f"{path} lists more frames than it has directories: expected one directory for each; "
+            "save the stack again"
+        )
+    check_promise(path, "TIFF", start + shots[0].nbytes, size)
+    return int(page.index)
+
+
+def _check_imagej_promise(path: Path, tiff: Any, page: Any, size: int) -> None:
+    """Refuse a stack that ends before the frames that ImageJ lists."""
+    stated = tiff.imagej_metadata or {}
+    promised = [stated.get("images", 1)]
+    promised += [math.prod(stated.get(axis, 1) for axis in ("frames", "slices", "channels"))]
+    if page.is_final and max(promised) > page.samplesperpixel:
+        check_promise(path, "TIFF", page.dataoffsets[0] + max(promised) * page.nbytes, size)
+
+
+@as_file_errors
+def count_tiff_frames(path: Path) -> int:
+    """Return how many frames a TIFF has."""
+    return _layout_of(path).count
+
+
+def read_tiff(path: Path, number: int | None = None) -> tuple[AnyArray, dict[str, Any]]:
+    """Read frame `number`, from 0, of a TIFF; without a number its only one."""
+    layout = _layout_of(path)
+    if number is None and layout.count != 1:
+        raise FileFormatError(
+            f"{path} has {layout.count} frames: expected one image; invert all of them as a "
+            "stack of shots, or save the frame you need separately"
+        )
+    number = number or 0
+    is_stored_together = layout.count > len(layout.pages)
+    with _open_tiff(path) as tiff:
+        page = tiff.pages[layout.pages[0 if is_stored_together else number]].aspage()
+        _check_kind(path, page)
+        _check_complete(path, page)
+        if is_stored_together:
+            start = page.dataoffsets[0] + number * page.nbytes
+            dtype = page.dtype.newbyteorder(tiff.byteorder)
+            array = np.fromfile(path, dtype, page.size, offset=start).reshape(page.shape)
+        else:
+            array = page.asarray()
+        if "S" in page.axes:
+            array = np.moveaxis(array, page.axes.index("S"), -1)
+        missing = _missing_pixels(tiff, page, array, _mask_page(layout, number))
+        array, notes = _convert_values(path, tiff, page, _without_alpha(page, array))
+        check_picture(path, "TIFF", array)
+        array, without = without_pixels(array, missing)
+        array, turned = _turn_upright(array, _tag(tiff, page, 274))
+        size = _pixel_size(tiff, page)
+        metadata = {
+            "bits": int(np.max(page.bitspersample)),
+            "notes": (*notes, *turned, *without),
+            "warnings": _warnings(page, layout),
+            **geometry_of(size, is_drawn=page.software.startswith("shadowinv")),
+        }
+    return array, metadata
+
+
+def _tag(tiff: Any, page: Any, number: int, default: Any = None) -> Any:
+    """Return the value of a tag of a page, or of the first ones: programs write some only there."""
+    pages = (page, *(tiff.pages[index].aspage() for index in range(min(2, len(tiff.pages)))))
+    values = (each.tags.valueof(number) for each in pages)
+    return next((value for value in values if value is not None), default)
+
+
+def _check_kind(path: Path, page: Any) -> None:
+    colours = page.photometric
+    is_decoded = colours == _YCBCR and page.compression in _PICTURE_CODECS
+    if 262 in page.tags and not (colours in _GREY_OR_RGB or is_decoded):
+        raise FileFormatError(
+            f"{path} holds pixels of the photometric kind {_name(colours)}, which are not "
+            "proportional to the light: expected grey or RGB; export it as greyscale TIFF"
+        )
+    if page.dtype is None or page.dtype.kind not in "buif":
+        kind = f"{page.bitspersample} bits in sample format {_name(page.sampleformat)}"
+        raise FileFormatError(
+            f"{path} holds pixels of {kind}: expected whole or real numbers; export it as 16-bit "
+            "TIFF"
+        )
+
+
+def _name(value: int) -> str:
+    """Return the name of a tag's value with its number, or the number alone."""
+    return f"{value.name} ({int(value)})" if hasattr(value, "name") else str(value)
+
+
+def _check_complete(path: Path, page: Any) -> None:
+    # tifffile fills missing strips with zeros, which would pass for a void in the beam.
+    size = path.stat().st_size
+    places = list(zip(page.dataoffsets, page.databytecounts, strict=True))
+    end = max((offset + count for offset, count in places), default=0)
+    if not 0 < end <= size or not all(count for _, count in places):
+        raise FileFormatError(
+            f"{path} is truncated: its TIFF header implies {end} bytes in {len(places)} parts, "
+            f"found {size}, or a part without data; copy it again"
+        )
+    packed_bytes = sum(page.databytecounts)
+    packing = 1 if page.compression == 1 else _TIFF_RATIO
+    bits = int(np.max(page.bitspersample))
+    check_promise(path, "TIFF", page.size * bits // 8, packing * packed_bytes)
+    # One tile may be far larger than what is used of it.
+    check_size(path, max(page.size, math.prod(page.chunks)) * max(8, page.dtype.itemsize))
+    _check_strips(path, page)
+
+
+def _check_strips(path: Path, page: Any) -> None:
+    """Refuse a strip or tile that unpacks to far more than its pixels; the decoder accepts it."""
+    pixels = math.prod(page.chunks) * page.dtype.itemsize
+    most = max(2 * pixels, _SMALL_STRIP)
+    with path.open("rb") as file:
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            file.seek(offset)
+            if page.compression in _PICTURE_CODECS:
+                unpacked = _promised_bytes(file.read(count))
+            elif page.compression in _UNPACKERS and count * _TIFF_RATIO > most:
+                unpacker = _UNPACKERS[page.compression]()
+                unpacked = len(unpacker.decompress(file.read(count), most + 1))
+            else:
+                continue
+            if unpacked > most:
+                raise FileFormatError(
+                    f"{path} is damaged: a strip of {count} bytes unpacks to more than {most} "
+                    f"bytes, expected {pixels}; save it again"
+                )
+
+
+def _promised_bytes(strip: bytes) -> int:
+    """Return the size of a picture in a strip by its own header; 0 if it cannot be known."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(BytesIO(strip)) as picture:
+            return math.prod(picture.size) * len(picture.getbands())
+    except (UnidentifiedImageError, OSError, SyntaxError):
+        return 0
+
+
+def _without_alpha(page: Any, array: AnyArray) -> AnyArray:
+    is_alpha = page.extrasamples and page.extrasamples[-1] in _ALPHA
+    if not is_alpha or array.ndim != 3:
+        return array
+    return array[..., 0] if array.shape[-1] == 2 else array[..., :-1]
+
+
+def _mask_page(layout: _Layout, number: int) -> int | None:
+    if len(layout.masks) in (1, layout.count):
+        return layout.masks[number if len(layout.masks) > 1 else 0]
+    return None
+
+
+def _missing_pixels(tiff: Any, page: Any, array: AnyArray, mask: int | None) -> BoolArray | None:
+    """Return where a file says that pixels are transparent or without data; None without a word."""
+    missing = np.zeros(array.shape[:2], dtype=bool)
+    if array.ndim == 3 and _without_alpha(page, array) is not array:
+        missing |= array[..., -1] == 0
+    try:
+        fill = float(_tag(tiff, page, 42113, "nan"))
+    except ValueError:
+        fill = math.nan
+    is_fill = array == (np.float32(fill) if array.dtype == np.float32 else fill)
+    missing |= is_fill if array.ndim == 2 else is_fill.all(axis=-1)
+    if mask is not None:
+        covered = tiff.pages[mask].aspage().asarray() == 0
+        missing |= covered if covered.shape == missing.shape else False
+    return missing if missing.any() else None
+
+
+def _convert_values(
+    path: Path, tiff: Any, page: Any, array: AnyArray
+) -> tuple[AnyArray, tuple[str, ...]]:
+    """Turn stored values into those that the file means, and say how."""
+    kind = _tag(tiff, page, 33445)
+    if kind in (_ROOTS, _PROPORTIONAL):
+        counts, per = _tag(tiff, page, 33446, (1, 1))
+        power = 2 if kind == _ROOTS else 1
+        values = array.astype(np.float64) ** power * (counts / per if counts and per else 1.0)
+        return values, (f"values of a gel scanner, to the power {power}, as the file says",)
+    stated = tiff.imagej_metadata or {}
+    if tiff.is_imagej:
+        # ImageJ shows tables of colours and inverted greys, and leaves the pixels as they are.
+        return _calibrate(path, array, stated)
+    if 262 in page.tags and page.photometric == _WHITE_IS_ZERO:
+        if array.dtype.kind not in "bu":
+            raise FileFormatError(
+                f"{path} says that 0 is white, but holds {array.dtype} pixels, which have no "
+                "black: expected black is zero; save it so"
+            )
+        if array.dtype.kind == "b":
+            return ~array, ("0 is white, inverted as the file says",)
+        white = 2**page.bitspersample - 1
+        return (white - array).astype(array.dtype), ("0 is white, inverted as the file says",)
+    if page.photometric == _PALETTE and page.colormap is not None and array.ndim == 2:
+        return np.moveaxis(page.colormap[:, array.astype(np.intp)], 0, -1), ()
+    return _scale(_tag(tiff, page, 42112), array)
+
+
+def _calibrate(
+    path: Path, array: AnyArray, stated: dict[str, Any]
+) -> tuple[AnyArray, tuple[str, ...]]:
+    """Apply the calibration of ImageJ, which has one for whole numbers of 8 and 16 bits."""
+    function = int(stated.get("cf", _UNCALIBRATED))
+    if function == _UNCALIBRATED or array.dtype.kind != "u" or array.dtype.itemsize > 2:
+        return array, ()
+    if function not in _POLYNOMIALS:
+        raise FileFormatError(
+            f"{path} has ImageJ's calibration function {function} of unit "
+            f"{stated.get('vunit', 'none')!r}: expected a straight line or a polynomial; choose "
+            "the function None in Analyze > Calibrate, or save pixels proportional to the light"
+        )
+    powers = [float(stated.get(f"c{power}", 0.0)) for power in range(function + 2)]
+    values = np.polynomial.polynomial.polyval(array.astype(np.float64), powers)
+    text = " + ".join(f"{factor:g}·v^{power}" for power, factor in enumerate(powers) if factor)
+    return values, (f"values calibrated by ImageJ: {text or 0}",)
+
+
+def _scale(text: Any, array: AnyArray) -> tuple[AnyArray, tuple[str, ...]]:
+    """Apply the scale and offset of GDAL's metadata."""
+    if not isinstance(text, str):
+        return array, ()
+    samples = 1 if array.ndim == 2 else array.shape[-1]
+    stated = {"scale": np.ones(samples), "offset": np.zeros(samples)}
+    for item in ElementTree.fromstring(text.strip("\0 \n")).iter("Item"):
+        role, sample = item.get("role"), int(item.get("sample", 0))
+        if role in stated and sample < samples:
+            stated[role][sample] = float(item.text or "nan")
+    if (stated["scale"] == 1).all() and not stated["offset"].any():
+        return array, ()
+    factor, offset = (each if array.ndim == 3 else each[0] for each in stated.values())
+    return array * factor + offset, ("scale and offset applied as the file says",)
+
+
+def _turn_upright(array: AnyArray, orientation: Any) -> tuple[AnyArray, tuple[str, ...]]:
+    """Return an array as it is seen, by the tag Orientation, and a note if it was stored else."""
+    if orientation not in range(2, 9):
+        return array, ()
+    turned = array.swapaxes(0, 1) if orientation >= 5 else array
+    down, right = orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)
+    return turned[:: -1 if down else 1, :: -1 if right else 1], (TURNED_NOTE,)
+
+
+def _warnings(page: Any, layout: _Layout) -> tuple[Caution, ...]:
+    profile, curve = page.tags.valueof(34675), page.tags.valueof(301)
+    cautions = []
+    if profile is not None and not is_linear_profile(bytes(profile)):
+        cautions.append(gamma_warning("a TIFF with a colour profile"))
+    elif curve is not None and not _is_straight(np.asarray(curve, dtype=np.float64)):
+        cautions.append(gamma_warning("a TIFF with a transfer function"))
+    elif page.photometric == _YCBCR:
+        cautions.append(gamma_warning("a JPEG in a TIFF"))
+    if layout.left_out:
+        text = (
+            f"pictures of {', '.join(layout.left_out)} pixels in the same file were taken for "
+            "thumbnails and left out: save them separately if they are shots"
+        )
+        cautions.append(Caution("file", text))
+    return tuple(cautions)
+
+
+def _is_straight(curve: AnyArray) -> bool:
+    line = np.linspace(curve.flat[0], curve.flat[-1], curve.size)
+    return bool(np.abs(curve - line).max() <= 0.01 * max(np.ptp(curve), 1.0))
+
+
+def _pixel_size(tiff: Any, page: Any) -> tuple[float, bool] | None:
+    """Return the size of a pixel (m), and whether a program of science states it."""
+    first = tiff.pages.first
+    if first.is_ome:
+        (pixels, *_) = [
+            element
+            for element in ElementTree.fromstring(first.description).iter()
+            if element.tag.endswith("Pixels")
+        ] or [{}]
+        unit = pixels.get("PhysicalSizeXUnit", "µm")
+        sizes = [pixels.get(f"PhysicalSize{axis}") for axis in "XY"]
+        return _in_metres([float(size) for size in sizes if size], unit)
+    ratios = [page.tags.valueof(number) for number in (282, 283)]
+    if not all(isinstance(ratio, tuple) and len(ratio) == 2 and all(ratio) for ratio in ratios):
+        return None
+    sizes = [per / count for count, per in ratios]
+    if unit := (tiff.imagej_metadata or {}).get("unit"):
+        return _in_metres(sizes, str(unit))
+    unit = _TO_METRES.get(page.tags.valueof(296, default=2))
+    if unit is None or not _are_square(sizes) or sizes[0] in (0.0, 1.0):
+        return None
+    return unit * sizes[0], unit < 0.01
+
+
+def _in_metres(sizes: list[float], unit: str) -> tuple[float, bool] | None:
+    from napari_shadowinv.physics.beam import number_in_unit
+
+    unit = unit.encode().decode("unicode_escape") if "\\u" in unit else unit
+    unit = {"micron": "µm", "microns": "µm"}.get(unit, unit)
+    if not sizes or not _are_square(sizes) or sizes[0] in (0.0, 1.0):
+        return None  # 1 is written by programs that do not know it
+    try:
+        return number_in_unit(f"{sizes[0]:.12g} {unit}", "m"), unit not in ("cm", "m")
+    except ValueError:
+        return None
+
+
+def _are_square(sizes: list[float]) -> bool:
+    return max(sizes) <= 1.01 * min(sizes)
+
+
+def write_tiff(path: Path, plane: AnyArray, pixel_size: float | None = None) -> None:
+    """Write a plane as float32 TIFF, the width of a pixel (m) as its resolution."""
+    import tifffile
+
+    options: dict[str, Any] = {}
+    if pixel_size is not None:
+        per_centimetre = 0.01 / pixel_size
+        options = {"resolution": (per_centimetre, per_centimetre), "resolutionunit": "CENTIMETER"}
+    values = np.asarray(plane, dtype=np.float32)
+    tifffile.imwrite(path, values, photometric="minisblack", software="shadowinv", **options)
