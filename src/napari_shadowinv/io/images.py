@@ -136,13 +136,13 @@ def check_picture(path: Path, name: str, array: AnyArray) -> None:
         )
 
 
-def without_pixels(array: AnyArray, missing: BoolArray | None) -> tuple[AnyArray, tuple[str, ...]]:
-    """Return an array with NaN at missing pixels, and a note if there are any."""
+def without_pixels(array: AnyArray, missing: BoolArray | None) -> AnyArray:
+    """Return an array with NaN at missing pixels."""
     if missing is None or not missing.any():
-        return array, ()
+        return array
     values = array.astype(np.float64)
     values[missing] = np.nan
-    return values, (f"{missing.sum()} pixels are transparent or without data: left out",)
+    return values
 
 
 def geometry_of(size: tuple[float, bool] | None, is_drawn: bool = False) -> dict[str, Any]:
@@ -219,13 +219,13 @@ def read_picture(path: Path) -> tuple[AnyArray, dict[str, Any]]:
         is_turned = picture.getexif().get(_ORIENTATION, 1) in range(2, 9)
         array, missing = _pixels_and_gaps(ImageOps.exif_transpose(picture))
         metadata = {
+            "notes": (TURNED_NOTE,) * is_turned,
             "bits": 8 * max(1, array.dtype.itemsize),
             "warnings": _light_warnings(picture.format, picture.info),
             **geometry_of(_printed_size(picture.info)),
         }
     check_picture(path, "picture's", array)
-    array, notes = without_pixels(array, missing)
-    return array, {**metadata, "notes": (*(TURNED_NOTE,) * is_turned, *notes)}
+    return without_pixels(array, missing), metadata
 
 
 def _pixels_and_gaps(picture: Any) -> tuple[AnyArray, BoolArray | None]:

@@ -185,12 +185,11 @@ def read_tiff(path: Path, number: int | None = None) -> tuple[AnyArray, dict[str
         missing = _missing_pixels(tiff, page, array, _mask_page(layout, number))
         array, notes = _convert_values(path, tiff, page, _without_alpha(page, array))
         check_picture(path, "TIFF", array)
-        array, without = without_pixels(array, missing)
-        array, turned = _turn_upright(array, _tag(tiff, page, 274))
+        array, turned = _turn_upright(without_pixels(array, missing), _tag(tiff, page, 274))
         size = _pixel_size(tiff, page)
         metadata = {
             "bits": int(np.max(page.bitspersample)),
-            "notes": (*notes, *turned, *without),
+            "notes": (*notes, *turned),
             "warnings": _warnings(page, layout),
             **geometry_of(size, is_drawn=page.software.startswith("shadowinv")),
         }

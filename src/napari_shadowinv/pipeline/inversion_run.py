@@ -408,10 +408,7 @@ def collect_inputs(
         check_spacing(shot, "the image", setup.pixel_sizes)
         check_spacing(source, "the source", setup.pixel_sizes)
     usable = _mask(mask, recipe.mask, "mask", radiograph) or _Mask(radiograph.mask, None)
-    usable = _without_masked(usable, shot, source)
-    for image in (radiograph, beam):
-        if image is not None and image.mask is not None:  # of its file, beside a mask of the user
-            usable = _Mask(join_masks(usable.pixels, np.isfinite(image.image)), usable.file)
+    usable = _without_missing(_without_masked(usable, shot, source), radiograph, beam)
     bare = _mask(source_mask, recipe.source_mask, "source mask", radiograph)
     bare = bare or _Mask(radiograph.source_mask, None)
     if kind is None:
@@ -504,9 +501,19 @@ def _without_masked(mask: _Mask, *images: Any) -> _Mask:
     return _Mask(join_masks(mask.pixels, *masks), None)
 
 
+def _without_missing(mask: _Mask, *images: Radiograph | None) -> _Mask:
+    """Remove the pixels without a value in the files of images from a mask."""
+    masked = (image for image in images if image is not None and image.mask is not None)
+    present = [~np.isnan(image.image) for image in masked]
+    if all(each.all() or mask.pixels is not None and each[mask.pixels].all() for each in present):
+        return mask
+    return _Mask(join_masks(mask.pixels, *present), None)
+
+
 def picture_mask(path: Path, variable: str | None = None) -> BoolArray:
-    """Read a mask from a picture that is 0 at unusable pixels."""
-    mask: BoolArray = read_radiograph(path, channel="mean", variable=variable).image != 0
+    """Read a mask from a picture that is 0, or transparent, at unusable pixels."""
+    image = read_radiograph(path, channel="mean", variable=variable).image
+    mask: BoolArray = np.nan_to_num(image) != 0
     return mask
 
 
