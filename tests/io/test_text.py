@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from helpers.public_data import public_file
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.io import read, read_radiograph
 from napari_shadowinv.io.formats import kind_of
 from napari_shadowinv.physics.setup import ProtonSetup
 
@@ -199,3 +200,57 @@ def test_published_example() -> None:
     assert image.shape == (128, 128)
     assert image.mean() == pytest.approx(1, rel=1e-3)
     np.testing.assert_array_equal(image, np.loadtxt(path))
+
+
+NOISE = np.random.default_rng(0).poisson(200, (12, 15)).astype(float)
+
+
+@pytest.mark.parametrize("step", [1, -1, 0.5, 6.5e-6])
+@pytest.mark.parametrize("delimiter", [" ", "\t", ","])
+def test_column_and_row_of_coordinates_are_refused(
+    tmp_path: Path, step: float, delimiter: str
+) -> None:
+    path = tmp_path / "export.asc"
+    y, x = step * np.arange(1, 13), step * np.arange(15) + 3
+    corner = np.block([[np.zeros((1, 1)), x[None]], [y[:, None], NOISE]])
+    tables = {
+        "column": np.column_stack([y, NOISE]), "row": np.vstack([x, NOISE]), "column or row": corner
+    }  # fmt: skip
+    for name, table in tables.items():
+        np.savetxt(path, table, delimiter=delimiter)
+        with pytest.raises(FileFormatError, match=rf"in its first {name[:6].strip()}"):
+            read(path)
+
+
+def test_coordinates_of_uneven_steps_are_refused(tmp_path: Path) -> None:
+    wavelengths = 500 + 0.3 * np.arange(12) - 0.002 * np.arange(12) ** 2
+    np.savetxt(tmp_path / "export.txt", np.column_stack([wavelengths, NOISE]))
+    with pytest.raises(FileFormatError, match="in its first column"):
+        read(tmp_path / "export.txt")
+
+
+def test_list_of_coordinates_and_values_is_refused(tmp_path: Path) -> None:
+    y, x = np.indices(NOISE.shape)
+    for columns in ((x, y, NOISE), (y, x, NOISE)):
+        np.savetxt(tmp_path / "export.csv", np.column_stack([c.ravel() for c in columns]))
+        with pytest.raises(FileFormatError, match=r"values of 1[25] × 1[25] pixels in columns"):
+            read(tmp_path / "export.csv")
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        NOISE,
+        np.add.outer(3.0 * np.arange(12), 2.0 * np.arange(15)),
+        np.ones((12, 15)),
+        NOISE[:, :3],
+        np.tile(np.arange(15.0), (12, 1)),
+        np.hypot(*np.indices((12, 15))),
+        np.exp(-(np.hypot(*(np.indices((40, 50)) - 25)) ** 2) / 200),
+        np.pad(NOISE, 3),
+        np.arange(12.0 * 15).reshape(12, 15),
+    ],
+)
+def test_images_as_text_are_no_coordinates(tmp_path: Path, image: FloatArray) -> None:
+    np.savetxt(tmp_path / "shot.txt", image)
+    np.testing.assert_allclose(read(tmp_path / "shot.txt").image, image)

@@ -27,6 +27,7 @@ the columns (y) that can be used.
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -65,6 +66,11 @@ _BLOCK = re.compile(r"^[#%]\s*(flux2D|flux2D_ref|mask)\s*(?:\(\s*(\d+)\s*,\s*(\d
 _SELECTED = re.compile(r"^[#%]\s*([xy])-mask\s+([\d.]+)\s*%?\s*-\s*([\d.]+)")
 
 
+# Of a column or row that counts: noise and slopes of light have no such steps.
+_MIN_STEPS, _STEP_DEVIATION = 4, 0.3
+_MIN_TRIPLETS = 16  # rows of x, y and value
+
+
 def read_text(path: Path) -> tuple[FloatArray, dict[str, Any]]:
     """Read an image with its ``geometry`` (m, MeV), and ``source`` and ``mask`` if present."""
     # Once to find mistakes, once to keep: a bad file never fills the memory.
@@ -96,6 +102,7 @@ def read_text(path: Path) -> tuple[FloatArray, dict[str, Any]]:
     image = _read_rows(path, height, width)
     metadata: dict[str, Any] = {"bits": 64, "geometry": _complete_distances(geometry)}
     if "flux2D" not in blocks:
+        _check_no_coordinates(path, image)
         return image, metadata
     image, parts = _split_blocks(path, image, blocks, selected)
     return image, {**metadata, **parts}
@@ -138,6 +145,36 @@ def _split_blocks(
         parts["mask"] = np.zeros(image.shape, dtype=bool)
         parts["mask"][part] = True
     return image, parts
+
+
+def _check_no_coordinates(path: Path, image: FloatArray) -> None:
+    """Refuse a table whose first column or row counts, or that lists x, y and value."""
+    for name, table in (("column", image), ("row", image.T)):
+        # The first number may belong to the other axis.
+        if _is_axis(table[1:, 0]) and not _is_axis(table[1:, 1]):
+            raise FileFormatError(
+                f"{path} has coordinates or numbers of pixels in its first {name} "
+                f"({', '.join(f'{number:g}' for number in table[1:4, 0])}, …): expected pixels "
+                f"only; delete this {name}, "
+                "or export the image as a matrix without axes"
+            )
+    height, width = image.shape
+    if width in (3, 4) and height >= _MIN_TRIPLETS:
+        sides = [np.unique(image[:, column]).size for column in (0, 1)]
+        if math.prod(sides) == height and min(sides) > 1:
+            raise FileFormatError(
+                f"{path} lists coordinates and values of {sides[0]} × {sides[1]} pixels in columns:"
+                " expected one row of pixels per line; export the image as a matrix"
+            )
+
+
+def _is_axis(numbers: FloatArray) -> bool:
+    """Return whether numbers rise or fall by steps of nearly one size."""
+    steps = np.diff(numbers)
+    if len(steps) < _MIN_STEPS or not np.isfinite(steps).all():
+        return False
+    usual = float(np.median(steps))
+    return usual != 0 and bool((np.abs(steps / usual - 1) < _STEP_DEVIATION).all())
 
 
 def _read_rows(path: Path, height: int, width: int) -> FloatArray:
