@@ -11,6 +11,7 @@ the formats and must not wait for numpy.
 from __future__ import annotations
 
 import codecs
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -189,14 +190,56 @@ IMAGE_WRITERS = {
 NETCDF_SUFFIX = HDF5.suffixes[-1]
 FIGURE_SUFFIXES = (PNG.suffix, ".pdf", ".svg")
 
+_CAMERA_RAW = "a raw file of a photographic camera, whose pixels have different colour filters"
+
+# What files of other formats begin with, as regular expressions.
 _FOREIGN_FORMATS = {
-    b"PK\x03\x04": "a zip archive (such as NPZ or XLSX)",
-    b"\x1f\x8b": "a gzip archive",
-    b"%PDF": "a PDF document",
-    b"GIF8": "a GIF picture",
-    b"SIMPLE  =": "a FITS file",
-    b"CDF": "a NetCDF 3 file",
+    rb"Andor Technology": "an Andor SIF file",
+    rb"PK\x03\x04": "a zip archive (such as NPZ or XLSX)",
+    rb"\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf": "a compressed file (gzip, bzip2, xz or 7z)",
+    rb"%PDF|%!PS": "a PDF or PostScript document",
+    rb"GIF8": "a GIF picture",
+    rb"SIMPLE  =": "a FITS file",
+    rb"CDF[\x01\x02\x05]": "a NetCDF 3 file",
+    rb"\s*\{\s*(HeaderID|EDF_|HEADER_BYTES|ByteOrder|Dim_1)": "an ESRF EDF file",
+    rb"CI\x2c\0": "a Phantom CINE movie",
+    rb"IM.[\x00-\x1f]": "a Hamamatsu HIS or IMG file",
+    rb"\0\x70[\x44\x64]\0": "a PerkinElmer HIS file",
+    rb"\0\0\0[\x03\x04]": "a DigitalMicrograph DM3 or DM4 file",
+    rb".{208}MAP [\x44\x11\0]": "an MRC file",
+    rb"P[1-7Ff]\s": "a PGM or PPM picture (Netpbm)",
+    rb".{128}DICM": "a DICOM file",
+    rb"ZISRAWFILE": "a Zeiss CZI file",
+    rb"\xda\xce\xbe\x0a": "a Nikon ND2 file",
+    rb"\x70\0\0\0.{4}\x2a": "a Leica LIF file",
+    rb"NRRD": "an NRRD file",
+    rb".{4}ftypcrx|II\x2a\0.{4}CR|II(RO|RS|U\0)|MMOR|FUJIFILMCCD-RAW|FOVb": _CAMERA_RAW,
+    rb".{4}ftyp(hei|hev|mif|msf|avi)": "a HEIC or AVIF picture",
+    rb".{4}ftyp|RIFF.{4}AVI |\x1aE\xdf\xa3|LUCAM-RECORDER|\xed\xfe\0\0": "a movie",
+    rb"RIFF.{4}WEBP": "a WebP picture",
+    rb"\0\0\0\x0cjP  |\xff\x4f\xff\x51": "a JPEG 2000 picture",
+    rb"\0\0\0\x0cJXL |\xff\x0a": "a JPEG XL picture",
+    rb"\xd0\xcf\x11\xe0": "an OLE file (such as .xls, .oib or .zvi)",
+    rb"8BPS|gimp xcf": "a project of a picture program",
+    rb"\x0e\x03\x13\x01": "an HDF4 file",
+    rb"# vtk DataFile": "a VTK file",
+    rb"\s*<(\?xml|svg|html|!DOCTYPE)": "an XML or HTML document",
 }
+# Endings of files without a mark, or with one that many programs share.
+_CAMERA_RAW_SUFFIXES = re.compile(
+    r"\.(nef|nrw|cr2|arw|sr2|dng|pef|srw|3fr|iiq|erf|kdc|dcr|mef|mos)", re.IGNORECASE
+)
+_RAW_SUFFIXES = re.compile(
+    r"\.(raw|img|fli|bin|mraw|im7|imx|his|sif|edf|cine|mrc|dcm)", re.IGNORECASE
+)
+
+
+def _foreign_title(head: bytes, suffix: str) -> str | None:
+    """Name the format of a file that another program marks as its own."""
+    if _CAMERA_RAW_SUFFIXES.fullmatch(suffix):
+        return _CAMERA_RAW
+    marks = (title for mark, title in _FOREIGN_FORMATS.items() if re.match(mark, head, re.DOTALL))
+    return next(marks, None)
 
 
 @as_file_errors
@@ -211,14 +254,18 @@ def format_of(path: Path) -> Format:
         head = file.read(_HEAD_BYTES)
     if not head:
         raise FileFormatError(f"{path} is empty (0 bytes): expected {READABLE}; copy it again")
+    title = _foreign_title(head, path.suffix)
     for each in FORMATS:
-        if each.fits(path, head):
+        if title is None and each.fits(path, head):
             return each
-    title = next((text for mark, text in _FOREIGN_FORMATS.items() if head.startswith(mark)), None)
-    is_text = _is_text(head[:_EXCERPT_BYTES])
-    title = title or ("a text file" if is_text else "not in a recognised image format")
+    if title is None and (raw := _RAW_SUFFIXES.fullmatch(path.suffix)):
+        title = f"a file of a camera's own program, such as FLI's ({raw[1].upper()})"
+    elif title is None:
+        is_text = _is_text(head[:_EXCERPT_BYTES])
+        title = "a text file" if is_text else "not in a recognised image format"
     raise FileFormatError(
-        f"{path} is {title}: expected {READABLE}; export the image to one of these"
+        f"{path} is {title}: expected {READABLE}; export the image to one of these, such as "
+        "16-bit TIFF"
     )
 
 

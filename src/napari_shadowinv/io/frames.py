@@ -148,7 +148,9 @@ def find_frames(
     if os.path.isdir(file):
         files = images_in(file)
         if not files:
-            raise FileFormatError(f"{file} contains no image: expected a folder of radiographs")
+            is_zarr = any((file / name).exists() for name in ("zarr.json", ".zgroup", ".zarray"))
+            kind = "is a Zarr store of another program" if is_zarr else "contains no image"
+            raise FileFormatError(f"{file} {kind}: expected a folder of radiographs, such as TIFF")
     elif is_pattern(file):
         files = matching_files(file)
         if not files:
