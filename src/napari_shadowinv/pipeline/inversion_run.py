@@ -505,9 +505,8 @@ def _without_missing(mask: _Mask, *images: Radiograph | None) -> _Mask:
     """Remove the pixels without a value in the files of images from a mask."""
     masked = (image for image in images if image is not None and image.mask is not None)
     present = [~np.isnan(image.image) for image in masked]
-    if all(each.all() or (mask.pixels is not None and each[mask.pixels].all()) for each in present):
-        return mask
-    return _Mask(join_masks(mask.pixels, *present), None)
+    pixels = join_masks(mask.pixels, *present)
+    return mask if np.array_equal(pixels, mask.pixels) else _Mask(pixels, None)
 
 
 def picture_mask(path: Path, variable: str | None = None) -> BoolArray:
