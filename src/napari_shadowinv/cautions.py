@@ -47,6 +47,7 @@ CAUTION_CODES: Mapping[str, str] = MappingProxyType(
         "file": "part of the file was not used",
         "film-range": "a film is darker than its calibration covers",
         "film-alignment": "the alignment of the films is uncertain",
+        "film-pixels": "the size of the films' pixels is unlike a scanner's",
         "film-side": "the side from which the films are seen is not known",
         # codes of later versions
         "other": "other warnings",

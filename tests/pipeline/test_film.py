@@ -20,6 +20,7 @@ from napari_shadowinv.film.scans import upright
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read, read_toml, write
 from napari_shadowinv.pipeline import read_pack, run_film, write_layers
+from napari_shadowinv.pipeline._film import _pixel_warnings
 from napari_shadowinv.pipeline.shot_table import table_rows
 from simulated_pack import Truth, simulate
 
@@ -211,6 +212,30 @@ def test_a_lost_film_is_bridged(truth: Truth, doses, changed) -> None:
     inner = np.s_[30:-30, 30:-30]
     assert abs(np.median(bridged[inner] / with_film[inner]) - 1) < 0.15
     assert np.isnan(result.corners[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("numbers", "is_doubtful"),
+    [((72, 96, 180, 240, 20, 25, 30_000), True), ((75, 150, 300, 508, 1200, 25_400 / 75), False)],
+)
+def test_resolution_unlike_a_scanner_is_doubted(changed, numbers, is_doubtful) -> None:
+    pack = read_pack(changed())
+    for per_inch in numbers:
+        cautions = _pixel_warnings(pack, 25.4e-3 / per_inch)
+        assert [caution.code for caution in cautions] == ["film-pixels"] * is_doubtful
+    assert not _pixel_warnings(pack.model_copy(update={"pixel_size": 1e-4}), 1e-4)
+
+
+def test_scans_saved_again_by_a_picture_program_are_doubted(truth: Truth, changed) -> None:
+    pack = changed()
+    for file in truth.files:
+        scan = pack.parent / file.name
+        scan.unlink()
+        dots = {"resolution": (72, 72), "resolutionunit": "INCH"}
+        tifffile.imwrite(scan, tifffile.imread(file), photometric="rgb", **dots)
+    doses = run_film(read_pack(pack))
+    assert "72 dots per inch (pixels of 352.8 µm)" in sentences_of(doses)
+    assert "pixel size" in sentences_of(doses)
 
 
 @pytest.mark.parametrize("way", [np.s_[::-1, ::-1], np.s_[:, ::-1]])

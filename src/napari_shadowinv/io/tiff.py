@@ -417,8 +417,9 @@ def _pixel_size(tiff: Any, page: Any) -> tuple[float, bool] | None:
     if not all(isinstance(ratio, tuple) and len(ratio) == 2 and all(ratio) for ratio in ratios):
         return None
     sizes = [per / count for count, per in ratios]
-    if unit := (tiff.imagej_metadata or {}).get("unit"):
-        return _in_metres(sizes, str(unit))
+    named = _in_metres(sizes, str((tiff.imagej_metadata or {}).get("unit", "")))
+    if named is not None:
+        return named
     unit = _TO_METRES.get(page.tags.valueof(296, default=2))
     if unit is None or not _are_square(sizes) or sizes[0] in (0.0, 1.0):
         return None

@@ -46,7 +46,7 @@ from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.fitting.measurements import estimated_noise
 from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.io.files import text_of
-from napari_shadowinv.io.images import Scan, read_scan
+from napari_shadowinv.io.images import INCH_M, Scan, read_scan
 from napari_shadowinv.provenance import ImageOrigin, Provenance
 
 _UNEXPOSED_RANGE = (0.98, 1.2)  # unexposed film over the lightest film of the table
@@ -279,6 +279,8 @@ def _turn_places(places: FloatArray, scan: Scan, turned: int, mirrored: bool) ->
 
 _MAX_SIZE_DEVIATION = 0.1  # from the median size
 _MAX_PIXEL_DEVIATION = 0.01
+# Scanners have round resolutions: 75, 300, 1200 dots per inch, or pixels of 25 or 50 µm.
+_SCANNER_DPI, _SCANNER_DPI_STEP, _SCANNER_STEP_M, _MAX_STEP_DEVIATION = (74, 9700), 25, 5e-6, 0.001
 _MAX_DARK_SHARE = 0.01  # of a film's pixels
 _CUT_APART_PX = 3.0  # films whose sides differ by more were not cut together
 
@@ -394,7 +396,7 @@ def run_film(
         energies=spectra.energies,
         bands=np.array([(band.peak, band.low, band.high) for band in response.bands]),
         provenance=Provenance(kind="film pack", pack=pack, images=origins),
-        cautions=tuple(_warnings(aligned, doses, poses, pack)),
+        cautions=(*_warnings(aligned, doses, poses, pack), *_pixel_warnings(pack, pixel)),
         pixel_size=pixel,
         setups=pack.setups(spectra.energies, pixel),
     )
@@ -428,6 +430,25 @@ def _pixel_size(pack: Pack, scans: list[Scan]) -> float | None:
             "expected all films scanned with the same resolution; scan them again"
         )
     return sizes[0]
+
+
+def _pixel_warnings(pack: Pack, pixel: float | None) -> tuple[Caution, ...]:
+    """Warn of a size of the scans' pixels that no scanner has."""
+    if pixel is None or pack.pixel_size is not None:
+        return ()
+    per_inch = INCH_M / pixel
+    by_inch, by_length = per_inch / _SCANNER_DPI_STEP, pixel / _SCANNER_STEP_M
+    is_round = any(
+        abs(n / round(n) - 1) < _MAX_STEP_DEVIATION for n in (by_inch, by_length) if n > 1
+    )
+    if is_round and _SCANNER_DPI[0] <= per_inch <= _SCANNER_DPI[1]:
+        return ()
+    text = (
+        f"the scans give {per_inch:.4g} dots per inch (pixels of {1e6 * pixel:.4g} µm), unlike a "
+        "scanner: picture programs write such a number when they save a scan again, and then all "
+        "lengths are wrong; give the pack's pixel size (25.4 mm over the scanner's dots per inch)"
+    )
+    return (Caution("film-pixels", text),)
 
 
 def _common_shape(films: list[Film]) -> tuple[int, int]:
