@@ -11,7 +11,7 @@ from napari_shadowinv import FitOptions, InversionOptions, fit, invert, syntheti
 from napari_shadowinv._napari.widgets._panels import fact_rows as window_rows
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli._summary import fact_rows as table_rows
-from napari_shadowinv.facts import Level
+from napari_shadowinv.facts import Level, percent, to_figures, with_error
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 
 
@@ -24,6 +24,46 @@ def image():
 @pytest.fixture(scope="module")
 def inversion(image):
     return invert(image, options=InversionOptions(n_sites=400))
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "written"),
+    [
+        (0.0312, 0.0, "0.0312"),
+        (14.2, 1.42, "14.2 ± 1.4"),
+        (5.0, 150.0, "5 ± 150"),
+        (9.6e-7, 3.3e-4, "(0.0 ± 3.3) × 10⁻⁴"),
+        (3.21e7, 4e5, "(3.210 ± 0.040) × 10⁷"),
+    ],
+)
+def test_a_number_has_the_figures_that_its_error_allows(value, error, written):
+    assert with_error(value, error) == written
+
+
+@pytest.mark.parametrize(
+    ("value", "written"),
+    [
+        (99.4, "99"),
+        (99.6, "100"),
+        (136.0, "136"),
+        (9.97, "10"),
+        (9.9999e-7, "1 × 10⁻⁶"),
+        (-2.5e7, "-2.5 × 10⁷"),
+        (0.0, "0"),
+        (np.inf, "inf"),
+        (np.nan, "nan"),
+    ],
+)
+def test_two_figures_never_end_in_an_exponent_of_a_program(value, written):
+    assert to_figures(value) == written
+    assert percent(value / 100) == f"{written} %"
+
+
+def test_errors_without_a_displacement_have_their_length():
+    texts = texts_by_key(invert(np.full((32, 32), 7.0)).facts)
+    assert texts["errors"].startswith("0.")
+    assert " px (r.m.s.): beam 0." in texts["errors"]
+    assert "%" not in texts["errors"].partition("(5 %")[0]
 
 
 def texts_by_key(facts):

@@ -1,5 +1,7 @@
 """A result in words, for every face: `Fact`, `Headline`, `Level`, `Verdict`; its `ResultKind`.
 
+Numbers in words: `to_figures`, `percent`, `with_error`; their power of ten: `power_of_ten`.
+
 Results describe themselves once, as facts. The command prints them as a table, a window shows them
 as a report, a figure writes them below its panels; none of them words or rounds anything itself.
 
@@ -10,6 +12,7 @@ the file's description in `cli`, the layers in `_napari`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -17,6 +20,56 @@ from typing import Any
 
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.cautions import Caution
+
+_MIN_PLAIN, _MAX_PLAIN = 1e-3, 1e5  # other numbers have a power of ten
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def power_of_ten(largest: float, least: float = _MIN_PLAIN) -> tuple[int, str]:
+    """Return the power of ten of a number that is not plain, rounded, and its text; else 0, ""."""
+    rounded = float(f"{abs(largest):.3g}")
+    if not 0 < rounded < math.inf or least <= rounded < _MAX_PLAIN:
+        return 0, ""
+    power = math.floor(math.log10(rounded))
+    return power, f"× 10{str(power).translate(_RAISED)}"
+
+
+def to_figures(value: float, figures: int = 2) -> str:
+    """Write a number to a few figures.
+
+    >>> [to_figures(value) for value in (0.0123, 5, 99.6, 136.4, 2.5e7)]
+    ['0.012', '5', '100', '136', '2.5 × 10⁷']
+    """
+    power, text = power_of_ten(value, 10.0**-4)
+    rounded = float(f"{value:.{figures}g}")
+    if power:
+        return f"{rounded / 10.0**power:.{figures}g} {text}"
+    return f"{value:.0f}" if 10.0**figures <= abs(rounded) < math.inf else f"{rounded:g}"
+
+
+def percent(share: float) -> str:
+    """Write a share in per cent to two figures, such as "2.1 %"."""
+    return f"{to_figures(100 * share)} %"
+
+
+def decimals_of(error: float) -> int:
+    """Return the decimals that show an error to two figures."""
+    return max(0, 1 - math.floor(math.log10(error)))
+
+
+def with_error(value: float, error: float, sign: str = "") -> str:
+    """Write a number with its error, to two figures of the error; "+" writes every sign.
+
+    >>> with_error(97.13, 2.06), with_error(9e-7, 3.3e-4)
+    ('97.1 ± 2.1', '(0.0 ± 3.3) × 10⁻⁴')
+    """
+    if not 0 < error < math.inf:
+        return f"{value:{sign}.3g}"
+    power, text = power_of_ten(max(abs(value), error))
+    value, error = (number / 10.0**power for number in (value, error))
+    digits = decimals_of(error)
+    written = f"{value:{sign}.{digits}f} ± {error:.{digits}f}"
+    return f"({written}) {text}" if text else written
 
 
 class ResultKind(StrEnum):

@@ -12,7 +12,6 @@ from napari_shadowinv.physics.units import (
     shown_fields,
     shown_potential,
     takes_prefix,
-    with_error,
 )
 
 
@@ -36,14 +35,6 @@ def test_peak_and_largest_leave_out_masked_pixels() -> None:
     assert np.isnan(field.magnitude[2, 3])
     (field,) = shown_fields([displacement], None)
     assert (field.peak, field.largest) == ((2, 3), 9.0)
-
-
-@pytest.mark.parametrize(
-    ("value", "share", "written"),
-    [(0.0312, 0.0, "0.0312"), (14.2, 0.1, "14.2 ± 1.4"), (5.0, 30.0, "5 ± 150")],
-)
-def test_a_number_has_the_figures_that_its_error_allows(value, share, written) -> None:
-    assert with_error(value, share) == written
 
 
 def test_light_is_shown_by_its_deflection(optical_setup: OpticalSetup) -> None:

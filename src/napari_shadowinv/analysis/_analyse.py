@@ -18,7 +18,7 @@ from napari_shadowinv.analysis.kinds import product_from_dict, product_from_text
 from napari_shadowinv.analysis.product import FieldNoise, Product, Values
 from napari_shadowinv.analysis.result import ProductResult
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Level, caution_facts
+from napari_shadowinv.facts import Fact, Level, caution_facts, percent
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.results import unpack_result
@@ -219,7 +219,7 @@ class _Task:
             return {}
         factor = 1.0 + share * abs(frame.setup.sensitivity_to_beam(frame.unit.field))
         scaled = self.measure(factor * self.field.potential, factor * self.field.displacement)
-        return {f"{frame.setup.beam_quantity().noun}, {100 * share:.2g} %": scaled - value}
+        return {f"{frame.setup.beam_quantity().noun}, {percent(share)}": scaled - value}
 
     def _by_product(self) -> Values:
         """Return the errors by the products' own methods."""

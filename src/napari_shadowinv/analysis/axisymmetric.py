@@ -40,7 +40,7 @@ from napari_shadowinv.analysis.product import (
 )
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact
+from napari_shadowinv.facts import Fact, percent, to_figures
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import displacement_from_potential, length_text, number_field
 from napari_shadowinv.physics.units import PIXEL
@@ -423,9 +423,7 @@ class AxisymmetricProfile(Product):
         # Noise raises both shares, which say how far the object is from the assumptions.
         shares = {name: float(quantities[name].value) for name in ("asymmetry", "edge", "ends")}
         return [
-            replace(fact, text=f"{100 * shares[fact.key]:.2g} %", short="")
-            if fact.key in shares
-            else fact
+            replace(fact, text=percent(shares[fact.key]), short="") if fact.key in shares else fact
             for fact in super().facts(quantities, frame)
         ]
 
@@ -464,7 +462,7 @@ class AxisymmetricProfile(Product):
             "radius; an inclination of the axis towards the beam is not seen."
         )
         (y0, x0), (y1, x1) = self._axis.start, self._axis.end
-        error = "" if self.axis_error is None else f", position ± {self.axis_error:.2g} px"
+        error = "" if self.axis_error is None else f", position ± {to_figures(self.axis_error)} px"
         yield (
             f"The axis runs from y = {y0:.1f}, x = {x0:.1f} to y = {y1:.1f}, x = {x1:.1f} px"
             f"{error}."

@@ -13,7 +13,7 @@ from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.maps import MIN_SPACINGS, ORDER, Smoothed, smooth
 from napari_shadowinv.analysis.product import Values, Variable
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.facts import Fact, Level
+from napari_shadowinv.facts import Fact, Level, to_figures
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import number_field
 
@@ -121,7 +121,7 @@ class Contrast(Smoothed):
         if not is_near or frame.has_crossed_rays:
             return []
         text = (
-            f"the beam is compressed by up to {compression:.2g}, near 1, where rays cross: an "
-            "inversion never shows crossed rays, so µ may be larger; fit several images"
+            f"the beam is compressed by up to {to_figures(compression)}, near 1, where rays cross: "
+            "an inversion never shows crossed rays, so µ may be larger; fit several images"
         )
         return [Caution("folds", text)]

@@ -31,7 +31,7 @@ from napari_shadowinv.analysis.power_spectra import window_weights
 from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Product, Values, Variable
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact
+from napari_shadowinv.facts import Fact, to_figures
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import displacement_from_potential
 
@@ -193,8 +193,9 @@ class Filaments(Product):
         elif float(quantities["elongation"].value) < _MIN_ELONGATION:
             yield Caution(
                 "misfit",
-                f"structures are only {float(quantities['elongation'].value):.2g} times as long as "
-                "wide: they are blobs rather than filaments, and their direction means nothing",
+                f"structures are only {to_figures(float(quantities['elongation'].value))} times as "
+                "long as wide: they are blobs rather than filaments, and their direction means "
+                "nothing",
             )
         spacing, radius = (float(quantities[name].value) for name in ("spacing", "radius"))
         if abs(math.sqrt(2) * radius / spacing - _WAVE_ZERO) < _WAVE_MARGIN:

@@ -14,6 +14,7 @@ import numpy as np
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import percent
 from napari_shadowinv.physics.beam import SIField
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.units import PIXEL
@@ -202,7 +203,7 @@ class FieldFrame:
         if self.setup is not None and not self.setup.is_collimated:
             source = self.setup.source_object_distance
             errors = " and ".join(
-                f"{100 * error:.2g} % for an object of {1e3 * share * source:.3g} mm along the beam"
+                f"{percent(error)} for an object of {1e3 * share * source:.3g} mm along the beam"
                 for error, share in _THIN_SCREEN_ERRORS
             )
             sentences.append(

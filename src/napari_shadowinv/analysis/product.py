@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.analysis.frame import FIELD_UNITS, FieldFrame
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact
+from napari_shadowinv.facts import Fact, decimals_of, power_of_ten
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.units import PIXEL, display_unit, prefix_for
 from napari_shadowinv.preprocessing.steps import Choice
@@ -33,8 +34,6 @@ BANDS = 0.68, 0.95
 _NO_PREFIX = ("", "1", PIXEL, "m⁻²", "m⁻³")
 _MIN_SAMPLES = 2
 _NOTABLE_MASK = 0.02
-_MIN_PLAIN, _MAX_PLAIN = 1e-3, 1e5  # other numbers have a power of ten
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _NOTABLE_BIAS = 0.3  # of the standard deviation
 
 
@@ -251,11 +250,9 @@ def shown_unit(unit: str, frame: FieldFrame, largest: float) -> tuple[float, str
     """Return the factor from a unit of a dataset to a handy one, and the unit's name."""
     if unit == frame.si_unit and frame.unit.size != 1:
         return 1 / frame.unit.size, frame.unit.symbol
-    is_large = unit not in ("", "1", PIXEL) and not unit.isascii() and largest >= _MAX_PLAIN
-    if is_large or (unit == "1" and 0 < largest < _MIN_PLAIN):
-        power = math.floor(math.log10(largest))
-        symbol = "" if unit == "1" else f" {unit}"
-        return 10.0**-power, f"× 10{str(power).translate(_RAISED)}{symbol}"
+    power, text = power_of_ten(largest)
+    if text and (unit == "1" or (power > 0 and not unit.isascii())):
+        return 10.0**-power, text if unit == "1" else f"{text} {unit}"
     if unit in _NO_PREFIX or not unit.isascii() or PIXEL in unit:
         return 1.0, display_unit(unit).replace("1", "") if unit == "1" else display_unit(unit)
     factor, prefix = prefix_for(largest)
@@ -285,11 +282,11 @@ def quantity_text(quantity: Quantity, unit: str, frame: FieldFrame) -> str:
     value = float(corrected(quantity))
     if np.isnan(value):
         return "none"
-    factor, name = shown_unit(unit, frame, abs(value))
-    ends: Sequence[tuple[float, ...]] = ()
-    if has_bands(quantity):
-        ends = [tuple(factor * float(end) for end in quantity.band(share)) for share in BANDS]
-    return value_text(factor * value, ends, name)
+    bands = [quantity.band(share) for share in BANDS] if has_bands(quantity) else []
+    ends = [tuple(float(end) for end in band) for band in bands]
+    largest = max(map(abs, filter(math.isfinite, (value, *itertools.chain(*ends)))), default=0.0)
+    factor, name = shown_unit(unit, frame, largest)
+    return value_text(factor * value, [tuple(factor * end for end in band) for band in ends], name)
 
 
 def value_text(value: float, ends: Sequence[tuple[float, ...]], unit: str) -> str:
@@ -302,7 +299,7 @@ def value_text(value: float, ends: Sequence[tuple[float, ...]], unit: str) -> st
     width = (ends[0][1] - ends[0][0]) / 2 if ends else 0.0
     if not (width > 0 and np.isfinite(width)):
         return f"{value:.4g}{unit}"
-    decimals = max(0, 1 - int(np.floor(np.log10(width))))
+    decimals = decimals_of(width)
     bands = [f"{low:.{decimals}f} to {high:.{decimals}f}" for low, high in ends]
     shares = ("", *(f"{share:.0%} ".replace("%", " %:") for share in BANDS[1:]))
     listed = "; ".join(f"{share}{band}" for share, band in zip(shares, bands, strict=True))

@@ -47,7 +47,7 @@ from napari_shadowinv.analysis.power_spectra import (
 from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Product, Values, Variable
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Level
+from napari_shadowinv.facts import Fact, Level, to_figures
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import length_text, number_field
 from napari_shadowinv.physics.units import PIXEL
@@ -219,9 +219,9 @@ class TurbulenceSpectrum(Product):
         most = _MAX_CONTRAST if product.response else _MAX_RAW_CONTRAST
         if self.slope and is_inversion and contrast > most:
             raise InputError(
-                f"the contrast of the image is {contrast:.2g}, expected at most {most:g} for a "
-                "slope from one image: rays cross so often that the inversion returns a false "
-                "one; fit several images, or ask for the spectrum without a slope"
+                f"the contrast of the image is {to_figures(contrast)}, expected at most {most:g} "
+                "for a slope from one image: rays cross so often that the inversion returns a "
+                "false one; fit several images, or ask for the spectrum without a slope"
             )
         trusted = np.flatnonzero(product._trusted(spectrum)) + 1
         ends = (int(trusted[0]), int(trusted[-1])) if len(trusted) else (0, 0)
@@ -231,8 +231,8 @@ class TurbulenceSpectrum(Product):
             raise InputError(
                 f"the range has {count} trusted rings of wavenumbers, expected at least "
                 f"{_MIN_RINGS} for a slope: noise, a spacing of the sites of "
-                f"{product.resolution:.2g} px and crossed rays end the range; ask for the spectrum "
-                "without a slope"
+                f"{to_figures(product.resolution)} px and crossed rays end the range; ask for the "
+                "spectrum without a slope"
             )
         return product
 
@@ -478,9 +478,9 @@ class TurbulenceSpectrum(Product):
         if contrast > _MAX_CONTRAST and self.resolution:
             yield Caution(
                 "folds",
-                f"the contrast is {contrast:.2g}, above {_MAX_CONTRAST:g}: rays cross so often "
-                "that the spectrum of one image is too weak, and its slope wrong; fit several "
-                "images",
+                f"the contrast is {to_figures(contrast)}, above {_MAX_CONTRAST:g}: rays cross so "
+                "often that the spectrum of one image is too weak, and its slope wrong; fit "
+                "several images",
             )
         if self.resolution and not self.response:
             yield Caution(

@@ -34,7 +34,7 @@ from napari_shadowinv.cli._terminal import (
     say_on_stderr,
 )
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.facts import Level
+from napari_shadowinv.facts import Level, to_figures
 from napari_shadowinv.io.shot_columns import joined_columns
 from napari_shadowinv.io.store import (
     DAMAGED,
@@ -246,7 +246,7 @@ def _site_rows(store: StackStore) -> Rows:
     rows = [("sites", f"{least if least == most else f'{least} to {most}'}; {reason}")]
     errors = [report["errors"] for report in reports if report.get("errors")]
     medians = [
-        f"{name} {np.median(values):.2g} px"
+        f"{name} {to_figures(np.median(values))} px"
         for name in ("noise", "discretisation")
         if (values := [rms[name][0] for rms in errors if np.isfinite(rms[name][0])])
     ]

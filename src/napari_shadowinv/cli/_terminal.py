@@ -21,7 +21,7 @@ from pydantic import ValidationError
 
 from napari_shadowinv._system.machine import ENDING_SIGNALS, handling
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.facts import ResultKind, Verdict
+from napari_shadowinv.facts import ResultKind, Verdict, to_figures
 from napari_shadowinv.physics.beam import setup_warnings
 
 if TYPE_CHECKING:
@@ -199,8 +199,9 @@ def exit_unless_sound(result: Any, out: Path, checks: StaticChecks | None = None
     elif is_inversion and not result.report.converged:
         report = result.report
         text = (
-            f"NOT CONVERGED: {out} was written, but its flux residual is {report.residual:.2g} "
-            f"(tolerance {report.tolerance:.2g}): do not trust the field"
+            f"NOT CONVERGED: {out} was written, but its flux residual is "
+            f"{to_figures(report.residual)} (tolerance {to_figures(report.tolerance)}): do not "
+            "trust the field"
         )
     elif verdict not in (None, Verdict.DETERMINED):
         text = f"{verdict.upper()}: {out} was written, but {result.explanation}"

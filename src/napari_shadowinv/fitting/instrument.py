@@ -17,6 +17,7 @@ from scipy.fft import dctn, idctn
 
 from napari_shadowinv._system.arrays import complete_block_means
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
+from napari_shadowinv.facts import percent, with_error
 from napari_shadowinv.inversion.imperfections import (
     IMPERFECTIONS,
     BeamExcess,
@@ -350,22 +351,14 @@ def numbers_in_units(
 def number_text(key: str, rows: Sequence[Sequence[float]]) -> str:
     """Describe the numbers of one imperfection, as `numbers_in_units` returns them."""
     if key == "gamma":
-        return f"gamma {_with_error((1 + rows[0][0], rows[0][1]))}"
+        return f"gamma {with_error(1 + rows[0][0], rows[0][1])}"
     if key == "blur":
-        return f"variance of the point spread {_with_error(rows[0], '+')} px²"
+        return f"variance of the point spread {with_error(*rows[0], '+')} px²"
     if key in ("background", "other_field"):
-        listed = ", ".join(_with_error([100 * value for value in row]) for row in rows)
+        listed = ", ".join(with_error(100 * value, 100 * error) for value, error in rows)
         return f"{TITLES[key]} {listed} %"
     size = np.sqrt(np.mean([row[0] ** 2 for row in rows]))
-    return f"{TITLES[key]} {100 * size:.2g} % (r.m.s.)"
-
-
-def _with_error(row: Sequence[float], sign: str = "") -> str:
-    value, error = row
-    if not error > 0:
-        return f"{value:{sign}.3g}"
-    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 6))
-    return f"{value:{sign}.{digits}f} ± {error:.{digits}f}"
+    return f"{TITLES[key]} {percent(size)} (r.m.s.)"
 
 
 def widen(image: FloatArray, variance: float) -> FloatArray:

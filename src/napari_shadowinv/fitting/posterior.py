@@ -29,6 +29,7 @@ from scipy.ndimage import gaussian_filter
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import run_in_parallel
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.facts import percent, to_figures
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
 from napari_shadowinv.fitting.descent import Preconditioner, finer, settle
 from napari_shadowinv.fitting.forward import Linear, Scene
@@ -502,19 +503,19 @@ class BeamError:
     def name(self) -> str:
         """The name of an error that includes the beam's, such as "beam assumed, 5 %"."""
         origin = "assumed" if self.assumed else "stated"
-        return f"beam {origin}, {100 * self.variation:.2g} %" if self.variation else "noise"
+        return f"beam {origin}, {percent(self.variation)}" if self.variation else "noise"
 
     @property
     def text(self) -> str:
         """The response in a sentence."""
         beam = "the beam was assumed to be the source or uniform: " if self.assumed else ""
         sentence = (
-            f"{beam}a beam that differs by 1 % (r.m.s.) over {self.scale:.2g} of the image's "
-            f"shorter side would move the displacement by {self.sensitivity:.1%} (r.m.s.)"
+            f"{beam}a beam that differs by 1 % (r.m.s.) over {to_figures(self.scale)} of the "
+            f"image's shorter side would move the displacement by {self.sensitivity:.1%} (r.m.s.)"
         )
         if self.variation:
             sentence += (
-                f"; of beams that differ by {100 * self.variation:.2g} % the images leave "
+                f"; of beams that differ by {percent(self.variation)} the images leave "
                 f"{self.share:.1%} open"
             )
         return sentence

@@ -24,8 +24,11 @@ from napari_shadowinv.facts import (
     error_fact,
     in_headline,
     masked_fact,
+    percent,
     time_fact,
+    to_figures,
     verdict_fact,
+    with_error,
 )
 from napari_shadowinv.fitting.instrument import TITLES, number_text
 from napari_shadowinv.fitting.posterior import BeamError
@@ -235,7 +238,7 @@ class FitReport:
             return ""
         return (
             f"to first order, samples differ from fitted ones by {self.nonlinearity:.0%} of their "
-            f"change, and fitted ones scatter {self.spread_ratio:.2g} times as far"
+            f"change, and fitted ones scatter {to_figures(self.spread_ratio)} times as far"
         )
 
     @property
@@ -358,7 +361,7 @@ class Fit:
         if self.report.beam is not None:
             parts = {"beam": self.report.beam.share, **parts}
         key = max(parts, key=lambda part: parts[part])
-        return f"{TITLES[key]} {100 * parts[key]:.2g} %"
+        return f"{TITLES[key]} {percent(parts[key])}"
 
     def _error_facts(self) -> Iterator[Fact]:
         """The errors of the displacement, and its sensitivity to what is not stated."""
@@ -381,7 +384,7 @@ class Fit:
                 yield error_fact("beam", report.beam.text)
         names = {each.key: each.name(each.tested) for each in IMPERFECTIONS}
         effects = ", ".join(
-            f"{share:.2g} ({names[key]})" if share > 1 else f"{share:.2%} ({names[key]})"
+            f"{to_figures(share)} ({names[key]})" if share > 1 else f"{share:.2%} ({names[key]})"
             for key, share in report.sensitivities.items()
             if key not in report.parts
         )
@@ -493,7 +496,7 @@ class Fit:
         if shown.unit != "px" and setup is not None and self.instrument.energy:
             main = setup.other_fields.get(deflector_titles()[field.name], setup.main_field)
             by_energy = self.instrument.energy * abs(setup.sensitivity_to_beam(main.name))
-        cause = f"energy, {100 * self.instrument.energy:.2g} %"
+        cause = f"energy, {percent(self.instrument.energy)}"
         cause = cause if by_energy > share else self.report.error_name
         return PeakError(float(np.hypot(share, by_energy)), cause)
 
@@ -507,7 +510,7 @@ class Fit:
             parts += [self.setups[k].probe] if self.setups else []
             strengths = ", ".join(f"{strength:.3g}" for strength in self.strengths[k])
             parts += [
-                f"χ² {chi2:.3g}",
+                f"χ² {to_figures(chi2, 3)}",
                 f"strength {strengths}",
                 f"brightness {self.brightness[k]:.4g}",
             ]
@@ -515,10 +518,10 @@ class Fit:
                 dy, dx = self.frames[k][[0, 3]]
                 parts.append(f"shifted by y {dy:+.3g}, x {dx:+.3g} px")
             for title, rows in self.report.added.items():
-                light = ", ".join(f"{value:.3g} ± {error:.2g}" for value, error in rows[k])
+                light = ", ".join(with_error(value, error) for value, error in rows[k])
                 parts.append(f"{title} {light}")
             text = ", ".join(parts)
-            yield Fact(f"image_{k + 1}", f"Image {k + 1}", text, short=f"χ² {chi2:.3g}")
+            yield Fact(f"image_{k + 1}", f"Image {k + 1}", text, short=f"χ² {to_figures(chi2, 3)}")
 
     def _field_fact(self, field: FittedField) -> Fact:
         setup, deflector = self.setup, deflector_titles()[field.name]

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Verdict, to_figures
 from napari_shadowinv.fitting.instrument import TITLES
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
 from napari_shadowinv.fitting.result import Fit
@@ -221,9 +221,9 @@ def assess_verdict(
         origin = "was assumed, not measured" if beam.assumed else "is known to that only"
         return Verdict.UNCERTAIN, (
             f"the beam {origin}: if it differs by {beam.variation:.1%} (r.m.s.) over "
-            f"{beam.scale:.2g} of the image, the displacement is off by {beam.share:.0%} (r.m.s.); "
-            f"measure the beam to {allowed:.1g} % and give it as the source, state its variation, "
-            "or fit it with several energies, as a source that is unknown"
+            f"{to_figures(beam.scale)} of the image, the displacement is off by {beam.share:.0%} "
+            f"(r.m.s.); measure the beam to {allowed:.1g} % and give it as the source, state its "
+            "variation, or fit it with several energies, as a source that is unknown"
         )
     if not report.converged:
         return Verdict.UNCERTAIN, (
@@ -323,4 +323,6 @@ def _share_at_edge(values: FloatArray, inwards: int = 0) -> float:
 
 def _those(names: Sequence[str], chi2: FloatArray, which: BoolArray) -> str:
     rows = zip(names, chi2, which, strict=True)
-    return "; ".join(f"{name}: χ² {value:.2g}" for name, value, is_listed in rows if is_listed)
+    return "; ".join(
+        f"{name}: χ² {to_figures(value)}" for name, value, is_listed in rows if is_listed
+    )

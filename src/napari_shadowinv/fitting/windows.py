@@ -14,7 +14,7 @@ import numpy as np
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Level, Verdict
+from napari_shadowinv.facts import Fact, Level, Verdict, to_figures
 from napari_shadowinv.fitting.result import (
     Fit,
     field_dataset,
@@ -129,10 +129,14 @@ class LeaveOneOut:
     def _image_fact(self, k: int) -> Fact:
         is_explained = bool(self.explained[k])
         verdict = "explained" if is_explained else "not explained"
-        chi2 = f"χ² {self.chi2[k]:.3g}"
+        chi2 = f"χ² {to_figures(self.chi2[k], 3)}"
         parts = [self.names[k]] if self.names else []
         parts += [self.setups[k].probe] if self.setups else []
-        parts += [chi2, f"alone {self.alone[k]:.3g}", f"limit {self.limit[k]:.3g}"]
+        parts += [
+            chi2,
+            f"alone {to_figures(self.alone[k], 3)}",
+            f"limit {to_figures(self.limit[k], 3)}",
+        ]
         text = f"{', '.join(parts)}, r.m.s. {self.rms[k]:.2%}: {verdict}"
         level = Level.SOUND if is_explained else Level.DOUBTFUL
         short = chi2 if is_explained else f"{chi2}, {verdict}"
@@ -288,7 +292,7 @@ def _describe_windows(
             parts.append(f"mean {quantity.noun} {quantity.text(float(window[quantity.name]))}")
         if "time_of_flight" in window:
             parts.append(f"time of flight {float(window['time_of_flight']) * 1e12:.4g} ps")
-        parts.append(f"χ² {', '.join(f'{value:.3g}' for value in window['chi2'].values)}")
+        parts.append(f"χ² {', '.join(to_figures(value, 3) for value in window['chi2'].values)}")
         parts += [f"{name} {texts[w]}" for name, texts in peaks.items()]
         level = Level.SOUND if verdict == Verdict.DETERMINED else Level.DOUBTFUL
         text = f"{', '.join(parts)}: {verdict}"

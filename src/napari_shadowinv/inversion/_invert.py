@@ -26,6 +26,7 @@ from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import to_figures
 from napari_shadowinv.inversion import normalise
 from napari_shadowinv.inversion.budget import Budget, Errors
 from napari_shadowinv.inversion.machine_code import loading_kernels
@@ -534,8 +535,8 @@ def _make_report(
 ) -> Report:
     finest, options = solutions[-1], budget.options
     text = (
-        f"not converged: flux residual {finest.residual:.2g} per cell, tolerance "
-        f"{options.tolerance:.2g}; {finest.reason}"
+        f"not converged: flux residual {to_figures(finest.residual)} per cell, tolerance "
+        f"{to_figures(options.tolerance)}; {finest.reason}"
     )
     cautions: tuple[Caution, ...] = (Caution("not-converged", text),)
     if finest.converged:

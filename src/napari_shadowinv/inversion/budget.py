@@ -25,6 +25,7 @@ from scipy.spatial import KDTree
 from napari_shadowinv._system.machine import begin
 from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.cautions import Caution
+from napari_shadowinv.facts import percent, to_figures
 from napari_shadowinv.inversion.imperfections import (
     IMPERFECTIONS,
     SolvedShot,
@@ -59,11 +60,11 @@ _LEAST_NOISE = 0.1  # of the mean square, where correlation takes waves away
 
 _TESTED_VARIATION = 0.01  # of a beam, r.m.s.
 _BEAM_BASES = {  # name of the part, and its basis in a text
-    "assumed": ("beam assumed, {:.2g} %", "assumed"),
-    "stated": ("beam stated, {:.2g} %", "stated"),
-    "seen": ("image and source differ by {:.2g} %", "seen outside the object"),
-    "references": ("beam by its references, {:.2g} %", "by its references"),
-    "outside": ("beam measured outside the object, {:.2g} %", "measured outside the object"),
+    "assumed": ("beam assumed, {}", "assumed"),
+    "stated": ("beam stated, {}", "stated"),
+    "seen": ("image and source differ by {}", "seen outside the object"),
+    "references": ("beam by its references, {}", "by its references"),
+    "outside": ("beam measured outside the object, {}", "measured outside the object"),
 }
 
 _REDUCED_SHARE = 0.25  # of the wanted mean square, at least for parts that are to be reduced
@@ -159,7 +160,7 @@ class Errors:
         """Known errors by their causes, the largest first."""
         noise = "noise"
         if self.noise_correlation:
-            noise = f"noise, correlated over {self.noise_correlation:.2g} px"
+            noise = f"noise, correlated over {to_figures(self.noise_correlation)} px"
         parts = {noise: self.noise, "discretisation": self.discretisation, **self.effects}
         if self.beam is not None:
             parts[self._beam_name] = self.beam
@@ -168,13 +169,13 @@ class Errors:
 
     @property
     def _beam_name(self) -> str:
-        return _BEAM_BASES[self.beam_basis][0].format(100 * self.beam_variation)
+        return _BEAM_BASES[self.beam_basis][0].format(percent(self.beam_variation))
 
     @property
     def limited_by(self) -> str:
         """Largest part with its share of the displacement (r.m.s.), such as "beam 23 %"."""
         name, error = next(iter(self.parts.items()))
-        return f"{self._title(name)} {_percent(error.rms, self.rms)}"
+        return f"{self._title(name)} {_share_text(error.rms, self.rms)}"
 
     def _title(self, name: str) -> str:
         return "beam" if name == self._beam_name else name.partition(",")[0]
@@ -186,8 +187,8 @@ class Errors:
 
     @property
     def share_text(self) -> str:
-        """Total as a share of the displacement (r.m.s.), such as "23 %"."""
-        return _percent(self.total.rms, self.rms)
+        """Total as a share of the displacement (r.m.s.), such as "23 %"; else in px."""
+        return _share_text(self.total.rms, self.rms)
 
     @property
     def largest_part(self) -> str:
@@ -201,9 +202,9 @@ class Errors:
 
     def _part_text(self, name: str) -> str:
         """Describe a part by its title, its share, and the deviation that it stands for."""
-        share = _percent(self.parts[name].rms, self.rms)
+        share = _share_text(self.parts[name].rms, self.rms)
         if name == self._beam_name:
-            size = f"{100 * self.beam_variation:.2g} % rms over {self._beam_length}"
+            size = f"{percent(self.beam_variation)} rms over {self._beam_length}"
             return f"beam {share} ({size}, {_BEAM_BASES[self.beam_basis][1]})"
         title, _, size = name.partition(", ")
         return f"{title} {share} ({size})" if size else f"{title} {share}"
@@ -211,7 +212,7 @@ class Errors:
     @property
     def _beam_length(self) -> str:
         lengths = {0.25: "a quarter", 0.5: "half"}
-        return lengths.get(self.beam_scale, f"{self.beam_scale:.2g}")
+        return lengths.get(self.beam_scale, to_figures(self.beam_scale))
 
     def measure_next(self, share: float) -> str:
         """Return what has to be known better for a total of at most `share`, and that total.
@@ -247,7 +248,7 @@ class Errors:
         total = math.sqrt(sum(squares.values()))
         *others, last = statements
         listed = f"{', '.join(others)} and {last}" if others else last
-        return f"with {listed}: {_percent(total, self.rms)}"
+        return f"with {listed}: {_share_text(total, self.rms)}"
 
     def _statement(self, name: str, factor: float) -> tuple[str, float]:
         """Return what reduces a part by a factor, in round numbers, and their factor."""
@@ -257,30 +258,30 @@ class Errors:
             return f"{shots:,} shots averaged", shots**-0.5
         if title in _REMEDIES:
             return _REMEDIES[title], factor
-        if name == self._beam_name and self.beam_variation:
-            size, text, power, unit = self.beam_variation, "{:.1g} %", 1.0, 100.0
-        elif name in self.sizes:
-            size = self.sizes[name]
-            known = {each.title: each for each in IMPERFECTIONS}.get(title)
-            text, power, unit = "{:.1g} %", 1.0, 100.0
-            if known is not None:
-                text, unit = known.size_text, known.factor
-                power = 2.0 if known.is_even else 1.0
-        else:
+        is_beam = name == self._beam_name and self.beam_variation
+        if not is_beam and name not in self.sizes:
             return f"{factor:.1g} times the {title} error", factor
-        rounded = _round_down(unit * size * factor ** (1 / power))
-        return f"the {title} known to {text.format(rounded)}", (rounded / unit / size) ** power
+        size = self.beam_variation if is_beam else self.sizes[name]
+        known = {each.title: each for each in IMPERFECTIONS}.get(title)
+        unit, scale, power = "%", 100.0, 1.0
+        if known is not None:
+            unit, scale, power = known.unit, known.factor, 2.0 if known.is_even else 1.0
+        rounded = _round_down(scale * size * factor ** (1 / power))
+        text = f"the {title} known to {to_figures(rounded)} {unit}".rstrip()
+        return text, (rounded / scale / size) ** power
 
     def accuracy_caution(self, accuracy: float, why: str) -> Caution | None:
         """Warn if the discretisation error exceeds the accuracy and is not hidden by noise."""
         error = self.discretisation.rms
-        if not error > max(accuracy * self.rms, _SHARE_OF_NOISE * self.noise.rms):
+        if not self.rms > 0 or not error > max(
+            accuracy * self.rms, _SHARE_OF_NOISE * self.noise.rms
+        ):
             return None
         return Caution(
             "accuracy",
-            f"the accuracy of {100 * accuracy:.2g} % is not reached: {why}, the discretisation "
-            f"error is about {_percent(error, self.rms)} of the displacement; give a larger number "
-            "of sites",
+            f"the accuracy of {percent(accuracy)} is not reached: {why}, the discretisation "
+            f"error is about {_share_text(error, self.rms)} of the displacement; give a larger "
+            "number of sites",
         )
 
     def times(self, factor: float) -> Errors:
@@ -303,9 +304,9 @@ class Errors:
 
     def rows(self, subject: str = "displacement") -> list[tuple[str, str]]:
         """Describe the budget of a subject in words: names and texts."""
+        of_subject = f" of the {subject}" if self.rms > 0 else ""
         text = (
-            f"{self.share_text} of the {subject} (r.m.s.): {self.ranking}; "
-            "crossing rays are not in it"
+            f"{self.share_text}{of_subject} (r.m.s.): {self.ranking}; crossing rays are not in it"
         )
         if math.isnan(self.discretisation.rms):
             text += "; discretisation was not estimated, as only one level was solved"
@@ -316,11 +317,11 @@ class Errors:
         by_beam = (
             f"{basis}; a source that differs from it by 1 % (r.m.s.) over {self._beam_length} of "
             "the image's shorter side moves the displacement by "
-            f"{_percent(self.beam_sensitivity.rms, self.rms)} (r.m.s.), its peak by "
-            f"{_percent(self.beam_sensitivity.at_peak, self.peak)}"
+            f"{_share_text(self.beam_sensitivity.rms, self.rms)} (r.m.s.), its peak by "
+            f"{_share_text(self.beam_sensitivity.at_peak, self.peak)}"
         )
         effects = ", ".join(
-            f"{_percent(error.rms, self.rms)} ({name})"
+            f"{_share_text(error.rms, self.rms)} ({name})"
             for name, error in self.sensitivities.items()
         )
         by_instrument = f"the displacement would move by (r.m.s.): {effects}"
@@ -335,10 +336,10 @@ class Errors:
             return None
         return Caution(
             "beam",
-            f"image and source differ by {100 * self.beam_variation:.2g} % (r.m.s.) where there is "
-            f"no object: the field may be off by {_percent(self.beam.rms, self.rms)}, its peak by "
-            f"{_percent(self.beam.at_peak, self.peak)}; use a source of the same exposure, or fit "
-            "the beam",
+            f"image and source differ by {percent(self.beam_variation)} (r.m.s.) where there is "
+            f"no object: the field may be off by {_share_text(self.beam.rms, self.rms)}, its peak "
+            f"by {_share_text(self.beam.at_peak, self.peak)}; use a source of the same exposure, "
+            "or fit the beam",
         )
 
 
@@ -408,11 +409,11 @@ class Budget:
         rms = float(np.sqrt(np.mean(np.sum(self._move(solved[-1]) ** 2, axis=0))))
         squares, power = self._change(solved)
         error = float(np.sqrt(squares.mean()))
-        share = _percent(error, rms)
-        text = f"their discretisation error is about {share} of the displacement"
+        share = _share_text(error, rms)
+        text = f"their discretisation error is about {share}{' of the displacement' * (rms > 0)}"
         allowed = self.options.accuracy * rms
         if error <= allowed:
-            self.reason = f"{text}, below the accuracy of {100 * self.options.accuracy:.2g} %"
+            self.reason = f"{text}, below the accuracy of {percent(self.options.accuracy)}"
             return 0.0
         # An estimate for a uniform beam; the exact value is needed only where this is large.
         image_noise = self._noise()
@@ -423,7 +424,9 @@ class Budget:
             by_noise = _with_finer(_mean_square(moves), finer)
             noise = math.sqrt(float((by_noise * response.shares).sum()))
         if error < _SHARE_OF_NOISE * noise:
-            self.reason = f"{text}, below a fifth of what the noise does ({_percent(noise, rms)})"
+            self.reason = (
+                f"{text}, below a fifth of what the noise does ({_share_text(noise, rms)})"
+            )
             return 0.0
         excess = error / max(allowed, _SHARE_OF_NOISE * noise)
         return float(_SAFETY * excess ** (1 / power))
@@ -475,7 +478,7 @@ class Budget:
         for (errors, name, _), part in zip(tests, np.split(moves, ends[:-1], axis=1), strict=True):
             errors[name] = estimate(part)
         if share := self.instrument.other_field:
-            name = f"other field, {100 * share:.2g} %"
+            name = f"other field, {percent(share)}"
             effects[name], sizes[name] = lengths.times(share), share
         for cause, flux_errors in FLUX_ERRORS.items():
             samples = flux_errors(response, solved[-1], self.options)
@@ -717,8 +720,6 @@ def _round_down(number: float) -> float:
     return float(f"{math.floor(number / step + 1e-9) * step:.1g}")
 
 
-def _percent(error: float, total: float) -> str:
-    if not total > 0:
-        return "0 %"
-    percent = 100 * error / total
-    return f"{percent:.0f} %" if percent >= 100 else f"{percent:.2g} %"
+def _share_text(error: float, total: float) -> str:
+    """Write an error of a displacement in per cent of it; without a displacement, in px."""
+    return percent(error / total) if total > 0 else f"{to_figures(error)} px"

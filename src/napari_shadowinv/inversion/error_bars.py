@@ -44,6 +44,7 @@ from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import to_figures
 from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.inversion._invert import invert, plan_sites
 from napari_shadowinv.inversion.imperfections import InstrumentDraws, RecordedShot, Scene
@@ -434,7 +435,7 @@ def uncertainty(
     plan = replace(plan, levels=plan.levels.up_to(len(inversion.weights)))
     correlation = 0.0 if inversion.errors is None else inversion.errors.noise_correlation
     if correlation and not isinstance(noise, str):
-        noise_text += f", correlated over {correlation:.2g} px"
+        noise_text += f", correlated over {to_figures(correlation)} px"
     resampling = FullResampling(
         plan, inversion.weights, lambda rng: draw_noise(rng, correlation), clipping
     ).to_tolerance_of_noise(seeds[0])
@@ -587,9 +588,9 @@ class _LinearCheck:
             return None
         text = (
             "the response to noise and instrument is not linear: samples that were solved scatter "
-            f"{self.spread_ratio:.2g} times as far, and their mean differs by "
-            f"{self.mean_shift:.2g} of an error bar; the bands are corrected for both, but not "
-            "for a skewed distribution: use the method 'resolve'"
+            f"{to_figures(self.spread_ratio)} times as far, and their mean differs by "
+            f"{to_figures(self.mean_shift)} of an error bar; the bands are corrected for both, but "
+            "not for a skewed distribution: use the method 'resolve'"
         )
         return Caution("samples", text)
 

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.facts import percent, to_figures
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.inversion.readout import LinearResponse
 from napari_shadowinv.options import BeamPrior, Instrument
@@ -178,7 +179,7 @@ class Imperfection:
 
     key: str  # name in `Instrument`
     title: str  # in texts
-    size_text: str  # format of the standard deviation, such as "{:.2g} px"
+    unit: str  # unit of the standard deviation in texts
     tested: float  # standard deviation whose effect every budget states; 0 if it takes too long
     pattern: Pattern
     change: Change
@@ -187,12 +188,12 @@ class Imperfection:
 
     def name(self, size: float) -> str:
         """Return the title with the size, such as "background, 5 %"."""
-        return f"{self.title}, {self.size_text.format(self.factor * size)}"
+        return f"{self.title}, {to_figures(self.factor * size)} {self.unit}".rstrip()
 
     @property
     def factor(self) -> float:
         """Factor from the standard deviation to the number in its text."""
-        return 100 if "%" in self.size_text else 1
+        return 100 if self.unit == "%" else 1
 
     def stated(self, instrument: Instrument) -> float:
         """Return the standard deviation in an instrument."""
@@ -336,21 +337,19 @@ def _move(shot: RecordedShot, shift: float, numbers: FloatArray) -> RecordedShot
 
 
 IMPERFECTIONS: tuple[Imperfection, ...] = (
-    Imperfection("background", "background", "{:.2g} %", 0.05, _background, _add_background),
-    Imperfection("gamma", "gamma", "{:.2g}", 0.05, _response, _raise_to_power),
-    Imperfection("blur", "blur", "{:.2g} px", 1.0, _blur, _spread, is_even=True),
+    Imperfection("background", "background", "%", 0.05, _background, _add_background),
+    Imperfection("gamma", "gamma", "", 0.05, _response, _raise_to_power),
+    Imperfection("blur", "blur", "px", 1.0, _blur, _spread, is_even=True),
     Imperfection(
         "absorption",
         "absorption",
-        "{:.2g} %",
+        "%",
         0.01,
         _absorption,
         _absorb,
         count=lambda scene: scene.transmission.count,
     ),
-    Imperfection(
-        "registration", "registration", "{:.2g} px", 0.0, _registration, _move, lambda scene: 4
-    ),
+    Imperfection("registration", "registration", "px", 0.0, _registration, _move, lambda scene: 4),
 )
 """Quantities of the instrument with their effects on an image, in the order of the budget."""
 
@@ -413,7 +412,7 @@ class InstrumentDraws:
         self.recorded, self._other_field = shot, instrument.other_field
         names, even = [], [False]  # the first number is that of the other field
         if self._other_field:
-            names.append(f"other field, {100 * self._other_field:.2g} %")
+            names.append(f"other field, {percent(self._other_field)}")
         self._parts: list[tuple[Change, float, slice]] = []
 
         def add(change: Change, size: float, count: int, name: str, is_even: bool) -> None:
@@ -423,7 +422,7 @@ class InstrumentDraws:
 
         if beam.rms:
             excess = BeamExcess(beam, shot.scene.source)
-            add(excess.change, beam.rms, excess.count, f"beam, {100 * beam.rms:.2g} %", False)
+            add(excess.change, beam.rms, excess.count, f"beam, {percent(beam.rms)}", False)
         # From the light to the detector, which adds its background last.
         for each in reversed(IMPERFECTIONS):
             if size := each.stated(instrument):

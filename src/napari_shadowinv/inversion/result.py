@@ -26,7 +26,9 @@ from napari_shadowinv.facts import (
     error_fact,
     in_headline,
     masked_fact,
+    percent,
     time_fact,
+    to_figures,
     verdict_fact,
 )
 from napari_shadowinv.inversion.budget import Errors
@@ -216,7 +218,7 @@ class Inversion:
         if not share:
             return self.errors
         noun = setup.beam_quantity().noun
-        return self.errors.with_scale(f"{noun}, {100 * error:.2g} %", error, share)
+        return self.errors.with_scale(f"{noun}, {percent(error)}", error, share)
 
     @property
     def total_error(self) -> float | None:
@@ -375,7 +377,8 @@ class Inversion:
             Fact(
                 "flux_residual",
                 "Flux residual",
-                f"{report.residual:.2g} of a cell, tolerance {report.tolerance:.2g}: "
+                f"{to_figures(report.residual)} of a cell, tolerance "
+                f"{to_figures(report.tolerance)}: "
                 f"{'converged' if report.converged else 'NOT converged'}",
                 convergence,
                 short="" if report.converged else "NOT converged",

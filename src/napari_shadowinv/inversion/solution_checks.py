@@ -64,7 +64,7 @@ from napari_shadowinv._system.arrays import complete_block_means
 from napari_shadowinv._system.machine import available_threads, begin, in_ranges
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Verdict, to_figures
 from napari_shadowinv.geometry.compiler import kernel
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared
@@ -359,9 +359,9 @@ def _no_deflection(noise: ImageNoise, rms: float) -> str:
     if rms > max(most, _ROUNDING):
         return ""
     return (
-        f"no deflection found: the displacement of {rms:.2g} px (r.m.s.) is no larger than the "
-        f"{usual:.2g} px expected from the image's noise of {noise.typical:.1%} per pixel; "
-        "average shots, or bin or smooth the image, before interpreting the field"
+        f"no deflection found: the displacement of {to_figures(rms)} px (r.m.s.) is no larger than "
+        f"the {to_figures(usual)} px expected from the image's noise of {noise.typical:.1%} per "
+        "pixel; average shots, or bin or smooth the image, before interpreting the field"
     )
 
 
@@ -474,8 +474,8 @@ def _cut_off(
     by_noise = noise.largest * np.sqrt(sides.depth / sum(side.size for side in sides.outwards))
     if turned > max(TURNED_BACK * rms, _BAND_DEVIATIONS * by_noise):
         how = (
-            f"near the edge it displaces rays by {turned:.2g} px towards or away from the edge "
-            "on all sides"
+            f"near the edge it displaces rays by {to_figures(turned)} px towards or away from the "
+            "edge on all sides"
         )
     elif rms > 2 * noise.displacements(noise.largest)[1] and _is_strongest_at_edge(
         np.concatenate(sides.outwards), np.concatenate(sides.along), peak
@@ -545,6 +545,7 @@ def _peak_at_mask(displacement: FloatArray, mask: BoolArray) -> str:
         return ""
     return (
         "the peak of the field lies at masked pixels, where the field is only a smooth "
-        f"continuation (up to {under:.2g} px under the mask, {peak:.2g} px outside): the true peak "
-        "may be hidden, and the value given is that of the unmasked pixels; use a smaller mask"
+        f"continuation (up to {to_figures(under)} px under the mask, {to_figures(peak)} px "
+        "outside): the true peak may be hidden, and the value given is that of the unmasked "
+        "pixels; use a smaller mask"
     )

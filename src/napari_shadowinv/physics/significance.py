@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.facts import Fact, Level
+from napari_shadowinv.facts import Fact, Level, percent, to_figures
 
 LEVEL = 2.0
 """Standard deviations at which the border of a structure lies."""
@@ -206,16 +206,16 @@ def significance_fact(
         subject = "1 structure stands" if count == 1 else f"{count} structures stand"
         strongest = structures.peaks[0]
         peak = f"up to {strongest:.3g} σ" if math.isfinite(strongest) else "without any error"
-        text = f"{subject} above {LEVEL:g} σ, on {100 * structures.share:.2g} % of the pixels"
+        text = f"{subject} above {LEVEL:g} σ, on {percent(structures.share)} of the pixels"
         return Fact(key, title, f"{text}, {peak}{causes}")
     text = f"no structure stands above {LEVEL:g} σ{causes}"
     if structures.largest > structures.limit:
         reason = f"{structures.largest:.3g} σ are reached, but by a few pixels only"
     elif structures.largest > LEVEL:
         reason = (
-            f"the field reaches {structures.largest:.2g} σ, errors alone up to "
-            f"{structures.limit:.2g} σ among {structures.n_pixels:,} pixels"
+            f"the field reaches {to_figures(structures.largest)} σ, errors alone up to "
+            f"{to_figures(structures.limit)} σ among {structures.n_pixels:,} pixels"
         )
     else:
-        reason = f"the field reaches {structures.largest:.2g} σ"
+        reason = f"the field reaches {to_figures(structures.largest)} σ"
     return Fact(key, title, f"{text}: {reason}", Level.DOUBTFUL)

@@ -3,7 +3,7 @@
 - the field that an experimenter asks for: `shown_fields`; the potential: `shown_potential`
 - their strongest points in words: `peak_facts`
 - the grey limits of an image: `intensity_limits`
-- a number with its error: `with_error`, `PeakError`
+- the error of a largest value: `PeakError`
 - the prefix for a number: `prefix_for`; whether a unit takes one: `takes_prefix`
 - attributes of a variable of a dataset: `label`; of places: `place_label`; the places:
   `place_coordinates`; units as figures print them: `display_unit`
@@ -15,7 +15,6 @@ coordinates on to it. For pint ``px`` is a length, 1/96 inch, and ``flux`` a fem
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -24,7 +23,7 @@ import numpy as np
 
 from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
-from napari_shadowinv.facts import Fact
+from napari_shadowinv.facts import Fact, with_error
 
 if TYPE_CHECKING:
     import xarray
@@ -63,19 +62,6 @@ class PeakError(NamedTuple):
     cause: str  # the largest contribution
 
 
-def with_error(value: float, share: float = 0.0) -> str:
-    """Write a number with its error, a share of it, to two figures of the error.
-
-    >>> with_error(97.13, 0.0212)
-    '97.1 ± 2.1'
-    """
-    error = abs(value) * share
-    if not error > 0 or not np.isfinite(error):
-        return f"{value:.3g}"
-    decimals = max(0, 1 - math.floor(math.log10(error)))
-    return f"{value:.{decimals}f} ± {error:.{decimals}f}"
-
-
 @dataclass(frozen=True)
 class ShownField:
     """A vector field in the unit that it is shown in."""
@@ -106,7 +92,7 @@ class ShownField:
     def short_peak_text(self, error: PeakError | None = None) -> str:
         """Write the largest magnitude with its error."""
         share = error.share if error else 0.0
-        return f"peak {self.symbol} {with_error(self.largest, share)} {self.unit}"
+        return f"peak {self.symbol} {with_error(self.largest, share * self.largest)} {self.unit}"
 
     def peak_text(self, error: PeakError | None = None) -> str:
         """Write the largest magnitude, path-integrated fields also in MG·µm."""
@@ -115,7 +101,8 @@ class ShownField:
         if self.unit.endswith("T·m"):
             prefix = self.unit.removesuffix("T·m")
             power = next(power for power, name in _PREFIXES.items() if name == prefix)
-            text += f" ({with_error(self.largest * 10.0**power / 1e-4, share)} MG·µm)"
+            size = self.largest * 10.0**power / 1e-4
+            text += f" ({with_error(size, share * size)} MG·µm)"
         return f"{text} ({cause})" if cause else text
 
 

@@ -24,7 +24,7 @@ from napari_shadowinv._system.progress import OnProgress, Progress, Reporter, Sh
 from napari_shadowinv._system.validation import as_model, check_instance, suggestion, validate
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Verdict, percent
 from napari_shadowinv.fitting import Fit, FitShot, fit
 from napari_shadowinv.fitting.compilation import ensure_compiled as ensure_fit_compiled
 from napari_shadowinv.fitting.shots import NearField
@@ -42,7 +42,6 @@ from napari_shadowinv.pipeline.experiment_result import (
     ExperimentPlan,
     ExperimentSweep,
     PlannedShot,
-    percent,
 )
 from napari_shadowinv.pipeline.experiment_shots import ExperimentInputs, ShotSimulator
 

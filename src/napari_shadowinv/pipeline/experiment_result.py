@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.facts import Fact, Headline, Level, Verdict, time_fact
+from napari_shadowinv.facts import Fact, Headline, Level, Verdict, percent, time_fact, to_figures
 from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
@@ -262,7 +262,7 @@ class ExperimentPlan:
         factor = 1 / math.sqrt(1 + (4.0**power - 1) * scale**2)
         unit, digits = ("px", 1.0) if name in ("blur", "registration") else ("%", 100.0)
         unit, digits = ("", 1.0) if name == "gamma" else (unit, digits)
-        better, before = (f"{digits * x:.2g} {unit}".rstrip() for x in (size / 2, size))
+        better, before = (f"{to_figures(digits * x)} {unit}".rstrip() for x in (size / 2, size))
         return f"{self._title(name)} known to {better} instead of {before}", factor
 
     @property
@@ -310,7 +310,7 @@ class ExperimentPlan:
         yield Fact("peak_error", "Error at the peak", self.peak_error.text)
         total = f"{self.total.text} of the field (r.m.s.)"
         if not math.isnan(self.ratio):
-            total += f"; the error made is {self.ratio:.2g} times that (r.m.s.)"
+            total += f"; the error made is {to_figures(self.ratio)} times that (r.m.s.)"
         yield Fact("total", "Error reported", total)
         if self.parts:
             least = _LEAST_PART * next(iter(self.parts.values()))
@@ -495,9 +495,3 @@ def table_text(rows: Sequence[Mapping[str, Any]]) -> str:
     for row in rows:
         writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
     return text.getvalue()
-
-
-def percent(share: float) -> str:
-    """Return a share in per cent with two digits, such as "2.1 %"."""
-    size = 100 * share
-    return f"{size:.0f} %" if abs(size) >= 100 else f"{size:.2g} %"

@@ -20,7 +20,7 @@ from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.facts import ResultKind
+from napari_shadowinv.facts import ResultKind, to_figures
 from napari_shadowinv.fitting import Fit, FitShot
 from napari_shadowinv.fitting.windows import PREFIX
 from napari_shadowinv.inversion import Inversion
@@ -504,5 +504,5 @@ def _difference(before: xarray.Dataset, after: xarray.Dataset) -> str:
     ]
     text = f"{', '.join(pairs)} differ{'s' * (len(pairs) == 1)}"
     if displacements:
-        text = f"displacement differs by up to {max(displacements):.2g} px"
+        text = f"displacement differs by up to {to_figures(max(displacements))} px"
     return text + (f"; the verdict was '{verdict}'" if is_changed else "")

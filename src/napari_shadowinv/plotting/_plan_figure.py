@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from napari_shadowinv.facts import percent
 from napari_shadowinv.physics.units import intensity_limits, shown_fields
-from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep, percent
+from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep
 from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR
 

@@ -43,6 +43,7 @@ from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution, OnCaution, warn_of
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import to_figures
 from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics.setup import Setup, bin_setup
 from napari_shadowinv.preprocessing import pixels
@@ -399,7 +400,7 @@ def gaussian_source(
         return uniform_source(image, mask=mask)
     if rise > _NOTABLE_EXTRAPOLATION:
         text = (
-            f"the Gaussian beam rises to {rise:.2g} times the fitted data under the mask: "
+            f"the Gaussian beam rises to {to_figures(rise)} times the fitted data under the mask: "
             "compare it with another estimate, or mask less"
         )
         report_caution(Caution("source", text))
