@@ -31,6 +31,28 @@ def test_an_empty_cache_means_to_compile(tmp_path):
     assert printed.stdout.strip() == "False"
 
 
+def test_without_the_compiler_an_inversion_is_slow_and_the_same():
+    script = """
+import numpy as np
+from napari_shadowinv import invert, synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob
+image = synthetic_image(gaussian_blob((20, 20), 6.0, 4.0).displacement)
+print(repr(float(np.hypot(*invert(image).displacement).max())))
+"""
+    peaks = [
+        subprocess.run(
+            [sys.executable, "-W", "error", "-c", script],
+            env=os.environ | {"NUMBA_DISABLE_JIT": off},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for off in ("0", "1")
+    ]
+    assert float(peaks[1]) == pytest.approx(float(peaks[0]), rel=1e-6)
+    assert float(peaks[0]) > 0.5
+
+
 def test_compilation_is_reported_cancellable_and_done_once(monkeypatch):
     progress = []
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -27,6 +28,9 @@ def njit(**options: Any) -> Callable[[Function], Function]:
     """Return numba's decorator; `cache` is true wherever machine code can be cached."""
 
     def compiled(function: Function) -> Function:
+        if _is_compiler_off():
+            # Plain Python warns where the hashes of machine code wrap around.
+            return cast(Function, np.errstate(over="ignore")(function))
         dispatcher: Any = numba.njit(**{**options, "cache": is_code_cached()})(function)
         if _uses_private_folder():
             beside_package = Path(dispatcher.py_func.__code__.co_filename).parent / "__pycache__"
@@ -39,7 +43,14 @@ def njit(**options: Any) -> Callable[[Function], Function]:
 @cache
 def is_code_cached() -> bool:
     """Return whether machine code is cached for later processes."""
-    return _numba_can_cache() or _uses_private_folder()
+    return not _is_compiler_off() and (_numba_can_cache() or _uses_private_folder())
+
+
+@cache
+def _is_compiler_off() -> bool:
+    """Return whether NUMBA_DISABLE_JIT is set, as by debuggers and for coverage."""
+    settings: Any = numba.config
+    return bool(settings.DISABLE_JIT)
 
 
 @cache

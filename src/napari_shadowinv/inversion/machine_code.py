@@ -81,10 +81,11 @@ def is_compiled() -> bool:
 
 
 def is_loaded() -> bool:
-    """Return whether this process has loaded kernels of the triangulation."""
+    """Return whether this process has loaded kernels of the triangulation, or compiles none."""
     from napari_shadowinv.geometry.flips import build
 
-    return bool(build.signatures)  # type: ignore[attr-defined]
+    # NUMBA_DISABLE_JIT leaves plain functions.
+    return bool(getattr(build, "signatures", True))
 
 
 def code_folder() -> Path | None:
