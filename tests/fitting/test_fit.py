@@ -227,6 +227,20 @@ def test_a_start_at_the_truth_is_taken() -> None:
             fit(FitShot(image[0], start=wrong), noise=0.02, options=PLAIN)
 
 
+def test_a_mask_of_all_images_is_the_mask_of_each() -> None:
+    hole = np.zeros(SIZE, bool)
+    hole[30:38, 5:12] = True
+    shots = np.array(shots_of(WEAK))
+    shots[:, hole] = 1e6
+    by_all = fit(shots, strengths=STRENGTHS, noise=NOISE, mask=~hole, options=HASTY)
+    each = [FitShot(s, strength=(k,), mask=~hole) for s, k in zip(shots, STRENGTHS, strict=True)]
+    by_each = fit(each, noise=NOISE, options=HASTY)
+    assert_array_equal(by_all.mask, np.broadcast_to(~hole, shots.shape))
+    assert_array_equal(by_all.fields[0].potential, by_each.fields[0].potential)
+    truth = on_pixels(WEAK, SIZE)
+    assert distance(by_all.fields[0].displacement, truth) < 0.1
+
+
 def test_a_fit_that_runs_out_of_steps_says_so() -> None:
     image = noisy([counted(bump(1.2, 8, (22, 29)), SIZE)], 0.004)[0]
     for steps in (1, 100):

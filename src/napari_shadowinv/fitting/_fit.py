@@ -104,6 +104,7 @@ def fit(
     source: ArrayLike | Literal["unknown"] | None = None,
     noise: ArrayLike | KindOfNoise | None = None,
     psf: Any = 0.0,
+    mask: ArrayLike | None = None,
     brightness: ArrayLike | Literal["known", "free"] = "known",
     instrument: Instrument | None = None,
     options: FitOptions | None = None,
@@ -141,6 +142,8 @@ def fit(
     psf : float or array_like, default 0
         Standard deviation in px of the point spread, or a kernel with odd sides; one, or one for
         each image. See `point_spread`.
+    mask : array_like of bool, shape (H, W) or (L, H, W), optional
+        True where a pixel can be used, in all images or in each.
     brightness : "known", "free" or array_like, default "known"
         Brightness of each image relative to the source: factors, or "free" to fit them.
         Fitted in any case where the instrument leaves beam or transmission open.
@@ -187,6 +190,7 @@ def fit(
         source=source,
         noise=noise,
         psf=psf,
+        mask=mask,
         brightness=brightness,
         instrument=instrument,
         options=options,
