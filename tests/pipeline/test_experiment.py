@@ -27,6 +27,7 @@ from napari_shadowinv.pipeline.experiment_object import (
     object_of_displacement,
     object_of_field,
     object_of_phantom,
+    object_of_potential,
     object_of_result,
     phantom_of_text,
 )
@@ -66,6 +67,20 @@ def image_of(instrument: Instrument = EXACT, number: int = 0, **choices) -> NDAr
 
 
 # Objects
+
+
+def test_the_object_of_a_potential_displaces_by_minus_its_gradient() -> None:
+    sigma, peak = 9.0, 40.0
+    y, x = np.indices((64, 72)) - np.reshape((30.0, 37.0), (2, 1, 1))
+    potential = peak * np.exp(-(y**2 + x**2) / 2 / sigma**2)
+    truth = np.stack([y, x]) / sigma**2 * potential
+    in_px = object_of_potential(potential)
+    in_metres = object_of_potential(SETUP.potential(potential), SETUP)
+    for target in (in_px, in_metres):
+        np.testing.assert_allclose(target.samples, truth, atol=0.005 * np.abs(truth).max())
+    assert in_metres.setup == SETUP
+    with pytest.raises(InputError, match="potential"):
+        object_of_potential(np.stack([potential, potential]))
 
 
 def test_a_phantom_displaces_by_its_formula():
