@@ -241,7 +241,7 @@ def test_a_plan_keeps_its_mask(image):
     [
         (np.ones((20, 21), bool), r"mask has shape \(20, 21\), image \(20, 20\)"),
         (np.ones((20, 20)), "float64, expected booleans"),
-        (np.zeros((20, 20), bool), "mask is false everywhere"),
+        (np.zeros((20, 20), bool), "mask leaves 0 of 400 pixels usable"),
     ],
 )
 def test_a_bad_mask_is_one_clear_sentence(mask, says):

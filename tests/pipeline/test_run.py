@@ -8,6 +8,7 @@ import typing
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 from hypothesis import given
@@ -166,6 +167,22 @@ def test_a_point_source_is_where_it_was_in_the_recorded_image(steps: tuple[Step,
 def test_a_mask_is_kept_whole(mask: Any) -> None:
     stored = MaskOrigin.model_validate_json(MaskOrigin.of(mask).model_dump_json())
     np.testing.assert_array_equal(stored.mask(), mask)
+
+
+@pytest.mark.parametrize("n_bad", [0, 9])
+@pytest.mark.parametrize("key", ["mask", "file", "source_mask"])
+def test_a_mask_of_bad_pixels_is_called_inverted(
+    n_bad: int, key: str, image: FloatArray, tmp_path: Path
+) -> None:
+    bad = np.zeros(SHAPE, bool)
+    bad.flat[: 17 * n_bad : 17] = True
+    file = tmp_path / "pixel_mask.tif"
+    iio.imwrite(file, bad.astype(np.uint8))
+    recipe = Recipe(options=OPTIONS, mask=file if key == "file" else None)
+    masks = {} if key == "file" else {key: bad}
+    leaves = f"mask leaves {n_bad} of {bad.size:,} pixels usable"
+    with pytest.raises(InputError, match=f"{leaves}.*NeXus pixel masks 0 is usable"):
+        run(recipe, image, source=np.ones(SHAPE), **masks)
 
 
 def test_a_mask_too_complex_for_an_attribute_is_not_kept_in_part() -> None:

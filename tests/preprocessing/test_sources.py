@@ -268,7 +268,7 @@ def test_images_without_a_beam_are_refused(estimate, image, words):
     ("mask", "words"),
     [
         (np.ones((5, 6), dtype=bool), r"mask has shape \(5, 6\), image \(48, 60\)"),
-        (np.zeros(SHAPE, dtype=bool), "mask is false everywhere"),
+        (np.zeros(SHAPE, dtype=bool), "mask leaves 0 of .* pixels usable"),
         (np.ones(SHAPE), "float64, expected booleans"),
     ],
 )

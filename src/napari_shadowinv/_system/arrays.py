@@ -4,7 +4,8 @@
 - the same where a mask has no meaning: `plain_array`; in any order: `refuse_masked`
 - image, source and mask of one shot: `unpack_shot`; several planes: `unpack_planes`
 - numbers as floats: `as_numbers`; a plane of them: `check_plane`; a mask: `check_mask`
-- two masks together: `join_masks`; size of a pixel by the coordinates: `coordinate_spacing`
+- two masks together: `join_masks`; enough usable pixels: `check_usable`
+- size of a pixel by the coordinates: `coordinate_spacing`
 - blocks of a plane: `block_sums`, `block_means`, `complete_block_means`
 - places of values in their order: `order_by_value`
 
@@ -35,6 +36,8 @@ _PIXEL_NAMES = {"px", "pixel", "pixels"}
 _SQUARES = {f"{name}{power}" for name in _PIXEL_NAMES for power in ("²", "^2", "**2", "2")}
 _UNITS = {PIXELS: _PIXEL_NAMES, SQUARE_PIXELS: _SQUARES}
 _UNEVEN = 1e-2  # of the mean spacing
+_MIN_USABLE_PX = 4  # side of the smallest image
+_FEW_USABLE = 0.1  # of the pixels
 
 
 def unpack_array(
@@ -162,9 +165,23 @@ def check_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str = "imag
             f"mask has values of type {usable.dtype}, expected booleans, true where a pixel is "
             "usable: compare it with a number, as in mask > 0"
         )
-    if not usable.any():
-        raise InputError("mask is false everywhere, expected true where a pixel is usable")
+    check_usable(usable)
     return usable
+
+
+def check_usable(usable: BoolArray, name: str = "mask") -> None:
+    """Raise an `InputError` if a mask leaves no part of an image usable."""
+    from scipy.ndimage import binary_erosion
+
+    count = int(np.count_nonzero(usable))
+    block = np.ones((_MIN_USABLE_PX,) * usable.ndim)
+    if count > _FEW_USABLE * usable.size or binary_erosion(usable, block).any():
+        return
+    raise InputError(
+        f"{name} leaves {count:,} of {usable.size:,} pixels usable, expected at least "
+        f"{_MIN_USABLE_PX} × {_MIN_USABLE_PX} next to each other: a mask is true, in a file not "
+        "0, where a pixel is usable; in NeXus pixel masks 0 is usable, so invert such a mask"
+    )
 
 
 def check_shape(

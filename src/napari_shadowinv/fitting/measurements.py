@@ -18,6 +18,7 @@ from napari_shadowinv._system.arrays import (
     NORMAL_MAD,
     SQUARE_PIXELS,
     as_numbers,
+    check_usable,
     join_masks,
     mask_of_each,
     plain_array,
@@ -372,6 +373,7 @@ def _checked_mask(
                 "them"
             )
         if plane.mean() < 0.05:
+            check_usable(plane, f"mask of {name}")
             raise InputError(f"{name} has {plane.mean():.1%} of its pixels in use: unmask some")
         if not image[plane].mean() > 0:
             raise InputError(f"{name} has no flux: expected a beam; check its background")

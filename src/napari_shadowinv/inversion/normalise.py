@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import check_mask, check_plane
+from napari_shadowinv._system.arrays import check_mask, check_plane, check_shape, check_usable
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -28,7 +28,7 @@ _BYTES_PER_SITE = 2000  # measured peak of a whole inversion, rounded up
 _BYTES_PER_PIXEL, _BYTES_PER_PIXEL_FREE = 180, 320  # measured peak of a large image
 _NOTABLE_FLUX_CHANGE = 0.05
 _NOTABLE_RAISED = 1e-3  # share of the pixels
-_NOTABLE_MASK = 0.2  # of the pixels
+_NOTABLE_MASK, _MOSTLY_MASKED = 0.2, 0.8  # of the pixels
 _DIMMEST, _BRIGHTEST = 1e-301, 1e301  # sums of a whole image stay within double precision
 _SAMPLE_STEP = 97  # pixels
 _MAX_ROUNDING = 1e-6  # of the mean: difference by rounding to 32 bits
@@ -210,6 +210,8 @@ def _warnings(
             f"the mask excludes {excluded:.1%} of the pixels: the field there is only a smooth "
             "continuation. To hide the object from a source estimate, use a source mask instead"
         )
+        if excluded > _MOSTLY_MASKED:
+            text += "; in NeXus pixel masks 0 is usable: invert such a mask"
         cautions.append(Caution("mask", text))
     return tuple(cautions)
 
@@ -217,8 +219,9 @@ def _warnings(
 def check_source(source: ArrayLike, mask: BoolArray | None = None) -> FloatArray:
     """Return a source as floats, 0 where masked, perhaps without a copy, or raise `InputError`."""
     shape = check_plane(source, "source", _SMALLEST_SIDE).shape
-    if mask is not None and shape != mask.shape:
-        raise InputError(f"source has shape {shape}, image {mask.shape}: they must match")
+    if mask is not None:
+        check_shape("source", shape, mask.shape)
+        check_usable(mask)
     beam = _finite_image(source, "source", np.ones(shape, bool) if mask is None else mask)
     if beam.min() < 0:
         raise InputError(

@@ -44,9 +44,9 @@ from napari_shadowinv.film.registration import EDGE_ERROR_PX
 from napari_shadowinv.film.scans import common_shape, upright
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.fitting.measurements import estimated_noise
-from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.images import INCH_M, Scan, read_scan
+from napari_shadowinv.pipeline.inversion_run import picture_mask
 from napari_shadowinv.provenance import ImageOrigin, Provenance
 
 _UNEXPOSED_RANGE = (0.98, 1.2)  # unexposed film over the lightest film of the table
@@ -125,7 +125,7 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
             _check_rectangle(number, corners, scan.pixel_size)
         calibration, background, bits = calibrations[layer.film]
         _check_bits(layer.file or pack.scan, scan, bits)
-        mask = None if layer.mask is None else read_radiograph(layer.mask).image > 0
+        mask = None if layer.mask is None else picture_mask(layer.mask)
         _check_on_scan(fiducials.get(number, []), scan, pack.fiducials)
         turn = layer.turned, pack.is_mirrored(layer)
         marks = {

@@ -21,6 +21,7 @@ from napari_shadowinv._system.arrays import (
     check_plane,
     check_shape,
     check_spacing,
+    check_usable,
     join_masks,
     unpack_array,
     unpack_mask,
@@ -484,10 +485,12 @@ def _mask(values: ArrayLike | None, file: Path | None, name: str, shot: Radiogra
                 f"{name} has values of type {pixels.dtype}, expected booleans: compare it with "
                 "a number, as in mask > 0"
             )
+        check_shape(name, pixels.shape, shot.shape)
+        check_usable(pixels, name)
         return _Mask(pixels, None)
     if file is None:
         return None
-    pixels = picture_mask(file)
+    pixels = picture_mask(file, name)
     check_shape(f"{file}: {name}", pixels.shape, shot.shape)
     return _Mask(pixels, file)
 
@@ -509,10 +512,11 @@ def _without_missing(mask: _Mask, *images: Radiograph | None) -> _Mask:
     return mask if np.array_equal(pixels, mask.pixels) else _Mask(pixels, None)
 
 
-def picture_mask(path: Path, variable: str | None = None) -> BoolArray:
+def picture_mask(path: Path, name: str = "mask", variable: str | None = None) -> BoolArray:
     """Read a mask from a picture that is 0, or transparent, at unusable pixels."""
     image = read_radiograph(path, channel="mean", variable=variable).image
     mask: BoolArray = np.nan_to_num(image) != 0
+    check_usable(mask, f"{path}: {name}")
     return mask
 
 

@@ -431,7 +431,7 @@ class _Reader:
         if origin.file:
             path = self._find_changed(origin, "mask")
             self.masks[index] = origin.model_copy(update={"sha256": sha256(path)})
-            return picture_mask(path, origin.variable)
+            return picture_mask(path, variable=origin.variable)
         if image_mask is None:
             raise InputError(
                 "a mask is too complex to be stored in the result, and was not a file: repeat the "
