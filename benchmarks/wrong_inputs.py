@@ -3,8 +3,8 @@
     python benchmarks/wrong_inputs.py [--seeds 3]
 
 Wrong: a dark level, saturation, a negative, a reference shifted or exchanged with its image, hot
-pixels, all put into simulated shots of a toroid in two beams with noise of counting; and setups
-with common mistakes of units. Right: all phantoms with Gaussian noise of 0 to 30 % and 30 to 1000
+pixels, a dark rim, a beam stop, gaps of a detector, all put into simulated shots of a toroid in two
+beams with noise of counting; and setups with common mistakes of units. Right: all phantoms with Gaussian noise of 0 to 30 % and 30 to 1000
 counts, with a uniform, a smooth and a structured beam; the reference images, where they are there;
 frames of a real plume with their real reference; and the setups of the examples. No inversion is
 needed: the checks look at what goes into it.
@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv import read, synthetic_image
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion.normalise import mask_unlit
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.beam import setup_warnings
 from napari_shadowinv.physics.setup import SETUPS, setup_from_dict
@@ -110,6 +112,17 @@ def wrong_shots(image: FloatArray, source: FloatArray, counts: int) -> Iterator[
     places = np.random.default_rng(0).integers(4, min(image.shape) - 4, (2, 20))
     hot[tuple(places)] = 10 * counts
     yield "hot pixels", (hot, source)
+    y, x = np.indices(image.shape) - np.reshape(image.shape, (2, 1, 1)) / 2
+    rim, stop = np.hypot(y, x) > 0.45 * image.shape[0], np.hypot(y + 40, x) < 9
+    unlit = np.random.default_rng(1).poisson(0.3, (2, *image.shape)).astype(float)
+    for name, dark in (("dark rim", rim), ("beam stop", stop)):
+        planes = np.where(dark, unlit, (image, source))
+        yield name, (planes[0], planes[1])
+    yield "dark rim, no reference", (np.where(rim, unlit[0], image), None)
+    for mark in (2**32 - 1, -1):
+        gaps = image.copy()
+        gaps[150:157] = mark
+        yield f"gaps of {mark}", (gaps, source)
 
 
 CODES = {
@@ -119,8 +132,20 @@ CODES = {
     "hot pixels": "hot-pixels",
     "reference shifted by 5 px": "register",
     "reference shifted by 25 px": "register",
+    "dark rim": "unlit",
+    "dark rim, no reference": "unlit",
+    "beam stop": "unlit",
+    "gaps of 4294967295": "unlit",
+    "gaps of -1": "unlit",
 }
 """Caution of each mistake that is not named like it."""
+
+
+def cautions_of(image: FloatArray, source: FloatArray | None) -> list[Caution]:
+    """Return all cautions about an image, those of pixels without light among them."""
+    mask, cautions = mask_unlit(image, source, None)
+    usable = None if mask is None else np.asarray(mask)
+    return [*cautions, *image_warnings(image, source, usable)]
 
 
 def noticed_shots(seeds: int) -> dict[str, list[bool]]:
@@ -137,7 +162,7 @@ def noticed_shots(seeds: int) -> dict[str, list[bool]]:
                     shot = rng.poisson(counts * folded).astype(float)
                     source = rng.poisson(counts * clean).astype(float)
                     for mistake, (image, reference) in wrong_shots(shot, source, counts):
-                        codes = {caution.code for caution in image_warnings(image, reference)}
+                        codes = {caution.code for caution in cautions_of(image, reference)}
                         code = CODES.get(mistake, mistake)
                         named.setdefault(mistake, []).append(code in codes)
     return named
@@ -221,7 +246,7 @@ def main() -> None:
     examples: dict[str, str] = {}
     for label, (image, source) in right_shots(seeds):
         began = time.process_time()
-        cautions = image_warnings(image, source)
+        cautions = cautions_of(image, source)
         seconds += time.process_time() - began
         total += 1
         for caution in cautions:

@@ -32,6 +32,7 @@ CAUTION_CODES: Mapping[str, str] = MappingProxyType(
         "negative-pixels": "negative pixels were set to zero",
         "dark-pixels": "dark pixels were raised to the floor",
         "mask": "the mask excludes many pixels",
+        "unlit": "pixels without light were masked",
         "dark-level": "a dark level was left in the image",
         "saturation": "pixels are saturated",
         "hot-pixels": "single pixels stand out from their neighbours",

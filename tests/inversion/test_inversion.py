@@ -206,7 +206,7 @@ def handwriting(shape):
 
 def test_masked_handwriting_does_not_poison_the_field(phantom, image):
     ink = handwriting(SHAPE)
-    written = np.where(ink, 0.1, image)
+    written = np.where(ink, 0.2, image)
     poisoned = invert(written)
     masked = invert(written, mask=~ink)
     assert masked.report.converged

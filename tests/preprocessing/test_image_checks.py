@@ -19,7 +19,12 @@ from napari_shadowinv.preprocessing import (
     image_checks,
     image_warnings,
 )
-from napari_shadowinv.preprocessing.image_checks import CheckedImage, dark_level
+from napari_shadowinv.preprocessing.image_checks import (
+    CheckedImage,
+    dark_level,
+    mask_dark,
+    mask_gaps,
+)
 
 SHAPE = (160, 160)
 COUNTS = 300
@@ -50,6 +55,97 @@ def shot() -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module")
 def faint() -> tuple[np.ndarray, np.ndarray]:
     return counted(24.0)
+
+
+def peak_of(inversion) -> float:
+    length = np.hypot(*inversion.displacement)
+    return float(length[inversion.mask].max())
+
+
+Y, X = np.indices(SHAPE) - 79.5
+UNLIT = {
+    "rim": np.hypot(Y, X) > 74,
+    "frame": np.maximum(abs(Y), abs(X)) > 72,
+    "beam stop": (np.hypot(Y + 50, X - 40) < 9) | ((abs(X - 40) < 3) & (Y < -50)),
+}
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", UNLIT)
+def test_pixels_without_light_never_make_the_peak(name, seed) -> None:
+    truth = toroid(SHAPE, paper_setup(), 60.0, 20e-6).displacement
+    rng = np.random.default_rng(seed)
+    image, source = (
+        rng.poisson(60 * plane).astype(float)
+        for plane in (synthetic_image(truth, np.ones(SHAPE)), np.ones(SHAPE))
+    )
+    dark = UNLIT[name]
+    options = InversionOptions(n_sites=4000)
+    lit = invert(image, source=source, options=options)
+    image[dark], source[dark] = rng.poisson(0.2, (2, int(dark.sum())))
+    inversion = invert(image, source=source, options=options)
+    np.testing.assert_array_equal(inversion.mask, ~dark)
+    error = inversion.errors.of_peak.share * peak_of(lit)
+    assert peak_of(inversion) == pytest.approx(peak_of(lit), abs=2 * error)
+    (caution,) = (each for each in inversion.cautions if each.code == "unlit")
+    assert f"{int(dark.sum()):,} " in caution.text
+    plan = plan_sites(source, options)
+    planned = invert(image, plan=plan, options=options)
+    np.testing.assert_array_equal(planned.mask, ~dark)
+    np.testing.assert_array_equal(planned.potential, inversion.potential)
+
+
+@pytest.mark.parametrize("name", ["rim", "frame"])
+def test_without_a_source_a_dark_rim_is_masked_and_a_hollow_stays(name) -> None:
+    hollow = toroid(SHAPE, paper_setup(), 194.0, 30e-6).displacement
+    image = np.random.default_rng(2).poisson(300 * synthetic_image(hollow, np.ones(SHAPE)))
+    assert mask_dark(image.astype(float), None, None) == (None, [])
+    framed = np.where(UNLIT[name], 2.0, image)
+    lit, (caution,) = mask_dark(framed, None, None)
+    np.testing.assert_array_equal(lit, ~UNLIT[name])
+    assert caution.code == "unlit"
+
+
+def test_a_hollow_that_the_source_lights_is_not_masked() -> None:
+    source = np.random.default_rng(0).poisson(100.0, SHAPE).astype(float)
+    image = source.copy()
+    image[60:100, 60:100] = np.random.default_rng(1).poisson(0.2, (40, 40))
+    image[:, :20] = 0.0
+    assert mask_dark(image, source, None) == (None, [])
+
+
+@pytest.mark.parametrize("counts", [1000, 10_000])
+def test_a_beam_that_falls_smoothly_to_a_few_counts_is_light(counts) -> None:
+    beam = np.exp(-(Y**2 + X**2) / 2 / 32**2)
+    assert (beam * counts).min() < 25
+    rng = np.random.default_rng(3)
+    image, source = (rng.poisson(counts * beam).astype(float) for _ in range(2))
+    usable, _ = mask_dark(image, source, None)
+    assert usable is None or (beam * counts)[~usable].max() < 6
+
+
+@pytest.mark.parametrize("mark", [2**32 - 1, 2**16 - 1, 2**31 - 1, -1, -2, -9999])
+def test_gaps_of_a_detector_are_masked_by_their_mark(mark, shot) -> None:
+    image, source = (plane.copy() for plane in shot)
+    gaps = np.zeros(SHAPE, bool)
+    gaps[130:137] = gaps[:, 100:104] = True
+    expected = run(Recipe(), image, source=source, mask=~gaps)
+    image[gaps] = mark
+    inversion = run(Recipe(steps=(Dark(level=0),)), image, source=source)
+    np.testing.assert_array_equal(inversion.mask, ~gaps)
+    np.testing.assert_array_equal(inversion.potential, expected.potential)
+    (caution,) = (each for each in inversion.cautions if each.code == "unlit")
+    assert f"{int(gaps.sum()):,} pixels of the image are {mark}," in caution.text
+    source[gaps] = mark
+    assert mask_gaps(source, None, "source")[1]
+
+
+def test_light_up_to_the_limit_of_a_detector_is_no_gap(shot) -> None:
+    image = np.minimum(shot[0] * 60, 2.0**16 - 1)
+    assert (image == 2**16 - 1).sum() > 100
+    assert mask_gaps(image, None, "image") == (None, [])
+    subtracted = np.random.default_rng(0).poisson(0.3, (400, 400)) - 1.0
+    assert mask_gaps(subtracted, None, "image") == (None, [])
 
 
 def named(image, source, mask=None) -> list[str]:

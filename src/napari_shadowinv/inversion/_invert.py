@@ -31,7 +31,7 @@ from napari_shadowinv.inversion import normalise
 from napari_shadowinv.inversion.budget import Budget, Errors
 from napari_shadowinv.inversion.machine_code import loading_kernels
 from napari_shadowinv.inversion.noise import ImageNoise
-from napari_shadowinv.inversion.normalise import Prepared, margin_around, prepare
+from napari_shadowinv.inversion.normalise import Prepared, margin_around, mask_unlit, prepare
 from napari_shadowinv.inversion.readout import read_out
 from napari_shadowinv.inversion.result import Inversion, Report
 from napari_shadowinv.inversion.solution_checks import (
@@ -251,14 +251,18 @@ def invert(
                 )
             _check_boundary(plan, options)
             image = _unmasked_values(image, plan.mask)
-            source, mask = plan.source, plan.mask
+            source, mask, measured = plan.source, plan.mask, plan.measured
         else:
             image, source, mask = unpack_shot(image, source, mask)
+            measured = measured and source is not None
+        mask, unlit = mask_unlit(image, source if measured else None, mask)
+        if unlit and plan is not None:
+            plan, start = _plan(plan.source, options, mask, plan.measured), None
         prepared = prepare(image, source, options, mask)
         report("prepare", 1, 1)
     with measure_time("sites", seconds):
         if plan is None:
-            plan = _plan(prepared.source, options, mask, measured and source is not None)
+            plan = _plan(prepared.source, options, mask, measured)
         levels = plan.levels.with_reporter(report)
     with measure_time("transport", seconds):
         if plan.margin is not None and options.flux == "fit":
@@ -335,7 +339,7 @@ def invert(
         why = "with the most sites placed unless more are given"
         by_accuracy = [errors.accuracy_caution(options.accuracy, why)]
     with measure_time("prepare", seconds):
-        warnings = *by_errors, *quality.warnings, *by_accuracy, *begin_checks()()
+        warnings = *by_errors, *unlit, *quality.warnings, *by_accuracy, *begin_checks()()
     reprojection = fields.reprojection * prepared.unit
     return Inversion(
         image=prepared.image,

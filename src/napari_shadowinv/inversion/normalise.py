@@ -1,6 +1,7 @@
 """An image and a source made ready for the transport.
 
 - check and normalise: `prepare`; a source alone: `check_source`
+- without pixels that carry no light: `mask_unlit`
 - only normalise, many images of one source: `flooring_for`
 - the margin of a free boundary, and how many sites: `margin_around`, `number_of_sites`
 """
@@ -20,6 +21,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
+from napari_shadowinv.preprocessing.image_checks import mask_dark, mask_gaps
 
 _SMALLEST_SIDE = 4
 _LEAST_MARGIN = 4
@@ -69,9 +71,11 @@ def prepare(
     values = _finite_image(image, "image", usable)
     negative = int(np.count_nonzero(values < 0)) if values.min() < 0 else 0
     if negative and options.negative == "refuse":
+        lowest, is_mark = values.min(), len(np.unique(values[values < 0])) == 1
+        remedy = "if the detector marks bad pixels so, mask them; " if is_mark else ""
         raise InputError(
-            f"image has {negative} negative pixels (lowest {values.min():.4g}), expected none: "
-            "if they result from background subtraction, clip them",
+            f"image has {negative} negative pixels (lowest {lowest:.4g}), expected none: "
+            f"{remedy}if they result from background subtraction, clip them",
             option="clip_negative",
         )
     values = _clip_negative(values)
@@ -113,6 +117,29 @@ def prepare(
         flux_scale=flux_scale,
         warnings=_warnings(ratio if conserved else 1.0, negative, below, usable, options),
     )
+
+
+def mask_unlit(
+    image: ArrayLike, source: ArrayLike | None, mask: ArrayLike | None
+) -> tuple[ArrayLike | None, list[Caution]]:
+    """Mask the pixels without light, by `mask_gaps` and `mask_dark`; the source was recorded."""
+    planes = [check_plane(image, "image", _SMALLEST_SIDE)]
+    usable = check_mask(mask, planes[0].shape)
+    if source is not None:
+        planes.append(check_plane(source, "source", _SMALLEST_SIDE))
+    if any(plane.shape != usable.shape for plane in planes):
+        return mask, []
+    values = [np.where(usable, plane, 0.0) for plane in planes]
+    if not all(np.abs(plane).max() < _BRIGHTEST for plane in values):
+        return mask, []  # refused later
+    cautions = []
+    lit: BoolArray | None = usable
+    for plane, name in zip(values, ("image", "source"), strict=False):
+        lit, gaps = mask_gaps(plane, lit, name)
+        cautions += gaps
+    lit, dark = mask_dark(values[0], values[1] if source is not None else None, lit)
+    cautions += dark
+    return (lit, cautions) if cautions else (mask, [])
 
 
 def flooring_for(

@@ -22,6 +22,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitShot, compare, fit, point_spread
 from napari_shadowinv.fitting.shots import common_values, value_of_first
 from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.inversion.normalise import mask_unlit
 from napari_shadowinv.io.files import name_of, sha256, text_of
 from napari_shadowinv.options import BeamPrior, FitChoices, FitOptions, Instrument
 from napari_shadowinv.physics.beam import setup_warnings
@@ -378,7 +379,9 @@ def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) ->
     try:
         shot = inputs.prepare(should_stop)
         source, estimate = shot.source, inputs.recipe.estimate
-        doubts = [*image_warnings(shot.image, source, shot.mask)]
+        mask, doubts = mask_unlit(shot.image, source, shot.mask)
+        shot = replace(shot, mask=mask)
+        doubts += image_warnings(shot.image, source, shot.mask)
         if shot.setup is not None:
             doubts += setup_warnings(shot.setup, shot.shape)
         if estimate is not None and not isinstance(estimate, UniformEstimate):

@@ -34,7 +34,7 @@ from napari_shadowinv.cautions import Caution, OnCaution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, invert, plan_sites
 from napari_shadowinv.inversion.compilation import ensure_compiled
-from napari_shadowinv.inversion.normalise import check_source, prepare
+from napari_shadowinv.inversion.normalise import check_source, mask_unlit, prepare
 from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.io.files import join_address, sha256, split_address, text_of
 from napari_shadowinv.options import InversionOptions
@@ -267,7 +267,7 @@ def run(
     inputs = collect_inputs(recipe, shot, source=source, mask=mask, source_mask=source_mask)
     inputs.recipe.check(inputs.shot)
     ready = inputs.prepare(should_stop)
-    inversion = run_prepared(
+    return run_prepared(
         inputs,
         ready,
         on_progress=on_progress,
@@ -276,7 +276,6 @@ def run(
         preview=preview,
         began=clock,
     )
-    return inversion.with_warnings(dict.fromkeys(ready.warnings))
 
 
 def run_prepared(
@@ -312,7 +311,10 @@ def run_prepared(
     seconds: dict[str, float] = {}
     clock = time.perf_counter() if began is None else began
     report("prepare", 0, None)
-    doubts: list[Caution] = []
+    mask, doubts = mask_unlit(shot.image, shot.source, shot.mask)
+    shot = replace(shot, mask=mask)
+    if start is not None and not same_array(start.mask, shot.usable):
+        start = None
     # Before an estimate is made, and before sites are spread: mistakes are reported at once.
     if shot.source is None:
         prepare(shot.image, None, options, shot.mask)
@@ -353,7 +355,7 @@ def run_prepared(
     if shot.setup is not None:
         doubts += setup_warnings(shot.setup, shot.shape)
         doubts += deflection_warnings(shot.setup, inversion.displacement)
-    return inversion.with_warnings(doubts)
+    return inversion.with_warnings(dict.fromkeys((*doubts, *shot.warnings)))
 
 
 def _source(

@@ -3,9 +3,10 @@
 - all of them, as cautions: `image_warnings`
 - of one image: `CheckedImage`, `stray_pixels`
 - of an image and its reference: `dark_level`, `ReferencePair`
+- pixels that carry no light, and are masked: `mask_gaps`, `mask_dark`
 
 An image must be linear in the fluence, without offset, and on the same pixels as its reference.
-No check changes an image: each sentence states the observation, its effect on the field, and the
+No check changes a value: each sentence states the observation, its effect on the field, and the
 step that helps. docs/trust.md lists the errors that no image shows: the offset of an image without
 deep shadows, the gamma of a detector.
 
@@ -34,6 +35,20 @@ from napari_shadowinv._system.arrays import NORMAL_MAD, complete_block_means, or
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.preprocessing.pixels import nonnegative_fit
+
+# Gaps of detectors
+_TYPE_BITS = (15, 16, 20, 24, 31, 32)  # the largest numbers mark gaps, and three below bad pixels
+_MAX_LIGHT = 0.5  # of the mark, for all other pixels
+_MAX_MARKS = 3  # negative ones, in one image
+_MIN_GAP_SHARE, _GAP_SIDE_PX = 0.5, 3  # of the pixels with a mark, in squares
+
+# Dark pixels, by their means over squares
+_SIDES_PX = 3, 9  # for darkness, and for noise
+_DARK, _DIM = 0.03, 0.1  # of the light elsewhere: without doubt, and if noise exceeds it
+_MIN_NOISE = 0.8  # of the light, per pixel
+_LIT = 0.3  # of the light elsewhere, just outside the sharp edge of a window
+_MAX_PILE = 1.5  # there, unless the light was deflected out of a hollow
+_EDGE_PX = 6, 9  # outside a dark region
 
 # Saturation
 _MIN_PLATEAU_PIXELS, _MIN_PLATEAU_SHARE = 10, 5e-4
@@ -149,6 +164,143 @@ class CheckedImage:
         values = differences / np.maximum(brightness, _MIN_DARK * abs(float(brightness.mean())))
         limit = _clip_limit(np.abs(values))
         return np.clip(values, -limit, limit)
+
+
+def mask_gaps(
+    plane: FloatArray, mask: BoolArray | None, name: str
+) -> tuple[BoolArray | None, list[Caution]]:
+    """Mask the pixels that a detector has marked, as gaps between its modules.
+
+    Marks are the largest numbers of an integer type, if no light comes near, and negative whole
+    numbers that fill areas. Returns the mask, and a caution if it has changed.
+    """
+    usable = np.ones(plane.shape, bool) if mask is None else mask
+    gaps = np.zeros(plane.shape, bool)
+    while (marked := _marked_pixels(plane, usable & ~gaps)) is not None:
+        gaps |= marked
+    if not gaps.any() or not (usable & ~gaps).any():
+        return mask, []
+    marks = ", ".join(f"{value:.0f}" for value in np.unique(plane[gaps]))
+    text = (
+        f"gaps: {int(gaps.sum()):,} pixels of the {name} are {marks}, by which detectors mark gaps "
+        "and bad pixels; they were masked, and the field there is only a smooth continuation: give "
+        "the detector's mask"
+    )
+    return usable & ~gaps, [Caution("unlit", text)]
+
+
+def _marked_pixels(plane: FloatArray, usable: BoolArray) -> BoolArray | None:
+    """Return the usable pixels with one more mark; None if there is none."""
+    if not usable.any():
+        return None
+    values = plane[usable]
+    highest, lowest = float(values.max()), float(values.min())
+    if any(-1 <= 2.0**bits - highest <= 3 for bits in _TYPE_BITS):
+        marked = usable & (plane > highest - 3)
+        others = values[values <= highest - 3]
+        is_gap = ndimage.binary_erosion(marked, np.ones((2, 2))).any()
+        if is_gap and others.size and others.max() < _MAX_LIGHT * highest:
+            return marked
+    if not lowest < 0:
+        return None
+    negative = np.unique(values[values < 0])
+    for mark in (negative[-1], lowest):
+        marked = usable & (plane <= mark)
+        marks = negative[negative <= mark]
+        if len(marks) <= _MAX_MARKS and (marks == np.rint(marks)).all():
+            filled = ndimage.binary_opening(marked, np.ones((_GAP_SIDE_PX, _GAP_SIDE_PX)))
+            if filled.sum() >= _MIN_GAP_SHARE * marked.sum():
+                return marked
+    return None
+
+
+def mask_dark(
+    image: FloatArray, source: FloatArray | None, mask: BoolArray | None
+) -> tuple[BoolArray | None, list[Caution]]:
+    """Mask the pixels that carry no light, such as the rim of a round window or a beam stop.
+
+    They are dark in the image and in its source, so that a hollow from which an object has
+    deflected the light stays. Without a recorded source they reach the border of the image, and no
+    light is piled up around them. Returns the mask, and a caution if it has changed.
+    """
+    usable = np.ones(image.shape, bool) if mask is None else mask
+    is_recorded = source is not None and np.ptp(source[usable]) > 0
+    dark = _dark_pixels([image] if source is None or not is_recorded else [source, image], usable)
+    if not dark.any():
+        return mask, []
+    where, remedy = "image and source", "give a mask of the lit pixels"
+    if not is_recorded:
+        where, remedy = "the image up to its border", f"{remedy}, or the recorded source"
+    text = (
+        f"pixels without light: {int(dark.sum()):,} ({dark.mean():.1%}) are dark in {where}, as at "
+        "the rim of a window or behind a beam stop; they were masked, because their noise looks "
+        f"like a field, and the field there is only a smooth continuation: {remedy}"
+    )
+    return usable & ~dark, [Caution("unlit", text)]
+
+
+def _dark_pixels(planes: Sequence[FloatArray], usable: BoolArray) -> BoolArray:
+    """Return the pixels that are dark in all planes, the source first if it was recorded."""
+    dark, noisy, dim, lights = usable, usable, usable, []
+    for plane in planes:
+        light = _mean_around(plane, usable, _SIDES_PX[1])
+        bright = light[usable & (light >= plane[usable].mean())]
+        if not bright.size or not bright.mean() > 0:
+            return np.zeros_like(usable)
+        level = float(bright.mean())
+        limit = _DARK if len(planes) > 1 else _DIM
+        dark = dark & (_mean_around(plane, usable, _SIDES_PX[0]) < limit * level)
+        noisy = noisy & (light < _DIM * level)
+        if noisy.any():
+            squares = _mean_around((plane / level) ** 2, usable, _SIDES_PX[1])
+            noisy &= squares >= (1 + _MIN_NOISE**2) * (light / level) ** 2
+        if not (dark.any() or noisy.any()):
+            return dark
+        dim = dim & (plane < _LIT * level)
+        lights.append(light / level)
+    square = np.ones((3, 3))
+    noisy = ndimage.binary_opening(noisy, square)
+    regions, count = ndimage.label(noisy | dark)
+    is_dark = np.zeros(count + 1, bool)
+    for number, box in enumerate(ndimage.find_objects(regions), 1):
+        is_dark[number] = _is_dark_region(regions == number, box, noisy, lights, usable)
+    core = is_dark[regions]
+    if core.any():
+        core = ndimage.binary_dilation(core, square, iterations=_EDGE_PX[1], mask=dim)
+    return np.asarray(core)
+
+
+def _mean_around(plane: FloatArray, usable: BoolArray, side: int) -> FloatArray:
+    """Return means of usable pixels over squares; 0 where there are none."""
+    if usable.all():
+        return np.asarray(ndimage.uniform_filter(plane, side))
+    sums = ndimage.uniform_filter(np.where(usable, plane, 0.0), side)
+    share = ndimage.uniform_filter(usable.astype(float), side)
+    return np.divide(sums, share, out=np.zeros_like(sums), where=share > 1e-9)
+
+
+def _is_dark_region(
+    region: BoolArray,
+    box: tuple[slice, ...],
+    noisy: BoolArray,
+    lights: Sequence[FloatArray],
+    usable: BoolArray,
+) -> bool:
+    """Return whether a region was dark before any deflection, by its noise and its edge."""
+    if len(lights) > 1 and noisy[region].mean() > 0.5:
+        return True
+    least, most = _EDGE_PX
+    around = tuple(slice(max(side.start - most, 0), side.stop + most) for side in box)
+    distance = ndimage.distance_transform_edt(~region[around])
+    ring = usable[around] & (distance > least) & (distance <= most)
+    if not ring.any():
+        return False
+    at_edge = [float(np.median(light[around][ring])) for light in lights]
+    if len(lights) > 1:
+        return min(at_edge) > _LIT
+    # Shorter than the image's sides, it could be the object's.
+    is_rim = region[1:-1, 1:-1].sum() < region.sum() >= min(region.shape)
+    return _LIT < at_edge[0] < _MAX_PILE and bool(is_rim)
 
 
 def image_warnings(

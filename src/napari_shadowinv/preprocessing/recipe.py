@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -25,6 +26,7 @@ from napari_shadowinv.options import FitChoices, Instrument, InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing.estimates import Estimate
 from napari_shadowinv.preprocessing.filters import Filter, HotPixelFilter
+from napari_shadowinv.preprocessing.image_checks import mask_gaps
 from napari_shadowinv.preprocessing.steps import Choice, Dark, Radiograph, Step, choices_of
 
 _MIN_VISIBLE_SHARE = 0.1  # of an object under the source mask, for the inversion to see it
@@ -189,7 +191,14 @@ class Recipe(CheckedModel):
             )
 
     def prepare(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
-        """Return a shot, with its source and masks, after all steps; see `Step.apply`."""
+        """Return a shot, with its source and masks, after all steps; see `Step.apply`.
+
+        Gaps of the detector are masked before the steps, which would change their values.
+        """
+        for plane, name in ((shot.image, "image"), (shot.source, "source")):
+            if plane is not None:
+                mask, doubts = mask_gaps(plane, shot.mask, name)
+                shot = replace(shot, mask=mask, warnings=(*shot.warnings, *doubts))
         for step in self.steps:
             shot = step.apply(shot, should_stop)
         return shot

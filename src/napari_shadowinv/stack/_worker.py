@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from napari_shadowinv._system.arrays import join_masks
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
@@ -36,6 +37,7 @@ from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Cache, Inputs, collect_inputs, run_fit, run_prepared
 from napari_shadowinv.pipeline.fit_run import usual_fields
+from napari_shadowinv.pipeline.inversion_run import same_array
 from napari_shadowinv.preprocessing import Estimate, Radiograph, Recipe, UniformEstimate
 from napari_shadowinv.stack._shots import ArrayReference, Shot, checksum
 from napari_shadowinv.transport.sites import SitePlan
@@ -114,7 +116,9 @@ class _SharedSites(Cache):
         *,
         measured: bool = True,
     ) -> SitePlan:
-        beam = self.beam or Beam(source.shape, source, mask)
+        beam = self.beam
+        if beam is None or not same_array(mask, beam.mask):
+            beam = Beam(source.shape, source, mask)  # the shot has unlit pixels of its own
         return shared_plan(beam, options, measured=measured, should_stop=should_stop)
 
 
@@ -235,7 +239,7 @@ class InvertTask(Task):
         if beam is None and isinstance(recipe.source, UniformEstimate):
             beam = Beam(ready.shape, None, ready.mask)
         if beam is not None:
-            ready = replace(ready, source=beam.image)
+            ready = replace(ready, source=beam.image, mask=join_masks(ready.mask, beam.mask))
             if beam.source is None:
                 ready = replace(ready, image=_divide_by_mean(ready.image, ready.mask))
         options = recipe.options
