@@ -4,8 +4,9 @@
 
 Wrong: a dark level, saturation, a negative, a reference shifted or exchanged with its image, hot
 pixels, a dark rim, a beam stop, gaps of a detector, all put into simulated shots of a toroid in two
-beams with noise of counting; and setups with common mistakes of units. Right: all phantoms with Gaussian noise of 0 to 30 % and 30 to 1000
-counts, with a uniform, a smooth and a structured beam; the reference images, where they are there;
+beams with noise of counting; and setups with common mistakes of units. Right: all phantoms with
+Gaussian noise of 0 to 30 % and 30 to 1000 counts, with a uniform, a smooth and a structured beam;
+the reference images, where they are there;
 frames of a real plume with their real reference; and the setups of the examples. No inversion is
 needed: the checks look at what goes into it.
 """
