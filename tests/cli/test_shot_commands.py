@@ -1337,20 +1337,39 @@ def test_ctrl_c_while_writing_keeps_the_old_result(folder: Path, shot: Path) -> 
 
 
 @pytest.mark.draws_figures
-def test_neither_result_nor_figure_is_left_on_a_full_disk(
-    small_disk: tuple[Path, Callable[[str], bool]], shot: Path
+@pytest.mark.parametrize("full", ["result", "figure"])
+def test_a_full_disk_costs_the_figure_but_not_the_result(
+    full: str, small_disk: tuple[Path, Callable[[str], bool]], shot: Path
 ) -> None:
     disk, resize = small_disk
     assert resize("64k")
-    for out, figure in (("shot.shadowinv", disk / "a.png"), (disk / "a.shadowinv", "a.png")):
-        (disk / "other").write_bytes(bytes(60_000))
-        result = shadowinv("invert", shot, "--n-sites", 300, "--out", out, "--figure", figure)
-        assert result.exit_code == 2
-        (line,) = result.stderr.splitlines()
-        assert f"{disk}/a." in line
-        assert "cannot be written (No space left on device): free some disk space" in line
-        assert [path.name for path in disk.iterdir()] == ["other"]
-        assert sorted(content(shot.parent)) == ["shot.npy"]
+    (disk / "other").write_bytes(bytes(60_000))
+    out = disk / "a.shadowinv" if full == "result" else Path("a.shadowinv")
+    figure = disk / "a.png" if full == "figure" else Path("a.png")
+    result = shadowinv("invert", shot, "--n-sites", 300, "--out", out, "--figure", figure)
+    assert result.exit_code == (2 if full == "result" else 0)
+    (line,) = result.stderr.splitlines()
+    assert f"{disk}/a." in line
+    assert "cannot be written (No space left on device): free some disk space" in line
+    assert [path.name for path in disk.iterdir()] == ["other"]
+    is_written = full == "figure"
+    assert sorted(content(shot.parent)) == ["a.shadowinv"] * is_written + ["shot.npy"]
+
+
+def test_a_figure_that_fails_does_not_cost_the_result(
+    folder: Path, shot: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: Any, **keywords: Any) -> None:
+        raise RuntimeError("latex was not able to process it")
+
+    monkeypatch.setattr("napari_shadowinv.plotting.figures.report_figure", fail)
+    result = shadowinv("invert", shot, "--n-sites", 300)
+    assert result.exit_code == 0, result.output
+    assert sorted(content(folder)) == ["shot.npy", "shot.shadowinv"]
+    assert "the figure shot.png could not be drawn" in result.stderr
+    assert "latex was not able" in result.stderr
+    assert "shot.shadowinv" in result.stdout
+    assert "shot.png" not in result.stdout
 
 
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")

@@ -9,6 +9,7 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from matplotlib import rc_context, rcParams
 from matplotlib.figure import Figure
 
 from napari_shadowinv.cautions import Caution
@@ -185,6 +186,24 @@ def test_saved_figure_has_page_size_and_replaces_on_request(
         save_figure(path, figure)
     save_figure(path, figure, overwrite=True)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_users_matplotlibrc_changes_no_figure(inversion: Inversion, tmp_path: Path) -> None:
+    theirs = {
+        "text.usetex": True,
+        "font.family": "No Such Font",
+        "font.size": 30.0,
+        "axes.grid": True,
+        "image.origin": "lower",
+        "image.cmap": "jet",
+        "savefig.bbox": "tight",
+        "savefig.transparent": True,
+    }
+    usual = save_figure(tmp_path / "usual.png", report_figure(inversion))
+    with rc_context(theirs):
+        under_theirs = save_figure(tmp_path / "theirs.png", report_figure(inversion))
+        assert rcParams["font.size"] == 30.0
+    np.testing.assert_array_equal(iio.imread(under_theirs), iio.imread(usual))
 
 
 def test_no_window_system_is_touched(inversion: Inversion) -> None:

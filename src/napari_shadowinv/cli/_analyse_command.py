@@ -116,23 +116,22 @@ def analyse(
             results = [each.result for each in series]
         else:
             results = measure(dataset, chosen, samples=samples, **common)
-    with ExitStack() as stack:  # all files, or none
+    with ExitStack() as stack:  # both files, or none
         if csv is not None:
             temporary = stack.enter_context(replacing(csv, overwrite))
             temporary.write_text(products_table(results), encoding="utf-8")
-        if figure is not None:
-            from napari_shadowinv.plotting import products_figure
-            from napari_shadowinv.plotting.figures import DOTS_PER_INCH
-
-            temporary = stack.enter_context(replacing(figure, overwrite))
-            products_figure(results).savefig(temporary, dpi=DOTS_PER_INCH)
         if out is not None:
             write(out, add_products(dataset, results), overwrite=overwrite)
+    failed: list[Path] = []
+    if figure is not None:
+        from napari_shadowinv.plotting import products_figure
+
+        failed = _inputs.write_figures({figure: lambda: products_figure(results)}, overwrite)
     if not quiet:
         for table in _tables(results):
             say(table)
         if outputs:
-            say(two_columns("Files", written_rows(outputs)))
+            say(two_columns("Files", written_rows(outputs, failed)))
 
 
 def _times(text: str | None, shots: Sequence[int]) -> list[float] | None:

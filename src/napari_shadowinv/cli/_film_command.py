@@ -113,7 +113,7 @@ def film(
     with work_callbacks(quiet) as callbacks:
         doses = run_film(content, **callbacks)
     written = [result, figure]
-    _inputs.write_result(doses, [str(pack)], result, figure, overwrite)
+    failed = _inputs.write_result(doses, [str(pack)], result, figure, overwrite)
     if layers is not None:
         written.append(write_layers(doses, layers, form=layers_format, overwrite=overwrite)[-1])
     if corners is not None:
@@ -128,7 +128,7 @@ def film(
     if not quiet:
         say(film_table(doses))
         facts = [fact for fact in doses.facts if not fact.is_detail]
-        say(two_columns("Film pack", [*fact_rows(facts), *written_rows(written)]))
+        say(two_columns("Film pack", [*fact_rows(facts), *written_rows(written, failed)]))
 
 
 def film_table(doses: FilmDoses) -> Table:

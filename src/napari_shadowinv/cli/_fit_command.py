@@ -145,7 +145,7 @@ def fit(
     with work_callbacks(quiet) as callbacks:
         named = [replace(shot, name=name) for shot, name in zip(shots, short, strict=True)]
         static = run_checks(chosen, named, result_fit, **checks, **callbacks)
-    _inputs.write_result(result_fit, names, result, figure, overwrite, static)
+    failed = _inputs.write_result(result_fit, names, result, figure, overwrite, static)
     if save_recipe is not None:
         setups = {shot.setup for shot in shots}
         (common,) = setups if len(setups) == 1 else (None,)
@@ -155,5 +155,5 @@ def fit(
             if check is not None:
                 say(two_columns(title, fact_rows(check.facts)))
         fit_rows = _fit_result.fit_rows(result_fit, names, printed)
-        say(two_columns("Fit", [*fit_rows, *written_rows(outputs)]))
+        say(two_columns("Fit", [*fit_rows, *written_rows(outputs, failed)]))
     exit_unless_sound(result_fit, result, static)

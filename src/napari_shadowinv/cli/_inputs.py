@@ -6,13 +6,14 @@ the work, and their files are written after it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv.cli._flags import fit_recipe_of, recipe_of
+from napari_shadowinv.cli._terminal import is_interrupted, say_on_stderr
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import split_address
 from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, PRADFORMAT, RESULT, suffixes_for
@@ -20,6 +21,8 @@ from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.preprocessing import MeasuredSource, Radiograph, Recipe
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from napari_shadowinv.facts import ResultKind
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.pipeline.static_checks import StaticChecks
@@ -104,28 +107,48 @@ def write_result(
     figure: Path,
     overwrite: bool,
     checks: StaticChecks | None = None,
-) -> None:
-    """Write a result and its figures, all or none; the names of its files are the title."""
+) -> list[Path]:
+    """Write a result, then its figures, whose title is the names of its files.
+
+    Returns the figures that could not be drawn; see `write_figures`.
+    """
     from napari_shadowinv.cli._fit_result import static_figures
-    from napari_shadowinv.io import replacing, write
+    from napari_shadowinv.io import write
     from napari_shadowinv.io.files import name_of
     from napari_shadowinv.plotting import left_out_figure, result_figure, windows_figure
-    from napari_shadowinv.plotting.figures import DOTS_PER_INCH
 
     title = ", ".join(name_of(name) for name in names)
-    dataset, figures = result.to_dataset(), {figure: result_figure(result, title=title)}
+    dataset = result.to_dataset()
+    figures: dict[Path, Callable[[], Figure]] = {
+        figure: partial(result_figure, result, title=title)
+    }
     if checks is not None:
         dataset = checks.add_to(dataset)
         left_out, windows = static_figures(figure, left_out=True, window=1)
         if checks.left_out is not None:
-            figures[left_out] = left_out_figure(checks.left_out, title=title)
+            figures[left_out] = partial(left_out_figure, checks.left_out, title=title)
         if checks.windows is not None:
-            figures[windows] = windows_figure(checks.windows, title=title)
-    with ExitStack() as stack:
-        for path, page in figures.items():
-            temporary = stack.enter_context(replacing(path, overwrite))
-            page.savefig(temporary, dpi=DOTS_PER_INCH)
-        write(out, dataset, overwrite=overwrite)
+            figures[windows] = partial(windows_figure, checks.windows, title=title)
+    write(out, dataset, overwrite=overwrite)
+    return write_figures(figures, overwrite)
+
+
+def write_figures(figures: Mapping[Path, Callable[[], Figure]], overwrite: bool) -> list[Path]:
+    """Draw and write figures; print a caution for each that fails, and return their files."""
+    from napari_shadowinv.plotting import save_figure
+
+    failed = []
+    for path, draw in figures.items():
+        try:
+            save_figure(path, draw(), overwrite)
+        except Exception as error:
+            if is_interrupted():
+                raise
+            failed.append(path)
+            reason = str(error) or type(error).__name__
+            text = f"the figure {path} could not be drawn, everything else is written: {reason}"
+            say_on_stderr(text, "yellow")
+    return failed
 
 
 def recipe_from(

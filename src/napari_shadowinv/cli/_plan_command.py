@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -104,7 +105,6 @@ def plan(
     from napari_shadowinv.pipeline.experiment_result import ExperimentSweep, table_text
     from napari_shadowinv.pipeline.files import setup_from
     from napari_shadowinv.plotting import plan_figure, sweep_figure
-    from napari_shadowinv.plotting.figures import save_figure
 
     page = figure or _inputs.figure_beside(out)
     _inputs.check_outputs([(out, SITES.suffixes), (page, FIGURE_SUFFIXES)], overwrite)
@@ -126,12 +126,16 @@ def plan(
             quantity, values = _sweep(sweep)
             result = sweep_experiment(target, setups, quantity=quantity, values=values, **choices)
     is_sweep = isinstance(result, ExperimentSweep)
-    drawing = sweep_figure(result) if is_sweep else plan_figure(result)
     with replacing(out, overwrite) as temporary:
         temporary.write_text(table_text(result.rows()), encoding="utf-8")
-    save_figure(page, drawing, overwrite)
+    draw: Any = partial(sweep_figure if is_sweep else plan_figure, result)
+    failed = _inputs.write_figures({page: draw}, overwrite)
     if not quiet:
-        rows = [headline_row(result.headline), *fact_rows(result.facts), *written_rows([out, page])]
+        rows = [
+            headline_row(result.headline),
+            *fact_rows(result.facts),
+            *written_rows([out, page], failed),
+        ]
         say(two_columns("Sweep" if is_sweep else "Plan", rows))
     if not result.is_determined:
         raise Exit(EXIT_NOT_CONVERGED)

@@ -167,7 +167,7 @@ def invert(
         beam = read_part(measured.file or image, channel, measured.variable)
     printed = warn_of_setups([(chosen.setup or shot.setup, shot.shape)])
     inversion = invert_shot(chosen, shot, beam, quiet)
-    _inputs.write_result(inversion, [str(image)], result, figure, overwrite)
+    failed = _inputs.write_result(inversion, [str(image)], result, figure, overwrite)
     if save_recipe is not None:
         write_recipe(save_recipe, chosen, overwrite=overwrite)
     if not quiet:
@@ -177,7 +177,7 @@ def invert(
             *provenance_rows(inversion.provenance),
             ("setup", setup_text(inversion.setup, shot, inversion.image.shape)),
             *fact_rows(inversion.facts, printed),
-            *written_rows(outputs),
+            *written_rows(outputs, failed),
         ]
         say(two_columns("Inversion", rows))
     exit_unless_sound(inversion, result)
@@ -215,7 +215,7 @@ def rerun(
     with work_callbacks(quiet) as callbacks:
         again = inputs.run(**callbacks)
     names = [str(file) for file in inputs.files[: len(inputs.shots)]] or [str(result)]
-    _inputs.write_result(again.content, names, again_out, figure, overwrite, again.checks)
+    failed = _inputs.write_result(again.content, names, again_out, figure, overwrite, again.checks)
     content: Any = again.content
     if not quiet:
         rows = [
@@ -224,7 +224,7 @@ def rerun(
             ("difference", again.difference),
             headline_row(content.headline),
             *fact_rows(content.facts, printed),
-            *written_rows([again_out, figure]),
+            *written_rows([again_out, figure], failed),
         ]
         say(two_columns("Rerun", rows))
     exit_unless_sound(content, again_out, again.checks)
@@ -376,7 +376,7 @@ def demo(
     from napari_shadowinv.physics.forward import synthetic_image
     from napari_shadowinv.physics.phantoms import paper_setup, toroid
     from napari_shadowinv.physics.poisson import poisson_invert
-    from napari_shadowinv.plotting import comparison_figure, report_figure, save_figure
+    from napari_shadowinv.plotting import comparison_figure, report_figure
 
     setup = paper_setup()
     truth = toroid((200, 200), setup, peak=dm, sigma=30e-6).displacement
@@ -388,24 +388,25 @@ def demo(
     fields = {"True": truth, "Retrieved": inversion.displacement, "Poisson": poisson}
     errors = {name: _error_text(fields[name], truth) for name in ("Retrieved", "Poisson")}
     caption = "Errors: " + "; ".join(f"{field} {error}" for field, error in errors.items())
-    comparison = comparison_figure(fields, setup, title="True and retrieved", caption=caption)
     name = f"toroid_{dm:g}"
-    report = report_figure(inversion, setup, title=f"Demo {name}")
-    written = [
-        write(out / f"{name}{RESULT.suffix}", inversion, setup=setup, overwrite=True),
-        save_figure(out / f"{name}{PNG.suffix}", report, overwrite=True),
-        save_figure(out / f"{name}_comparison{PNG.suffix}", comparison, overwrite=True),
-    ]
+    figures = {
+        out / f"{name}{PNG.suffix}": lambda: report_figure(inversion, setup, title=f"Demo {name}"),
+        out / f"{name}_comparison{PNG.suffix}": lambda: comparison_figure(
+            fields, setup, title="True and retrieved", caption=caption
+        ),
+    }
+    result = write(out / f"{name}{RESULT.suffix}", inversion, setup=setup, overwrite=True)
+    failed = _inputs.write_figures(figures, overwrite=True)
     rows = [
         headline_row(inversion.headline_in(setup)),
         ("setup", setup_text(setup, shape=image.shape)),
         *fact_rows(inversion.facts_in(setup)),
         ("error", errors["Retrieved"]),
         ("error of Poisson", errors["Poisson"]),
-        *written_rows(written),
+        *written_rows([result, *figures], failed),
     ]
     say(two_columns("Demo", rows))
-    exit_unless_sound(inversion, written[0])
+    exit_unless_sound(inversion, result)
 
 
 def _error_text(estimate: FloatArray, truth: FloatArray) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,9 +71,9 @@ def fact_rows(facts: Iterable[Fact], printed: tuple[str, ...] = ()) -> Rows:
     ]
 
 
-def written_rows(paths: Iterable[Path]) -> Rows:
-    """Return a row for each file that was written."""
-    return [("written", str(path)) for path in paths]
+def written_rows(paths: Iterable[Path], failed: Collection[Path] = ()) -> Rows:
+    """Return a row for each file that was written, unless writing it has failed."""
+    return [("written", str(path)) for path in paths if path not in failed]
 
 
 def setup_text(

@@ -17,7 +17,7 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.physics.units import display_unit, prefix_for, takes_prefix
-from napari_shadowinv.plotting._panels import STYLE, choose_grid, image_scale, new_page
+from napari_shadowinv.plotting._panels import choose_grid, image_scale, new_page, own_style
 
 if TYPE_CHECKING:
     import xarray
@@ -120,8 +120,6 @@ def _draw_frames(
     limits: tuple[float, float],
 ) -> Iterator[NDArray[np.uint8]]:
     """Redraw a figure with the values and the name of each shot."""
-    from matplotlib import rc_context
-
     grid = choose_grid(shape, 1, title=False)
     lines = textwrap.wrap(label, max(12, int(grid.height / _LETTER_WIDTH_IN)))
     grid = replace(grid, right_margin=grid.right_margin + _LINE_HEIGHT_IN * (len(lines) - 1))
@@ -132,7 +130,7 @@ def _draw_frames(
     for plane, name in planes:
         panel.hatch_gaps(plane)
         panel.axes.images[0].set_data(plane)
-        with rc_context(STYLE):
+        with own_style():
             panel.axes.set_title(name)
             figure.set_dpi(_DOTS_PER_INCH)
             canvas.draw()

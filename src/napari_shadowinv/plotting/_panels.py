@@ -29,7 +29,7 @@ LINE_IN = 0.18  # of a header or footer
 
 
 ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR = "#b00020", "#1b6e3c", "0.3"
-STYLE: Any = {
+_STYLE: Any = {
     "font.family": ["DejaVu Sans"],
     "font.size": 9.0,
     "axes.titlesize": 10.5,
@@ -135,13 +135,23 @@ def panel_size(shape: Sequence[int]) -> tuple[float, float]:
 
 
 @contextmanager
+def own_style() -> Iterator[None]:
+    """Draw, or save, in the style of all pages, whatever the user's matplotlibrc says."""
+    from matplotlib import rc_context, rcdefaults, rcParams
+
+    with rc_context():
+        rcdefaults()
+        rcParams.update(_STYLE)
+        yield
+
+
+@contextmanager
 def styled_figure(size: tuple[float, float], **layout: Any) -> Iterator[Figure]:
     """Yield an empty figure with an Agg canvas, to be drawn in the style of all pages."""
-    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    with rc_context(STYLE):
+    with own_style():
         figure = Figure(figsize=size, **layout)
         FigureCanvasAgg(figure)
         yield figure

@@ -159,6 +159,6 @@ def save_figure(path: str | Path, figure: Figure, overwrite: bool = False) -> Pa
     Returns the path. A `FileFormatError` if the file exists and `overwrite` does not allow to
     replace it, or its folder cannot be written.
     """
-    with replacing(path, overwrite) as temporary:
+    with replacing(path, overwrite) as temporary, _panels.own_style():
         figure.savefig(temporary, dpi=DOTS_PER_INCH)
     return Path(path)

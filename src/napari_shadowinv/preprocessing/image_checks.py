@@ -295,12 +295,12 @@ def _is_dark_region(
     ring = usable[around] & (distance > least) & (distance <= most)
     if not ring.any():
         return False
-    at_edge = [float(np.median(light[around][ring])) for light in lights]
+    at_edge = float(np.median(lights[0][around][ring]))
     if len(lights) > 1:
-        return min(at_edge) > _LIT
+        return at_edge > _LIT
     # Shorter than the image's sides, it could be the object's.
     is_rim = region[1:-1, 1:-1].sum() < region.sum() >= min(region.shape)
-    return _LIT < at_edge[0] < _MAX_PILE and bool(is_rim)
+    return _LIT < at_edge < _MAX_PILE and bool(is_rim)
 
 
 def image_warnings(
