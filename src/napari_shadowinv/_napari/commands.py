@@ -17,6 +17,7 @@ from napari_shadowinv._napari import layers as results
 from napari_shadowinv._napari import viewer_sync
 from napari_shadowinv._napari.events import without_proxy
 from napari_shadowinv._napari.layer_metadata import Frame, frame_of, main_layers
+from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.preferences import use_preferred_threads
 from napari_shadowinv._napari.shots import radiograph_of, shot_layer
 from napari_shadowinv._system.progress import ShouldStop
@@ -248,7 +249,8 @@ def _source_for(selection: _Selection, layer: Any, viewer: Any) -> tuple[FloatAr
     sources = [each for each in fitting if about.role_of(each) == about.SOURCE]
     for candidates in (selected, sources):
         if len(candidates) == 1:
-            return np.asarray(candidates[0].data, dtype=np.float64), candidates[0].name
+            beam = source_on(candidates[0], candidates[0].data, layer)
+            return np.asarray(beam, dtype=np.float64), candidates[0].name
     supplied = about.source_of(layer)
     if supplied is None:
         raise InputError(

@@ -15,6 +15,7 @@ from napari_shadowinv import io
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import Frame, frame_for, metadata_for, metadata_of
 from napari_shadowinv._napari.layers import FullLayerData, LayerData
+from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import show_caution
 from napari_shadowinv._typing import FloatArray
@@ -112,14 +113,23 @@ def radiograph_of(layer: Any, image: Any, plane: int | None = None) -> Radiograp
 
 
 def source_of_shot(
-    layer: Any, image: Any, shot: Radiograph, plane: int | None = None
+    layer: Any, data: Any, image: Any, *, plane: int | None = None, of: int | None = None
 ) -> Radiograph:
-    """Return a layer's image as the source of a shot, without the file of another shot."""
-    beam = radiograph_of(layer, image, plane)
-    if about.role_of(layer) != about.SOURCE or beam.path == shot.path:
+    """Return a layer's data as the source of an image layer, or of files (None).
+
+    `plane` is the image's in its stack, `of` the source's. A file of another shot, or of more
+    pixels than the image has, is not the source's.
+    """
+    beam = radiograph_of(layer, data, of)
+    if image is None:
         return beam
-    # It came with another shot, whose file contains more than the source.
-    return replace(beam, path=None, metadata={})
+    on_image = source_on(layer, data, image)
+    is_whole = tuple(on_image.shape) == tuple(data.shape)
+    with_shot = radiograph_of(image, image.data, plane).path
+    is_own_file = about.role_of(layer) != about.SOURCE or beam.path == with_shot
+    if is_whole and is_own_file:
+        return beam
+    return replace(beam, image=on_image, path=None, metadata={})
 
 
 def load_radiograph(shot: Radiograph, name: str) -> Radiograph:

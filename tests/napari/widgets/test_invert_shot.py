@@ -415,9 +415,9 @@ def test_a_mistake_is_told_once_and_the_viewer_lives(
     tool.image.layer = window.layers["shot"]
     tool.source.set_kind("layer")
     tool.source.layers.layer = window.layers["small"]
-    expect("ource has shape (9, 9), image (20, 20)")
+    expect("9 × 9 px, the image 'shot' 20 × 20 px: they must match")
     tool.masks.layer = window.layers["labels"]
-    expect("he mask 'labels' has shape (9, 9)")
+    expect("he mask 'labels' has 9 × 9 px")
     tool.masks.layer = None
     tool.source.set_kind("file")
     expect("o source file")

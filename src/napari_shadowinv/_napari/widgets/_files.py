@@ -256,7 +256,7 @@ class FitRecipeButton(RecipeButton):
                 f"'{source.layer.name}' has a source for each image, but a recipe has one source "
                 "for all: choose one plane (right click on the layer → Split Stack)"
             )
-        return source.measured_for_each([Radiograph(image.data)])[0]
+        return source.measured_for_each([(image, None)])[0]
 
 
 def _refuse_estimates(recipe: Recipe, path: Path) -> None:

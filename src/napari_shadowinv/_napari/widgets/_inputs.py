@@ -330,43 +330,41 @@ class SourcePicker(forms.ModelPicker):
             self.set_kind(FILE)
             self.changed.emit()
 
-    def measured(self, image_layer: Any) -> preprocessing.Radiograph | None:
+    def measured(self, image: Any) -> preprocessing.Radiograph | None:
         """Return the measured source of an image layer; None for estimates and files."""
         if self.kind == LAYER:
             layer = self._selected_layer()
             data = layers.image_of(layer, "source image")
-            shot = preprocessing.Radiograph(data)
-            if image_layer is not None:
-                shot = radiograph_of(image_layer, image_layer.data)
-            return replace(source_of_shot(layer, data, shot), warnings=layers.warnings_of(layer))
+            beam = source_of_shot(layer, data, image)
+            return replace(beam, warnings=layers.warnings_of(layer))
         if not self.is_supplied:
             return None
-        supplied = about.source_of(image_layer)
+        supplied = about.source_of(image)
         if supplied is None:
             raise InputError(
-                f"no source was supplied with '{image_layer.name}': choose another kind of source"
+                f"no source was supplied with '{image.name}': choose another kind of source"
             )
-        return radiograph_of(image_layer, supplied)
+        return radiograph_of(image, supplied)
 
     def measured_for_each(
-        self, shots: Sequence[preprocessing.Radiograph]
+        self, images: Sequence[tuple[Any, int | None]]
     ) -> list[preprocessing.Radiograph | None]:
-        """Return the measured sources of the images of a fit; None for another kind of source."""
+        """Return the measured sources of a fit's images, each a layer and its plane; or None."""
         if self.kind != LAYER:
-            return [None] * len(shots)
+            return [None] * len(images)
         layer = self._selected_layer()
         if layer.ndim != 3:
-            image = layers.image_of(layer, "source")
-            return [source_of_shot(layer, image, shot) for shot in shots]
+            beam = layers.image_of(layer, "source")
+            return [source_of_shot(layer, beam, image, plane=plane) for image, plane in images]
         planes = layers.stack_of(layer)
-        if len(planes) != len(shots):
+        if len(planes) != len(images):
             raise InputError(
-                f"'{layer.name}' has {len(planes)} sources for {len(shots)} images: expected one "
+                f"'{layer.name}' has {len(planes)} sources for {len(images)} images: expected one "
                 "source for each image, or one for all"
             )
         return [
-            source_of_shot(layer, plane, shot, k)
-            for k, (plane, shot) in enumerate(zip(planes, shots, strict=True))
+            source_of_shot(layer, beam, image, plane=plane, of=k)
+            for k, (beam, (image, plane)) in enumerate(zip(planes, images, strict=True))
         ]
 
     def _selected_layer(self) -> Any:

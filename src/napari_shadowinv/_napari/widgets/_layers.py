@@ -12,6 +12,7 @@ from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QCheckBox, QWidget
 
 from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.placement import labels_on, mapped, matrix_between
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._forms import labelled
@@ -102,24 +103,35 @@ def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> BoolArr
     """Return the usable pixels of an image (None for files) by labels or shapes; None for all."""
     if layer is None:
         return None
-    shape = None if image is None else tuple(_grey(image, "image").shape[-2:])
-    if kind_of(layer) == "labels":
-        painted = np.asarray(layer.data) != 0
-        if shape is not None and painted.shape != shape:
-            raise InputError(
-                f"the mask '{layer.name}' has shape {painted.shape}, the image {shape}: they "
-                "must match; create new labels while the image is the only layer"
-            )
+    if image is not None:
+        _grey(image, "image")
+    is_of_labels = kind_of(layer) == "labels"
+    if is_of_labels and layer.ndim != 2:
+        raise InputError(
+            f"the mask '{layer.name}' has shape {tuple(layer.data.shape)}, expected one plane "
+            "(y, x): press ✎ to paint labels of the image's size"
+        )
+    if is_of_labels:
+        is_drawn = bool(np.any(layer.data))
+        painted = np.asarray(layer.data) != 0 if image is None else labels_on(layer, image)
     else:
-        assert shape is not None
-        painted = np.zeros(shape, bool)
-        if len(layer.data):
-            corners = _corners_in_pixels(layer, image)
-            on_pixels = Shapes(corners, shape_type=list(layer.shape_type))
-            painted = on_pixels.to_masks(mask_shape=shape).astype(np.bool_).any(axis=0)
-    if not painted.any():
+        is_drawn, painted = bool(len(layer.data)), _pixels_in_shapes(layer, image)
+    if not is_drawn:
         return None
+    if not painted.any():
+        raise InputError(
+            f"the mask '{layer.name}' lies beside the image '{image.name}': draw it on the image, "
+            "or move it there (layer controls → transform)"
+        )
     return ~painted if painted_is_unusable else painted
+
+
+def _pixels_in_shapes(layer: Any, image: Any) -> BoolArray:
+    shape = tuple(_data_of(image).shape[-2:])
+    if not len(layer.data):
+        return np.zeros(shape, np.bool_)
+    on_pixels = Shapes(_corners_in_pixels(layer, image), shape_type=list(layer.shape_type))
+    return on_pixels.to_masks(mask_shape=shape).astype(np.bool_).any(axis=0)
 
 
 def crop_of(layer: Any | None, image: Any) -> Crop | None:
@@ -139,10 +151,8 @@ def crop_of(layer: Any | None, image: Any) -> Crop | None:
 
 def _corners_in_pixels(layer: Any, image: Any) -> list[FloatArray]:
     """Return the corners of shapes in the pixels of an image, which may have another scale."""
-    return [
-        np.array([image.world_to_data(layer.data_to_world(corner))[-2:] for corner in shape])
-        for shape in layer.data
-    ]
+    matrix = matrix_between(layer, image)
+    return [mapped(matrix, shape) for shape in layer.data]
 
 
 def new_mask(viewer: Any, image: Any, title: str, painted: BoolArray | None = None) -> Any:

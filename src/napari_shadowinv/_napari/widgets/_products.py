@@ -13,6 +13,7 @@ from qtpy import QtWidgets
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layers import add_layers
+from napari_shadowinv._napari.placement import mapped, matrix_between
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _qt as qt
@@ -253,8 +254,8 @@ class ProductForm(QtWidgets.QWidget):
                 f"'{shapes.name}' has no shape for the {self.kind.title}, expected {expected}: "
                 "press ✎ and draw one"
             )
-        to_pixels = pixel_mapper(layer)
-        return shape_fields(shapes.shape_type[index], to_pixels(world_corners(shapes, index)))
+        corners = mapped(matrix_between(shapes, layer), shapes.data[index])
+        return shape_fields(shapes.shape_type[index], corners)
 
     def choose(self, layer: Any) -> None:
         """Select the result that a layer belongs to, or raise an `InputError`."""
@@ -389,11 +390,6 @@ def selected_shape(shapes: Any, suits: Callable[[str], bool]) -> int | None:
     return next(reversed(selected or suitable), None)
 
 
-def world_corners(shapes: Any, index: int) -> FloatArray:
-    """Return the corners (n, 2) of a shape in world coordinates."""
-    return np.array([shapes.data_to_world(corner)[-2:] for corner in shapes.data[index]])
-
-
 def shape_fields(shape_type: str, corners: FloatArray) -> dict[str, Any]:
     """Return the fields of a product for a shape of napari with corners (n, 2) in px.
 
@@ -409,17 +405,6 @@ def shape_fields(shape_type: str, corners: FloatArray) -> dict[str, Any]:
     angles = np.linspace(0, 2 * np.pi, _ELLIPSE_CORNERS, endpoint=False)[:, None]
     points = center + np.cos(angles) * axes[0] + np.sin(angles) * axes[1]
     return {"path": [tuple(map(float, point)) for point in points]}
-
-
-def pixel_mapper(layer: Any) -> Callable[[Any], Any]:
-    """Return the function from world points to a layer's pixels, which may be rotated."""
-    leading = np.zeros(layer.ndim - 2)
-    origin, next_row, next_column = (
-        np.asarray(layer.data_to_world((*leading, *pixel))[-2:])
-        for pixel in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
-    )
-    to_pixels = np.linalg.inv(np.stack([next_row - origin, next_column - origin], axis=1))
-    return lambda points: (points - origin) @ to_pixels.T
 
 
 def map_layer(measured: ProductResult, name: str, layer: Any) -> Any:

@@ -34,20 +34,27 @@ def result_frame(image: Any, recipe: Recipe) -> about.Frame:
 def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any]) -> bool:
     """Place an image and the layers on it with the setup's pixels; return whether it moved."""
     # napari warns about each layer while pixels and lengths are mixed.
-    old_frame = about.frame_of(image)
+    old = about.frame_of(image)
     same_size = [
         layer
         for layer in viewer.layers
-        if layer is not image
-        and kind_of(layer) in ("image", "labels")
+        if kind_of(layer) in ("image", "labels")
         and tuple(layer.data.shape[-2:]) == tuple(image.data.shape[-2:])
+        and about.frame_of(layer) == old
     ]
-    followers = [layer for layer in (*companions, *same_size) if about.frame_of(layer) == old_frame]
+    drawn = [layer for layer in companions if about.frame_of(layer).units == old.units]
     about.place_image(image, setup)
-    if about.frame_of(image) == old_frame:
+    new = about.frame_of(image)
+    if new == old:
         return False
-    for layer in followers:
-        layer.scale = (*layer.scale[:-2], *image.scale[-2:])
+    ratio = np.divide(new.scale, old.scale)
+    for layer in dict.fromkeys((*drawn, *same_size)):
+        if layer is image:
+            continue
+        frame = about.frame_of(layer)
+        shift = ratio * np.subtract(frame.translate, old.translate)
+        layer.translate = (*layer.translate[:-2], *(new.translate + shift))
+        layer.scale = (*layer.scale[:-2], *(ratio * frame.scale))
         layer.units = (*layer.units[:-2], *image.units[-2:])
     viewer.reset_view()
     return True

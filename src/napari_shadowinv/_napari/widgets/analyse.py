@@ -10,6 +10,7 @@ from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, Qt
 
 from napari_shadowinv._napari.layer_metadata import role_of, unit_of
+from napari_shadowinv._napari.placement import pixel_mapper
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _products as products
 from napari_shadowinv._napari.widgets import _qt as qt
@@ -150,7 +151,7 @@ class Analyse(qt.Docked):
             line = products.selected_shape(shapes, lambda kind: kind in products.OPEN_SHAPES)
         self.profiles = []
         if line is not None and layers:
-            vertices = products.world_corners(shapes, line)
+            vertices = np.array([shapes.data_to_world(end)[-2:] for end in shapes.data[line]])
             step = min(float(np.min(np.abs(layer.scale[-2:]))) for layer in layers)
             _, self._distance = sample_path(vertices, step)
             self._unit = f"{layers[0].units[-1]:~P}"
@@ -162,7 +163,7 @@ class Analyse(qt.Docked):
                 Profile(
                     layer.name,
                     unit_of(layer),
-                    interpolate(shown_plane(layer, position), points, products.pixel_mapper(layer)),
+                    interpolate(shown_plane(layer, position), points, pixel_mapper(layer, shapes)),
                     averaging,
                 )
                 for layer in layers

@@ -234,7 +234,7 @@ class FitImages(ToolPanel):
     def _shots(self, rows: list[ImageRow], setup: Setup | None) -> tuple[FitShot, ...]:
         """Return the images, lazy if their layers are, with all their settings."""
         images = [radiograph_of(row.layer, row.data, row.plane) for row in rows]
-        sources = self.source.measured_for_each(images)
+        sources = self.source.measured_for_each([(row.layer, row.plane) for row in rows])
         factors = self._known_brightness(rows)
         return tuple(
             FitShot(

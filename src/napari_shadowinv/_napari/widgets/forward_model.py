@@ -13,6 +13,7 @@ from qtpy.QtWidgets import QLabel, QSpinBox
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
 from napari_shadowinv._napari.layers import LayerData
+from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets import _forms as forms
@@ -298,6 +299,8 @@ class ForwardModel(ObjectPanel):
         if self.object.kind == LAYER:
             layer: Any = self.potential.layer
             field = input_field(layer, self.viewer.dims.point, setup)
+            if source is not None:
+                common["source"] = source_on(self.source.layer, source, layer)
             return ForwardJob(
                 field.values,
                 to_px2=field.to_px2,

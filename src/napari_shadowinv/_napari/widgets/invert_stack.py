@@ -14,6 +14,7 @@ from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QCheckBox, QFileDialog, QHeaderView, QLabel, QLineEdit, QSpinBox
 
 from napari_shadowinv._napari.layer_metadata import main_layers, may_be_shot, role_of
+from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.stores import follow_shots, shot_rows
 from napari_shadowinv._napari.widgets import _stack_jobs as stack_jobs
 from napari_shadowinv._napari.widgets._files import result_buttons, shot_to_save
@@ -284,7 +285,8 @@ class InvertStack(InversionInputs, ToolPanel):
         # A stack of sources has one for each shot.
         layer_of_source = self.source.layer
         if layer_of_source is not None and layer_of_source.ndim == 3:
-            return stack_of(layer_of_source)
+            beams = stack_of(layer_of_source)
+            return beams if layer is None else source_on(layer_of_source, beams, layer)  # type: ignore[no-any-return]
         beam = self.source.measured(layer)
         return None if beam is None else beam.image
 
