@@ -375,7 +375,7 @@ def preferences_window() -> None:
     viewer = new_window("preferences")
     dialog = PreferencesDialog(viewer.window._qt_window)
     rows = [dialog._list.item(row).text() for row in range(dialog._list.count())]
-    dialog._list.setCurrentRow(rows.index("Shadowgrams and proton radiographs"))
+    dialog._list.setCurrentRow(rows.index("Shadowinv"))
     dialog.resize(1065, 620)
     dialog.show()
     settle(2.0)

@@ -161,7 +161,7 @@ def test_the_dialog_of_napari_shows_and_keeps_the_preferences(
     dialog = PreferencesDialog(window.window._qt_window)
     qtbot.addWidget(dialog)
     pages = {dialog._list.item(row).text(): row for row in range(dialog._list.count())}
-    dialog._list.setCurrentRow(pages["Shadowgrams and proton radiographs"])
+    dialog._list.setCurrentRow(pages["Shadowinv"])
     page = dialog._stack.currentWidget()
     choices = [
         box

@@ -23,7 +23,7 @@ from napari_shadowinv.io.store import DONE
 from simulated_pack import Truth
 
 PAGES = Path(__file__).parents[3] / "docs" / "tutorials"
-PLUGIN = "Shadowgrams and proton radiographs"
+PLUGIN = "Shadowinv"
 PATIENCE_MS = 300_000
 
 

@@ -81,8 +81,8 @@ def _grey(layer: Any | None, role: str) -> Any:
     if getattr(layer, "rgb", False):
         raise InputError(
             f"'{layer.name}' is a colour image, expected a greyscale one: if it is a scan of "
-            "film, which darkens with dose, convert it to dose first (Plugins → Film pack); if it "
-            "is linear in fluence, split it (right click on the layer → Split RGB) and choose one "
+            "film, which darkens with dose, convert it to dose first (Plugins → Shadowinv → Film "
+            "pack); if it is linear in fluence, split it (right click on the layer → Split RGB) and choose one "
             "channel"
         )
     return _data_of(layer)

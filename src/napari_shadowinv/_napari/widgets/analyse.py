@@ -150,7 +150,7 @@ class Analyse(qt.Docked):
         if shapes is not None:
             line = products.selected_shape(shapes, lambda kind: kind in products.OPEN_SHAPES)
         self.profiles = []
-        if line is not None and layers:
+        if shapes is not None and line is not None and layers:
             vertices = np.array([shapes.data_to_world(end)[-2:] for end in shapes.data[line]])
             step = min(float(np.min(np.abs(layer.scale[-2:]))) for layer in layers)
             _, self._distance = sample_path(vertices, step)

@@ -187,9 +187,9 @@ def input_field(layer: Any | None, point: Any, setup: Any) -> InputField:
     """
     if layer is None:
         raise InputError(
-            "there is no potential or result to start from: invert a shot (Plugins → Invert "
-            "shot), open a .shadowinv file or an image of a potential in px² (File → Open), or "
-            "select a simulated object"
+            "there is no potential or result to start from: invert a shot (Plugins → Shadowinv → "
+            "Invert shot), open a .shadowinv file or an image of a potential in px² (File → Open), "
+            "or select a simulated object"
         )
     result = about.result_of(layer)
     is_masked = about.role_of(layer) == "potential" and bool(np.isnan(layer.data).any())

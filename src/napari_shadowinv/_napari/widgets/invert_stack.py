@@ -286,7 +286,7 @@ class InvertStack(InversionInputs, ToolPanel):
         layer_of_source = self.source.layer
         if layer_of_source is not None and layer_of_source.ndim == 3:
             beams = stack_of(layer_of_source)
-            return beams if layer is None else source_on(layer_of_source, beams, layer)  # type: ignore[no-any-return]
+            return beams if layer is None else source_on(layer_of_source, beams, layer)
         beam = self.source.measured(layer)
         return None if beam is None else beam.image
 
