@@ -183,8 +183,30 @@ def test_a_setup_from_a_toml_file_says_so(
     tool = opened(InvertShot)
     tool.setup.files.load_button.click()
     assert tool.setup.setup() == proton_setup
+    assert tool.setup.note.text() == "Loaded from tcc.toml."
+    assert setup_of(plain) is None
+    tool.request()
     assert tool.setup.note.text() == "Loaded from tcc.toml for 'plain'."
     assert setup_origin_of(plain) == "loaded from tcc.toml for 'plain'"
+
+
+def test_a_loaded_setup_goes_with_the_image_until_run(
+    viewer: ViewerModel, opened: Any, plain: Any, proton_setup: ProtonSetup
+) -> None:
+    tool = opened(InvertShot)
+    tool.image.layer = plain
+    tool.setup.load(proton_setup.model_dump(exclude_none=True), "tcc.toml")
+    tool.setup.picker.form.editors["energy"].set_value(5.0)
+    other = viewer.add_image(np.ones((20, 30)), name="other")
+    tool.image.layer = other
+    assert tool.setup.setup().energy == 5.0
+    tool.request()
+    assert setup_of(plain) is None
+    assert setup_of(other).energy == 5.0
+    assert setup_origin_of(other) == "loaded from tcc.toml, changed by hand for 'other'"
+    # From then on it is the setup of this image only.
+    tool.image.layer = plain
+    assert tool.setup.setup() is None
 
 
 def test_other_files_do_not_inherit_a_setup(viewer: ViewerModel, opened: Any) -> None:

@@ -18,9 +18,9 @@ from napari_shadowinv._napari.preferences import preference
 from napari_shadowinv._napari.shots import radiograph_of, source_of_shot
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
+from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox, format_number
 from napari_shadowinv._napari.widgets._files import RecipeButton
-from napari_shadowinv._napari.widgets._qt import column
 from napari_shadowinv._napari.widgets._results import describe_inputs
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv._typing import BoolArray
@@ -69,12 +69,16 @@ class _Entry:
 
 
 class SetupPicker(QWidget):
-    """A setup, stored with its image; the user's setups are offered to the next image."""
+    """A setup, stored with its image; the user's setups are offered to the next image.
+
+    With `until_run`, a loaded setup goes with whatever image is chosen until `keep` is called.
+    """
 
     changed = Signal()
 
-    def __init__(self) -> None:
+    def __init__(self, *, until_run: bool = False) -> None:
         super().__init__()
+        self._until_run, self._is_loaded = until_run, False
         self._layer: Any = None
         self._name, self._stores = "", True
         self._last = _NONE  # the kind that the user chose last
@@ -89,7 +93,7 @@ class SetupPicker(QWidget):
         self.warning_label = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
         self.note = forms.WrappingLabel()
         self.files = forms.TomlButtons("setup", self._to_save, self.load)
-        column(self, self.picker, self.geometry_label, self.warning_label, self.note, self.files)
+        qt.column(self, self.picker, self.geometry_label, self.warning_label, self.note, self.files)
         self._state = self.picker.state()
         self.picker.changed.connect(self._on_edit)
 
@@ -136,6 +140,10 @@ class SetupPicker(QWidget):
         # The setup may be typed before the files are chosen.
         is_typed_before = layer is None and self._layer is None and not self._name
         self._layer, self._name, self._stores = layer, name, store
+        if self._is_loaded:
+            self._show_notes()
+            self.changed.emit()
+            return
         setup = None if layer is None else about.setup_of(layer)
         if setup is not None:
             self.suggest(setup, about.setup_origin_of(layer) or f"{about.CAME_WITH} '{layer.name}'")
@@ -160,10 +168,20 @@ class SetupPicker(QWidget):
         kind = str(values["kind"])
         entry = _Entry(dict(values), origin or self._typed_origin())
         self._last = kind
+        self._is_loaded = bool(origin) and self._until_run
         self._show(kind, entry)
         self._remember(kind, entry)
         self._store_with_image()
         self.changed.emit()
+
+    def keep(self) -> None:
+        """Store a loaded setup with the image that is chosen now."""
+        if self._is_loaded:
+            self._is_loaded, kind = False, self.picker.kind
+            origin = self.origin + self._typed_origin().removeprefix("typed")
+            self._remember(kind, _Entry(self.picker.state()["values"][kind], origin))
+            self._show_notes()
+            self._store_with_image()
 
     def _show_default(self) -> None:
         """Show the setup of images without one of their own: none, or the user's last."""
@@ -190,6 +208,7 @@ class SetupPicker(QWidget):
             else:
                 origin = old_entry.origin.removesuffix(_CHANGED) + _CHANGED
             self._remember(kind, _Entry(values, origin))
+        self._is_loaded &= kind == before["kind"]
         self._last = kind
         self._show_notes()
         self._store_with_image()
@@ -202,7 +221,7 @@ class SetupPicker(QWidget):
             self._entered[kind] = entry
 
     def _store_with_image(self) -> None:
-        if self._layer is None or not self._stores:
+        if self._layer is None or not self._stores or self._is_loaded:
             return
         try:
             setup = self.setup()
@@ -238,7 +257,7 @@ class SetupPicker(QWidget):
 
     def load(self, entries: dict[str, Any], path: str) -> None:
         values = setup_from_dict(entries, path).model_dump()
-        owner = self._typed_origin().removeprefix("typed")
+        owner = "" if self._until_run else self._typed_origin().removeprefix("typed")
         self.show_setup(values, f"loaded from {Path(path).name}{owner}")
 
 
@@ -247,7 +266,8 @@ class SourcePicker(forms.ModelPicker):
 
     def __init__(self, viewer: Any, kinds: Sequence[str], tip: str) -> None:
         self._image: Any = None
-        self._kind_before_supplied = UNIFORM
+        self._own_kind = UNIFORM  # without a source that came with the image or is likely
+        self.is_chosen, self._is_guessed = False, False
         self._recipe_source = preprocessing.MeasuredSource()
         layer_tip = "Image layer of the undisturbed beam."
         if UNKNOWN in kinds:
@@ -260,6 +280,9 @@ class SourcePicker(forms.ModelPicker):
         super().__init__("Source", described, tip)
         self.layers.picked.connect(self.changed)
         self.file.changed.connect(self.changed)
+        for box in (self.choice, self.layers):
+            box.activated.connect(self._choose)
+        qt.while_alive(self, viewer.layers, ("inserted", "removed"), self._guess)
 
     @property
     def layer(self) -> Any | None:
@@ -385,40 +408,59 @@ class SourcePicker(forms.ModelPicker):
     def state(self) -> dict[str, Any]:
         """Return the choice without layers and files, which belong to a session."""
         state = super().state()
-        kind = self._kind_before_supplied if state["kind"] == SUPPLIED else state["kind"]
+        kind = self._own_kind if self.is_supplied or self._is_guessed else state["kind"]
         return {**state, "kind": UNIFORM if kind in (LAYER, FILE) else kind}
 
+    def restore(self, state: Mapping[str, Any]) -> None:
+        super().restore(state)
+        self.is_chosen = self.kind != UNIFORM
+
+    def set_kind(self, kind: str) -> None:
+        self._choose()
+        super().set_kind(kind)
+
+    def _choose(self, _: int = 0) -> None:
+        self.is_chosen, self._is_guessed = True, False
+
     def follow(self, image_layer: Any) -> None:
-        """Select the source supplied with an image; without one, deselect the last image's."""
+        """Select the source supplied with an image, or a likely one; else the last one."""
         self._image = image_layer
         self.layers.fill()
         if image_layer is not None and about.source_of(image_layer) is not None:
-            if not self.is_supplied:
-                self._kind_before_supplied = self.kind
-            self.set_kind(SUPPLIED)
+            self._set_aside(SUPPLIED)
         elif self.is_supplied:
-            self.set_kind(self._kind_before_supplied)
+            super().set_kind(self._own_kind)
+        self._guess()
+
+    def _guess(self, _: Any = None) -> None:
+        """Select the only likely beam of the image, unless the user has chosen a source."""
+        if self.is_chosen or self.is_supplied:
+            return
+        image = self._image
+        beam = None if image is None else layers.likely_beam(image, self.layers.offered)
+        if beam is not None:
+            self.layers.layer = beam
+            self._set_aside(LAYER)
+        elif self._is_guessed:
+            super().set_kind(self._own_kind)
+        self._is_guessed = beam is not None
+
+    def _set_aside(self, kind: str) -> None:
+        """Select a kind for this image only."""
+        if not (self.is_supplied or self._is_guessed):
+            self._own_kind = self.kind
+        super().set_kind(kind)
+        self._is_guessed = False
 
     def _offers(self, layer: Any) -> bool:
         # An image cannot be its own source.
         return layer != self._image and about.may_be_source(layer)
 
     def _on_choice(self) -> None:
-        if self.kind == LAYER and self.layers.layer is None:
-            self.layers.layer = self._only_source()
+        if self.kind == LAYER and self.layers.layer is None and self._image is not None:
+            offered = self.layers.offered
+            self.layers.layer = layers.likely_beam(self._image, offered, estimates=True)
         super()._on_choice()
-
-    def _only_source(self) -> Any | None:
-        """Return the source layer that fits the image, if there is exactly one, outside results."""
-        shape = None if self._image is None else tuple(self._image.data.shape[-2:])
-        sources = [
-            layer
-            for layer in self.layers.offered
-            if about.role_of(layer) == about.SOURCE
-            and about.result_of(layer) is None
-            and tuple(layer.data.shape[-2:]) == shape
-        ]
-        return sources[0] if len(sources) == 1 else None
 
 
 class OptionsForm(forms.ModelForm):
@@ -491,7 +533,7 @@ class InversionInputs:
         self.source_masks = layers.MaskPicker(
             self.viewer, image, source_mask_tip, "Source mask", kinds
         )
-        self.setup = SetupPicker()
+        self.setup = SetupPicker(until_run=True)
         self.steps = forms.StepsSection()
         self.instrument = InstrumentForm()
         self.options = OptionsForm(InversionOptions, {"n_sites": PREVIEW_SITES})

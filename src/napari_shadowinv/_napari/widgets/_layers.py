@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -82,8 +83,8 @@ def _grey(layer: Any | None, role: str) -> Any:
         raise InputError(
             f"'{layer.name}' is a colour image, expected a greyscale one: if it is a scan of "
             "film, which darkens with dose, convert it to dose first (Plugins → Shadowinv → Film "
-            "pack); if it is linear in fluence, split it (right click on the layer → Split RGB) and choose one "
-            "channel"
+            "pack); if it is linear in fluence, split it (right click on the layer → Split RGB) "
+            "and choose one channel"
         )
     return _data_of(layer)
 
@@ -198,7 +199,7 @@ def _add_layer(viewer: Any, image: Any, kind: str, data: Any, title: str, **keyw
 
 
 _BLOCK_PX = 8
-_MIN_STRUCTURE_RATIO = 2.0
+_MIN_STRUCTURE_RATIO, _MIN_RATIO_OF_PAIR = 2.0, 1.2
 
 
 class LayerPicker(SteadyComboBox):
@@ -234,6 +235,13 @@ class LayerPicker(SteadyComboBox):
 
     @layer.setter
     def layer(self, layer: Any | None) -> None:
+        self._select(layer)
+
+    def _default(self) -> Any:
+        """Return the offered layer to begin with."""
+        return self.offered[-1]
+
+    def _select(self, layer: Any | None) -> None:
         if layer is None:
             self.setCurrentIndex(0 if self._none else -1)
         elif layer in self.offered:
@@ -255,9 +263,9 @@ class LayerPicker(SteadyComboBox):
             for layer in offered:
                 self.addItem(layer.name)
             if before in offered:
-                self.layer = before
+                self._select(before)
             elif not self._none and offered:
-                self.layer = offered[-1]
+                self._select(self._default())
         if self.layer is not before:
             self.picked.emit()
 
@@ -275,8 +283,8 @@ class LayerPicker(SteadyComboBox):
 class ShotPicker(LayerPicker):
     """A picker of the shot's layer.
 
-    Until the user selects a layer, it prefers images with structure: a reference that was opened
-    first is not the shot.
+    Until a layer is chosen, it is the image of an object rather than that of a beam, by names or
+    structure, whichever was opened first.
     """
 
     def __init__(self, viewer: Any) -> None:
@@ -285,26 +293,97 @@ class ShotPicker(LayerPicker):
         self.activated.connect(self._choose)
         qt.while_alive(self, viewer.layers, "inserted", self._on_insertion)
 
+    @property
+    def layer(self) -> Any | None:
+        return super().layer
+
+    @layer.setter
+    def layer(self, layer: Any | None) -> None:
+        self._choose()
+        self._select(layer)
+
     def _choose(self, _: int = 0) -> None:
         self.is_chosen = True
+
+    def _default(self) -> Any:
+        own = [layer for layer in self.offered if not about.belongs_to_result(layer)]
+        *earlier, best = own or self.offered
+        for layer in reversed(earlier):
+            if _is_rather_shot(layer, best, is_pair=len(own) == 2):
+                best = layer
+        return best
 
     def _on_insertion(self, new: Any) -> None:
         current = self.layer
         if self.is_chosen or current is None or new is current or new not in self.offered:
             return
-        if _structure(new) > _MIN_STRUCTURE_RATIO * _structure(current) > 0:
-            self.layer = new
+        own = [layer for layer in self.offered if not about.belongs_to_result(layer)]
+        if _is_rather_shot(new, current, is_pair=len(own) == 2):
+            self._select(new)
+
+
+# Whole words of a name: 'ref_3', 'shotBeam', but not 'refraction'.
+_BEAM_NAME = re.compile(
+    r"(?<![a-z])(ref|reference|beam|flat|flat.?field|source|bg|background|blank)s?(?![a-z])"
+)
+_DARK_NAME = re.compile(r"(?<![a-z])darks?(?![a-z])")
+
+
+def likely_beam(image: Any, offered: Sequence[Any], *, estimates: bool = False) -> Any | None:
+    """Return the only offered layer that may be an image's beam, by its size, name and structure.
+
+    Without a name, the beam is the smoother of two images, and much smoother if both are numbered
+    in one series.
+    """
+    fitting = [
+        layer
+        for layer in offered
+        if layer is not image
+        and not (about.belongs_to_result(layer) or layer.rgb)
+        and (estimates or not about.is_estimate(layer))
+        and layer.ndim == 2
+        and layer.data.shape == tuple(_data_of(image).shape[-2:])
+        and not _has_word(layer, _DARK_NAME)
+        # 'shot high-pass' is a filtered copy, while napari itself adds ' [1]'.
+        and (_is_beam(layer) or not re.match(rf"{re.escape(image.name)} [^\[]", layer.name))
+    ]
+    named = [layer for layer in fitting if _is_beam(layer)]
+    if len(named or fitting) != 1:
+        return None
+    (beam,) = named or fitting
+    is_of_series = re.sub(r"\d", "", beam.name) == re.sub(r"\d", "", image.name)
+    return beam if named or _is_rather_shot(image, beam, is_pair=not is_of_series) else None
+
+
+def _is_rather_shot(layer: Any, other: Any, *, is_pair: bool = False) -> bool:
+    """Whether of two images a layer is the one with an object; a pair may differ less."""
+    is_aside, other_is_aside = (
+        _is_beam(each) or _has_word(each, _DARK_NAME) for each in (layer, other)
+    )
+    if is_aside != other_is_aside:
+        return other_is_aside
+    is_pair &= layer.data.shape == other.data.shape
+    ratio = _MIN_RATIO_OF_PAIR if is_pair else _MIN_STRUCTURE_RATIO
+    return _structure(layer) > ratio * _structure(other)
+
+
+def _is_beam(layer: Any) -> bool:
+    return about.role_of(layer) == about.SOURCE or _has_word(layer, _BEAM_NAME)
+
+
+def _has_word(layer: Any, words: re.Pattern[str]) -> bool:
+    return bool(words.search(re.sub(r"(?<=[a-z])(?=[A-Z])", "_", layer.name).lower()))
 
 
 def _structure(layer: Any) -> float:
-    """Return the relative r.m.s. of structures between noise and the beam's shape; 0 if unknown."""
+    """Return the relative r.m.s. of structures between noise and the beam's shape; or NaN."""
     data = layer.data
     if not isinstance(data, np.ndarray) or data.ndim != 2 or min(data.shape) < 4 * _BLOCK_PX:
-        return 0.0
+        return np.nan
     means = complete_block_means(data, _BLOCK_PX)
     mean = means.mean()
     if not np.isfinite(mean) or mean <= 0:
-        return 0.0
+        return np.nan
     y, x = np.mgrid[-1 : 1 : means.shape[0] * 1j, -1 : 1 : means.shape[1] * 1j].reshape(2, -1)
     beam = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     smooth = beam @ np.linalg.lstsq(beam, means.ravel(), rcond=None)[0]

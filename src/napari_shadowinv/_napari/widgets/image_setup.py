@@ -24,7 +24,7 @@ class ImageSetup(qt.Docked):
             "Layer of an image, or of a stack of shots with a common setup.",
             suits=lambda layer: not about.belongs_to_result(layer),
         )
-        self.setup = SetupPicker()
+        self.setup = SetupPicker(until_run=True)
         self.status = forms.WrappingLabel()
         self.apply_button = qt.push_button(
             "Apply", "Store the setup with the image, and show the image at its scale.", self.apply
@@ -56,6 +56,7 @@ class ImageSetup(qt.Docked):
         if layer is None:
             raise InputError("there is no image: open one (File → Open), or a sample")
         setup = self.setup.setup()
+        self.setup.keep()
         about.store_setup(layer, setup, self.setup.origin)
         if setup is None:
             self.status.show_text(f"'{layer.name}' has no setup now", "")

@@ -142,6 +142,8 @@ class InvertShot(InversionInputs, panels.LivePanel):
     def request(self, preview: bool = False) -> jobs.InversionJob:
         layer: Any = self.image.layer
         image = layers.image_of(layer)
+        if not preview:
+            self.setup.keep()
         recipe = self.recipe()
         mask = self.masks.usable(layer)
         self.source.check(mask)

@@ -79,10 +79,16 @@ class StoreEdit(PathEdit):
         return path + STORE_SUFFIX
 
 
+class _StackPicker(LayerPicker):
+    def _default(self) -> Any:
+        stacks = [layer for layer in self.offered if layer.ndim == 3]
+        return (stacks or self.offered)[-1]
+
+
 class ShotsPicker(ModelPicker):
     def __init__(self, viewer: Any) -> None:
         tip = "Stack of images (shot, y, x); data on disk are read one shot at a time."
-        self.layers = LayerPicker(viewer, tip, suits=may_be_shot)
+        self.layers = _StackPicker(viewer, tip, suits=may_be_shot)
         tip = "A pattern such as shots/*.tif, files separated by ;, or a multi-page TIFF."
         self.files = _FilesEdit("Files of the shots", "shots/*.tif", tip)
         self.table = ShotTable()
@@ -257,6 +263,7 @@ class InvertStack(InversionInputs, ToolPanel):
 
     def request(self) -> stack_jobs.StackJob:
         layer = self.shots.layer
+        self.setup.keep()
         recipe = self.recipe()
         mask = self.masks.usable(layer)
         self.source.check(mask)

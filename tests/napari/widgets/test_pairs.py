@@ -1,0 +1,118 @@
+"""An image and its beam find their boxes, in whatever order they were opened."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from napari.components import ViewerModel
+
+from napari_shadowinv._napari.layer_metadata import metadata_for
+from napari_shadowinv._napari.widgets.invert_shot import EstimateSource, InvertShot
+from napari_shadowinv._napari.widgets.invert_stack import InvertStack
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import ellipse_pair
+
+SHAPE = (64, 72)
+NOISE = np.random.default_rng(4).normal(1, 0.01, (3, *SHAPE))
+OBJECT = synthetic_image(ellipse_pair(SHAPE).displacement) * NOISE[0]
+BEAM, LATER = NOISE[1:] * (1 + np.linspace(0, 0.3, SHAPE[1]))
+
+
+def boxes(tool: Any) -> tuple[str, str]:
+    source = tool.source.layer
+    return tool.image.layer.name, tool.source.kind if source is None else source.name
+
+
+@pytest.mark.parametrize("window_first", [True, False])
+@pytest.mark.parametrize("beam_first", [True, False])
+@pytest.mark.parametrize(
+    ("shot", "beam"),
+    [
+        ("tim_0034", "beam"), ("b", "a"), ("shot_012", "shot_013"), ("x-ray", "x-ray_ref"),
+        ("img12", "ReferenceImage"), ("Image", "Image [1]"), ("refraction", "BG_1"),
+        ("s7", "flat-field"), ("2026-05-01", "2026-05-01 blank"), ("p", "backgrounds"),
+    ],
+)  # fmt: skip
+def test_a_pair_fills_both_boxes(
+    viewer: ViewerModel, opened: Any, shot: str, beam: str, beam_first: bool, window_first: bool
+) -> None:
+    tool = opened(InvertShot) if window_first else None
+    images = {shot: OBJECT, beam: BEAM}
+    for name in (beam, shot) if beam_first else (shot, beam):
+        viewer.add_image(images[name], name=name)
+    assert boxes(tool or opened(InvertShot)) == (shot, beam)
+
+
+def test_a_name_counts_more_than_structure(viewer: ViewerModel, opened: Any) -> None:
+    """A beam through a mesh has more structure than a weak object."""
+    mesh = 1 + 0.5 * (np.indices(SHAPE).sum(axis=0) // 16 % 2)
+    for name, image in {"shot": BEAM, "ref": mesh, "dark": 0.01 * OBJECT}.items():
+        viewer.add_image(image, name=name)
+    assert boxes(opened(InvertShot)) == ("shot", "ref")
+    assert opened(EstimateSource).image.layer.name == "shot"
+
+
+@pytest.mark.parametrize(
+    "others",
+    [
+        {"shot_2": OBJECT[::-1]},  # two shots
+        {"shot high-pass": 0.5 + OBJECT / 2},  # a filtered copy
+        {"beam": BEAM[1:]},  # of another size
+        {"ref_1": BEAM, "ref_2": LATER},  # which of the two?
+        {"a": BEAM, "b": LATER},
+        {"dark": 0.01 * BEAM},
+    ],
+)
+def test_nothing_is_guessed_where_two_are_possible(
+    viewer: ViewerModel, opened: Any, others: dict[str, Any]
+) -> None:
+    for name, image in {**others, "shot": OBJECT}.items():
+        viewer.add_image(image, name=name)
+    assert boxes(opened(InvertShot)) == ("shot", "uniform")
+
+
+def test_a_choice_is_never_overruled(viewer: ViewerModel, opened: Any) -> None:
+    viewer.add_image(OBJECT, name="shot")
+    tool = opened(InvertShot)
+    tool.source.set_kind("polynomial")
+    viewer.add_image(BEAM, name="ref")
+    assert boxes(tool) == ("shot", "polynomial")
+
+    tool = opened(InvertShot)
+    tool.image.layer = viewer.layers["ref"]
+    viewer.add_image(OBJECT, name="shot 2")
+    assert tool.image.layer.name == "ref"
+
+
+def test_without_its_beam_an_image_has_the_source_from_before(
+    viewer: ViewerModel, opened: Any
+) -> None:
+    tool = opened(InvertShot)
+    viewer.add_image(OBJECT, name="shot")
+    beam = viewer.add_image(BEAM, name="ref")
+    assert boxes(tool) == ("shot", "ref")
+    assert tool.state()["source"]["kind"] == "uniform"
+    viewer.layers.remove(beam)
+    assert boxes(tool) == ("shot", "uniform")
+
+
+def test_an_estimate_is_not_taken_before_it_is_chosen(viewer: ViewerModel, opened: Any) -> None:
+    viewer.add_image(OBJECT, name="shot")
+    tool = opened(InvertShot)
+    made_from = {"estimate": "polynomial"}
+    estimate = viewer.add_image(
+        BEAM, name="shot source", metadata=metadata_for("source", "", made_from=made_from)
+    )
+    assert boxes(tool) == ("shot", "uniform")
+    tool.source.choice.setCurrentIndex(tool.source.choice.findData("layer"))
+    assert tool.source.layer is estimate
+
+
+def test_a_stack_is_taken_with_its_beam(viewer: ViewerModel, opened: Any) -> None:
+    viewer.add_image(np.stack([OBJECT, OBJECT]), name="run")
+    viewer.add_image(BEAM, name="reference")
+    tool = opened(InvertStack)
+    assert tool.shots.layer.name == "run"
+    assert tool.source.layer.name == "reference"
