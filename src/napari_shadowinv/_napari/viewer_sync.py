@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from napari_shadowinv._napari.events import connect, connect_layers, without_proxy
 from napari_shadowinv._napari.layer_metadata import Frame, frame_of, metadata_of, role_of
+from napari_shadowinv._system.validation import FieldError
 from napari_shadowinv.errors import InputError
 
 USER_ERRORS = (InputError, OSError, MemoryError)
@@ -56,7 +57,7 @@ def notify_errors(
 
 def error_text(error: BaseException) -> str:
     """Return the message of an error for the user; for a bug, its type and first line."""
-    text = str(error)
+    text = error.labelled if isinstance(error, FieldError) else str(error)
     if isinstance(error, MemoryError) and not text:
         text = "there is not enough memory for this"
     elif not isinstance(error, USER_ERRORS):

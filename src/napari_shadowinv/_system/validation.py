@@ -36,7 +36,38 @@ class _CheckedMeta(ModelMetaclass):
             try:
                 return super().__call__(*args, **values)
             except ValidationError as error:
-                raise InputError(_error_sentence(self, error, self.__name__, {})) from error
+                raise FieldError(self, error, self.__name__) from error
+
+
+class FieldError(InputError):
+    """Wrong values of a model's fields; a window calls these by their labels: `labelled`."""
+
+    def __init__(
+        self,
+        model_class: type[BaseModel],
+        error: ValidationError,
+        where: str,
+        names: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(_error_sentence(model_class, error, where, names or {}))
+        self._cause = model_class, error, where
+
+    def about(self, name: object) -> InputError:  # type: ignore[override]
+        return InputError(f"{name}: {self}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return InputError, self.args  # a worker's error is a sentence
+
+    @property
+    def labelled(self) -> str:
+        model_class, error, where = self._cause
+        return _error_sentence(model_class, error, where, labels_of(model_class))
+
+
+def labels_of(model_class: type[BaseModel]) -> dict[str, str]:
+    """Return the labels of a model's fields in quotes, by which windows call them."""
+    fields = model_class.model_fields
+    return {name: f"'{field.title}'" for name, field in fields.items() if field.title}
 
 
 class CombinationError(ValueError):
@@ -114,7 +145,7 @@ def validate(
     try:
         return model_class.model_validate(mapping)
     except ValidationError as error:
-        raise InputError(_error_sentence(model_class, error, where, names or {})) from error
+        raise FieldError(model_class, error, where, names) from error
 
 
 def map_paths(model: Model, move: Callable[[Path], Path]) -> Model:

@@ -66,7 +66,8 @@ _TILT_ERRORS = 4.0  # of three draws, below which an inclination is not signific
 _AZIMUTHAL = (
     "an azimuthal magnetic field is not visible from the side: its components across the beam "
     "cancel in each line of sight (∫B dz = 0), so it deflects nothing there; view it along its "
-    "axis (product 'azimuthal'), or choose the component 'axial' for the field of a coil"
+    "axis (azimuthal field along the beam), or choose the component of B 'axial' for the field of "
+    "a coil"
 )
 
 

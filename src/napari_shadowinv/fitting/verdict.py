@@ -183,8 +183,8 @@ def assess_verdict(
         return Verdict.UNCERTAIN, (
             f"the noise is {share} smaller than that of as many counts: a dark level of about "
             f"{share} seems to be left in the images, or the detector's response is not linear, "
-            "and either weakens the field; subtract the dark level from images and source by the "
-            "step 'dark', linearise the images, or, if the counts were averaged, scaled or "
+            "and either weakens the field; subtract the dark level from images and source, "
+            "linearise the images, or, if the counts were averaged, scaled or "
             "smoothed, give their noise"
         )
     best, *alternatives = fit.basins

@@ -428,7 +428,7 @@ def _deep_folds(jacobian: FloatArray, mask: BoolArray) -> str:
     return (
         "rays cross: folds look deeper than 10 % beyond the first caustic, where the field comes "
         "out too weak: 3–5 % off (L2) at 1.2 times the strength at which caustics begin, 9–14 % "
-        "at 1.5, 20–29 % at 2; see docs/trust.md"
+        "at 1.5, 20–29 % at 2"
     )
 
 
@@ -485,8 +485,7 @@ def _cut_off(
         return ""
     return (
         f"the field reaches the image's edge, which is closed: {how}, and truncating it there "
-        "distorts the field everywhere; try a free boundary, see docs/boundary.md, or record a "
-        "larger field of view"
+        "distorts the field everywhere; try a free boundary, or record a larger field of view"
     )
 
 
@@ -524,7 +523,7 @@ def _cut_by_edge(prepared: Prepared, noise: ImageNoise, beam_difference: float) 
                     f"the {side} edge of the image seems to cut the object: the image's contrast "
                     "is strong there and weak at the opposite edge, and what lies beyond is "
                     "missing, which makes the field wrong, by 7 to 73 % in tests; use a wider crop "
-                    "or field of view, or try a free boundary, see docs/boundary.md"
+                    "or field of view, or try a free boundary"
                 )
     return ""
 

@@ -339,7 +339,7 @@ def _warnings(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caut
             "dark-level",
             f"dark level: the noise of the image vanishes at {dark:.0%} of its mean instead of at "
             "zero, so the detector's dark level seems to be left in it: the field comes out too "
-            "weak, by this share or more; subtract it from image and source by the step 'dark'",
+            "weak, by this share or more; subtract it from image and source",
         )
     for name, plane in planes.items():
         if (share := plane.saturated) > 0:
@@ -354,7 +354,7 @@ def _warnings(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caut
                 "hot-pixels",
                 f"hot pixels: {count} pixel{'s' * (count > 1)} of the {name} differ"
                 f"{'s' * (count == 1)} from all neighbours by far more than the noise, and each "
-                "bends the field around it; replace them by the step 'hot-pixels'",
+                "bends the field around it; remove the hot pixels",
             )
     if source is None:
         return
@@ -379,7 +379,7 @@ def _warnings(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caut
             "register",
             f"register: at its borders the image lies {down:+.0f} px in y and {right:+.0f} px in x "
             "from the source: the shift would be taken for a field; "
-            "align source and image, or cut both to the same part of the beam (step 'crop')",
+            "align source and image, or crop both to the same part of the beam",
         )
 
 

@@ -17,7 +17,7 @@ from superqt import QCollapsible
 
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._editors import Editor, SteadyComboBox, editor_for
-from napari_shadowinv._system.validation import validate
+from napari_shadowinv._system.validation import labels_of, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import read_toml, replacing
 from napari_shadowinv.physics.beam import unit_in_title
@@ -225,12 +225,6 @@ class ModelForm(QtWidgets.QWidget):
                 unchecked.set_value(None)
 
 
-def labels_of(model_class: type[BaseModel]) -> dict[str, str]:
-    """Return the labels of a model's fields in quotes, by which errors call them."""
-    fields = model_class.model_fields
-    return {name: f"'{field.title}'" for name, field in fields.items() if field.title}
-
-
 def kinds_of(models: Mapping[str, Any]) -> Kinds:
     """Return the kinds of a `ModelPicker` from model classes with titles."""
     return {name: (model.title, model) for name, model in models.items()}
@@ -402,7 +396,8 @@ class StepsSection(QWidget):
         self._list = QWidget()
         qt.column(self._list)
         self.folded = titled_section(self._list, labelled("", self.choice))
-        qt.column(self, self.folded)
+        self._earlier = WrappingLabel(style=PROBLEM_STYLE)
+        qt.column(self, self.folded, self._earlier)
         self.choice.activated.connect(self._on_choice)
         self._on_change()
 
@@ -423,13 +418,20 @@ class StepsSection(QWidget):
 
     def show_steps(self, steps: Sequence[Step]) -> None:
         """Replace the steps by others, folded."""
-        self.restore([step.model_dump() for step in steps])
+        self._show([step.model_dump() for step in steps])
 
     def state(self) -> list[dict[str, Any]]:
         return [form.form.values() for form in self.forms]
 
     def restore(self, state: Any) -> None:
-        """Show the steps of a saved state; ignore unknown steps."""
+        """Show the steps of a saved state, and say that they are of an earlier image."""
+        self._show(state)
+        names = ", ".join(form.kind.title for form in self.forms)
+        text = f"Kept from an earlier image: {names}. Remove what does not suit this one."
+        self._earlier.show_text(text if names else "")
+
+    def _show(self, state: Any) -> None:
+        """Show steps from their values; ignore unknown steps."""
         with QSignalBlocker(self):
             for form in list(self.forms):
                 self._move(form, None)
@@ -459,6 +461,7 @@ class StepsSection(QWidget):
         self._on_change()
 
     def _on_change(self) -> None:
+        self._earlier.show_text("")
         # A folded section must show that there are steps.
         names = ", ".join(form.kind.title for form in self.forms)
         title = f"Steps: {names or 'none'}"

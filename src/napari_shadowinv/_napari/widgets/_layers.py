@@ -198,7 +198,7 @@ def _add_layer(viewer: Any, image: Any, kind: str, data: Any, title: str, **keyw
     return layer
 
 
-_BLOCK_PX = 8
+BLOCK_PX = 8
 _MIN_STRUCTURE_RATIO, _MIN_RATIO_OF_PAIR = 2.0, 1.2
 
 
@@ -377,17 +377,22 @@ def _has_word(layer: Any, words: re.Pattern[str]) -> bool:
 
 def _structure(layer: Any) -> float:
     """Return the relative r.m.s. of structures between noise and the beam's shape; or NaN."""
-    data = layer.data
-    if not isinstance(data, np.ndarray) or data.ndim != 2 or min(data.shape) < 4 * _BLOCK_PX:
-        return np.nan
-    means = complete_block_means(data, _BLOCK_PX)
+    pattern = block_pattern(layer.data)
+    return np.nan if pattern is None else float(np.std(pattern))
+
+
+def block_pattern(data: Any) -> FloatArray | None:
+    """Return an image's relative means of blocks without its smooth beam; None if unknown."""
+    if not isinstance(data, np.ndarray) or data.ndim != 2 or min(data.shape) < 4 * BLOCK_PX:
+        return None
+    means = complete_block_means(data, BLOCK_PX)
     mean = means.mean()
     if not np.isfinite(mean) or mean <= 0:
-        return np.nan
+        return None
     y, x = np.mgrid[-1 : 1 : means.shape[0] * 1j, -1 : 1 : means.shape[1] * 1j].reshape(2, -1)
     beam = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     smooth = beam @ np.linalg.lstsq(beam, means.ravel(), rcond=None)[0]
-    return float(np.std(means.ravel() - smooth) / mean)
+    return (means - smooth.reshape(means.shape)) / mean
 
 
 # By the mask's title: the meaning of painted pixels, and its tooltip.

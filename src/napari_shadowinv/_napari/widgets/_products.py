@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from napari.utils.notifications import show_info
@@ -34,6 +34,7 @@ from napari_shadowinv.analysis import (
     product_from_dict,
     products_table,
 )
+from napari_shadowinv.analysis.axisymmetric import AxisymmetricProfile
 from napari_shadowinv.analysis.outlines import Outlined
 from napari_shadowinv.analysis.product import BANDS
 from napari_shadowinv.analysis.series import shot_times
@@ -130,6 +131,10 @@ class ProductForm(QtWidgets.QWidget):
         self.unit = SteadyComboBox(tip="Unit of the field, which chooses the field, too.")
         tip = "<qt>Width of the strip across a profile's line, in px.</qt>"
         self.width_edit = QtWidgets.QDoubleSpinBox(maximum=1e4, toolTip=tip)
+        component = AxisymmetricProfile.model_fields["component"]
+        titles = {name: name for name in get_args(component.annotation)}
+        self.component = SteadyComboBox(titles, str(component.description))
+        self._component_row = forms.labelled(str(component.title), self.component)
         tip = "<qt>Number of samples of the field for the bands.</qt>"
         self.samples = QtWidgets.QSpinBox(minimum=20, maximum=2000, value=100, toolTip=tip)
         self.times = forms.LineEdit(
@@ -164,6 +169,7 @@ class ProductForm(QtWidgets.QWidget):
             forms.labelled("Product", self.product),
             forms.labelled("Shape", shapes),
             forms.labelled("Unit", self.unit),
+            self._component_row,
             forms.labelled("Width, samples", numbers),
             self.panel,
             self.plot,
@@ -186,6 +192,7 @@ class ProductForm(QtWidgets.QWidget):
         is_drawn = "path" in self.kind.model_fields
         self.shapes.parent().setEnabled(is_drawn)
         self.width_edit.setEnabled("width" in self.kind.model_fields)
+        self._component_row.setVisible("component" in self.kind.model_fields)
 
     def _on_result(self) -> None:
         """Show the rows of a store or of a single result, and offer the units of its fields."""
@@ -218,6 +225,8 @@ class ProductForm(QtWidgets.QWidget):
         values: dict[str, Any] = {"product": self.kind.name()}
         if "width" in self.kind.model_fields:
             values["width"] = self.width_edit.value()
+        if "component" in self.kind.model_fields:
+            values["component"] = self.component.currentData()
         if "path" in self.kind.model_fields:
             values |= self._outline(layer)
         symbol = self.unit.currentText()

@@ -216,6 +216,7 @@ class WatchJob(StackJob):
     """A folder to watch, as `shots`; the layers grow as shots arrive."""
 
     watch_options: WatchOptions = field(default_factory=WatchOptions)
+    newest: int = 0  # the last shot that could be inverted
     _reference_shot: int = 0  # decides on units and contrast
     _new_shots: list[int] = field(default_factory=list)  # not in the limits yet
     _updated_at: float = 0.0  # s
@@ -235,13 +236,12 @@ class WatchJob(StackJob):
         note = f" ({self.note})" if self.note else ""
         return Progress(stage, status.ended, None, f"{status.text}{note}")
 
-    def add_new_shots(self, layers: Sequence[Any]) -> int | None:
-        """Add the shots that have arrived to the layers; return the newest, or None."""
+    def add_new_shots(self, layers: Sequence[Any]) -> None:
+        """Add the shots that have arrived to the layers."""
         layer_data, self._longer_data = self._longer_data, None
         if layer_data is None:
-            return None
+            return
         content = {role_of(keywords): (data, keywords) for data, keywords, _ in layer_data}
-        length = 0
         for layer in layers:
             if role_of(layer) not in content:
                 continue
@@ -249,17 +249,17 @@ class WatchJob(StackJob):
             layer.metadata[KEY].update(keywords["metadata"][KEY])
             if kind_of(layer) in ("image", "labels"):
                 layer.data = data
-                length = len(data)
-        return length - 1 if length else None
 
     def _update(self, index: int | None) -> None:
         """Describe the longer layers from time to time, so that the shots need not wait."""
         if index is not None:
             self._new_shots.append(index)
+            self.newest = max(self.newest, index)
         is_behind = self.waiting > 1 and time.monotonic() <= self._updated_at + _UPDATE_INTERVAL_S
         if not self.layer_data:
             with suppress(InputError, OSError):
                 self._reference_shot = first_shot(self.out) if index is None else index
+                self.newest = max(self.newest, self._reference_shot)
                 self._describe(self._reference_shot)
         elif index is not None and is_behind:
             return
@@ -276,12 +276,6 @@ def shot_in_view(viewer: Any, layers: Sequence[Any]) -> int | None:
     """Return the shot of the layers that the viewer shows; None without a shot in view."""
     shot = int(viewer.dims.current_step[viewer.dims.ndim - 3]) if viewer.dims.ndim > 2 else -1
     return shot if 0 <= shot <= newest_shot(layers) and any(map(is_image, layers)) else None
-
-
-def is_newest_in_view(viewer: Any, layers: Sequence[Any]) -> bool:
-    """Whether the viewer shows the newest shot of the layers."""
-    axis = viewer.dims.ndim - 3
-    return any(map(is_image, layers)) and viewer.dims.current_step[axis] >= newest_shot(layers)
 
 
 def show_shot(viewer: Any, shot: int) -> None:

@@ -19,7 +19,7 @@ from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
 from napari_shadowinv._napari.widgets._qt import side_by_side, while_alive
 from napari_shadowinv._napari.widgets._results import describe_inputs, result_frame
 from napari_shadowinv._napari.widgets._tables import ImageRow, ImageTable, beam_column
-from napari_shadowinv._system.validation import validate
+from napari_shadowinv._system.validation import labels_of, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import FitShot, point_spread
 from napari_shadowinv.options import FitChoices, FitOptions
@@ -298,7 +298,7 @@ class FitImages(ToolPanel):
         beam = self.images.beam
         values = {**base.model_dump(), beam.name: self.images.beam_value(row)}
         model_class = SETUPS[setup.kind]
-        names = forms.labels_of(model_class) | {beam.name: f"'{beam.title}'"}
+        names = labels_of(model_class) | {beam.name: f"'{beam.title}'"}
         return validate(model_class, values, f"the setup of '{row.name}'", names)
 
     def _base_setup(self, row: ImageRow, setup: Setup) -> Setup:

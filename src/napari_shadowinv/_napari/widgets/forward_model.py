@@ -199,6 +199,7 @@ def input_field(layer: Any | None, point: Any, setup: Any) -> InputField:
     potential = shown_plane(layer, point) if layer.ndim == 3 else image_of(layer, "potential")
     unit, layer_setup = about.unit_of(layer), about.setup_of(layer)
     if about.role_of(layer) != "potential":
+        _refuse_counts(potential, layer.name)
         text = (
             "This image is not labelled as a potential. Its values are treated as a potential in "
             "px² of the object plane."
@@ -214,6 +215,17 @@ def input_field(layer: Any | None, point: Any, setup: Any) -> InputField:
         )
     to_px2 = float(field_setup.normalized_potential(parse_number(f"1 {unit}", "m")))
     return InputField(potential, to_px2, field_setup, f"A potential in {unit}.")
+
+
+def _refuse_counts(potential: ArrayLike, name: str) -> None:
+    """Refuse whole numbers from zero on, which a detector counts and no potential has."""
+    values = np.asarray(potential)
+    if values.any() and values.min() >= 0 and np.array_equal(values, np.round(values)):
+        raise InputError(
+            f"'{name}' has whole numbers from {values.min():g} to {values.max():g}, as a detector "
+            "counts, expected a potential in px²: invert the image first (Plugins → Shadowinv → "
+            "Invert shot), or choose a layer of a result"
+        )
 
 
 class ForwardModel(ObjectPanel):

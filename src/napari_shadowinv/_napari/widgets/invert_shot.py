@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from napari_shadowinv._napari import jobs
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layers import LayerData
@@ -30,12 +32,14 @@ from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Cache
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_PIXELS, PREVIEW_SITES
 from napari_shadowinv.preprocessing import ESTIMATES, Estimate, Radiograph, Recipe, estimate_source
+from napari_shadowinv.preprocessing.estimates import LowPassEstimate, TotalVariationEstimate
 
 # Measured on two cores with images of 0.25 to 4 Mpx and 5,000 to 1,000,000 sites, including the
 # layers of the result.
 _SECONDS_PER_PIXEL, _SECONDS_PER_SITE = 3e-6, 11e-6
 _BYTES, _BYTES_PER_PIXEL, _BYTES_PER_SITE = 200e6, 280.0, 1700.0
 _MIN_PIXELS_FOR_ESTIMATE = 1_000_000
+_NOTABLE_PATTERN = 0.25
 
 
 @dataclass(frozen=True)
@@ -225,7 +229,9 @@ class InvertShot(InversionInputs, panels.LivePanel):
     def _report(self, inversion: Inversion, setup: Setup | None, input_rows: panels.Rows) -> None:
         self.verdict.show_headline(inversion.headline_in(setup))
         facts = inversion.facts_in(setup)
-        rows = [*panels.warning_rows(facts), *input_rows, *panels.fact_rows(facts)]
+        said = self.setup.warning_label.text()  # in the form, above
+        warnings = [row for row in panels.warning_rows(facts) if row[1] not in said]
+        rows = [*warnings, *input_rows, *panels.fact_rows(facts)]
         self.report.show_rows(rows, panels.fact_rows(facts, details=True))
 
     def _show_inversion(self, finished: jobs.Finished, job: jobs.InversionJob) -> None:
@@ -341,7 +347,7 @@ class EstimateSource(panels.LivePanel):
         tip = "Labels or shapes on pixels that the estimate ignores."
         self.masks = layers.MaskPicker(self.viewer, lambda: self.image.layer, tip)
         self.method = forms.ModelPicker("Method", forms.kinds_of(ESTIMATES))
-        self.method.set_kind("total-variation")
+        self.method.set_kind("polynomial")
         self.live.setToolTip("Update the estimate after each change.")
         self.add(forms.labelled("Image", self.image), self.masks, self.method)
         self.add(self.live, self.keep_earlier, self.panel)
@@ -367,3 +373,21 @@ class EstimateSource(panels.LivePanel):
 
     def show_result(self, finished: jobs.Finished, job: SourceJob) -> None:
         self.show_layers(job.image, finished.layer_data, job.preview)
+        share = _pattern_share(finished.content, job)
+        if share >= _NOTABLE_PATTERN:
+            self.panel.say(
+                f"The estimate contains {share:.0%} of the pattern in the image: what of it is the "
+                "object's is missing in the field. Choose a smoother estimate, or mask the object.",
+                problem=True,
+            )
+
+
+def _pattern_share(source: FloatArray, job: SourceJob) -> float:
+    """Return how much of an image's pattern an estimate keeps that smooths the whole image."""
+    smooths = isinstance(job.estimate, LowPassEstimate | TotalVariationEstimate)
+    if not smooths or job.shot.source_mask is not None:
+        return 0.0
+    kept, pattern = (layers.block_pattern(np.asarray(each)) for each in (source, job.shot.image))
+    if kept is None or pattern is None or not pattern.any():
+        return 0.0
+    return float(np.vdot(kept, pattern) / np.vdot(pattern, pattern))

@@ -206,7 +206,7 @@ class InvertStack(InversionInputs, ToolPanel):
         panel = RunPanel("Invert stack", "Run", tip, patience=math.inf)
         super().__init__(napari_viewer, "invert-stack", panel)
         self._shown: stack_jobs.StackJob | None = None
-        self._ended, self._resets_view = 0, False
+        self._ended, self._resets_view, self._newest = 0, False, 0
         self._arrows: Any = None
         self._read_arrows: Callable[[], None] | None = None
         self._refresh_timer = timer(self, _REFRESH_INTERVAL_MS, self._refresh, once=True)
@@ -335,7 +335,7 @@ class InvertStack(InversionInputs, ToolPanel):
             self._resets_view = False
             self.viewer.reset_view()
             if isinstance(self._shown, stack_jobs.WatchJob):
-                stack_jobs.show_shot(self.viewer, stack_jobs.newest_shot(self.results.layers))
+                self._follow(self._shown)
         layers = self.results.layers
         arrows = next((layer for layer in layers if role_of(layer) == "arrows"), None)
         if arrows is not self._arrows:
@@ -358,10 +358,15 @@ class InvertStack(InversionInputs, ToolPanel):
         if self.results.busy:
             self._refresh_timer.start()
             return
-        is_at_end = stack_jobs.is_newest_in_view(self.viewer, self.results.layers)
-        newest = shown.add_new_shots(self.results.layers)
-        if is_at_end and newest is not None:
-            stack_jobs.show_shot(self.viewer, newest)
+        shot = stack_jobs.shot_in_view(self.viewer, self.results.layers)
+        shown.add_new_shots(self.results.layers)
+        self._follow(shown, moves=shot is not None and shot >= self._newest)
+
+    def _follow(self, shown: stack_jobs.WatchJob, *, moves: bool = True) -> None:
+        """Show the newest shot that could be inverted; a failed one would leave a black canvas."""
+        self._newest = min(shown.newest, stack_jobs.newest_shot(self.results.layers))
+        if moves:
+            stack_jobs.show_shot(self.viewer, self._newest)
 
     def forget(self) -> None:
         self._ended = 0

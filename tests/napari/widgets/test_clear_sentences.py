@@ -1,0 +1,131 @@
+"""Windows speak of their own labels, once, and of what an earlier image left behind."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from napari.components import ViewerModel
+
+from helpers.reports import texts_of
+from napari_shadowinv._napari.viewer_sync import error_text
+from napari_shadowinv._napari.widgets._forms import StepsSection
+from napari_shadowinv._napari.widgets._products import ProductForm
+from napari_shadowinv._napari.widgets.forward_model import input_field
+from napari_shadowinv._napari.widgets.invert_shot import EstimateSource, InvertShot
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import ellipse_pair
+from napari_shadowinv.physics.setup import ProtonSetup, setup_from_dict
+from napari_shadowinv.preprocessing import Bin
+
+PATIENCE = 60_000  # ms
+
+
+def test_an_error_calls_the_fields_of_a_setup_by_their_labels() -> None:
+    with pytest.raises(InputError) as caught:
+        setup_from_dict({"kind": "proton", "object_image_distance": 0}, "the setup")
+    assert "'object_image_distance' is 0" in str(caught.value)
+    text = error_text(caught.value)
+    assert "'Object to image (m)' is 0" in text
+    assert "_" not in text
+    sent = pickle.loads(pickle.dumps(caught.value))
+    assert (type(sent), str(sent)) == (InputError, str(caught.value))
+
+
+def test_a_doubt_of_a_setup_stands_in_the_form_only(
+    viewer: ViewerModel, opened: Any, qtbot: Any, messages: list[str]
+) -> None:
+    image = synthetic_image(ellipse_pair((40, 52)).displacement)
+    viewer.add_image(image, name="shot")
+    tool = opened(InvertShot)
+    tool.options.set_values({"n_sites": 200})
+    swapped = {"source_object_distance": 1.0, "object_image_distance": 0.01, "energy": 14.7}
+    tool.setup.show_setup(ProtonSetup(pixel_size=1e-6, **swapped).model_dump())
+    doubt = tool.setup.warning_label.text()
+    assert "the magnification is 1.01" in doubt
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: tool.verdict.text() != "", timeout=PATIENCE)
+    assert doubt not in texts_of(tool.report).values()
+
+
+def test_steps_of_an_earlier_image_are_announced(qtbot: Any) -> None:
+    steps = StepsSection()
+    qtbot.addWidget(steps)
+    steps.restore([{"step": "bin", "factor": 2}])
+    assert steps._earlier.text().startswith("Kept from an earlier image: bin.")
+    steps.show_steps([Bin(factor=3)])  # of a recipe that the user loads
+    assert steps._earlier.text() == ""
+    steps.restore([])
+    assert steps._earlier.text() == ""
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float64])
+def test_raw_counts_are_no_potential(viewer: ViewerModel, dtype: type) -> None:
+    counts = np.random.default_rng(2).poisson(300, (40, 50)).astype(dtype)
+    layer = viewer.add_image(counts, name="shot")
+    with pytest.raises(InputError, match="as a detector counts"):
+        input_field(layer, viewer.dims.point, None)
+    layer.data = counts / 7
+    assert "px²" in input_field(layer, viewer.dims.point, None).text
+
+
+def test_the_component_of_an_axisymmetric_field_is_offered(viewer: ViewerModel, qtbot: Any) -> None:
+    form = ProductForm(viewer)
+    qtbot.addWidget(form)
+    assert form._component_row.isHidden()
+    form.product.setCurrentIndex(form.product.findData("axisymmetric"))
+    assert not form._component_row.isHidden()
+    choices = [form.component.itemText(row) for row in range(form.component.count())]
+    assert choices == ["azimuthal", "axial"]
+
+
+def estimated(tool: Any, method: str, qtbot: Any) -> str:
+    before = tool.results
+    tool.method.set_kind(method)
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: tool.results is not before, timeout=PATIENCE)
+    return str(tool.panel.status.text())
+
+
+def test_an_estimate_that_contains_the_object_says_so(
+    viewer: ViewerModel, opened: Any, qtbot: Any
+) -> None:
+    image = synthetic_image(ellipse_pair((96, 120)).displacement)
+    viewer.add_image(image * np.random.default_rng(5).normal(1, 0.01, image.shape), name="shot")
+    tool = opened(EstimateSource)
+    assert tool.method.kind == "polynomial"
+    assert estimated(tool, "polynomial", qtbot) == ""
+    assert "of the pattern in the image" in estimated(tool, "total-variation", qtbot)
+    mask = np.zeros(image.shape, int)
+    mask[20:76, 20:100] = 1
+    tool.masks.layer = viewer.add_labels(mask)
+    assert estimated(tool, "total-variation", qtbot) == ""
+
+
+def test_a_file_that_fails_is_not_shown_in_place_of_the_last_shot(
+    window: Any, open_widget: Any, qtbot: Any, tmp_path: Path
+) -> None:
+    tool = open_widget("Invert stack")
+    tool.options.set_values({"n_sites": 100})
+    tool.shots.set_kind("folder")
+    tool.shots.folder.folder.edit.setText(str(tmp_path))
+    tool.shots.folder.pattern.setText("*.npy")
+    tool.store.edit.setText(str(tmp_path / "a.shadowinv.zarr"))
+    image = synthetic_image(ellipse_pair((40, 52)).displacement)
+    (tmp_path / "a0.npy").write_bytes(b"")
+    for number in (1, 2):
+        np.save(tmp_path / f"a{number}.npy", image)
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: "2 done" in tool.panel.status.text(), timeout=PATIENCE)
+    (tmp_path / "a3.npy").write_bytes(b"")
+    qtbot.waitUntil(lambda: tool.failures.count == 2, timeout=PATIENCE)
+    qtbot.wait(1000)
+    assert window.dims.current_step[0] == 2
+    np.save(tmp_path / "a4.npy", image)
+    qtbot.waitUntil(lambda: window.dims.current_step[0] == 4, timeout=PATIENCE)
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
