@@ -94,7 +94,7 @@ def test_spe_is_known_by_its_marks_or_its_name(tmp_path: Path) -> None:
     assert read_radiograph(save_spe(tmp_path / "shot.dat", pixels, 3)).image[1, 2] == 11
     assert read_radiograph(save_spe(tmp_path / "a.SPE", pixels, 3, marked=False)).image[1, 2] == 11
     with pytest.raises(FileFormatError, match="not in a recognised image format"):
-        read_radiograph(save_spe(tmp_path / "shot.bin", pixels, 3, marked=False))
+        read_radiograph(save_spe(tmp_path / "shot.xyz", pixels, 3, marked=False))
 
 
 def test_several_frames_and_regions_are_refused(tmp_path: Path) -> None:
