@@ -40,7 +40,7 @@ CAUTION_CODES: Mapping[str, str] = MappingProxyType(
         "swapped": "image and source seem to be swapped",
         "register": "image and source are not in register",
         "source": "the estimated source is doubtful",
-        "setup": "the setup is unlike any common experiment",
+        "setup": "the setup is doubtful",
         # files
         "film-scan": "the image may be a scan of film",
         "gamma": "the pixels are not proportional to the light",

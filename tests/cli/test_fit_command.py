@@ -487,7 +487,7 @@ def test_rerun_refuses_a_fit_without_provenance(
 
 
 def test_a_saved_recipe_gives_the_same_fit(fit_arguments: dict[str, Any]) -> None:
-    tifffile.imwrite("mask.tif", np.eye(*SHAPE, dtype=np.uint8) == 0)
+    tifffile.imwrite("mask.tif", (np.eye(*SHAPE) == 0).astype(np.uint8))
     chosen = ("--bin", 2, "--mask", "mask.tif", "--noise", "poisson", "--source", "unknown")
     lengths = ("--source-size", 1e-5, "--samples", 0)
     first = shadowinv(*PAIR, *chosen, *lengths, "--fields", "B,E", "--save-recipe", "r.toml")

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv import __version__
 from napari_shadowinv._system.machine import available_threads, physical_memory
@@ -100,12 +101,15 @@ def _picture_rows(path: Path, form: Format) -> _summary.Rows:
     from napari_shadowinv.io.images import film_warnings
 
     array, metadata = form.read(path)
-    warnings = film_warnings(array, None) if array.ndim == 2 else ()
+    found = film_warnings(array, None) if array.ndim == 2 else ()
+    warnings = (*found, *metadata.get("warnings", ()))
     rows = [("kind", f"{form.name.upper()} picture, {metadata['bits']} bits per sample")]
     if array.ndim == 3:
         advice = "convert a film scan to dose, or choose one with --channel"
         rows.append(("channels", f"{array.shape[-1]}: {advice}"))
-    return [*rows, *_array_rows(array), *[("warning", caution.text) for caution in warnings]]
+    rows += [*_array_rows(array), *_geometry_rows(metadata)]
+    rows += [("note", text) for text in metadata.get("notes", ())]
+    return [*rows, *[("warning", caution.text) for caution in warnings]]
 
 
 def _radiograph_rows(shot: Radiograph) -> _summary.Rows:
@@ -121,15 +125,21 @@ def _radiograph_rows(shot: Radiograph) -> _summary.Rows:
         rows.append(("source", "in the same file, below the image"))
     if shot.mask is not None:
         rows.append(("mask", f"in the same file, {(~shot.mask).sum()} pixels excluded"))
-    quantities = beam_quantities()
-    for name, value in shot.metadata.get("geometry", {}).items():
-        if isinstance(value, int | float):
-            unit = quantities[name].unit if name in quantities else "m"
-            rows.append((f"{name.replace('_', ' ')} ({unit})", f"{value:g}"))
+    rows += _geometry_rows(shot.metadata)
     rows.append(("setup", _summary.setup_text(shot.setup, shot, shot.shape)))
     rows += [("note", text) for text in shot.notes]
     warnings = () if shot.setup is None else setup_warnings(shot.setup, shot.shape)
     return [*rows, *[("warning", caution.text) for caution in (*shot.warnings, *warnings)]]
+
+
+def _geometry_rows(metadata: Mapping[str, Any]) -> _summary.Rows:
+    quantities = beam_quantities()
+    numbers = metadata.get("geometry", {}).items()
+    return [
+        (f"{name.replace('_', ' ')} ({quantities[name].unit if name in quantities else 'm'})", text)
+        for name, value in numbers
+        if isinstance(value, int | float) and (text := f"{value:g}")
+    ]
 
 
 def _array_rows(array: AnyArray) -> _summary.Rows:

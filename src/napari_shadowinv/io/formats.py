@@ -229,9 +229,7 @@ _FOREIGN_FORMATS = {
 _CAMERA_RAW_SUFFIXES = re.compile(
     r"\.(nef|nrw|cr2|arw|sr2|dng|pef|srw|3fr|iiq|erf|kdc|dcr|mef|mos)", re.IGNORECASE
 )
-_RAW_SUFFIXES = re.compile(
-    r"\.(raw|img|fli|bin|mraw|im7|imx|his|sif|edf|cine|mrc|dcm)", re.IGNORECASE
-)
+_RAW_SUFFIXES = re.compile(r"\.(raw|img|fli|mraw|im7|imx|his|sif|edf|cine|mrc|dcm)", re.IGNORECASE)
 
 
 def _foreign_title(head: bytes, suffix: str) -> str | None:

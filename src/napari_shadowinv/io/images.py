@@ -145,6 +145,15 @@ def without_pixels(array: AnyArray, missing: BoolArray | None) -> AnyArray:
     return values
 
 
+def gaps_in(array: AnyArray) -> dict[str, Any]:
+    """Return the mask of a picture with pixels without a value, and a note on them."""
+    missing = np.isnan(array) if array.ndim == 2 else np.isnan(array).any(axis=-1)
+    if not missing.any():
+        return {}
+    note = f"{missing.sum()} pixels without a value in the file are left out"
+    return {"mask": ~missing, "notes": (note,)}
+
+
 def geometry_of(size: tuple[float, bool] | None, is_drawn: bool = False) -> dict[str, Any]:
     """Return a file's size of a pixel (m) as metadata, and as geometry unless it may be a default.
 
@@ -218,14 +227,17 @@ def read_picture(path: Path) -> tuple[AnyArray, dict[str, Any]]:
             )
         is_turned = picture.getexif().get(_ORIENTATION, 1) in range(2, 9)
         array, missing = _pixels_and_gaps(ImageOps.exif_transpose(picture))
+        array = without_pixels(array, missing)
+        gaps = gaps_in(array)
         metadata = {
-            "notes": (TURNED_NOTE,) * is_turned,
+            **gaps,
+            "notes": ((TURNED_NOTE,) * is_turned) + gaps.get("notes", ()),
             "bits": 8 * max(1, array.dtype.itemsize),
             "warnings": _light_warnings(picture.format, picture.info),
             **geometry_of(_printed_size(picture.info)),
         }
     check_picture(path, "picture's", array)
-    return without_pixels(array, missing), metadata
+    return array, metadata
 
 
 def _pixels_and_gaps(picture: Any) -> tuple[AnyArray, BoolArray | None]:

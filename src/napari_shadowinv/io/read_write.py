@@ -163,11 +163,6 @@ def _as_radiograph(
     if array.ndim == 3 and channel is not None:
         facts["channel"] = channel
     source, mask = facts.pop("source", None), facts.pop("mask", None)
-    missing = np.isnan(image)
-    if missing.any():
-        mask = ~missing if mask is None else mask & ~missing
-        note = f"{missing.sum()} pixels without a value in the file are left out"
-        facts["notes"] = (*facts.get("notes", ()), note)
     return Radiograph(
         image=image,
         metadata=facts,

@@ -34,6 +34,7 @@ from napari_shadowinv.io.images import (
     TURNED_NOTE,
     check_picture,
     gamma_warning,
+    gaps_in,
     geometry_of,
     is_linear_profile,
     without_pixels,
@@ -186,10 +187,11 @@ def read_tiff(path: Path, number: int | None = None) -> tuple[AnyArray, dict[str
         array, notes = _convert_values(path, tiff, page, _without_alpha(page, array))
         check_picture(path, "TIFF", array)
         array, turned = _turn_upright(without_pixels(array, missing), _tag(tiff, page, 274))
-        size = _pixel_size(tiff, page)
+        size, gaps = _pixel_size(tiff, page), gaps_in(array)
         metadata = {
+            **gaps,
             "bits": int(np.max(page.bitspersample)),
-            "notes": (*notes, *turned),
+            "notes": (*notes, *turned, *gaps.get("notes", ())),
             "warnings": _warnings(page, layout),
             **geometry_of(size, is_drawn=page.software.startswith("shadowinv")),
         }

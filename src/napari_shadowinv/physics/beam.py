@@ -13,11 +13,13 @@ experiment: laser-driven and fusion protons, electrons, laser light.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -409,6 +411,7 @@ def length_unit(length: float) -> tuple[float, str]:
 
 _MIN_SIZE_M, _MAX_SIZE_M = 10e-9, 1e-3  # of a pixel at the object
 _MIN_PARTICLE_DETECTOR_PIXEL_M = 3e-6  # no film scanner or plate reader resolves less
+_MAX_PIXEL_DEVIATION = 0.03  # of a file's pixel size from the setup's
 _MAX_DETECTOR_PIXEL_M = 10e-3
 _MAX_DETECTOR_DISTANCE_M = 10.0
 _MIN_PARTICLE_DISTANCE_M = 1e-4
@@ -452,7 +455,11 @@ def field_of_view_text(setup: BeamSetup, shape: tuple[int, int]) -> str:
     return f"{sides} {unit}"
 
 
-def setup_warnings(setup: BeamSetup, shape: tuple[int, int] | None = None) -> tuple[Caution, ...]:
+def setup_warnings(
+    setup: BeamSetup,
+    shape: tuple[int, int] | None = None,
+    metadata: Mapping[str, Any] = MappingProxyType({}),
+) -> tuple[Caution, ...]:
     """Return a sentence for everything about a setup that no common experiment has.
 
     Parameters
@@ -460,6 +467,8 @@ def setup_warnings(setup: BeamSetup, shape: tuple[int, int] | None = None) -> tu
     setup : BeamSetup
     shape : tuple of int, optional
         Height and width of the image in px; without it the field of view is not checked.
+    metadata : mapping, optional
+        Of the image, with the ``geometry`` in its file and the factor of its ``bin``.
 
     Returns
     -------
@@ -475,6 +484,7 @@ def setup_warnings(setup: BeamSetup, shape: tuple[int, int] | None = None) -> tu
     'setup: the magnification is 1.04: '
     """
     doubts = [*_pixel_doubts(setup), *_distance_doubts(setup, shape), *setup.probe_doubts()]
+    doubts += _file_doubts(setup, metadata)
     return tuple(Caution("setup", f"setup: {doubt}") for doubt in doubts)
 
 
@@ -504,6 +514,21 @@ def deflection_warnings(setup: BeamSetup, displacement: FloatArray) -> tuple[Cau
                 "laboratory plasma has: check the energy (MeV), the distances and the pixel size"
             )
     return (Caution("setup", text),) if text else ()
+
+
+def _file_doubts(setup: BeamSetup, metadata: Mapping[str, Any]) -> Iterator[str]:
+    """Compare the pixels with those of the image's file, which may be of either plane."""
+    geometry = metadata.get("geometry", {})
+    names = ("pixel_size", "detector_pixel_size")
+    stated = [geometry[name] * metadata.get("bin", 1) for name in names if geometry.get(name)]
+    pairs = itertools.product(setup.pixel_sizes, stated)
+    if stated and not any(abs(size / file - 1) < _MAX_PIXEL_DEVIATION for size, file in pairs):
+        here, there = map(length_text, setup.pixel_sizes)
+        yield (
+            f"a pixel is {length_text(stated[0])} by the image's file, but {here} at the object "
+            f"and {there} at the detector: all lengths scale with it; check it, unless a lens "
+            "changes the size of the pixels"
+        )
 
 
 def _pixel_doubts(setup: BeamSetup) -> Iterator[str]:

@@ -20,6 +20,8 @@ from napari_shadowinv.io.files import write_toml
 from napari_shadowinv.physics.setup import SETUPS, Setup, setup_from_dict
 from napari_shadowinv.preprocessing import Radiograph, Recipe
 
+_PIXEL_SIZES = {"pixel_size", "detector_pixel_size"}
+
 
 def read_recipe(path: Path) -> Recipe:
     """Read a recipe; file names in it are relative to its folder.
@@ -64,14 +66,14 @@ def setup_from(
         defaults = {}
     elif defaults and "kind" not in defaults:
         # A text image contains distances, and the energy of particles, but not their species.
-        kind = entries.get("kind") or _kind_of(entries) or _kind_of(defaults) or "proton"
+        is_particle = "proton" if defaults.keys() - _PIXEL_SIZES else ""
+        kind = entries.get("kind") or _kind_of(entries) or _kind_of(defaults) or is_particle
         others = (model.own_fields() for name, model in SETUPS.items() if name != kind)
         strange = set().union(*others)
         defaults = {name: defaults[name] for name in defaults if name not in strange}
-        defaults["kind"] = kind
-    pixel_sizes = {"pixel_size", "detector_pixel_size"}
-    if pixel_sizes & entries.keys():
-        defaults = {name: value for name, value in defaults.items() if name not in pixel_sizes}
+        defaults |= {"kind": kind} if kind else {}
+    if _PIXEL_SIZES & entries.keys():
+        defaults = {name: value for name, value in defaults.items() if name not in _PIXEL_SIZES}
     return setup_from_dict({**defaults, **entries}, str(path))
 
 

@@ -383,7 +383,7 @@ def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) ->
         shot = replace(shot, mask=mask)
         doubts += image_warnings(shot.image, source, shot.mask)
         if shot.setup is not None:
-            doubts += setup_warnings(shot.setup, shot.shape)
+            doubts += setup_warnings(shot.setup, shot.shape, shot.metadata)
         if estimate is not None and not isinstance(estimate, UniformEstimate):
             recorded = inputs.shot.shape
             positioned = estimate.adapt_to(shot.setup, recorded, inputs.recipe.matrix(recorded))

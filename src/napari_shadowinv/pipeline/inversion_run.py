@@ -353,7 +353,7 @@ def run_prepared(
         inversion, report=replace(inversion.report, seconds=seconds), provenance=provenance
     )
     if shot.setup is not None:
-        doubts += setup_warnings(shot.setup, shot.shape)
+        doubts += setup_warnings(shot.setup, shot.shape, shot.metadata)
         doubts += deflection_warnings(shot.setup, inversion.displacement)
     return inversion.with_warnings(dict.fromkeys((*doubts, *shot.warnings)))
 

@@ -1,0 +1,75 @@
+"""The size of a pixel that an image's file states: offered to the setup, and compared with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from napari_shadowinv import ProtonSetup, Recipe, run
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.io import read_radiograph, write
+from napari_shadowinv.pipeline.files import setup_from
+from napari_shadowinv.preprocessing import Bin
+
+SHOT = np.random.default_rng(0).poisson(400, (40, 44)).astype(np.uint16)
+LENGTHS = {"energy": 14.7, "source_object_distance": 0.01, "object_image_distance": 0.09}  # M = 10
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A shot whose file states pixels of 20 µm."""
+    path = tmp_path / "shot.tif"
+    tifffile.imwrite(path, SHOT, resolution=(500, 500), resolutionunit="CENTIMETER")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("size", "is_doubted"),
+    [
+        ({"detector_pixel_size": 20e-6}, False),
+        ({"pixel_size": 2e-6}, False),
+        ({"pixel_size": 20e-6}, False),  # the file may mean those at the object
+        ({"detector_pixel_size": 25e-6}, True),
+        ({"pixel_size": 4e-6}, True),
+    ],
+)
+@pytest.mark.parametrize("steps", [(), (Bin(factor=2),)])
+def test_setup_with_other_pixels_than_the_file_is_doubted(
+    path: Path, size: dict[str, float], is_doubted: bool, steps: tuple[Any, ...]
+) -> None:
+    setup = ProtonSetup(**LENGTHS, **size)
+    recipe = Recipe(setup=setup, steps=steps, options={"n_sites": 100})
+    result = run(recipe, path)
+    texts = [caution.text for caution in result.report.warnings if caution.code == "setup"]
+    assert any("by the image's file" in text for text in texts) == is_doubted
+
+
+def toml(path: Path, **entries: Any) -> Path:
+    rows = (f"{key} = {value!r}".replace("'", '"') for key, value in entries.items())
+    path.write_text("\n".join(rows))
+    return path
+
+
+def test_setup_is_completed_by_the_file_unless_it_states_a_size(path: Path, tmp_path: Path) -> None:
+    geometry = read_radiograph(path).metadata["geometry"]
+    setup = setup_from(toml(tmp_path / "a.toml", kind="proton", **LENGTHS), geometry)
+    assert setup.object_pixel_size == pytest.approx(2e-6)
+    own = toml(tmp_path / "b.toml", kind="proton", pixel_size=7e-6, **LENGTHS)
+    assert setup_from(own, geometry).object_pixel_size == 7e-6
+
+
+def test_size_of_a_pixel_does_not_name_the_beam(path: Path, tmp_path: Path) -> None:
+    geometry = read_radiograph(path).metadata["geometry"]
+    with pytest.raises(InputError, match="'kind' is missing"):
+        setup_from(toml(tmp_path / "a.toml", object_image_distance=0.09), geometry)
+
+
+def test_own_images_state_the_pixels_at_the_object(path: Path) -> None:
+    setup = ProtonSetup(**LENGTHS, detector_pixel_size=20e-6)
+    write(path, SHOT.astype(float), setup=setup, overwrite=True)
+    stated = read_radiograph(path).metadata["geometry"]
+    assert stated == {"pixel_size": pytest.approx(setup.object_pixel_size)}
