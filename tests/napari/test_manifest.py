@@ -25,10 +25,10 @@ def test_its_readers_and_writers_are_those_of_the_registry(manifest: Any) -> Non
 
     contributions = manifest.contributions
     (reader,) = contributions.readers
-    readable = {end for each in formats.FORMATS if each.reader for end in each.suffixes}
-    assert sorted(reader.filename_patterns) == sorted(
-        f"*{suffix}" for suffix in readable - formats.OPENED_BY_NAPARI
-    )
+    readable = {end for each in formats.FORMATS if each.title for end in each.suffixes}
+    # The last stands for arrays in files, run.h5::/entry/data.
+    patterns = {*(f"*{suffix}" for suffix in readable - formats.OPENED_BY_NAPARI), "*::*"}
+    assert sorted(reader.filename_patterns) == sorted(patterns)
     # A store is a folder, and folders are offered whatever their name.
     assert reader.accepts_directories
     written = [suffix for writer in contributions.writers for suffix in writer.filename_extensions]

@@ -115,11 +115,11 @@ def test_text_with_a_header_brings_scale_and_source(viewer: ViewerModel, tmp_pat
     np.testing.assert_allclose(layer.scale, 10.0)
 
 
-@pytest.mark.parametrize("suffix", [".h5", ".hdf5"])
-def test_other_hdf5_is_left_to_others_at_once(tmp_path: Path, suffix: str) -> None:
+@pytest.mark.parametrize("suffix", [".h5", ".nxs"])
+def test_hdf5_without_image_is_left_to_others_at_once(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"other{suffix}"
     with h5py.File(path, "w") as file:
-        file["data"] = np.zeros((5, 5))
+        file["times"] = np.zeros(5)
     assert get_reader(str(path)) is None
     path.write_bytes(b"no HDF5 at all")
     assert get_reader(str(path)) is None

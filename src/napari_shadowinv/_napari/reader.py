@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,9 @@ from napari_shadowinv._napari.viewer_sync import (
 )
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io.formats import PRADFORMAT, RADIOGRAPH_SUFFIXES, RESULT, STORE
+from napari_shadowinv.io.files import split_address
+from napari_shadowinv.io.formats import HDF5, RADIOGRAPH_SUFFIXES, RESULT, STORE
+from napari_shadowinv.io.frames import images_in, is_pattern, left_out_of, matching_files
 
 
 def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[Any]] | None:
@@ -25,24 +26,19 @@ def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], lis
         return read_paths if path and all(_is_image_name(Path(item)) for item in path) else None
     if path.endswith(STORE.suffix) or Path(path).suffix.lower() in RESULT.suffixes:
         return read_paths
-    if "*" in path:
-        return read_paths if any(map(_is_image_name, _matches(path))) else None
-    return read_paths if _can_read(Path(path)) else None
+    if is_pattern(path):
+        return read_paths if any(map(_is_image_name, matching_files(path))) else None
+    return read_paths if _can_read(split_address(path)[0]) else None
 
 
 def _can_read(path: Path) -> bool:
-    from napari_shadowinv.io.frames import images_in
-
     if path.is_dir():
         return bool(images_in(path))
-    if path.suffix.lower() in PRADFORMAT.suffixes:
-        from napari_shadowinv.io.pradformat import is_ours
+    # Other programs use the endings of HDF5, too.
+    if path.suffix.lower() in HDF5.suffixes:
+        from napari_shadowinv.io.hdf5_arrays import has_images
 
-        # Other programs use the suffix of HDF5, too.
-        try:
-            return is_ours(path)
-        except FileFormatError:
-            return False
+        return has_images(path)
     return _is_image_name(path)
 
 
@@ -54,7 +50,6 @@ def _is_image_name(path: Path) -> bool:
 def read_paths(path: str | Sequence[str]) -> list[Any]:
     """Read paths that `get_reader` accepts as layers; in a window, errors become notifications."""
     from napari_shadowinv._napari.shots import stack_layers
-    from napari_shadowinv.io.frames import images_in
 
     if not isinstance(path, str):
         return stack_layers([Path(item) for item in path])
@@ -65,21 +60,17 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
         follow_once_added(layers)
         _show_in_window(layers)
         return layers
-    if "*" in path:
-        return stack_layers(_matches(path))
+    if is_pattern(path):
+        return stack_layers(matching_files(path))
     if Path(path).is_dir():
         folder = Path(path)
         images = images_in(folder)
         if not images:  # they may be gone since napari asked for a reader
             raise FileFormatError(f"{folder} contains no image: expected a folder of radiographs")
+        if others := left_out_of(folder):
+            show_caution(f"{folder.name}: left out: {others}; open them as a pattern or a list")
         return stack_layers(images, folder.name)
     return _read_file(Path(path))
-
-
-def _matches(pattern: str) -> list[Path]:
-    from napari_shadowinv.io.files import in_counting_order
-
-    return in_counting_order(Path(name) for name in glob.glob(pattern))
 
 
 @as_file_errors

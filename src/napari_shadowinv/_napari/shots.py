@@ -18,7 +18,7 @@ from napari_shadowinv._napari.layers import FullLayerData, LayerData
 from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import show_caution
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.physics.units import intensity_limits
@@ -43,17 +43,23 @@ def radiograph_layers(shot: Radiograph, name: str = "") -> LayerData:
         )
         layers.append((data, {**keywords, "visible": False}, kind))
     if shot.mask is not None:
-        keywords = {
-            "name": f"{name} mask",
-            "visible": False,
-            "metadata": metadata_for(about.MASK, "", shot.setup, **facts),
-            **frame.keywords(stacked=False),
-        }
-        layers.append(((~shot.mask).astype(np.uint8), keywords, "labels"))
+        layers.append(_mask_layer(shot.mask, name, frame, shot.setup, **facts))
     layers.append(
         shot_layer(shot.image, name, shot.setup, limits, frame=frame, source=shot.source, **facts)
     )
     return layers
+
+
+def _mask_layer(
+    usable: BoolArray, name: str, frame: Frame, setup: Setup | None = None, **facts: Any
+) -> FullLayerData:
+    keywords = {
+        "name": f"{name} mask",
+        "visible": False,
+        "metadata": metadata_for(about.MASK, "", setup, **facts),
+        **frame.keywords(stacked=False),
+    }
+    return (~usable).astype(np.uint8), keywords, "labels"
 
 
 def shot_layer(
@@ -167,7 +173,10 @@ def stack_layers(paths: Sequence[Path], name: str = "") -> LayerData:
 def frame_layers(frames: xarray.Dataset, name: str) -> LayerData:
     """Describe the frames of one file as a lazy stack."""
     images = frames["image"].data
-    return [shot_layer(images, name, None, intensity_limits(np.asarray(images[0])))]
+    layers = [shot_layer(images, name, None, intensity_limits(np.asarray(images[0])))]
+    if "mask" in frames:
+        layers.insert(0, _mask_layer(frames["mask"].values, name, frame_for(images.shape, None)))
+    return layers
 
 
 def lazy_stack(

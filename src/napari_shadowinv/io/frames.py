@@ -202,13 +202,15 @@ def lazy_frames(frames: Sequence[Frame], read: Callable[[Frame], Radiograph]) ->
     Returns
     -------
     xarray.Dataset
-        ``image`` (shot, y, x), a chunk for each frame, and the coordinate ``name``.
+        ``image`` (shot, y, x), a chunk for each frame, and the coordinate ``name``; ``mask``
+        (y, x) if the first has one.
     """
     import xarray as xr
     from dask.base import tokenize
 
     da: Any = import_module("dask.array")
-    first = read(frames[0]).image
+    shot = read(frames[0])
+    first = shot.image
     stamps = {frame.path: frame.path.stat().st_mtime_ns for frame in frames}
     layer = f"frames-{tokenize([repr(frame) for frame in frames], *stamps.values())}"
     tasks = {
@@ -218,8 +220,13 @@ def lazy_frames(frames: Sequence[Frame], read: Callable[[Frame], Radiograph]) ->
     chunks = ((1,) * len(frames), *((side,) for side in first.shape))
     image = da.Array(tasks, layer, chunks, dtype=first.dtype)
     names = np.array([frame.name for frame in frames], dtype=str)
+    variables: dict[str, Any] = {
+        "image": (("shot", "y", "x"), image, {"units": "1", "long_name": "Image"})
+    }
+    if shot.mask is not None:
+        variables["mask"] = (("y", "x"), shot.mask, {"long_name": "Usable pixels of the first"})
     return xr.Dataset(
-        {"image": (("shot", "y", "x"), image, {"units": "1", "long_name": "Image"})},
+        variables,
         coords={"name": ("shot", names, {"long_name": "Name of the shot"})},
         attrs={"format": FRAMES_FORMAT},
     )

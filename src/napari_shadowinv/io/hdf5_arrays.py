@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from napari_shadowinv._system.safety import as_file_errors, check_size
+from napari_shadowinv._system.safety import as_file_errors, check_regular, check_size
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.arrays import FRAME_INDEX, check_one_frame, frame_axes
@@ -97,6 +97,16 @@ def default_array(path: Path) -> str:
             f"{path} is an HDF5 file with {count}: expected one, or the name of one, as "
             f"{path.name}::/name; it holds {list_arrays(file)}"
         )
+
+
+def has_images(path: Path) -> bool:
+    """Return whether a file is HDF5 with an image; false for a file that cannot be read."""
+    try:
+        check_regular(path, "an HDF5 file")
+        with open_hdf5(path) as file:
+            return any(not entry.reason for entry in _entries(file))
+    except (OSError, RuntimeError, KeyError, ValueError):
+        return False
 
 
 def _frame(path: Path, dataset: Any, number: int) -> AnyArray:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import PLANE, unpack_array, unpack_planes
+from napari_shadowinv._system.arrays import PLANE, join_masks, unpack_array, unpack_planes
 from napari_shadowinv._system.validation import map_paths
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
@@ -488,7 +488,9 @@ def _read_first(items: Sequence[Shot], read: Callable[[Shot], Value], count: int
 
 
 def _from_xarray(shots: xarray.DataArray | xarray.Dataset) -> Shots:
+    usable = None
     if hasattr(shots, "data_vars"):
+        usable = shots.get("mask")
         planes = [name for name, variable in shots.data_vars.items() if variable.ndim == 3]
         chosen = ["image"] if "image" in planes else planes
         if len(chosen) != 1:
@@ -502,11 +504,14 @@ def _from_xarray(shots: xarray.DataArray | xarray.Dataset) -> Shots:
     if not shots.variable._in_memory and name in shots.dims:
         shots = shots.chunk({name: 1})  # otherwise the whole file would be read
     values, _ = unpack_array(shots, "shots", ("shot", *PLANE))
-    return _from_array(
+    found = _from_array(
         values,
         None if coordinate is None else coordinate.values,
         None if labels is None or labels.dims != (name,) else labels.values,
     )
+    if usable is None or usable.dims != PLANE or usable.dtype != np.bool_:
+        return found
+    return replace(found, mask=join_masks(found.mask, usable.values))
 
 
 def _from_array(shots: Any, coordinate: Any = None, labels: Any = None) -> Shots:
