@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import tifffile
+from scipy.io import savemat
 
 from napari_shadowinv import FileFormatError, InputError, read
 from napari_shadowinv.io import hdf5, read_radiograph
-from napari_shadowinv.io.frames import Frame, find_frames
+from napari_shadowinv.io.frames import Frame, find_frames, images_in, left_out_of
 from napari_shadowinv.io.read_write import read_frame
 
 CUBE = np.arange(2 * 3 * 5 * 7, dtype=np.uint16).reshape(2, 3, 5, 7)
@@ -175,3 +177,110 @@ def test_unreadable_file_among_many_is_a_frame(tmp_path, nexus):
     names = [frame.name for frame in find_frames(f"{tmp_path}/*.nxs::/entry/data/data")]
     assert len(names) == 7
     assert names[-1] == "run_13.nxs"
+
+
+def write_spe(path: Path, frames: np.ndarray) -> None:
+    """Write the frames as SPE 3, each followed by eight bytes of times."""
+    count, height, width = frames.shape
+    header = bytearray(4100)
+    for code, offset, value in (
+        *(("<H", 42, width), ("<H", 656, height), ("<h", 108, 3), ("<i", 1446, count)),
+        *(("<f", 1992, 3.0), ("<I", 2996, 0x01234567), ("<H", 4098, 0x5555)),
+    ):
+        struct.pack_into(code, header, offset, value)
+    body = b"".join(frame.astype("<u2").tobytes() + b"\xff" * 8 for frame in frames)
+    struct.pack_into("<Q", header, 678, 4100 + len(body))
+    size = 2 * height * width
+    footer = f'<DataBlock type="Frame" count="{count}" size="{size}" stride="{size + 8}">'
+    path.write_bytes(bytes(header) + body + footer.encode())
+
+
+@pytest.mark.parametrize("name", ["burst.spe", "burst.npy", "burst.mat", "burst.h5", "burst.nc"])
+def test_burst_in_one_file_is_a_stack(tmp_path, name):
+    path, planes = tmp_path / name, CUBE.reshape(6, 5, 7)
+    if path.suffix == ".spe":
+        write_spe(path, planes)
+    elif path.suffix == ".npy":
+        np.save(path, planes)
+    elif path.suffix == ".mat":
+        savemat(path, {"burst": np.moveaxis(planes, 0, -1)})
+    else:
+        with h5py.File(path, "w") as file:
+            file["entry/instrument/detector/data"] = planes
+    frames = read(path)
+    np.testing.assert_array_equal(frames.image, planes)
+    assert str(frames.name[4].values) == f"{name}[4]"
+    with pytest.raises(FileFormatError, match="holds 6 frames"):
+        read_radiograph(path)
+
+
+def test_frame_of_a_matlab_stack_has_an_address(tmp_path):
+    path = tmp_path / "shots.mat"
+    savemat(path, {"burst": np.moveaxis(CUBE, (0, 1), (2, 3)), "beam": CUBE[0, 0]})
+    np.testing.assert_array_equal(read(f"{path}::/burst[1,2]").image, CUBE[1, 2])
+    np.testing.assert_array_equal(read(f"{path}::beam").image, CUBE[0, 0])
+    with pytest.raises(InputError, match=r"no burst\[2, 0\]: it holds 'burst' \(5×7×2×3"):
+        read(f"{path}::burst[2,0]")
+
+
+def test_arrays_of_a_deep_file_are_counted_and_loops_end(tmp_path):
+    path = tmp_path / "deep.h5"
+    with h5py.File(path, "w") as file:
+        for number in range(20):
+            file[f"a/b/c/d/shot_{number:02d}/image"] = CUBE[0, 0]
+        file["a/b/again"] = file["a"]
+        file["a/same"] = file["a/b/c/d/shot_00/image"]
+        file["elsewhere"] = h5py.ExternalLink("other.h5", "/data")
+    with pytest.raises(InputError) as error:
+        read(f"{path}::a/b/c/d/shot_17/imge")
+    assert "it holds 'a/b/c/d/shot_17/image' (5×7 uint16)" in str(error.value)
+    assert str(error.value).endswith("and 13 more")
+
+
+def test_why_arrays_are_no_images(tmp_path):
+    path = tmp_path / "none.h5"
+    with h5py.File(path, "w") as file:
+        file["field"] = CUBE[0, 0] * 1j
+        file["table"] = np.zeros((2, 2), [("a", "f4")])
+        file["names"] = np.full((2, 2), b"a")
+        file["elsewhere"] = h5py.ExternalLink("other.h5", "/data")
+        file["times"] = np.arange(3.0)
+    with pytest.raises(FileFormatError, match="with no image") as error:
+        read(path)
+    for words in ("complex", "compound", "text", "in another file, 'other.h5'"):
+        assert words in str(error.value)
+    assert "times" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("https://example.org/shot.tif", "https://example.org/shot.tif is a location on"),
+        ("s3://bucket/run.h5::/entry", "is a location on the network"),
+        ("::/entry/data", "names an array without its file"),
+        ("", "an empty text"),
+    ],
+)
+def test_what_is_no_path_is_called_what_it_is(path, words):
+    with pytest.raises(InputError, match=words):
+        find_frames(path)
+
+
+def test_brackets_in_the_name_of_a_folder_are_no_pattern(tmp_path):
+    for name in ("run[3]", "run3"):
+        (tmp_path / name).mkdir()
+        np.save(tmp_path / name / f"{name}.npy", CUBE[0, 0])
+    found = [frame.path.name for frame in find_frames(tmp_path / "run[3]" / "*.npy")]
+    assert found == ["run[3].npy"]
+    (tmp_path / "run[3]").rename(tmp_path / "run4")
+    found = [frame.path.name for frame in find_frames(tmp_path / "run[3]" / "*.npy")]
+    assert found == ["run3.npy"]
+
+
+def test_case_and_spelling_of_endings_are_alike(tmp_path):
+    names = ["shot_1.tif", "SHOT_2.TIF", "shot_3.Tiff"]
+    for name in (*names, "shot_4.png", "notes.txt", "log.csv"):
+        (tmp_path / name).touch()
+    assert [frame.name for frame in find_frames(tmp_path / "*.tif")] == names
+    assert [path.name for path in images_in(tmp_path)] == names
+    assert left_out_of(tmp_path) == "1 .csv, 1 .png, 1 .txt"

@@ -595,3 +595,34 @@ def test_status_counts_verdicts_and_lists_warnings_once(store):
     codes = {caution["code"] for report in doubtful for caution in report["warnings"]}
     verdicts = {report["verdict"] for report in reports} - {"determined"}
     assert text.count("warning ") == len(codes) + len(verdicts)
+
+
+def test_arrays_of_a_file_are_shots_source_mask_and_rows(night, folder):
+    usable = np.ones(night.source.shape, np.uint8)
+    usable[:3] = 0
+    with h5py.File("run.h5", "w") as file:
+        file["entry/data"], file["entry/beam"], file["entry/usable"] = (
+            night.images[:2], night.source, usable,
+        )  # fmt: skip
+    Path("table.csv").write_text("file, mask\nrun.h5::/entry/data[1], run.h5::/entry/usable\n")
+    common = ("--source", "run.h5::/entry/beam", "--n-sites", 100, "--scheduler", "threads")
+    mask = ("--mask", "run.h5::/entry/usable")
+    results = {}
+    for name, more in (("run.h5::/entry/data", mask), ("table.csv", ())):
+        out = Path(f"{len(results)}.shadowinv.zarr")
+        result = shadowinv("batch", name, *common, *more, "--out", out)
+        assert result.exit_code in (0, 3), flat(result.output)
+        results[name] = read(out)
+    many, row = results.values()
+    np.testing.assert_array_equal(many.mask, usable != 0)
+    np.testing.assert_array_equal(row.displacement[0], many.displacement[1])
+    assert list(row.name.values) == ["run.h5::/entry/data[1]"]
+
+
+def test_a_folder_says_which_files_it_leaves_out(night, folder):
+    Path("shots/log.txt").write_text("0")
+    result = shadowinv(
+        "batch", "shots", "--source", "reference.npy", "--out", "n.shadowinv.zarr",
+        "--n-sites", 100, "--scheduler", "threads",
+    )  # fmt: skip
+    assert "left out 1 .txt" in flat(result.output)

@@ -556,3 +556,16 @@ def test_file_written_during_its_read_is_read_again(folder, out):
     assert len(watch.shots) == 1
     expected = invert(IMAGES[4], plan=plan_sites(SOURCE, OPTIONS), options=OPTIONS)
     np.testing.assert_array_equal(watch.result.displacement[0], expected.displacement)
+
+
+def test_other_endings_are_counted_and_spellings_are_not(folder, out, tmp_path):
+    for number, name in enumerate(("shot_1.npy", "SHOT_2.NPY")):
+        np.save(folder / "temporary.npy", IMAGES[number])
+        (folder / "temporary.npy").rename(folder / name)
+    for name in ("shot_1.bmp", "log.txt", "notes.txt"):
+        (folder / name).write_text("0")
+    with Watched(folder, out, pattern="*") as watch:
+        watch.ended(2)
+    notes = [event.note for event in watch.events if event.note]
+    assert any(note.startswith("Left out: 1 .bmp, 2 .txt; choose others") for note in notes)
+    assert set(watch.result.name.values) == {"shot_1.npy", "SHOT_2.NPY"}

@@ -27,6 +27,8 @@ _HDF5_MARK = b"\x89HDF\r\n\x1a\n"
 _COMPONENT = re.compile(r"[BE]_?[xyz]", re.IGNORECASE)
 _EXPECTED = "an openPMD file or a NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez"
 _SAME_PLACE = 1e-6  # of a cell
+# By the powers of length, mass, time, current, temperature, amount and luminous intensity.
+_UNITS = {(0, 1, -2, -1, 0, 0, 0): "T", (1, 1, -3, -1, 0, 0, 0): "V/m"}
 _MAX_LISTED = 10
 _BYTES_PER_NODE = 100  # six components, twice in double precision
 
@@ -48,38 +50,47 @@ def is_field_grid(path: Path) -> bool:
 
 @as_file_errors
 def describe_field_grid(path: Path) -> list[tuple[str, str]]:
-    """Return title and text of the kind, and of each field with its shape, spacing and unit."""
+    """Return title and text of the kind, and of each field with its shape, unit and spacing."""
     with open_hdf5(path) as content:
         is_openpmd = "openPMD" in content.attrs
         standard = f"openPMD {_text(content.attrs['openPMD'])}" if is_openpmd else "NetCDF"
         rows = [("kind", f"fields on a grid ({standard}): trace particles with shadowinv forward")]
         if not is_openpmd:
-            fields = [item for name, item in members(content) if _COMPONENT.fullmatch(name)]
-            return rows + [_field_row(item.name.strip("/"), item, []) for item in fields]
+            fields = [(name, item) for name, item in members(content) if _COMPONENT.fullmatch(name)]
+            units = (_text(item.attrs.get("units", "")) for _, item in fields)
+            return rows + [
+                (name, f"{_shape_text(item)} {unit}")
+                for (name, item), unit in zip(fields, units, strict=True)
+            ]
         base = _text(content.attrs.get("basePath", "/data/%T/"))
         parent = member(path, content, base.partition("%T")[0].strip("/"))
+        meshes = _text(content.attrs.get("meshesPath", "fields/"))
         for number in sorted(filter(str.isdecimal, parent or ()), key=int)[:_MAX_LISTED]:
-            meshes = _text(content.attrs.get("meshesPath", "fields/"))
             for name, record in members(member(path, parent[number], meshes) or {}):
                 parts = [("", record)] if hasattr(record, "shape") else members(record)
-                spacing = np.ravel(record.attrs.get("gridSpacing", [])).astype(float)
-                metres = spacing * np.ravel(record.attrs.get("gridUnitSI", 1.0)).astype(float)
-                for key, part in parts:
-                    title = "/".join(filter(None, (number, name, key)))
-                    rows.append(_field_row(title, part, metres.tolist()))
+                rows += [
+                    ("/".join(filter(None, (number, name, key))), _mesh_text(record, part))
+                    for key, part in parts
+                ]
         return rows
 
 
-def _field_row(title: str, field: Any, spacing: list[float]) -> tuple[str, str]:
-    shape = field.shape if hasattr(field, "shape") else np.ravel(field.attrs["shape"])
-    texts = ["×".join(map(str, shape))]
-    if spacing:
-        texts.append(f"spacing {' × '.join(f'{length:g}' for length in spacing)} m")
-    if unit := _text(field.attrs.get("units", "")):
-        texts.append(unit)
-    if "unitSI" in field.attrs:
-        texts.append(f"{float(np.ravel(field.attrs['unitSI'])[0]):g} of the SI unit")
-    return title, ", ".join(texts)
+def _mesh_text(record: Any, part: Any) -> str:
+    dimension = tuple(np.ravel(record.attrs.get("unitDimension", ())).astype(int).tolist())
+    unit = _UNITS.get(dimension, "of the SI unit")
+    scale = float(np.ravel(part.attrs.get("unitSI", 1.0))[0])
+    metres = np.ravel(record.attrs.get("gridSpacing", ())) * np.ravel(
+        record.attrs.get("gridUnitSI", 1.0)
+    )
+    labels = map(_text, np.ravel(record.attrs.get("axisLabels", ())))
+    spacing = ", ".join(f"{axis} {side:g}" for axis, side in zip(labels, metres, strict=False))
+    return f"{_shape_text(part)}, in {scale:g} {unit}, spacing {spacing or 'unknown'} m"
+
+
+def _shape_text(item: Any) -> str:
+    # A constant component has its shape as an attribute.
+    shape = item.shape if hasattr(item, "shape") else np.ravel(item.attrs["shape"])
+    return "×".join(map(str, shape))
 
 
 @as_file_errors

@@ -1,0 +1,152 @@
+"""Values in HDF5 files mean what CF, NeXus and HDF5 Image say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from napari_shadowinv import FileFormatError, InversionOptions, Recipe, invert_stack, read
+from napari_shadowinv.io import read_radiograph
+
+COUNTS = np.arange(15, dtype=np.int16).reshape(3, 5)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Iterator[Any]:
+    with h5py.File(tmp_path / "run.h5", "w") as content:
+        yield content
+
+
+def shot_in(file: Any, name: str = "data") -> Any:
+    """Return what is read from a file that is still open for writing."""
+    path = Path(file.filename)
+    file.close()
+    return read_radiograph(f"{path}::{name}")
+
+
+def test_packed_values_of_netcdf_are_those_of_xarray(tmp_path: Path) -> None:
+    path = tmp_path / "shot.nc"
+    image = np.array([[0.5, 1.0], [np.nan, 10.0]])
+    packing = {"dtype": "int16", "scale_factor": 0.5, "add_offset": 3.0, "_FillValue": -99}
+    xr.Dataset({"image": (("y", "x"), image)}).to_netcdf(
+        path, engine="h5netcdf", encoding={"image": packing}
+    )
+    shot = read(path)
+    np.testing.assert_array_equal(shot.image, image)
+    np.testing.assert_array_equal(shot.mask, np.isfinite(image))
+    assert shot.metadata["dtype"] == "int16"
+
+
+def test_values_outside_the_valid_range_are_left_out(file: Any) -> None:
+    file["data"] = COUNTS
+    file["data"].attrs.update(valid_range=np.array([2, 9], np.int16), scale_factor=2.0)
+    shot = shot_in(file)
+    np.testing.assert_array_equal(shot.mask, (COUNTS >= 2) & (COUNTS <= 9))
+    assert np.nanmax(shot.image) == 18
+
+
+@pytest.mark.parametrize("prefix", ["", "data_"])
+def test_offset_of_nexus_is_added_before_its_factor(file: Any, prefix: str) -> None:
+    file["entry/data"] = COUNTS
+    file[f"entry/{prefix}offset"], file[f"entry/{prefix}scaling_factor"] = 5.0, 2.0
+    np.testing.assert_array_equal(shot_in(file, "entry/data").image, (COUNTS + 5) * 2)
+
+
+def test_factor_of_each_frame_is_its_own(file: Any) -> None:
+    file["data"] = np.stack([COUNTS, COUNTS])
+    file["data_scaling_factor"] = np.array([2.0, 3.0])
+    np.testing.assert_array_equal(shot_in(file, "data[1]").image, 3 * COUNTS)
+
+
+def test_factors_of_another_number_are_refused(file: Any) -> None:
+    file["data"], file["data_scaling_factor"] = COUNTS, np.ones(7)
+    with pytest.raises(FileFormatError, match="7 numbers in 'data_scaling_factor'"):
+        shot_in(file)
+
+
+def nexus(file: Any, frames: Any) -> Any:
+    """Write frames as a detector does, its description elsewhere in the entry."""
+    file["entry/data/data"] = frames
+    detector = file.create_group("entry/instrument/detector")
+    detector.attrs["NX_class"] = "NXdetector"
+    return detector
+
+
+def test_pixels_that_a_nexus_detector_rejects_are_left_out(file: Any) -> None:
+    detector = nexus(file, COUNTS)
+    flags = np.zeros((3, 5), np.uint32)
+    flags[0, 1], flags[2, 2] = 1, 1 << 31  # a gap; interpolated, but good
+    detector["pixel_mask"] = flags
+    detector["saturation_value"] = 13
+    shot = shot_in(file, "entry/data/data")
+    expected = np.ones((3, 5), bool)
+    expected[0, 1] = expected[2, 4] = False
+    np.testing.assert_array_equal(shot.mask, expected)
+    assert np.isnan(shot.image[0, 1])
+    assert any("1 pixels left out, pixel_mask" in note for note in shot.notes)
+
+
+def test_pixel_mask_of_each_frame_is_its_own(file: Any) -> None:
+    flags = np.zeros((2, 3, 5), np.uint32)
+    flags[1, 2, 0] = 1
+    nexus(file, np.stack([COUNTS, COUNTS]))["pixel_mask"] = flags
+    path = file.filename
+    file.close()
+    assert read_radiograph(f"{path}::entry/data/data[0]").mask is None
+    assert not read_radiograph(f"{path}::entry/data/data[1]").mask[2, 0]
+
+
+@pytest.mark.parametrize(("unit", "size"), [("um", 75.0), ("m", 75e-6)])
+def test_pixel_size_of_a_nexus_detector_is_in_metres(file: Any, unit: str, size: float) -> None:
+    detector = nexus(file, COUNTS)
+    for name in ("x_pixel_size", "y_pixel_size"):
+        detector[name] = size
+        detector[name].attrs["units"] = unit
+    geometry = shot_in(file, "entry/data/data").metadata["geometry"]
+    assert geometry == {"detector_pixel_size": pytest.approx(75e-6)}
+
+
+def test_white_as_zero_is_inverted(file: Any) -> None:
+    file["data"] = COUNTS.astype(np.uint8)
+    file["data"].attrs.update(CLASS=np.bytes_("IMAGE"), IMAGE_WHITE_IS_ZERO=np.uint8(1))
+    np.testing.assert_array_equal(shot_in(file).image, 255 - COUNTS)
+
+
+@pytest.mark.parametrize(
+    ("origin", "expected"),
+    [("UL", COUNTS), ("LL", COUNTS[::-1]), ("UR", COUNTS[:, ::-1]), ("LR", COUNTS[::-1, ::-1])],
+)
+def test_origin_of_the_display_is_turned_to_the_top_left(
+    file: Any, origin: str, expected: Any
+) -> None:
+    file["data"] = COUNTS
+    file["data"].attrs["DISPLAY_ORIGIN"] = np.bytes_(origin)
+    np.testing.assert_array_equal(shot_in(file).image, expected)
+
+
+def test_pictures_in_colour_are_refused(file: Any) -> None:
+    file["data"] = np.zeros((3, 8, 8), np.uint8)
+    file["data"].attrs["IMAGE_SUBCLASS"] = np.bytes_("IMAGE_TRUECOLOR")
+    with pytest.raises(FileFormatError, match="as a picture in colour"):
+        shot_in(file, "data[0]")
+
+
+@pytest.mark.parametrize("as_dataset", [True, False])
+def test_a_stack_leaves_out_the_pixels_of_the_file(tmp_path: Path, as_dataset: bool) -> None:
+    path = tmp_path / "run.h5"
+    frames = np.full((2, 24, 24), 2**32 - 1, np.uint32)
+    usable = np.ones((24, 24), bool)
+    usable[10:13] = False
+    frames[:, usable] = 100
+    with h5py.File(path, "w") as content:
+        nexus(content, frames)["pixel_mask"] = (~usable).astype(np.uint32)
+    shots = read(path) if as_dataset else path
+    results = invert_stack(shots, Recipe(options=InversionOptions(n_sites=100))).compute()
+    np.testing.assert_array_equal(results["mask"], usable)
+    assert float(np.abs(results["displacement"]).max()) < 0.5
