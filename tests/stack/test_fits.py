@@ -5,21 +5,26 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
+import typer
 import xarray as xr
 
 from helpers.command_line import flat, shadowinv
 from helpers.store_content import content
 from napari_shadowinv import InputError, Recipe, RunOptions, run_stack, synthetic_image
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.cli._batch import exit_unless_reliable
 from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.io import read
-from napari_shadowinv.io.store import StackStore
+from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import ProtonSetup
@@ -69,6 +74,33 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     Path("shots.csv").write_text("\n".join(lines))
     write_recipe(Path("r.toml"), Recipe(fit=CHOICES))
     return tmp_path
+
+
+def test_a_stored_fit_keeps_its_cautions(images: Any, out: Path) -> None:
+    images[1, 10, 12] = 9.0
+    recipe = Recipe(setup=SETUPS[0], fit=CHOICES)
+    store = run_stack(images, out, recipe, scheduler="synchronous")
+    alone = run_fit(recipe, [images[1]])
+    report = StackStore(out).reports()[1]
+    assert [Caution.from_json(each) for each in report["warnings"]] == list(alone.cautions)
+    codes = [caution.code for caution in alone.cautions]
+    assert "hot-pixels" in codes
+    assert str(store["cautions"].values[1]).split() == list(dict.fromkeys(codes))
+    assert "hot pixels: 1 pixel" in flat(shadowinv("status", out).stdout)
+    table = out.with_name("night.csv")
+    assert shadowinv("export", out, "--out", table, "--format", "csv").exit_code == 0
+    with table.open(encoding="utf-8") as file:
+        row = list(csv.DictReader(file))[1]
+    assert "hot-pixels" in row["cautions"].split()
+
+
+@pytest.mark.parametrize(("code", "exits"), [("samples", True), ("hot-pixels", False)])
+def test_unreliable_error_bars_of_a_stored_fit_are_an_exit_code(code: str, exits: bool) -> None:
+    report = {"verdict": "determined", "warnings": [{"code": code, "text": "…"}]}
+    store: Any = SimpleNamespace(statuses=lambda: np.array([DONE]), reports=lambda: [report])
+    with pytest.raises(typer.Exit) if exits else nullcontext() as ended:
+        exit_unless_reliable(store)
+    assert not exits or ended.value.exit_code == 3
 
 
 def test_each_shot_of_an_array_is_fitted_alone(images: Any, out: Path) -> None:

@@ -304,7 +304,7 @@ def test_lazy_stack_computes_only_requested_variables(night):
         night.images, Recipe(setup=setup, options=OPTIONS), variables=["potential_si"]
     )
     quality = {"converged", "flux_residual", "image_residual", "iterations"}
-    quality |= {"verdict", "total_error", "limited_by"}
+    quality |= {"verdict", "cautions", "total_error", "limited_by"}
     quality |= {"noise_error", "discretisation_error"}
     assert set(stack.data_vars) == {"potential_si", *quality}
     alone = invert(night.images[0], options=OPTIONS)

@@ -137,7 +137,8 @@ def _exit_unless_reliable(store: StackStore) -> None:
     if not np.isin(statuses, (DONE, SKIPPED)).all():
         raise typer.Exit(EXIT_FAILED_SHOTS)
     for status, report in zip(statuses, store.reports(), strict=True):
-        is_sound = report.get("verdict") == _DETERMINED
+        codes = {caution["code"] for caution in report.get("warnings", ())}
+        is_sound = report.get("verdict") == _DETERMINED and "samples" not in codes
         if "level" in report:  # an inversion
             is_sound = report.get("converged")
         if status == DONE and not is_sound:
@@ -286,12 +287,12 @@ def _trouble_rows(store: StackStore) -> Rows:
 
 
 def _warning_rows(store: StackStore) -> Rows:
-    """List each kind of warning about inversions with its shots."""
+    """List each kind of warning with its shots, but for the verdicts of fits."""
     warned: dict[str, tuple[str, list[str]]] = {}
     for name, report in zip(store.names, store.reports(), strict=True):
-        if "level" not in report:
-            continue
         for caution in map(Caution.from_json, report.get("warnings", ())):
+            if caution.code == "verdict":
+                continue
             key = caution.text if caution.code == "other" else caution.code
             warned.setdefault(key, (caution.text, []))[1].append(name)
     return [("warning", f"{_list_text(names)}: {warning}") for warning, names in warned.values()]

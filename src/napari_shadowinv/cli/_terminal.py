@@ -205,6 +205,8 @@ def exit_unless_sound(result: Any, out: Path, checks: StaticChecks | None = None
         )
     elif verdict not in (None, Verdict.DETERMINED):
         text = f"{verdict.upper()}: {out} was written, but {result.explanation}"
+    elif doubts := [each.text for each in result.cautions if each.code == "samples"]:
+        text = f"UNRELIABLE ERROR BARS: {out} was written, but {doubts[0]}"
     else:
         return
     say_on_stderr(text)

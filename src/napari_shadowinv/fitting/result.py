@@ -432,13 +432,6 @@ class Fit:
         return Headline(level, "; ".join(texts))
 
     @property
-    def verdict_caution(self) -> Caution | None:
-        """The verdict as a reason to doubt the fields; None if they are determined."""
-        if self.verdict is Verdict.DETERMINED:
-            return None
-        return Caution("verdict", self.explanation)
-
-    @property
     def facts(self) -> tuple[Fact, ...]:
         """The result in words, as every face shows it."""
         return self.facts_with_names([each.file for each in self._origins])

@@ -101,6 +101,12 @@ COLUMNS: tuple[Column, ...] = (
         format="s",
         width=len("determined"),  # not broken into letters
     ),
+    Column(
+        "cautions",
+        "Codes of the reasons to doubt the result",
+        kind=str,
+        value=lambda result: " ".join(dict.fromkeys(each.code for each in result.cautions)),
+    ),
     _of_fits(
         "chi2",
         "Largest χ² of the shot's images",

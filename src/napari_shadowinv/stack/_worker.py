@@ -399,7 +399,6 @@ class FitTask(Task):
         return {name: plane for name, plane in planes.items() if plane is not None}, field
 
     def report(self, result: Fit) -> dict[str, Any]:
-        report, doubt = dataclasses.asdict(result.report), result.verdict_caution
         entries = {
             **column_values(FITS, result),
             "explanation": result.explanation,
@@ -407,8 +406,8 @@ class FitTask(Task):
             "brightness": result.brightness.tolist(),
             "strengths": result.strengths.tolist(),
             "objective": result.report.objective,
-            "stages": report["seconds"],
-            "warnings": [] if doubt is None else [dataclasses.asdict(doubt)],
+            "stages": result.report.seconds,
+            "warnings": [dataclasses.asdict(caution) for caution in result.cautions],
         }
         provenance = result.provenance
         if provenance is not None and any(image.file for image in provenance.images):
