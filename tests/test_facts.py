@@ -2,17 +2,32 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
+import re
+import textwrap
+from pathlib import Path
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from napari_shadowinv import FitOptions, InversionOptions, fit, invert, synthetic_image
+from napari_shadowinv import (
+    FitOptions,
+    InputError,
+    InversionOptions,
+    analyse,
+    fit,
+    invert,
+    read,
+    synthetic_image,
+)
 from napari_shadowinv._napari.widgets._panels import fact_rows as window_rows
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli._summary import fact_rows as table_rows
 from napari_shadowinv.facts import Level, percent, to_figures, with_error
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+from napari_shadowinv.preprocessing import Radiograph
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +79,61 @@ def test_errors_without_a_displacement_have_their_length():
     assert texts["errors"].startswith("0.")
     assert " px (r.m.s.): beam 0." in texts["errors"]
     assert "%" not in texts["errors"].partition("(5 %")[0]
+
+
+def results_of(image, inversion):
+    hasty = FitOptions(samples=0, max_iterations=2, spacing=0.25)
+    doubtful = inversion.with_warnings(
+        Caution("other", f"doubt {number} of <script> & co, {'very ' * 60}long")
+        for number in range(9)
+    )
+    radiograph = Radiograph(image, path=Path("<b>.tif"), mask=image > 0)
+    products = analyse(inversion, ["contrast"])
+    return [inversion, doubtful, fit([image], noise=0.01, options=hasty), radiograph, *products]
+
+
+def test_a_result_prints_a_few_lines_and_no_array(image, inversion):
+    for result in results_of(image, inversion):
+        lines = repr(result).splitlines()
+        assert lines[0].startswith(type(result).__name__)
+        assert len(lines) <= 6
+        assert max(map(len, lines)) <= 160
+        assert "array" not in repr(result)
+        if hasattr(result, "headline"):
+            assert lines[1] == textwrap.shorten(result.headline.text, 160, placeholder=" …")
+    assert "9 more" not in repr(inversion)
+    assert repr(results_of(image, inversion)[1]).endswith("and 6 more")
+
+
+def test_a_notebook_shows_the_picture_of_a_result(image, inversion):
+    for result in results_of(image, inversion):
+        shown = result._repr_html_()
+        assert "<script>" not in shown
+        assert "<b>.tif" not in shown
+        assert ("<img" in shown) == hasattr(result, "image") or hasattr(result, "fields")
+    mask = np.ones(image.shape, bool)
+    mask[5:9, 20:30] = False
+    masked = invert(image, mask=mask, options=InversionOptions(n_sites=400))
+    data = re.search('base64,([^"]+)"', masked._repr_html_())[1]
+    picture = iio.imread(base64.b64decode(data))
+    np.testing.assert_array_equal(picture[..., 3] > 0, mask)
+    length = np.where(mask, np.hypot(*masked.displacement), -1)
+    strongest = np.unravel_index(length.argmax(), mask.shape)
+    np.testing.assert_array_equal(picture[strongest][:3], (253, 231, 37))
+
+
+@pytest.mark.parametrize("function", [invert, fit])
+def test_a_file_or_its_content_is_no_image_yet(function, image, tmp_path):
+    file = tmp_path / "shot.npy"
+    np.save(file, image)
+    for path in (file, str(file)):
+        with pytest.raises(InputError, match=r"is the file .*shot.npy.*read\(.*\)\.image"):
+            function(path)
+    with pytest.raises(InputError, match=r"source is a Radiograph, .* give its \.image"):
+        function(image, source=read(file))
+    if function is invert:
+        with pytest.raises(InputError, match=r"image is a Radiograph, .* give its \.image"):
+            function(read(file))
 
 
 def texts_by_key(facts):

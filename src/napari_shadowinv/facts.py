@@ -1,5 +1,7 @@
 """A result in words, for every face: `Fact`, `Headline`, `Level`, `Verdict`; its `ResultKind`.
 
+A few lines and a picture of a result, as in a notebook: `Summarised`.
+
 Numbers in words: `to_figures`, `percent`, `with_error`; their power of ten: `power_of_ten`.
 
 Results describe themselves once, as facts. The command prints them as a table, a window shows them
@@ -12,17 +14,27 @@ the file's description in `cli`, the layers in `_napari`.
 
 from __future__ import annotations
 
+import base64
+import html
 import math
+import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from napari_shadowinv._typing import BoolArray
+import numpy as np
+
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 
 _MIN_PLAIN, _MAX_PLAIN = 1e-3, 1e5  # other numbers have a power of ten
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+_MAX_LINES, _LINE_LETTERS = 5, 160  # of a summary, below its title
+_PICTURE_PX = 256
+_SHOWN_PERCENTILES = 0.5, 99.5
+_COLOURS = (68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)
 
 
 def power_of_ten(largest: float, least: float = _MIN_PLAIN) -> tuple[int, str]:
@@ -70,6 +82,59 @@ def with_error(value: float, error: float, sign: str = "") -> str:
     digits = decimals_of(error)
     written = f"{value:{sign}.{digits}f} ± {error:.{digits}f}"
     return f"({written}) {text}" if text else written
+
+
+class Summarised:
+    """Mixin: shows its headline, its cautions and a picture instead of all its arrays."""
+
+    def _summary(self) -> list[str]:
+        """Return the lines below the title, the most important first."""
+        result: Any = self
+        lines = [result.headline.text] if hasattr(result, "headline") else []
+        if not hasattr(result, "cautions"):
+            return [*lines, *(f"{fact.title}: {fact.text}" for fact in result.facts)]
+        return lines + [each.text for each in result.cautions if each.code != "verdict"]
+
+    def _picture(self) -> FloatArray | None:
+        """Return the plane to show, NaN where there is nothing; None without a picture."""
+        return None
+
+    def _lines(self) -> list[str]:
+        plane, title = self._picture(), type(self).__name__
+        if plane is not None:
+            title += f", {plane.shape[1]} × {plane.shape[0]} px (width × height)"
+        lines = [
+            textwrap.shorten(line, _LINE_LETTERS, placeholder=" …") for line in self._summary()
+        ]
+        if len(lines) > _MAX_LINES:
+            lines[_MAX_LINES - 1 :] = [f"and {len(lines) - _MAX_LINES + 1} more"]
+        return [title, *lines]
+
+    def __repr__(self) -> str:
+        return "\n".join(self._lines())
+
+    def _repr_html_(self) -> str:
+        title, *lines = map(html.escape, self._lines())
+        items = "".join(f"<li>{line}</li>" for line in lines)
+        plane = self._picture()
+        picture = "" if plane is None else _picture_html(plane)
+        return f"<b>{title}</b><ul>{items}</ul>{picture}"
+
+
+def _picture_html(plane: FloatArray) -> str:
+    """Return an image tag with a plane in colours, transparent where it is NaN."""
+    import imageio.v3 as iio
+
+    step = -(-max(plane.shape) // _PICTURE_PX)
+    shown = np.asarray(plane[::step, ::step], float)
+    is_shown = np.isfinite(shown)
+    low, high = np.percentile(shown[is_shown], _SHOWN_PERCENTILES) if is_shown.any() else (0, 1)
+    share = np.clip((np.where(is_shown, shown, low) - low) / ((high - low) or 1.0), 0, 1)
+    stops = np.linspace(0, 1, len(_COLOURS))
+    channels = [np.interp(share, stops, channel) for channel in zip(*_COLOURS, strict=True)]
+    pixels = np.stack([*channels, 255.0 * is_shown], axis=-1).astype(np.uint8)
+    data = base64.b64encode(iio.imwrite("<bytes>", pixels, extension=".png")).decode()
+    return f'<img src="data:image/png;base64,{data}" width="{_PICTURE_PX}">'
 
 
 class ResultKind(StrEnum):

@@ -15,7 +15,15 @@ from napari_shadowinv._system.validation import validate
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Headline, Level, ResultKind, caution_facts, in_headline
+from napari_shadowinv.facts import (
+    Fact,
+    Headline,
+    Level,
+    ResultKind,
+    Summarised,
+    caution_facts,
+    in_headline,
+)
 from napari_shadowinv.film.pack import Pack
 from napari_shadowinv.film.unfolding import relative_strengths
 from napari_shadowinv.physics.setup import ProtonSetup
@@ -44,8 +52,8 @@ _BANDS = ("peak", "energy_low", "energy_high")  # columns of `FilmDoses.bands`
 _MIN_TIME_IN_NS = 1e-9  # s; shorter times are in ps
 
 
-@dataclass(frozen=True, eq=False)
-class FilmDoses:
+@dataclass(frozen=True, eq=False, repr=False)
+class FilmDoses(Summarised):
     """Doses and fluences of the films of a pack on common pixels, with their warnings.
 
     Arrays have an entry for each of the n layers, also for excluded films, whose values are NaN.
@@ -101,6 +109,10 @@ class FilmDoses:
     pixel_size: float | None = None
     setups: tuple[ProtonSetup, ...] = ()
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
+
+    def _picture(self) -> FloatArray:
+        has_dose = np.isfinite(self.dose).any(axis=(1, 2))
+        return np.asarray(self.dose[int(has_dose.argmax())])
 
     @property
     def pack(self) -> Pack:

@@ -81,6 +81,13 @@ def on_films(truth: Truth, doses, plane: Callable[[int], np.ndarray], layer: int
     return ndimage.map_coordinates(plane(layer), np.moveaxis(at, -1, 0), order=3, mode="nearest")
 
 
+def test_doses_print_a_few_lines_with_a_picture(doses) -> None:
+    lines = repr(doses).splitlines()
+    assert lines[1] == doses.headline.text
+    assert len(lines) <= 6
+    assert "<img" in doses._repr_html_()
+
+
 def test_places_of_a_packs_pixels_are_in_metres(doses) -> None:
     pixel = doses.pixel_size
     labelled = doses.to_dataset()

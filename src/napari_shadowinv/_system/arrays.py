@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,13 @@ def unpack_array(
     `name` is for messages; values in another unit than `unit` are refused. Raises an `InputError`
     if dimensions have other names, or pixels are not square.
     """
+    if isinstance(values, (str, PurePath)):
+        raise InputError(
+            f"{name} is the file {values}, expected an array: read it first, as in "
+            f'read("{values}").image'
+        )
+    if hasattr(values, "image"):
+        raise InputError(f"{name} is a {type(values).__name__}, expected an array: give its .image")
     if _is_labelled(values):
         values = _order_axes(values, name, dims, unit)
     if isinstance(values, (list, tuple)):

@@ -22,7 +22,7 @@ from napari_shadowinv.analysis.kinds import product_from_dict
 from napari_shadowinv.analysis.paths import csv_text
 from napari_shadowinv.analysis.product import BANDS, Coordinate, Product, Variable, has_bands
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Level
+from napari_shadowinv.facts import Fact, Level, Summarised
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.units import display_unit, label, numbers_of, prefix_for
 
@@ -35,8 +35,8 @@ _STATISTICS = ("bias", "std", "low_68", "high_68", "low_95", "high_95")
 _COLUMNS = ("product", "quantity", "place", "place_unit", "value", "unit", *_STATISTICS)
 
 
-@dataclass(frozen=True, eq=False)
-class ProductResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class ProductResult(Summarised):
     """A product of a field, with its bands.
 
     Attributes

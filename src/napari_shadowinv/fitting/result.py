@@ -19,6 +19,7 @@ from napari_shadowinv.facts import (
     Headline,
     Level,
     ResultKind,
+    Summarised,
     Verdict,
     caution_facts,
     error_fact,
@@ -265,8 +266,8 @@ class FitReport:
         return self.beam.name if self.beam else "noise"
 
 
-@dataclass(frozen=True)
-class Fit:
+@dataclass(frozen=True, repr=False)
+class Fit(Summarised):
     """Fields, beam and brightness that explain several images of one object.
 
     Attributes
@@ -340,6 +341,9 @@ class Fit:
     def normalised_residual(self) -> FloatArray:
         """The residual over σ, shape (L, H, W); NaN where masked."""
         return normalise_residual(self.residual, self.mask, self.noise)
+
+    def _picture(self) -> FloatArray:
+        return np.where(self.used, np.hypot(*self.fields[0].displacement), np.nan)
 
     @property
     def used(self) -> BoolArray:

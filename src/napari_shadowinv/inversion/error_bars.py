@@ -44,7 +44,7 @@ from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import to_figures
+from napari_shadowinv.facts import Summarised, to_figures
 from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.inversion._invert import invert, plan_sites
 from napari_shadowinv.inversion.imperfections import InstrumentDraws, RecordedShot, Scene
@@ -180,8 +180,8 @@ def _checked_share(share: float) -> float:
     return share
 
 
-@dataclass(frozen=True)
-class Uncertainty:
+@dataclass(frozen=True, repr=False)
+class Uncertainty(Summarised):
     """An inversion with its scatter due to image noise, and to its instrument if stated.
 
     Attributes
@@ -239,6 +239,14 @@ class Uncertainty:
     residuals: tuple[float, ...]
     converged: tuple[bool, ...]
     warnings: tuple[Caution, ...]
+
+    def _summary(self) -> list[str]:
+        drawn = ", ".join((self.noise, *self.imperfections))
+        shown = self.inversion.headline.text, f"{self.n} samples, {self.method}: {drawn}"
+        return [*shown, *(caution.text for caution in self.warnings)]
+
+    def _picture(self) -> FloatArray:
+        return np.where(self.inversion.mask, np.hypot(*self.displacement_std), np.nan)
 
     def band(self, share: float = 0.68) -> tuple[FloatArray, FloatArray]:
         """Return the displacement's lower and upper end at every pixel, (2, H, W) each, px.

@@ -21,6 +21,7 @@ from napari_shadowinv.facts import (
     Headline,
     Level,
     ResultKind,
+    Summarised,
     Verdict,
     caution_facts,
     error_fact,
@@ -127,8 +128,8 @@ class Assessment(NamedTuple):
     caution: Caution | None = None
 
 
-@dataclass(frozen=True)
-class Inversion:
+@dataclass(frozen=True, repr=False)
+class Inversion(Summarised):
     """Deflection potential of one shot, with its errors and warnings.
 
     Lengths are object-plane pixels; arrays are ``[y, x]``, vectors in axis order
@@ -196,6 +197,10 @@ class Inversion:
     instrument: Instrument = field(default_factory=Instrument)
     provenance: Provenance | None = None
     pixel_errors: PixelErrors | None = None
+
+    def _picture(self) -> FloatArray:
+        (field,) = shown_fields([self.displacement], self.setup, mask=self.mask)
+        return field.magnitude
 
     @property
     def errors(self) -> Errors | None:
@@ -510,8 +515,8 @@ def _pixel_errors(dataset: xarray.Dataset, name: str) -> PixelErrors | None:
 _STORED_CAUSES = ("noise and stated instrument, without an assumed beam",)
 
 
-@dataclass(frozen=True, eq=False)
-class RetrievedField:
+@dataclass(frozen=True, eq=False, repr=False)
+class RetrievedField(Summarised):
     """A displacement of another program, of a pradformat file, or of a shot of a store.
 
     Attributes
@@ -524,6 +529,9 @@ class RetrievedField:
     cautions: ClassVar[tuple[Caution, ...]] = ()
 
     dataset: xarray.Dataset
+
+    def _picture(self) -> FloatArray:
+        return np.hypot(*self.displacement)
 
     @property
     def displacement(self) -> FloatArray:

@@ -34,7 +34,7 @@ from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Level
+from napari_shadowinv.facts import Fact, Level, Summarised
 from napari_shadowinv.physics.field_grid import FieldGrid, field_grid
 from napari_shadowinv.physics.forward import checked_shape, synthetic_image, usable_threads
 from napari_shadowinv.physics.particle_flight import (
@@ -64,8 +64,8 @@ _MAX_EDGE_SHARE = 0.1
 _VECTORS = ("component", *PLANE)
 
 
-@dataclass(frozen=True, eq=False)
-class TracedImage:
+@dataclass(frozen=True, eq=False, repr=False)
+class TracedImage(Summarised):
     """The image that a 3-D field casts, and the truth about the field.
 
     Attributes
@@ -121,6 +121,9 @@ class TracedImage:
     edge_share: float
     steps: int
     particles: TracedParticles | None = None
+
+    def _picture(self) -> FloatArray:
+        return self.image
 
     @property
     def thin_displacement(self) -> FloatArray:

@@ -19,7 +19,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.facts import Fact, Headline, Level, Verdict, percent, time_fact, to_figures
+from napari_shadowinv.facts import (
+    Fact,
+    Headline,
+    Level,
+    Summarised,
+    Verdict,
+    percent,
+    time_fact,
+    to_figures,
+)
 from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
@@ -133,8 +142,8 @@ class Gain:
     total: float
 
 
-@dataclass(frozen=True, eq=False)
-class ExperimentPlan:
+@dataclass(frozen=True, eq=False, repr=False)
+class ExperimentPlan(Summarised):
     """Simulated shots of an experiment with their inversions or fits.
 
     Attributes
@@ -175,6 +184,9 @@ class ExperimentPlan:
     retrieved: FloatArray
     seconds: dict[str, float]
     is_thin: bool = True
+
+    def _picture(self) -> FloatArray:
+        return np.asarray(self.images[0])
 
     @property
     def verdicts(self) -> dict[Verdict, int]:

@@ -24,14 +24,15 @@ from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Summarised
 
 if TYPE_CHECKING:
     from napari_shadowinv._system.progress import ShouldStop
     from napari_shadowinv.physics.setup import Setup
 
 
-@dataclass(frozen=True, eq=False)
-class Radiograph:
+@dataclass(frozen=True, eq=False, repr=False)
+class Radiograph(Summarised):
     """One image, ready to be inverted.
 
     Attributes
@@ -62,6 +63,15 @@ class Radiograph:
     source_mask: BoolArray | None = None
     warnings: tuple[Caution, ...] = ()
     dark: FloatArray | None = None
+
+    def _summary(self) -> list[str]:
+        parts = [str(self.path)] if self.path is not None else []
+        parts += [self.setup.probe] if self.setup is not None else []
+        parts += [f"with {name}" for name in ("source", "mask") if getattr(self, name) is not None]
+        return [", ".join(parts) or "no setup", *(caution.text for caution in self.warnings)]
+
+    def _picture(self) -> FloatArray:
+        return self.image
 
     @property
     def shape(self) -> tuple[int, int]:
