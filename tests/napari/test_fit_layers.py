@@ -131,12 +131,12 @@ def test_a_verdict_cannot_be_missed(
     for layer in layers.values():
         assert metadata_of(layer)["verdict"] == "one of several"
         assert metadata_of(layer)["explanation"] == WHY
-    assert layers["field"].name == "|∫B×dz| (µT·m) – pack (one of several)"
+    assert layers["field"].name == "? |∫B×dz| (µT·m) – pack"
     good = replace(doubtful, verdict=Verdict.DETERMINED, explanation="all starts lead to one")
     layers = opened(viewer, write(tmp_path / "good.shadowinv", good))
     assert len(messages) == 1
     assert metadata_of(layers["field"])["verdict"] == "determined"
-    assert layers["field"].name == "|∫B×dz| (µT·m) – good"
+    assert layers["field"].name == "✓ |∫B×dz| (µT·m) – good"
 
 
 def test_warnings_of_a_saved_inversion_are_told(
@@ -207,7 +207,7 @@ def test_significance_and_structures_are_among_the_other_layers(
         assert structures is not None
         np.testing.assert_array_equal(layers[f"structures{part}"].data, outline(structures.labels))
         assert structures.labels.any()
-    assert layers["significance"].name.startswith("|d|/σ – pack")
+    assert layers["significance"].name.startswith("? |d|/σ – pack")
 
 
 def test_the_map_of_a_fit_is_that_of_its_total_error(two_fields: Fit) -> None:

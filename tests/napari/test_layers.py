@@ -229,7 +229,7 @@ def test_many_sites_are_thinned_and_the_name_says_so(
     monkeypatch.setattr("napari_shadowinv._napari.layers._MAX_SHOWN_SITES", 200)
     sites = by_role(add_inversion(viewer, solved, all_layers=True))["sites"]
     np.testing.assert_array_equal(sites.data, solved.sites[::3])
-    assert sites.name == "sites (1 in 3)"
+    assert sites.name == "✓ sites (1 in 3)"
     np.testing.assert_array_equal(sites.features["weight"], solved.weights[::3])
 
 
@@ -316,7 +316,7 @@ def test_layers_keep_their_order_when_some_are_deleted_between_results(
     layer_data = inversion_layers(solved)
     names = [keywords["name"] for _, keywords, _ in layer_data]
     _, results = show_layers(window, qtbot, layer_data)
-    for name in ("|d| (px)", "dx (px)", "sites"):
+    for name in ("✓ |d| (px)", "✓ dx (px)", "✓ sites"):
         window.layers.remove(name)
     window.add_image(np.ones((9, 9)), name="other")
     complete: list[bool] = []
@@ -350,15 +350,16 @@ EDGE = (Caution("closed-edge", "the field reaches the edge"),)
 
 
 def test_doubtful_result_has_the_doubt_in_its_names(solved: Inversion) -> None:
-    marks = {((), True): "", (EDGE, True): " (reaches the edge)", (EDGE, False): " (failed)"}
+    marks = {((), True): "✓", (EDGE, True): "?", (EDGE, False): "✗"}
     for (warnings, converged), mark in marks.items():
         report = replace(solved.report, warnings=warnings, converged=converged)
         for _, keywords, _ in inversion_layers(replace(solved, report=report), name="a"):
-            assert keywords["name"].endswith(f" – a{mark}")
+            assert keywords["name"].startswith(f"{mark} ")
+            assert keywords["name"].endswith(" – a")
         names = [
             keywords["name"] for _, keywords, _ in inversion_layers(replace(solved, report=report))
         ]
-        assert f"|d| (px){mark}" in names
+        assert f"{mark} |d| (px)" in names
 
 
 def test_structures_of_an_inversion_are_outlined_on_its_significance(

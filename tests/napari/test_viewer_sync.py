@@ -29,29 +29,29 @@ def test_only_the_image_that_is_seen_has_a_colour_bar(
     add_inversion(viewer, solved, name="a")
     add_inversion(viewer, solved, name="b")
     layers = viewer.layers
-    assert bars(viewer) == ["|d| (px) – b"]
-    layers["|d| (px) – b"].visible = False
-    assert bars(viewer) == ["|d| (px) – a"]
-    layers["residual (% of mean) – b"].visible = True
-    assert bars(viewer) == ["residual (% of mean) – b"]
-    layers.move(layers.index("|d| (px) – a"), len(layers))
-    assert bars(viewer) == ["|d| (px) – a"]
+    assert bars(viewer) == ["✓ |d| (px) – b"]
+    layers["✓ |d| (px) – b"].visible = False
+    assert bars(viewer) == ["✓ |d| (px) – a"]
+    layers["✓ residual (% of mean) – b"].visible = True
+    assert bars(viewer) == ["✓ residual (% of mean) – b"]
+    layers.move(layers.index("✓ |d| (px) – a"), len(layers))
+    assert bars(viewer) == ["✓ |d| (px) – a"]
     # What covers them is no image of this plugin's.
     viewer.add_image(np.ones((40, 52)), name="other")
     assert bars(viewer) == []
     layers.remove("other")
-    assert bars(viewer) == ["|d| (px) – a"]
-    layers.remove("|d| (px) – a")
-    assert bars(viewer) == ["residual (% of mean) – b"]
+    assert bars(viewer) == ["✓ |d| (px) – a"]
+    layers.remove("✓ |d| (px) – a")
+    assert bars(viewer) == ["✓ residual (% of mean) – b"]
 
 
 def test_a_colour_bar_that_was_switched_off_stays_off(
     viewer: ViewerModel, solved: Inversion
 ) -> None:
     add_inversion(viewer, solved, name="a")
-    viewer.layers["|d| (px) – a"].colorbar.visible = False
-    viewer.layers["|d| (px) – a"].visible = False
-    viewer.layers["residual (% of mean) – a"].visible = True
+    viewer.layers["✓ |d| (px) – a"].colorbar.visible = False
+    viewer.layers["✓ |d| (px) – a"].visible = False
+    viewer.layers["✓ residual (% of mean) – a"].visible = True
     assert not any(layer.colorbar.visible for layer in viewer.layers if hasattr(layer, "colorbar"))
 
 
@@ -60,7 +60,7 @@ def test_a_long_name_is_smaller_beside_the_colour_bar(
 ) -> None:
     add_inversion(viewer, solved, name="a")
     add_inversion(viewer, solved, name=80 * "b")
-    short, long = (viewer.layers[f"|d| (px) – {name}"] for name in ("a", 80 * "b"))
+    short, long = (viewer.layers[f"✓ |d| (px) – {name}"] for name in ("a", 80 * "b"))
     long.visible = False
     sizes = [layer.name_overlay.font_size for layer in (short, long)]
     assert sizes[1] * len(long.name) < 1.01 * sizes[0] * 46
@@ -76,7 +76,7 @@ def test_an_image_of_the_same_size_lies_on_the_result(
         messages.clear()
         image = viewer.add_image(data, name="other")
         assert frame_of(image) == frame
-        assert f"'{image.name}' has the same size in pixels as '|∫B×dz| (mT·m) – a'" in messages[-1]
+        assert f"'{image.name}' has the same size in pixels as '✓ |∫B×dz| (mT·m) – a'" in messages[-1]
         assert "1.5 µm" in messages[-1]
     np.savetxt(tmp_path / "other.txt", np.ones((40, 52)))
     (opened,) = viewer.open(tmp_path / "other.txt", plugin="napari-shadowinv")

@@ -146,7 +146,7 @@ def test_a_layer_that_was_changed_is_named(
     layers["potential"].data = layers["potential"].data + 1
     viewer.layers.save(str(tmp_path / "b.shadowinv"), plugin=PLUGIN)
     (text,) = messages
-    assert "'potential (px²)' changed since the result was computed" in text
+    assert "'✓ potential (px²)' changed since the result was computed" in text
 
 
 def test_pradformat_has_the_potential(

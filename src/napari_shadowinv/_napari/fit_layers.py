@@ -19,7 +19,7 @@ from napari_shadowinv._napari.layers import (
 )
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Level
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import intensity_limits
 
@@ -44,7 +44,6 @@ def fit_layers(result: Result[Fit], frame: Frame, name: str, *, alone: bool = Fa
             for layer in alternative_layers(result, number, frame, name):
                 layer[1]["visible"] = False
                 layers.append(layer)
-    suffix = "" if fit.verdict is Verdict.DETERMINED else f" ({fit.verdict.value})"
     for m, field in reversed(list(enumerate(fit.fields))):
         variables: dict[str, Any] = {
             "potential": (("y", "x"), field.potential),
@@ -56,9 +55,10 @@ def fit_layers(result: Result[Fit], frame: Frame, name: str, *, alone: bool = Fa
         variables |= significance_variables(field.displacement, errors, structures)
         if field.uncertainty is not None:
             variables["displacement_uncertainty"] = ("component", "y", "x"), field.uncertainty
-        title = f"{_field_title(name, fit, field)}{suffix}"
+        title = _field_title(name, fit, field)
         part = {"part": field.name} if m else {}
-        layers += _field_layers(variables, fit, m, frame, title, facts | part)
+        level = fit.headline.level
+        layers += _field_layers(variables, fit, m, frame, title, facts | part, level)
     return layers
 
 
@@ -94,7 +94,13 @@ def _field_title(name: str, fit: Fit, field: FittedField) -> str:
 
 
 def _field_layers(
-    variables: dict[str, Any], fit: Fit, m: int, frame: Frame, title: str, facts: dict[str, Any]
+    variables: dict[str, Any],
+    fit: Fit,
+    m: int,
+    frame: Frame,
+    title: str,
+    facts: dict[str, Any],
+    level: Level | None = None,
 ) -> LayerData:
     """Describe the layers of the field number `m`; only the layers of the first are visible."""
     import xarray as xr
@@ -102,7 +108,7 @@ def _field_layers(
     facts = {**facts, "displacement": variables["displacement"][1]}
     deflector = deflector_titles()[fit.fields[m].name]
     view = View(xr.Dataset(variables), fit.setup, deflector=deflector)
-    layer_data = dataset_layers(view, frame, title, facts)
+    layer_data = dataset_layers(view, frame, title, facts, level)
     for _, keywords, _ in layer_data:
         keywords["visible"] &= m == 0
     return layer_data

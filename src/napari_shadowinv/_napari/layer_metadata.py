@@ -13,6 +13,7 @@ import numpy as np
 
 from napari_shadowinv._napari.preferences import AUTOMATIC, preference
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.facts import Level
 
 if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
@@ -196,9 +197,13 @@ def main_layers(layer_data: Sequence[_LayerTuple], also: Collection[str] = ()) -
     ]
 
 
-def layer_name(title: str, name: str) -> str:
+_MARKS = {Level.SOUND: "✓ ", Level.DOUBTFUL: "? ", Level.FAILED: "✗ "}
+
+
+def layer_name(title: str, name: str, level: Level | None = None) -> str:
     """Name a layer by its quantity, then its result: napari cuts long names in the middle."""
-    return f"{title} – {name}" if name else title
+    mark = "" if level is None else _MARKS[level]
+    return f"{mark}{title} – {name}" if name else f"{mark}{title}"
 
 
 KEY = "napari-shadowinv"

@@ -16,7 +16,7 @@ from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import connect_viewer, show_scale_bar
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Level, Verdict
+from napari_shadowinv.facts import Level
 from napari_shadowinv.inversion.variables import VARIABLES
 from napari_shadowinv.io.store import of_each_setup
 from napari_shadowinv.physics.significance import PixelErrors, Structures, significance
@@ -119,7 +119,7 @@ def add_inversion(
     >>> viewer = ViewerModel()
     >>> layers = add_inversion(viewer, invert(np.ones((20, 20))), name="blank")
     >>> [layer.name for layer in layers if layer.visible]
-    ['|d| (px) – blank (too uncertain)', 'displacement arrows – blank (too uncertain)']
+    ['? |d| (px) – blank', '? displacement arrows – blank']
     """
     layer_data = inversion_layers(inversion, setup, name=name, **keywords)
     return add_layers(viewer, layer_data if all_layers else about.main_layers(layer_data))
@@ -181,11 +181,9 @@ def result_layers(
     dataset = xr.Dataset(
         {name: (dims, getattr(content, name)) for name, (dims, _, _) in VARIABLES.items()}
     ).assign(significance_variables(content.displacement, content.pixel_errors, content.structures))
-    level, verdict = content.headline.level, content.verdict
-    doubt = level if verdict is Verdict.DETERMINED or level is Level.FAILED else verdict
-    suffix = "" if level is Level.SOUND else f"({doubt})"
     view = View(dataset, result.setup, cells=power_cells(content) if cells else None)
-    layer_data = dataset_layers(view, frame, name, shared_metadata(result, name), suffix)
+    facts, level = shared_metadata(result, name), content.headline.level
+    layer_data = dataset_layers(view, frame, name, facts, level)
     for _, keywords, _ in layer_data:
         if role_of(keywords) == "image":
             # With beam and mask, the image can be inverted again.
@@ -195,9 +193,9 @@ def result_layers(
 
 
 def dataset_layers(
-    view: View, frame: Frame, name: str, facts: Mapping[str, Any], suffix: str = ""
+    view: View, frame: Frame, name: str, facts: Mapping[str, Any], level: Level | None = None
 ) -> LayerData:
-    """Describe the layers of a result or of a stack; all names end with `suffix`."""
+    """Describe the layers of a result, with the mark of its level, or of a stack."""
     layers = []
     for kind in about.KINDS:
         if not view.has(kind):
@@ -208,7 +206,7 @@ def dataset_layers(
             data = np.where(view.masked, np.nan, data)
         unit = words.get("unit", kind.unit)
         keywords = {
-            "name": f"{about.layer_name(kind.title.format(**words), name)} {suffix}".rstrip(),
+            "name": about.layer_name(kind.title.format(**words), name, level),
             "metadata": about.metadata_for(kind.role, unit, view.setup, **facts),
             "visible": kind.visible,
             **frame.keywords(stacked=view.shot is not None),

@@ -701,7 +701,7 @@ def test_refine_starts_from_the_last_inversion(
         ),
         timeout=PATIENCE,
     )
-    assert any(name.startswith("|∫B×dz| (mT·m) – shot") for name in names), names
+    assert any(name[2:].startswith("|∫B×dz| (mT·m) – shot") for name in names), names
     refined = layer_of(window, "field", "refined")
     assert refined.data.shape == shot.shape
     qtbot.waitUntil(lambda: not tool.fit_view.results.busy, timeout=PATIENCE)

@@ -313,12 +313,10 @@ class SourcePicker(forms.ModelPicker):
 
     @property
     def short_name(self) -> str:
-        """The source in the name of a result; empty if uniform or supplied with the shot."""
-        if self.kind in (SUPPLIED, UNIFORM):
+        """The estimated source in the name of a result; empty if uniform or measured."""
+        if self.kind == UNIFORM:
             return ""
-        if self.kind == LAYER:
-            return "" if self.layer is None else str(self.layer.name)
-        return Path(self.file.path).name if self.kind == FILE else f"{self.kind} source"
+        return f"{self.kind} source" if self.kind in preprocessing.ESTIMATES else ""
 
     def chosen(self) -> preprocessing.Estimate | preprocessing.MeasuredSource | None:
         """Return the source as a recipe describes it, None if it is fitted; or an `InputError`."""

@@ -327,7 +327,7 @@ class SourceJob(jobs.Job):
             source_mask=self.shot.source_mask,
         )
         keywords = {
-            "name": f"{layer.name} source{' preview' if self.preview else ''}",
+            "name": f"{layer.name} source: {'preview' if self.preview else self.estimate.title}",
             "metadata": metadata,
             "colormap": layer.colormap.name,
             "contrast_limits": tuple(layer.contrast_limits),
