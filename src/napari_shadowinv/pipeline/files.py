@@ -61,7 +61,11 @@ def setup_from(
     path: Path, defaults: Mapping[str, Any] | None = None, changes: Mapping[str, Any] | None = None
 ) -> Setup:
     """Read a setup from a file, with changes; missing entries come from `defaults`."""
-    entries, defaults = {**read_toml(path), **(changes or {})}, defaults or {}
+    return complete_setup({**read_toml(path), **(changes or {})}, defaults or {}, str(path))
+
+
+def complete_setup(entries: Mapping[str, Any], defaults: Mapping[str, Any], where: str) -> Setup:
+    """Make a setup from entries, and from `defaults` for those that are missing."""
     if "kind" in defaults and entries.get("kind", defaults["kind"]) != defaults["kind"]:
         defaults = {}
     elif defaults and "kind" not in defaults:
@@ -74,7 +78,7 @@ def setup_from(
         defaults |= {"kind": kind} if kind else {}
     if _PIXEL_SIZES & entries.keys():
         defaults = {name: value for name, value in defaults.items() if name not in _PIXEL_SIZES}
-    return setup_from_dict({**defaults, **entries}, str(path))
+    return setup_from_dict({**defaults, **entries}, where)
 
 
 def _kind_of(entries: Mapping[str, Any]) -> str:

@@ -25,6 +25,7 @@ from napari_shadowinv._napari.widgets._results import describe_inputs
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.options import (
     ASSUMED_BEAM,
     BEAM_SOURCES,
@@ -33,7 +34,8 @@ from napari_shadowinv.options import (
     InversionOptions,
 )
 from napari_shadowinv.physics.beam import geometry_text, setup_warnings, unit_in_title
-from napari_shadowinv.physics.setup import SETUPS, Setup, deflector_titles, setup_from_dict
+from napari_shadowinv.physics.setup import SETUPS, Setup, deflector_titles
+from napari_shadowinv.pipeline.files import complete_setup
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
 
 _NONE = "none"
@@ -198,7 +200,10 @@ class SetupPicker(QWidget):
         self._show_notes()
 
     def _on_edit(self) -> None:
-        kind, before = self.picker.kind, self._state
+        kind, before, form = self.picker.kind, self._state, self.picker.form
+        if kind != before["kind"] and form is not None and form.is_empty and self._fill_in(form):
+            name = self._layer.name
+            self._shown[kind] = _Entry(form.values(), f"begun with the file of '{name}'")
         values = self.picker.state()["values"].get(kind, {})
         # Selecting another form, or leaving a field as it was, changes no values.
         if kind == before["kind"] and values != before["values"].get(kind):
@@ -251,12 +256,31 @@ class SetupPicker(QWidget):
         self.geometry_label.show_text("" if setup is None else geometry_text(setup, shape))
         self.warning_label.show_text("\n".join(caution.text for caution in cautions))
 
+    def _file_geometry(self) -> dict[str, Any]:
+        """Return the part of a setup in the image's file, also of an image that napari opened."""
+        if self._layer is None:
+            return {}
+        metadata = about.metadata_of(self._layer).get("file")
+        path = self._layer.source.path
+        if metadata is None and path is not None and self._layer.ndim == 2:
+            with suppress(InputError, OSError):
+                metadata = read_radiograph(path).metadata
+        return dict((metadata or {}).get("geometry", {}))
+
+    def _fill_in(self, form: forms.ModelForm) -> bool:
+        """Begin an empty form with what the image's file says; return whether that is anything."""
+        geometry = self._file_geometry()
+        values = {name: geometry[name] for name in form.editors if name in geometry}
+        with QSignalBlocker(self.picker):
+            form.set_values(form.values() | values)
+        return bool(values)
+
     def _to_save(self) -> dict[str, object]:
         setup = self.setup()
         return {} if setup is None else setup.model_dump()
 
     def load(self, entries: dict[str, Any], path: str) -> None:
-        values = setup_from_dict(entries, path).model_dump()
+        values = complete_setup(entries, self._file_geometry(), path).model_dump()
         owner = "" if self._until_run else self._typed_origin().removeprefix("typed")
         self.show_setup(values, f"loaded from {Path(path).name}{owner}")
 
