@@ -130,7 +130,7 @@ def press_run(widget: Any) -> None:
 def show_only(viewer: napari.Viewer, *titles: str) -> None:
     """Switch on the layers whose names begin with these titles, and off all others."""
     for layer in viewer.layers:
-        layer.visible = layer.name.startswith(titles)
+        layer.visible = layer.name.lstrip("✓?✗ ").startswith(titles)
 
 
 def toroid_window() -> None:
@@ -171,7 +171,7 @@ def first_windows() -> None:
     bar.setValue(bar.maximum() - 15)  # begin with a whole row
     photograph(viewer, "tutorial-first-field.png", close=False)
     show_only(viewer, "residual (% of mean)")
-    viewer.layers.selection.active = viewer.layers["residual (% of mean) – toroid"]
+    viewer.layers.selection.active = viewer.layers["✓ residual (% of mean) – toroid"]
     photograph(viewer, "tutorial-first-residual.png", close=False)
     show_only(viewer, "|∫B×dz| (mT·m)")
     profile = open_widget(viewer, "Analyse")
@@ -179,7 +179,7 @@ def first_windows() -> None:
     profile.lines.layer.add([[99.5, 5.0], [99.5, 194.0]], shape_type="line")
     for layer in profile.checked():
         profile.check(layer, False)
-    profile.check(viewer.layers["|∫B×dz| (mT·m) – toroid"])
+    profile.check(viewer.layers["✓ |∫B×dz| (mT·m) – toroid"])
     photograph(viewer, "tutorial-first-profile.png")
 
 
@@ -190,17 +190,15 @@ def proton_windows() -> None:
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
         exec(compile(making, "proton-radiograph.md", "exec"), {})
         viewer = new_window("proton radiograph")
-        viewer.open("shot.tif")
+        viewer.open(["shot.tif", "reference.tif"])
         invert_shot = open_widget(viewer, "Invert shot")
-        invert_shot.source.set_kind("file")
-        invert_shot.source.file.edit.setText("reference.tif")
         invert_shot.setup.picker.set_kind("proton")
         fields = invert_shot.setup.picker.form
         fields.set_values(PROTON_FIELDS)
         invert_shot.setup.picker.changed.emit()
         photograph(viewer, "tutorial-proton-setup.png", close=False)
         press_run(invert_shot)
-        viewer.layers["caustics – shot, reference.tif"].visible = True
+        viewer.layers["✓ caustics – shot"].visible = True
         photograph(viewer, "tutorial-proton-field.png")
 
 
@@ -209,7 +207,6 @@ def source_windows() -> None:
     viewer = new_window("no reference image", height=880)
     viewer.open_sample(PLUGIN, "four_toroids")
     estimate = open_widget(viewer, "Estimate source")
-    estimate.method.set_kind("polynomial")
     press_run(estimate)
     photograph(viewer, "tutorial-source-estimate.png", close=False)
     invert_shot = open_widget(viewer, "Invert shot")
