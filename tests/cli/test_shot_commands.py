@@ -1451,3 +1451,19 @@ def test_the_package_runs_as_the_command() -> None:
     command = [sys.executable, "-m", "napari_shadowinv", "--version"]
     ended = subprocess.run(command, capture_output=True, text=True, check=True)
     assert ended.stdout == f"shadowinv {__version__}\n"
+
+
+def test_a_doubt_of_the_setup_is_printed_once(shot: Path) -> None:
+    Path("swapped.toml").write_text(PROTON_TOML.replace("= 0.01", "= 1").replace("0.3", "0.01"))
+    result = shadowinv("invert", shot, "--n-sites", 300, "--setup", "swapped.toml")
+    printed = flat(result.stdout) + flat(result.stderr)
+    assert printed.count("the magnification is 1.01") == 1
+    # The result keeps it.
+    assert "the magnification is 1.01" in flat(shadowinv("info", "shot.shadowinv").stdout)
+
+
+def test_info_lists_options_that_have_a_value(shot: Path) -> None:
+    shadowinv("invert", shot)
+    text = flat(shadowinv("info", "shot.shadowinv").stdout)
+    assert "= None" not in text
+    assert "boundary = closed" in text
