@@ -27,4 +27,4 @@ def test_info_of_a_picture_states_size_turn_and_gaps(tmp_path: Path, channels: i
     assert "turned upright as the file says" in text
     assert "not proportional to the light" in text
     if channels == 1:
-        assert f"{np.count_nonzero(SHOT == SHOT[0, 0])} pixels without a value" in text
+        assert f"{np.count_nonzero(SHOT[0, 0] == SHOT)} pixels without a value" in text
