@@ -41,8 +41,9 @@ from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError
 
 _LONGEST_LINE = 4_000_000  # a row of 100 000 pixels with all their digits has 2.5 MB
-_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "nm": 1e-9, "mev": 1.0, "kev": 1e-3, "ev": 1e-6}
-_UNITS |= dict.fromkeys(("um", "µm", "μm", "micron", "microns"), 1e-6)
+LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "nm": 1e-9}
+LENGTHS |= dict.fromkeys(("um", "µm", "μm", "micron", "microns"), 1e-6)
+_UNITS = {**LENGTHS, "mev": 1.0, "kev": 1e-3, "ev": 1e-6}
 _ENERGY_UNITS = {"mev", "kev", "ev"}
 
 _NAMES = {

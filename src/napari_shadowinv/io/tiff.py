@@ -39,6 +39,7 @@ from napari_shadowinv.io.images import (
     is_linear_profile,
     without_pixels,
 )
+from napari_shadowinv.io.text import LENGTHS
 
 _TIFF_RATIO = 3 * DEFLATE_RATIO  # LZW at its best packs two and a half times as well as zlib
 _SMALL_STRIP = 50_000_000  # bytes, which do not matter
@@ -51,7 +52,7 @@ _PICTURE_CODECS = {6, 7, 33003, 33004, 33005, 34712, 34892, 34933, 34934, 50001}
 _WHITE_IS_ZERO, _RGB, _PALETTE, _MASK, _YCBCR = 0, 2, 3, 4, 6
 _GREY_OR_RGB = {_WHITE_IS_ZERO, 1, _RGB, _PALETTE}
 _ALPHA = {1, 2}  # of the tag ExtraSamples
-_TO_METRES = {2: INCH_M, 3: 0.01, 4: 1e-3, 5: 1e-6}  # by the unit of resolution
+_UNITS_M = {2: INCH_M, 3: 0.01, 4: 1e-3, 5: 1e-6, "inch": INCH_M, **LENGTHS}
 _POLYNOMIALS, _UNCALIBRATED = range(4), 20  # of ImageJ's calibration functions
 _ROOTS, _PROPORTIONAL = 2, 128  # of gel scanners' values
 
@@ -76,7 +77,7 @@ def _open_tiff(path: Path) -> Iterator[Any]:
     logger.disabled = True
     try:
         # Their series may open other files, or take tags for granted.
-        kinds = dict.fromkeys(("is_ome", "is_mmstack", "is_ndtiff", "is_mdgel"), False)
+        kinds: Any = dict.fromkeys(("is_ome", "is_mmstack", "is_ndtiff", "is_mdgel"), False)
         with tifffile.TiffFile(path, **kinds) as tiff:
             yield tiff
     finally:
@@ -85,7 +86,7 @@ def _open_tiff(path: Path) -> Iterator[Any]:
 
 def _layout_of(path: Path) -> _Layout:
     check_regular(path, "a TIFF")
-    status = path.stat()
+    status = path.stat()  # a changed file is opened again
     return _find_frames(path, status.st_mtime_ns, status.st_size)
 
 
@@ -116,8 +117,8 @@ def _find_frames(path: Path, _modified_ns: int, size: int) -> _Layout:
             return _Layout(count, (_first_of_stored_together(path, shots, size),), (), sizes)
         if count == 1:
             _check_imagej_promise(path, tiff, shots[0].keyframe, size)
-        indices = (sorted(page.index for s in group for page in s) for group in (shots, masks))
-        return _Layout(count, *map(tuple, indices), sizes)
+        pages, covers = (tuple(sorted(p.index for s in g for p in s)) for g in (shots, masks))
+        return _Layout(count, pages, covers, sizes)
 
 
 def _sides(series: Any) -> tuple[int, int]:
@@ -404,45 +405,23 @@ def _is_straight(curve: AnyArray) -> bool:
 
 
 def _pixel_size(tiff: Any, page: Any) -> tuple[float, bool] | None:
-    """Return the size of a pixel (m), and whether a program of science states it."""
+    """Return the size of a pixel (m), and whether its unit is one of measurements."""
     first = tiff.pages.first
     if first.is_ome:
-        (pixels, *_) = [
-            element
-            for element in ElementTree.fromstring(first.description).iter()
-            if element.tag.endswith("Pixels")
-        ] or [{}]
-        unit = pixels.get("PhysicalSizeXUnit", "µm")
-        sizes = [pixels.get(f"PhysicalSize{axis}") for axis in "XY"]
-        return _in_metres([float(size) for size in sizes if size], unit)
-    ratios = [page.tags.valueof(number) for number in (282, 283)]
-    if not all(isinstance(ratio, tuple) and len(ratio) == 2 and all(ratio) for ratio in ratios):
+        root = ElementTree.fromstring(first.description)
+        stated = next((part.attrib for part in root.iter() if part.tag.endswith("Pixels")), {})
+        sizes = [float(stated.get(f"PhysicalSize{axis}", 0)) for axis in "XY"]
+        unit: Any = stated.get("PhysicalSizeXUnit", "µm")
+    else:
+        ratios = [page.tags.valueof(number) for number in (282, 283)]
+        is_stated = all(isinstance(ratio, tuple) and all(ratio) for ratio in ratios)
+        sizes = [per / count for count, per in ratios] if is_stated else [0.0]
+        unit = (tiff.imagej_metadata or {}).get("unit", page.tags.valueof(296, default=2))
+    unit_m = _UNITS_M.get(unit.replace("\\u00B5", "µ") if isinstance(unit, str) else unit)
+    # Programs that do not know it write 1.
+    if unit_m is None or sizes[0] in (0.0, 1.0) or max(sizes) > 1.01 * min(sizes):
         return None
-    sizes = [per / count for count, per in ratios]
-    named = _in_metres(sizes, str((tiff.imagej_metadata or {}).get("unit", "")))
-    if named is not None:
-        return named
-    unit = _TO_METRES.get(page.tags.valueof(296, default=2))
-    if unit is None or not _are_square(sizes) or sizes[0] in (0.0, 1.0):
-        return None
-    return unit * sizes[0], unit < 0.01
-
-
-def _in_metres(sizes: list[float], unit: str) -> tuple[float, bool] | None:
-    from napari_shadowinv.physics.beam import number_in_unit
-
-    unit = unit.encode().decode("unicode_escape") if "\\u" in unit else unit
-    unit = {"micron": "µm", "microns": "µm"}.get(unit, unit)
-    if not sizes or not _are_square(sizes) or sizes[0] in (0.0, 1.0):
-        return None  # 1 is written by programs that do not know it
-    try:
-        return number_in_unit(f"{sizes[0]:.12g} {unit}", "m"), unit not in ("cm", "m")
-    except ValueError:
-        return None
-
-
-def _are_square(sizes: list[float]) -> bool:
-    return max(sizes) <= 1.01 * min(sizes)
+    return unit_m * sizes[0], unit_m <= 1e-3
 
 
 def write_tiff(path: Path, plane: AnyArray, pixel_size: float | None = None) -> None:

@@ -510,8 +510,8 @@ def _without_missing(mask: _Mask, *images: Radiograph | None) -> _Mask:
     """Remove the pixels without a value in the files of images from a mask."""
     masked = (image for image in images if image is not None and image.mask is not None)
     present = [~np.isnan(image.image) for image in masked]
-    pixels = join_masks(mask.pixels, *present)
-    return mask if np.array_equal(pixels, mask.pixels) else _Mask(pixels, None)
+    pixels: Any = join_masks(mask.pixels, *present)
+    return _Mask(pixels, None if (pixels != mask.pixels).any() else mask.file) if present else mask
 
 
 def picture_mask(path: Path, name: str = "mask", variable: str | None = None) -> BoolArray:
