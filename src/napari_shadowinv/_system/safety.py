@@ -38,8 +38,8 @@ _ALWAYS_FITS = 1_000_000
 _LARGEST_TEXT = 1_000_000
 _LONGEST_SHOWN = 300  # characters of a path
 
-_DECODING_ERRORS = (OSError, EOFError, SyntaxError, UnicodeError, struct.error)
-_DECODING_ERRORS += (zlib.error, lzma.LZMAError)
+_DECODING_ERRORS: tuple[type[Exception], ...] = (OSError, EOFError, SyntaxError, UnicodeError)
+_DECODING_ERRORS += (struct.error, zlib.error, lzma.LZMAError)
 _NOT_SUPPORTED = re.compile(
     r"not (available|implemented|installed|supported)|unsupported|unknown|requires the ", re.I
 )

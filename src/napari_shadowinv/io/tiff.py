@@ -52,7 +52,8 @@ _PICTURE_CODECS = {6, 7, 33003, 33004, 33005, 34712, 34892, 34933, 34934, 50001}
 _WHITE_IS_ZERO, _RGB, _PALETTE, _MASK, _YCBCR = 0, 2, 3, 4, 6
 _GREY_OR_RGB = {_WHITE_IS_ZERO, 1, _RGB, _PALETTE}
 _ALPHA = {1, 2}  # of the tag ExtraSamples
-_UNITS_M = {2: INCH_M, 3: 0.01, 4: 1e-3, 5: 1e-6, "inch": INCH_M, **LENGTHS}
+_UNITS_M: dict[int | str, float] = {2: INCH_M, 3: 0.01, 4: 1e-3, 5: 1e-6, "inch": INCH_M}
+_UNITS_M |= LENGTHS
 _POLYNOMIALS, _UNCALIBRATED = range(4), 20  # of ImageJ's calibration functions
 _ROOTS, _PROPORTIONAL = 2, 128  # of gel scanners' values
 
@@ -60,7 +61,7 @@ _ROOTS, _PROPORTIONAL = 2, 128  # of gel scanners' values
 class _Layout(NamedTuple):
     """Where the frames of a TIFF are."""
 
-    count: int
+    n_frames: int
     pages: tuple[int, ...]  # numbers of their directories; only one if they follow each other
     masks: tuple[int, ...] = ()
     left_out: tuple[str, ...] = ()  # sizes of smaller pictures
@@ -159,19 +160,19 @@ def _check_imagej_promise(path: Path, tiff: Any, page: Any, size: int) -> None:
 @as_file_errors
 def count_tiff_frames(path: Path) -> int:
     """Return how many frames a TIFF has."""
-    return _layout_of(path).count
+    return _layout_of(path).n_frames
 
 
 def read_tiff(path: Path, number: int | None = None) -> tuple[AnyArray, dict[str, Any]]:
     """Read frame `number`, from 0, of a TIFF; without a number its only one."""
     layout = _layout_of(path)
-    if number is None and layout.count != 1:
+    if number is None and layout.n_frames != 1:
         raise FileFormatError(
-            f"{path} has {layout.count} frames: expected one image; invert all of them as a "
+            f"{path} has {layout.n_frames} frames: expected one image; invert all of them as a "
             "stack of shots, or save the frame you need separately"
         )
     number = number or 0
-    is_stored_together = layout.count > len(layout.pages)
+    is_stored_together = layout.n_frames > len(layout.pages)
     with _open_tiff(path) as tiff:
         page = tiff.pages[layout.pages[0 if is_stored_together else number]].aspage()
         _check_kind(path, page)
@@ -286,7 +287,7 @@ def _without_alpha(page: Any, array: AnyArray) -> AnyArray:
 
 
 def _mask_page(layout: _Layout, number: int) -> int | None:
-    if len(layout.masks) in (1, layout.count):
+    if len(layout.masks) in (1, layout.n_frames):
         return layout.masks[number if len(layout.masks) > 1 else 0]
     return None
 
