@@ -472,3 +472,24 @@ def test_damage_within_a_result_is_one_sentence(tmp_path: Path, inversion: Inver
         read_paths(str(path))
     assert error.value.__cause__ is not None
     assert "\n" not in str(error.value)
+
+
+def test_images_of_an_hdf5_file_are_layers(viewer: ViewerModel, tmp_path: Path) -> None:
+    path = tmp_path / "run.nxs"
+    frames = np.arange(60.0).reshape(3, 4, 5)
+    usable = np.ones((4, 5), np.uint32)
+    with h5py.File(path, "w") as file:
+        file["entry/data"], file["entry/beam"] = frames, frames[0] + 1
+    layers = {layer.name: layer.data for layer in viewer.open(path, plugin=PLUGIN)}
+    np.testing.assert_array_equal(layers["entry/beam"], frames[0] + 1)
+    np.testing.assert_array_equal(layers["entry/data"], frames)
+    with h5py.File(path, "a") as file:
+        file["entry/pixel_mask"] = 1 - usable
+        file.attrs["default"], file["entry"].attrs["signal"] = "entry", "data"
+    (layer,) = viewer.open(path, plugin=PLUGIN)
+    assert (layer.name, layer.data.shape) == ("run", (3, 4, 5))
+    read_layers = get_reader(f"{path}::/entry/beam")
+    assert read_layers is not None
+    ((data, _, kind),) = read_layers(f"{path}::/entry/beam")
+    assert kind == "image"
+    np.testing.assert_array_equal(data, frames[0] + 1)

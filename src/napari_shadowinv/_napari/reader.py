@@ -15,9 +15,11 @@ from napari_shadowinv._napari.viewer_sync import (
 )
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io.files import split_address
-from napari_shadowinv.io.formats import HDF5, RADIOGRAPH_SUFFIXES, RESULT, STORE
+from napari_shadowinv.io.files import join_address, split_address
+from napari_shadowinv.io.formats import HDF5, RADIOGRAPH_SUFFIXES, RESULT, STORE, format_of
 from napari_shadowinv.io.frames import images_in, is_pattern, left_out_of, matching_files
+
+_MAX_IMAGES = 8  # of one file that are opened as layers
 
 
 def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[Any]] | None:
@@ -36,9 +38,12 @@ def _can_read(path: Path) -> bool:
         return bool(images_in(path))
     # Other programs use the endings of HDF5, too.
     if path.suffix.lower() in HDF5.suffixes:
-        from napari_shadowinv.io.hdf5_arrays import has_images
+        from napari_shadowinv.io.hdf5_arrays import image_names
 
-        return has_images(path)
+        try:
+            return bool(image_names(path))
+        except FileFormatError:
+            return False
     return _is_image_name(path)
 
 
@@ -75,6 +80,19 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
 
 @as_file_errors
 def _read_file(path: Path) -> list[Any]:
+    from napari_shadowinv.io.field_grids import is_field_grid
+    from napari_shadowinv.io.hdf5_arrays import image_names
+
+    file, variable = split_address(path)
+    if variable is None and format_of(file) is HDF5 and not is_field_grid(file):
+        names = image_names(file)
+        if len(names) > 1:
+            arrays = [(join_address(file, name), name) for name in names[:_MAX_IMAGES]]
+            return [layer for address, name in arrays for layer in _read_content(address, name)]
+    return _read_content(path, "")
+
+
+def _read_content(path: Path, array: str) -> list[Any]:
     from napari_shadowinv._napari.result_files import layers_of_dataset
     from napari_shadowinv._napari.shots import frame_layers, radiograph_layers
     from napari_shadowinv.io import read
@@ -85,9 +103,9 @@ def _read_file(path: Path) -> list[Any]:
     if isinstance(content, Radiograph):
         for caution in content.warnings:
             show_caution(f"{path.name}: {caution.text}")
-        return radiograph_layers(content)
+        return radiograph_layers(content, array)
     if content.attrs.get("format") == FRAMES_FORMAT:
-        return frame_layers(content, path.stem)
+        return frame_layers(content, array or split_address(path)[0].stem)
     layers = layers_of_dataset(content, path.stem)
     _show_in_window(layers)
     result = result_of(layers[0][1])

@@ -420,9 +420,9 @@ class _WatchPrinter:
             skipped = f", {status.skipped} skipped" if status.skipped else ""
             counts = f"{status.done} done, {status.failed} failed{skipped}; "
             counts = counts if status.total else ""
+            names = "images" if self.pattern == "*" else self.pattern
             self._print(
-                self.out,
-                f"Watching {self.folder} for {self.pattern}; {counts}press Ctrl-C to stop.",
+                self.out, f"Watching {self.folder} for {names}; {counts}press Ctrl-C to stop."
             )
 
     def _print_shot(self, status: RunStatus) -> None:

@@ -142,7 +142,9 @@ def _detectors(path: Path, dataset: Any) -> Iterator[Any]:
     """Yield the group of an array, and the detector of its entry if there is only one."""
     yield dataset.parent
     instrument = member(path, dataset.parent.parent, "instrument")
-    groups = [] if instrument is None else [member(path, instrument, name) for name in instrument]
+    groups: list[Any] = (
+        [] if instrument is None else [member(path, instrument, name) for name in instrument]
+    )
     detectors = [
         group
         for group in groups

@@ -63,9 +63,9 @@ def describe_field_grid(path: Path) -> list[tuple[str, str]]:
                 for (name, item), unit in zip(fields, units, strict=True)
             ]
         base = _text(content.attrs.get("basePath", "/data/%T/"))
-        parent = member(path, content, base.partition("%T")[0].strip("/"))
+        parent: Any = member(path, content, base.partition("%T")[0].strip("/")) or {}
         meshes = _text(content.attrs.get("meshesPath", "fields/"))
-        for number in sorted(filter(str.isdecimal, parent or ()), key=int)[:_MAX_LISTED]:
+        for number in sorted(filter(str.isdecimal, parent), key=int)[:_MAX_LISTED]:
             for name, record in members(member(path, parent[number], meshes) or {}):
                 parts = [("", record)] if hasattr(record, "shape") else members(record)
                 rows += [

@@ -84,29 +84,27 @@ def default_array(path: Path) -> str:
             f"{path} holds fields on a grid, not an image: trace particles through them with "
             "shadowinv forward, or name one array of it"
         )
+    names = image_names(path)
+    if len(names) == 1:
+        return names[0]
+    count = f"{len(names)} images" if names else "no image"
     with open_hdf5(path) as file:
-        default = _member_or_default(path, file, "/")
-        if default is not None:
-            return str(default.name)
-        entries = [entry for entry in _entries(file) if not entry.reason]
-        images = [entry for entry in entries if not entry.name.endswith("pixel_mask")]
-        if len(images) == 1:
-            return images[0].name
-        count = f"{len(images)} images" if images else "no image"
         raise FileFormatError(
             f"{path} is an HDF5 file with {count}: expected one, or the name of one, as "
             f"{path.name}::/name; it holds {list_arrays(file)}"
         )
 
 
-def has_images(path: Path) -> bool:
-    """Return whether a file is HDF5 with an image; false for a file that cannot be read."""
-    try:
-        check_regular(path, "an HDF5 file")
-        with open_hdf5(path) as file:
-            return any(not entry.reason for entry in _entries(file))
-    except (OSError, RuntimeError, KeyError, ValueError):
-        return False
+@as_file_errors
+def image_names(path: Path) -> list[str]:
+    """Return the name of the image that NeXus shows by default, or those of all images."""
+    check_regular(path, "an HDF5 file")
+    with open_hdf5(path) as file:
+        default = _member_or_default(path, file, "/")
+        if default is not None and not _reason(default):
+            return [str(default.name)]
+        names = [entry.name for entry in _entries(file) if not entry.reason]
+        return [name for name in names if not name.endswith("pixel_mask")]
 
 
 def _frame(path: Path, dataset: Any, number: int) -> AnyArray:

@@ -106,7 +106,8 @@ def read_mat(
         check_one_frame(path, axes, chosen.name)
         index = (0,) * len(axes)
     facts = {"variable": chosen.name, "bits": 8 * array.dtype.itemsize, "geometry": {}}
-    return array[(..., *index)], facts
+    place: Any = (slice(None), slice(None), *index)
+    return array[place], facts
 
 
 @as_file_errors
