@@ -91,7 +91,7 @@ def test_the_commands_work_as_shown(folder, night):
             tifffile.imwrite("shots/shot_3.tif", night.images[4].astype("float32"))
         result = runner.invoke(app, [*watching.split()[1:], "--idle", "0.2", "--n-sites", "100"])
         assert result.exit_code == 0, result.output
-        assert result.stdout.splitlines()[0].startswith("Watching shots for *.tif; ")
+        assert result.stdout.splitlines()[0].startswith("Watching shots for images; ")
     keys = re.findall(r'"(\w+)":', re.findall(r"```text\n(\{.*?)```", PAGE, re.DOTALL)[0])
     status = Path("status.json").read_text()
     assert [key for key in keys if f'"{key}"' not in status] == []
