@@ -263,7 +263,7 @@ def test_why_arrays_are_no_images(tmp_path):
 )
 def test_what_is_no_path_is_called_what_it_is(path, words):
     with pytest.raises(InputError, match=words):
-        find_frames(path)
+        read(path)
 
 
 def test_brackets_in_the_name_of_a_folder_are_no_pattern(tmp_path):

@@ -60,9 +60,8 @@ _DEEP_KEY = re.compile(
 _DISTANCES = {"source_object_distance", "object_image_distance"}
 
 
-@as_file_errors
 def read(
-    path: Path, *, channel: str | int | None = None, variable: str | None = None
+    path: str | Path, *, channel: str | int | None = None, variable: str | None = None
 ) -> Radiograph | xarray.Dataset:
     """Read an image or a result, or many images lazily.
 
@@ -70,11 +69,10 @@ def read(
     ----------
     path : str or Path
         TIFF (8, 16 or 32 bits) and other pictures, NPY, MATLAB (version 5 to 7.3), frames
-        of cameras (one each), numbers as text, tracks in CR-39, a pradformat radiograph or
-        inversion, an array of any HDF5 file as ``file.h5::/entry/data/data``, a ``.shadowinv``
-        result, or a ``.shadowinv.zarr`` store of many shots (read lazily). Of many images, a TIFF
-        with several pages, an array with more than two axes, a folder, or a pattern such as
-        ``"shots/*.tif"``.
+        of cameras, numbers as text, tracks in CR-39, a pradformat radiograph or inversion, an
+        array of any HDF5 file as ``file.h5::/entry/data/data``, a ``.shadowinv`` result, or a
+        ``.shadowinv.zarr`` store of many shots (read lazily). Of many images, a TIFF with several
+        pages, an array with more than two axes, a folder, or a pattern such as ``"shots/*.tif"``.
     channel : {"red", "green", "blue", "mean"} or int, optional
         Channel to take from a colour image whose channels differ.
     variable : str, optional
@@ -96,6 +94,14 @@ def read(
     InputError
         If the channel or variable is needed and was not chosen, or does not exist.
     """
+    split_address(path, variable)  # refuses what is no path
+    return _read(path, channel, variable)
+
+
+@as_file_errors
+def _read(
+    path: Path, channel: str | int | None, variable: str | None
+) -> Radiograph | xarray.Dataset:
     if is_stack(path):
         return read_stack(path)
     frames = find_frames(path, variable)
