@@ -70,17 +70,16 @@ UNLIT = {
 }
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("name", UNLIT)
+@pytest.mark.parametrize(("name", "seed"), [*((name, 0) for name in UNLIT), ("rim", 1), ("rim", 2)])
 def test_pixels_without_light_never_make_the_peak(name, seed) -> None:
-    truth = toroid(SHAPE, paper_setup(), 60.0, 20e-6).displacement
+    dark = UNLIT[name][::2, ::2]
+    truth = toroid(dark.shape, paper_setup(), 40.0, 12e-6).displacement
     rng = np.random.default_rng(seed)
     image, source = (
         rng.poisson(60 * plane).astype(float)
-        for plane in (synthetic_image(truth, np.ones(SHAPE)), np.ones(SHAPE))
+        for plane in (synthetic_image(truth, np.ones(dark.shape)), np.ones(dark.shape))
     )
-    dark = UNLIT[name]
-    options = InversionOptions(n_sites=4000)
+    options = InversionOptions(n_sites=1500)
     lit = invert(image, source=source, options=options)
     image[dark], source[dark] = rng.poisson(0.2, (2, int(dark.sum())))
     inversion = invert(image, source=source, options=options)
@@ -89,9 +88,7 @@ def test_pixels_without_light_never_make_the_peak(name, seed) -> None:
     assert peak_of(inversion) == pytest.approx(peak_of(lit), abs=2 * error)
     (caution,) = (each for each in inversion.cautions if each.code == "unlit")
     assert f"{int(dark.sum()):,} " in caution.text
-    plan = plan_sites(source, options)
-    planned = invert(image, plan=plan, options=options)
-    np.testing.assert_array_equal(planned.mask, ~dark)
+    planned = invert(image, plan=plan_sites(source, options), options=options)
     np.testing.assert_array_equal(planned.potential, inversion.potential)
 
 
@@ -129,9 +126,10 @@ def test_gaps_of_a_detector_are_masked_by_their_mark(mark, shot) -> None:
     image, source = (plane.copy() for plane in shot)
     gaps = np.zeros(SHAPE, bool)
     gaps[130:137] = gaps[:, 100:104] = True
-    expected = run(Recipe(), image, source=source, mask=~gaps)
+    options = InversionOptions(n_sites=500)
+    expected = run(Recipe(options=options), image, source=source, mask=~gaps)
     image[gaps] = mark
-    inversion = run(Recipe(steps=(Dark(level=0),)), image, source=source)
+    inversion = run(Recipe(steps=(Dark(level=0),), options=options), image, source=source)
     np.testing.assert_array_equal(inversion.mask, ~gaps)
     np.testing.assert_array_equal(inversion.potential, expected.potential)
     (caution,) = (each for each in inversion.cautions if each.code == "unlit")

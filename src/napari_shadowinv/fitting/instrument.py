@@ -353,7 +353,7 @@ def number_text(key: str, rows: Sequence[Sequence[float]]) -> str:
     if key == "gamma":
         return f"gamma {with_error(1 + rows[0][0], rows[0][1])}"
     if key == "blur":
-        return f"variance of the point spread {with_error(*rows[0], '+')} px²"
+        return f"variance of the point spread {with_error(rows[0][0], rows[0][1], '+')} px²"
     if key in ("background", "other_field"):
         listed = ", ".join(with_error(100 * value, 100 * error) for value, error in rows)
         return f"{TITLES[key]} {listed} %"

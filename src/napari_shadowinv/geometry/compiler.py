@@ -30,7 +30,7 @@ def njit(**options: Any) -> Callable[[Function], Function]:
     def compiled(function: Function) -> Function:
         if _is_compiler_off():
             # Plain Python warns where the hashes of machine code wrap around.
-            return cast(Function, np.errstate(over="ignore")(function))
+            return np.errstate(over="ignore")(function)
         dispatcher: Any = numba.njit(**{**options, "cache": is_code_cached()})(function)
         if _uses_private_folder():
             beside_package = Path(dispatcher.py_func.__code__.co_filename).parent / "__pycache__"

@@ -121,25 +121,23 @@ def prepare(
 
 def mask_unlit(
     image: ArrayLike, source: ArrayLike | None, mask: ArrayLike | None
-) -> tuple[ArrayLike | None, list[Caution]]:
+) -> tuple[BoolArray | None, list[Caution]]:
     """Mask the pixels without light, by `mask_gaps` and `mask_dark`; the source was recorded."""
-    planes = [check_plane(image, "image", _SMALLEST_SIDE)]
-    usable = check_mask(mask, planes[0].shape)
-    if source is not None:
-        planes.append(check_plane(source, "source", _SMALLEST_SIDE))
-    if any(plane.shape != usable.shape for plane in planes):
-        return mask, []
-    values = [np.where(usable, plane, 0.0) for plane in planes]
-    if not all(np.abs(plane).max() < _BRIGHTEST for plane in values):
-        return mask, []  # refused later
+    shot = check_plane(image, "image", _SMALLEST_SIDE)
+    usable = check_mask(mask, shot.shape)
+    lit: BoolArray | None = None if mask is None else usable
+    planes = {"image": shot} if source is None else {"image": shot, "source": np.asarray(source)}
+    if any(plane.shape != shot.shape for plane in planes.values()):
+        return lit, []  # refused later, as are values that are not finite
+    values = {name: np.where(usable, plane, 0.0) for name, plane in planes.items()}
+    if not all(np.abs(plane).max() < _BRIGHTEST for plane in values.values()):
+        return lit, []
     cautions = []
-    lit: BoolArray | None = usable
-    for plane, name in zip(values, ("image", "source"), strict=False):
+    for name, plane in values.items():
         lit, gaps = mask_gaps(plane, lit, name)
         cautions += gaps
-    lit, dark = mask_dark(values[0], values[1] if source is not None else None, lit)
-    cautions += dark
-    return (lit, cautions) if cautions else (mask, [])
+    lit, dark = mask_dark(values["image"], values.get("source"), lit)
+    return lit, [*cautions, *dark]
 
 
 def flooring_for(

@@ -531,7 +531,7 @@ class RetrievedField(Summarised):
     dataset: xarray.Dataset
 
     def _picture(self) -> FloatArray:
-        return np.hypot(*self.displacement)
+        return np.asarray(np.hypot(*self.displacement))
 
     @property
     def displacement(self) -> FloatArray:

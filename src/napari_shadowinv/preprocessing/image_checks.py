@@ -276,7 +276,7 @@ def _mean_around(plane: FloatArray, usable: BoolArray, side: int) -> FloatArray:
         return np.asarray(ndimage.uniform_filter(plane, side))
     sums = ndimage.uniform_filter(np.where(usable, plane, 0.0), side)
     share = ndimage.uniform_filter(usable.astype(float), side)
-    return np.divide(sums, share, out=np.zeros_like(sums), where=share > 1e-9)
+    return np.asarray(np.divide(sums, share, out=np.zeros_like(sums), where=share > 1e-9))
 
 
 def _is_dark_region(
