@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from napari.components import ViewerModel
 
-from napari_shadowinv import InputError, OpticalSetup, ProtonSetup, add_inversion, invert
+from napari_shadowinv import OpticalSetup, ProtonSetup, add_inversion
 from napari_shadowinv._napari.layer_metadata import (
     frame_for,
     place_image,
@@ -19,7 +19,7 @@ from napari_shadowinv._napari.layer_metadata import (
     setup_of,
     unit_of,
 )
-from napari_shadowinv._napari.layers import inversion_layers, power_cells, sample_arrows
+from napari_shadowinv._napari.layers import inversion_layers, sample_arrows
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.significance import PixelErrors
@@ -195,32 +195,6 @@ def test_sites_are_coloured_by_displacement(viewer: ViewerModel, solved: Inversi
     order = np.argsort(sites.features["displacement"])
     brightness = sites.face_color[order][:, :3].sum(axis=1)
     assert brightness[-1] > brightness[0] + 1
-
-
-@pytest.mark.parametrize("boundary", ["closed", "free"])
-def test_power_cells_tile_the_image(viewer: ViewerModel, solved: Inversion, boundary: str) -> None:
-    if boundary == "free":
-        options = solved.options.model_copy(update={"boundary": boundary})
-        solved = invert(solved.image, options=options)
-    polygons, sites = power_cells(solved)
-    assert len(sites) == len(solved.sites) or boundary == "free"
-    areas = []
-    for polygon in polygons:
-        y, x = polygon.T
-        areas.append(0.5 * abs(np.dot(y, np.roll(x, 1)) - np.dot(x, np.roll(y, 1))))
-    np.testing.assert_allclose(sum(areas), solved.potential.size, rtol=1e-9)
-    corners = np.concatenate(polygons)
-    height, width = solved.potential.shape
-    assert corners.min() >= -0.5 - 1e-9
-    assert (corners <= [height - 0.5 + 1e-9, width - 0.5 + 1e-9]).all()
-    cells = by_role(add_inversion(viewer, solved, cells=True))["cells"]
-    assert len(cells.data) == len(sites)
-
-
-def test_too_many_cells_are_refused_in_one_sentence(solved: Inversion) -> None:
-    many = replace(solved, sites=np.zeros((5001, 2)))
-    with pytest.raises(InputError, match="5,001 sites: power cells can be shown for up to 5,000"):
-        power_cells(many)
 
 
 def test_many_sites_are_thinned_and_the_name_says_so(

@@ -179,7 +179,6 @@ KINDS = (
     Kind("field arrows", "displacement", "{arrows}", type="vectors", shown_of="shot"),
     Kind("arrows", "displacement", "displacement arrows", "px", type="vectors", visible=True),
     Kind("sites", "sites", "sites{share}", colormap="field", type="points", shown_of="shot"),
-    Kind("cells", "sites", "power cells", type="shapes", main=True, shown_of="shot"),
 )
 _MAIN_ROLES = {kind.role for kind in KINDS if kind.main or kind.visible}
 MASKED_ROLES = {"reprojection", "residual", "potential", "field y", "field x", "field"}

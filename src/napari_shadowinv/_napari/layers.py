@@ -1,4 +1,4 @@
-"""Results as layers, with the features of their sites and the shapes of their power cells."""
+"""Results as layers, with the features of their sites."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import Frame, Kind, Result, frame_for, role_of
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import connect_viewer, show_scale_bar
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
-from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
 from napari_shadowinv.inversion.variables import VARIABLES
 from napari_shadowinv.io.store import of_each_setup
@@ -58,14 +56,13 @@ def inversion_layers(
     setup: Setup | None = None,
     *,
     name: str = "",
-    cells: bool = False,
     attributes: Mapping[str, str] | None = None,
     **placement: Any,
 ) -> LayerData:
     """Describe the layers of a result, with the keywords of `add_inversion`."""
     setup = inversion.setup if setup is None else setup
     frame = frame_for(inversion.potential.shape, setup, **placement)
-    return result_layers(Result(inversion, setup, dict(attributes or {})), frame, name, cells=cells)
+    return result_layers(Result(inversion, setup, dict(attributes or {})), frame, name)
 
 
 def add_inversion(
@@ -97,18 +94,12 @@ def add_inversion(
     **keywords
         ``scale``, ``translate``, ``units`` (in axis order y, x): placement of the image in the
         world instead of the setup's, such as the placement of the layer it was cropped from.
-        ``cells`` (bool): whether to add the power cells as polygons, for up to 5,000 sites.
         ``attributes`` (mapping of str to str): origins in words, saved with the result.
 
     Returns
     -------
     list of napari.layers.Layer
         The new layers, the lowest first.
-
-    Raises
-    ------
-    InputError
-        If `cells` is set and there are too many sites.
 
     Examples
     --------
@@ -171,17 +162,15 @@ def shared_metadata(result: Result[AnyResult], name: str) -> dict[str, Any]:
     return {"result": result, "made_from": dict(result.attributes), "name": name}
 
 
-def result_layers(
-    result: Result[Inversion], frame: Frame, name: str = "", *, cells: bool = False
-) -> LayerData:
-    """Describe the layers of an inversion; with `cells`, its power cells."""
+def result_layers(result: Result[Inversion], frame: Frame, name: str = "") -> LayerData:
+    """Describe the layers of an inversion."""
     import xarray as xr
 
     content = result.content
     dataset = xr.Dataset(
         {name: (dims, getattr(content, name)) for name, (dims, _, _) in VARIABLES.items()}
     ).assign(significance_variables(content.displacement, content.pixel_errors, content.structures))
-    view = View(dataset, result.setup, cells=power_cells(content) if cells else None)
+    view = View(dataset, result.setup)
     facts, level = shared_metadata(result, name), content.headline.level
     layer_data = dataset_layers(view, frame, name, facts, level)
     for _, keywords, _ in layer_data:
@@ -223,7 +212,6 @@ class View:
     dataset: xarray.Dataset
     setup: Setup | None
     shot: int | None = None
-    cells: Cells | None = None
     deflector: str | None = None
 
     def has(self, kind: Kind) -> bool:
@@ -232,8 +220,6 @@ class View:
             return False
         if kind.role == "field arrows":
             return bool(self.field.arrows)
-        if kind.role == "cells":
-            return self.cells is not None
         return kind.role != "source" or bool(np.ptp(self.plane("source")))
 
     def along_shots(self, variable: str) -> bool:
@@ -444,27 +430,11 @@ def _sites(view: View, kind: Kind) -> Content:
     return sites[::step], {"share": "" if step == 1 else f" (1 in {step})"}, look
 
 
-def _cells(view: View, kind: Kind) -> Content:
-    polygons, site_numbers = view.cells or ([], [])
-    look = {
-        "shape_type": "polygon",
-        "features": {
-            key: values[site_numbers] for key, values in site_features(view.dataset).items()
-        },
-        "face_color": "transparent",
-        "edge_color": _CAUSTIC_COLOUR,
-        "edge_width": 0.05,
-        "opacity": 0.7,
-    }
-    return polygons, {}, look
-
-
 _CONTENTS: dict[str, Callable[[View, Kind], Content]] = {
     "image": _image,
     "labels": _labels,
     "vectors": _arrows,
     "points": _sites,
-    "shapes": _cells,
 }
 
 
@@ -498,11 +468,6 @@ def _nonempty(limits: Limits) -> Limits:
     return (low, high) if high > low else (low, low + 1.0)
 
 
-Cells = tuple[list[FloatArray], NDArray[np.intp]]
-
-_MAX_CELLS = 5_000
-
-
 def site_features(dataset: xarray.Dataset) -> dict[str, FloatArray]:
     """Return weight (px²), mass (flux), displacement (px) and flux residual of each site."""
     mass = dataset["site_mass"].values
@@ -513,48 +478,3 @@ def site_features(dataset: xarray.Dataset) -> dict[str, FloatArray]:
         # Excess of the cell's flux in the image, relative to the mass.
         "flux residual": dataset["site_flux"].values / mass - 1,
     }
-
-
-def power_cells(inversion: Inversion) -> Cells:
-    """Return corners (y, x) of the final non-empty cells, clipped to the image, and their sites."""
-    count = len(inversion.sites)
-    if count > _MAX_CELLS:
-        raise InputError(
-            f"the result has {count:,} sites: power cells can be shown for up to {_MAX_CELLS:,} "
-            "sites; invert with fewer sites to show the cells"
-        )
-    from napari_shadowinv.geometry.density import Density
-    from napari_shadowinv.geometry.power_diagram import PowerDiagram
-    from napari_shadowinv.geometry.triangulation import RegularTriangulation
-    from napari_shadowinv.inversion.normalise import margin_around
-
-    options, shape = inversion.options, inversion.potential.shape
-    margin = margin_around(shape, options) if options.boundary == "free" else 0
-    # The cells do not depend on the density.
-    uniform = Density.from_image(np.ones([side + 2 * margin for side in shape]))
-    triangulation = RegularTriangulation(
-        inversion.sites + margin, inversion.weights, region=uniform.region
-    )
-    diagram = PowerDiagram(triangulation, uniform, threads=options.threads)
-    polygons = [_clip(diagram.cell(site) - margin, *shape) for site in range(count)]
-    nonempty = np.flatnonzero([len(polygon) > 2 for polygon in polygons])
-    return [polygons[site] for site in nonempty], nonempty
-
-
-def _clip(corners: FloatArray, height: int, width: int) -> FloatArray:
-    """Clip a convex polygon to the image, one side after the other."""
-    sides = ((0, -1, 0.5), (0, 1, height - 0.5), (1, -1, 0.5), (1, 1, width - 0.5))
-    for axis, sign, limit in sides:
-        if not len(corners):
-            break
-        inside = limit - sign * corners[:, axis]
-        vertices = []
-        for k in range(len(corners)):
-            before, after = inside[k - 1], inside[k]
-            if (before >= 0) != (after >= 0):
-                share = before / (before - after)
-                vertices.append(corners[k - 1] + share * (corners[k] - corners[k - 1]))
-            if after >= 0:
-                vertices.append(corners[k])
-        corners = np.array(vertices).reshape(-1, 2)
-    return corners

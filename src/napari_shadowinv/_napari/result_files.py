@@ -47,17 +47,14 @@ _SAVED_KEYWORDS: dict[str, tuple[str, ...]] = {
     "image": ("colormap", "contrast_limits", "gamma", "interpolation2d"),
     "points": ("face_colormap", "face_contrast_limits"),
     "vectors": ("length", "edge_width", "vector_style"),
-    "shapes": ("edge_width",),
 }
 _COMMON_KEYWORDS = ("name", "visible", "opacity", "blending", *_PLACEMENT, *_TRANSFORM)
 
 
-def layers_of_result(
-    result: Result[AnyResult], frame: Frame, name: str = "", *, cells: bool = False
-) -> LayerData:
-    """Describe the layers of any result, the lowest first; with `cells`, also its power cells."""
+def layers_of_result(result: Result[AnyResult], frame: Frame, name: str = "") -> LayerData:
+    """Describe the layers of any result, the lowest first."""
     functions: dict[ResultKind, Callable[..., LayerData]] = {
-        ResultKind.INVERSION: partial(result_layers, cells=cells),
+        ResultKind.INVERSION: result_layers,
         ResultKind.FIT: partial(fit_layers, alone=True),
         ResultKind.FILM_DOSES: pack_layers,
         ResultKind.FIELD: field_layers,
@@ -87,7 +84,7 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> LayerData:
             shear=float(placement["shear"][-1]),
             affine=about.matrix_of(np.array(placement["affine"])[-3:, -3:]),
         )
-    layers = layers_of_result(result, frame, name, cells="cells" in looks)
+    layers = layers_of_result(result, frame, name)
     return [
         (data, keywords | looks.get(about.layer_key(keywords), {}), kind)
         for data, keywords, kind in main_layers(layers, also={*looks, "image"})
