@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import shlex
-import shutil
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,8 @@ import tifffile
 import xarray
 from typer.testing import CliRunner
 
-from napari_shadowinv import read, synthetic_image
+from napari_shadowinv import read
 from napari_shadowinv.cli import app
-from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import SPECIES, setup_from_dict
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
@@ -29,11 +28,9 @@ def blocks(language: str) -> list[str]:
 
 @pytest.fixture
 def shot_folder(tmp_path, monkeypatch):
-    source = 100 + 20 * np.random.default_rng(0).random((40, 50))
-    image = synthetic_image(gaussian_blob((40, 50), 20.0, 6.0).displacement, source)
-    tifffile.imwrite(tmp_path / "reference.tif", source.astype(np.float32))
-    tifffile.imwrite(tmp_path / "shot.tif", image.astype(np.float32))
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "docs")
     monkeypatch.chdir(tmp_path)
+    importlib.import_module("check_numbers").write_shot(tmp_path)
     return tmp_path
 
 
@@ -76,9 +73,6 @@ def test_commands_and_python_work_one_after_the_other_in_one_folder(shot_folder)
     (shot_folder / "setup.toml").write_text(setup, encoding="utf-8")
     slow_setup = setup.replace("14.7", "3.0")  # "at another energy"
     (shot_folder / "other.toml").write_text(slow_setup, encoding="utf-8")
-    (shot_folder / "shots").mkdir()
-    for number in (1, 2):
-        shutil.copy("shot.tif", f"shots/shot{number}.tif")
     done = []
     for kind, text in steps():
         if kind == "python":
