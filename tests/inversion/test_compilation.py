@@ -148,12 +148,13 @@ print([name for name, _ in signatures() - compiled])
 
 ONE_KERNEL = """
 import numpy as np
-from napari_shadowinv.inversion.readout import _differentiate as kernel
+from napari_shadowinv.preprocessing._total_variation import _smooth_row as kernel
 from napari_shadowinv.geometry.compiler import is_code_cached
 
-potential, displacement = np.ones((3, 4)), np.empty((2, 3, 4))
-kernel(0, 3, potential, displacement)
-assert (displacement == 0).all()
+image = np.ones((3, 4))
+smooth = np.empty(4)
+kernel(image, 0 * image, 0 * image, 1, smooth)
+assert (smooth == 1).all()
 print(is_code_cached(), sum(kernel.stats.cache_hits.values()), kernel.stats.cache_path)
 """
 

@@ -22,7 +22,8 @@ from napari_shadowinv.preprocessing import (
     uniform_source,
     uniform_warnings,
 )
-from napari_shadowinv.preprocessing.estimates import least_variation, point_distance
+from napari_shadowinv.preprocessing._total_variation import least_variation
+from napari_shadowinv.preprocessing.estimates import point_distance
 
 SHAPE = (48, 60)
 # 200 px from the source to the detector.

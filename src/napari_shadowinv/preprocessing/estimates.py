@@ -262,6 +262,8 @@ def total_variation_source(
     A. Chambolle, "An algorithm for total variation minimization and applications", Journal
     of Mathematical Imaging and Vision 20, 89 (2004).
     """
+    from napari_shadowinv.preprocessing._total_variation import least_variation
+
     values, usable = pixels.beam_pixels(image, mask)
     weight = pixels.checked_number("weight", weight, above=0, unit="px")
     iterations = pixels.checked_integer("iterations", iterations, least=1)
@@ -272,31 +274,6 @@ def total_variation_source(
     mean = values[usable].mean()
     beam = mean * least_variation(complete / mean, weight, iterations, report)
     return pixels.with_flux_of(beam, values, usable)
-
-
-def least_variation(
-    image: FloatArray, weight: float, iterations: int, report: Reporter
-) -> FloatArray:
-    """Return the u that minimises ½∑(u - image)² + weight·∑|∇u|, with forward differences.
-
-    Chambolle's fixed-point iteration for the dual field, equation (9), as `denoise_tv_chambolle` of
-    scikit-image has it, which cannot be cancelled. It ends when a step changes 1e-7 of the energy.
-    """
-    smooth, dual, slope = image, np.zeros((2, *image.shape)), np.zeros((2, *image.shape))
-    energies: list[float] = []
-    for step in range(iterations):
-        report("source", step, iterations)
-        slope[0, :-1], slope[1, :, :-1] = np.diff(smooth, axis=0), np.diff(smooth, axis=1)
-        size, change = np.sqrt(np.einsum("kyx,kyx->yx", slope, slope)), smooth - image
-        energies.append(float(np.vdot(change, change) + weight * size.sum()))
-        if step and abs(energies[-2] - energies[-1]) < 1e-7 * energies[0]:
-            break
-        dual += slope / 4
-        dual /= 1 + size / (4 * weight)
-        smooth = image + dual[0] + dual[1]
-        smooth[1:] -= dual[0, :-1]
-        smooth[:, 1:] -= dual[1, :, :-1]
-    return smooth
 
 
 class TotalVariationEstimate(Estimate):
