@@ -52,8 +52,9 @@ _PICTURE_CODECS = {6, 7, 33003, 33004, 33005, 34712, 34892, 34933, 34934, 50001}
 _WHITE_IS_ZERO, _RGB, _PALETTE, _MASK, _YCBCR = 0, 2, 3, 4, 6
 _GREY_OR_RGB = {_WHITE_IS_ZERO, 1, _RGB, _PALETTE}
 _ALPHA = {1, 2}  # of the tag ExtraSamples
-_UNITS_M: dict[int | str, float] = {2: INCH_M, 3: 0.01, 4: 1e-3, 5: 1e-6, "inch": INCH_M}
-_UNITS_M |= LENGTHS
+_UNITS_M: dict[Any, float] = {
+    **LENGTHS, 2: INCH_M, 3: 0.01, 4: 1e-3, 5: 1e-6, "inch": INCH_M,
+}  # fmt: skip
 _POLYNOMIALS, _UNCALIBRATED = range(4), 20  # of ImageJ's calibration functions
 _ROOTS, _PROPORTIONAL = 2, 128  # of gel scanners' values
 
