@@ -186,7 +186,10 @@ def read_tiff(path: Path, number: int | None = None) -> tuple[AnyArray, dict[str
             array = page.asarray()
         if "S" in page.axes:
             array = np.moveaxis(array, page.axes.index("S"), -1)
-        missing = _missing_pixels(tiff, page, array, _mask_page(layout, number))
+        missing = _missing_pixels(tiff, page, array)
+        if len(layout.masks) in (1, layout.n_frames):
+            cover = tiff.pages[layout.masks[min(number, len(layout.masks) - 1)]].aspage()
+            missing |= _covered_pixels(path, cover, missing)
         array, notes = _convert_values(path, tiff, page, _without_alpha(page, array))
         check_picture(path, "TIFF", array)
         array, turned = _turn_upright(without_pixels(array, missing), _tag(tiff, page, 274))
@@ -201,9 +204,9 @@ def read_tiff(path: Path, number: int | None = None) -> tuple[AnyArray, dict[str
     return array, metadata
 
 
-def _tag(tiff: Any, page: Any, number: int, default: Any = None) -> Any:
+def _tag(tiff: Any, page: Any, number: int, default: Any = None, *, among: int = 1) -> Any:
     """Return the value of a tag of a page, or of the first ones: programs write some only there."""
-    pages = (page, *(tiff.pages[index].aspage() for index in range(min(2, len(tiff.pages)))))
+    pages = (page, *(tiff.pages[index].aspage() for index in range(min(among, len(tiff.pages)))))
     values = (each.tags.valueof(number) for each in pages)
     return next((value for value in values if value is not None), default)
 
@@ -287,36 +290,34 @@ def _without_alpha(page: Any, array: AnyArray) -> AnyArray:
     return array[..., 0] if array.shape[-1] == 2 else array[..., :-1]
 
 
-def _mask_page(layout: _Layout, number: int) -> int | None:
-    if len(layout.masks) in (1, layout.n_frames):
-        return layout.masks[number if len(layout.masks) > 1 else 0]
-    return None
-
-
-def _missing_pixels(tiff: Any, page: Any, array: AnyArray, mask: int | None) -> BoolArray | None:
-    """Return where a file says that pixels are transparent or without data; None without a word."""
-    missing = np.zeros(array.shape[:2], dtype=bool)
-    if array.ndim == 3 and _without_alpha(page, array) is not array:
-        missing |= array[..., -1] == 0
+def _missing_pixels(tiff: Any, page: Any, array: AnyArray) -> BoolArray:
+    """Return where a frame is transparent or without data."""
     try:
         fill = float(_tag(tiff, page, 42113, "nan"))
     except ValueError:
         fill = math.nan
-    is_fill = array == (np.float32(fill) if array.dtype == np.float32 else fill)
-    missing |= is_fill if array.ndim == 2 else is_fill.all(axis=-1)
-    if mask is not None:
-        covered = tiff.pages[mask].aspage().asarray() == 0
-        missing |= covered if covered.shape == missing.shape else False
-    return missing if missing.any() else None
+    missing: BoolArray = array == (np.float32(fill) if array.dtype == np.float32 else fill)
+    missing = missing if array.ndim == 2 else missing.all(axis=-1)
+    if array.ndim == 3 and _without_alpha(page, array) is not array:
+        missing |= array[..., -1] == 0
+    return missing
+
+
+def _covered_pixels(path: Path, cover: Any, frame: BoolArray) -> BoolArray:
+    """Return where a page that is a mask has zeros; nowhere if it has another size."""
+    if cover.shape != frame.shape:
+        return np.zeros_like(frame)
+    _check_complete(path, cover)
+    return np.asarray(cover.asarray() == 0)
 
 
 def _convert_values(
     path: Path, tiff: Any, page: Any, array: AnyArray
 ) -> tuple[AnyArray, tuple[str, ...]]:
     """Turn stored values into those that the file means, and say how."""
-    kind = _tag(tiff, page, 33445)
+    kind = _tag(tiff, page, 33445, among=2)
     if kind in (_ROOTS, _PROPORTIONAL):
-        counts, per = _tag(tiff, page, 33446, (1, 1))
+        counts, per = _tag(tiff, page, 33446, (1, 1), among=2)
         power = 2 if kind == _ROOTS else 1
         values = array.astype(np.float64) ** power * (counts / per if counts and per else 1.0)
         return values, (f"values of a gel scanner, to the power {power}, as the file says",)
