@@ -52,9 +52,7 @@ _PICTURE_CODECS = {6, 7, 33003, 33004, 33005, 34712, 34892, 34933, 34934, 50001}
 _WHITE_IS_ZERO, _RGB, _PALETTE, _MASK, _YCBCR = 0, 2, 3, 4, 6
 _GREY_OR_RGB = {_WHITE_IS_ZERO, 1, _RGB, _PALETTE}
 _ALPHA = {1, 2}  # of the tag ExtraSamples
-_UNITS_M: dict[Any, float] = {
-    **LENGTHS, 2: INCH_M, 3: 0.01, 4: 1e-3, 5: 1e-6, "inch": INCH_M,
-}  # fmt: skip
+_UNITS_M: dict[Any, float] = {2: INCH_M, 3: 0.01, 4: 1e-3, 5: 1e-6, "inch": INCH_M, **LENGTHS}
 _POLYNOMIALS, _UNCALIBRATED = range(4), 20  # of ImageJ's calibration functions
 _ROOTS, _PROPORTIONAL = 2, 128  # of gel scanners' values
 
@@ -296,8 +294,8 @@ def _missing_pixels(tiff: Any, page: Any, array: AnyArray) -> BoolArray:
         fill = float(_tag(tiff, page, 42113, "nan"))
     except ValueError:
         fill = math.nan
-    missing: BoolArray = array == (np.float32(fill) if array.dtype == np.float32 else fill)
-    missing = missing if array.ndim == 2 else missing.all(axis=-1)
+    is_fill = np.equal(array, np.float32(fill) if array.dtype == np.float32 else fill)
+    missing: BoolArray = is_fill if array.ndim == 2 else is_fill.all(axis=-1)
     if array.ndim == 3 and _without_alpha(page, array) is not array:
         missing |= array[..., -1] == 0
     return missing
