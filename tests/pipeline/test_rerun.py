@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import tifffile
@@ -217,3 +218,25 @@ def test_a_result_is_repeated_bit_for_bit(example: Example, tmp_path: Path) -> N
     example.image.unlink()
     with pytest.raises(FileFormatError, match=f"{name} does not exist"):
         rerun(example.result)
+
+
+def test_arrays_of_one_file_are_found_again(tmp_path: Path) -> None:
+    with chdir(tmp_path):
+        images = np.stack([np.load(path) for path in record(tmp_path)])
+        rejected = np.zeros(SHAPE, np.uint32)
+        rejected[20, 10:14] = 1
+        with h5py.File("run.h5", "w") as file:
+            file["entry/data"], file["entry/pixel_mask"] = images, rejected
+            file["beam"], file["dark"] = np.load("beam.npy"), np.load("dark.npy")
+            file["usable"] = tifffile.imread("mask.tif")
+        recipe = Recipe(
+            steps=(Dark(level=Path("run.h5::/dark")),),
+            mask=Path("run.h5::/usable"),
+            setup=SETUPS[0],
+            options=InversionOptions(n_sites=150),
+        )
+        first = run(recipe, "run.h5::/entry/data[1]", source="run.h5::/beam")
+        again = rerun(write(Path("a.shadowinv"), first))
+    assert not first.mask[rejected != 0].any()
+    assert again.changes == ()
+    assert again.is_identical

@@ -246,7 +246,7 @@ _HELP = {
 
 argument = partial(Argument, show_default=False)
 
-ImageFile = Annotated[Path, argument(help=f"{IMAGE_TITLES}; with --variable, any HDF5 file.")]
+ImageFile = Annotated[Path, argument(help=f"{IMAGE_TITLES}; run.h5::/name for an array.")]
 StoreFolder = Annotated[Path, argument(help="name.shadowinv.zarr, from shadowinv batch.")]
 SourceFile = Annotated[Path | None, Option(help="Image of the undisturbed beam. Default: uniform.")]
 MaskFile = Annotated[Path | None, Option(help="Image of the same size, 0 at unusable pixels.")]

@@ -19,9 +19,9 @@ HELP = {
     "scheduler": "Address of a dask scheduler (tcp://host:8786), threads or processes.",
     "format": "tiff (float32, one file per shot and component), pradformat or openpmd (one file "
     "per shot), or csv (a table with a row per shot).",
-    "shots": "A quoted glob, a folder, a list of files, a multi-page TIFF with one shot per page, "
-    "an array of frames in HDF5 (run.h5::/entry/data/data), or a table (.csv) of images with one "
-    "row per shot.",
+    "shots": "A quoted glob, a folder, a list of files, a file with many frames (multi-page TIFF, "
+    "NPY, SPE, MATLAB), an array of frames in HDF5 (run.h5::/entry/data/data), or a table (.csv) "
+    "of images with one row per shot.",
     "fit": "Fit the forward model to each shot instead of inverting it, with the recipe's section "
     "[fit]; table rows with the same shot are images of one object.",
     "resume": "Resume an interrupted run and append new shots.",

@@ -402,7 +402,7 @@ def find_shots(
     if not hasattr(shots, "ndim"):
         raise InputError(
             f"shots are a {type(shots).__name__}: expected an array (shot, y, x), an xarray "
-            "object, paths, a glob such as 'shots/*.tif', or a multi-page TIFF"
+            "object, paths, a glob such as 'shots/*.tif', or a file with many frames"
         )
     return _from_array(shots)
 

@@ -89,7 +89,7 @@ class ShotsPicker(ModelPicker):
     def __init__(self, viewer: Any) -> None:
         tip = "Stack of images (shot, y, x); data on disk are read one shot at a time."
         self.layers = _StackPicker(viewer, tip, suits=may_be_shot)
-        tip = "A pattern such as shots/*.tif, files separated by ;, or a multi-page TIFF."
+        tip = "A pattern such as shots/*.tif, files separated by ;, or a file of frames."
         self.files = _FilesEdit("Files of the shots", "shots/*.tif", tip)
         self.table = ShotTable()
         self.folder = stack_jobs.FolderEdit()
