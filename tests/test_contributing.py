@@ -18,6 +18,7 @@ from helpers.command_line import flat
 from napari_shadowinv import Fit, FitOptions, Inversion, cli, fit, invert, synthetic_image, write
 from napari_shadowinv.analysis import PRODUCTS, analyse
 from napari_shadowinv.cli._terminal import EXIT_MISTAKE
+from napari_shadowinv.facts import with_error
 from napari_shadowinv.fitting import unknowns
 from napari_shadowinv.inversion.budget import FLUX_ERRORS
 from napari_shadowinv.io import store_columns
@@ -148,7 +149,7 @@ def test_the_unknown_is_fitted_with_the_field(names, monkeypatch):
         assert 1e-4 < deviation < 0.01
         assert abs(value - background) < 4 * deviation
     facts = {fact.key: fact.text for fact in result.facts}
-    assert f"background {rows[0, 0, 0]:.3g} ± " in facts["image_1"]
+    assert f"background {with_error(*rows[0, 0])}" in facts["image_1"]
     # The option is then one of FitOptions itself.
     monkeypatch.setattr("napari_shadowinv.fitting.result.FitOptions", options_class)
     again = Fit.from_dataset(result.to_dataset())
