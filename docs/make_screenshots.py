@@ -110,10 +110,15 @@ def photograph(viewer: napari.Viewer, name: str, *, close: bool = True) -> None:
 
 
 def open_widget(viewer: napari.Viewer, name: str) -> Any:
-    """Open a widget of the plugin as its menu does."""
-    _, widget = viewer.window.add_plugin_dock_widget(PLUGIN, name)
+    """Open a widget of the plugin by its menu."""
+    menu = viewer.window._qt_window.menuBar()
+    for title in ("Plugins", "Shadowinv"):
+        menu = next(a.menu() for a in menu.actions() if a.text().replace("&", "") == title)
+        menu.aboutToShow.emit()
+    title = f"{name} (Shadowinv)"
+    next(entry for entry in menu.actions() if entry.text() == title).trigger()
     settle()
-    return widget
+    return viewer.window.dock_widgets[title]
 
 
 def press_run(widget: Any) -> None:
@@ -138,7 +143,7 @@ def toroid_window() -> None:
     viewer = new_window("toroid with caustics")
     (shot,) = viewer.open_sample(PLUGIN, "toroid_with_caustics")
     shot.name = "toroid"
-    viewer.window.add_plugin_dock_widget(PLUGIN, "Invert shot")  # takes the selected shot
+    open_widget(viewer, "Invert shot")
     inversion = invert(shot.data, options=InversionOptions(n_sites=10_000))
     add_inversion(viewer, inversion, setup_of(shot), name="toroid")
     photograph(viewer, "napari-toroid.png")

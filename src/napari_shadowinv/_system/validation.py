@@ -40,7 +40,7 @@ class _CheckedMeta(ModelMetaclass):
 
 
 class FieldError(InputError):
-    """Wrong values of a model's fields; a window calls these by their labels: `labelled`."""
+    """Wrong values of a model's fields; `labelled` calls fields without a name by their labels."""
 
     def __init__(
         self,
@@ -50,18 +50,14 @@ class FieldError(InputError):
         names: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(_error_sentence(model_class, error, where, names or {}))
-        self._cause = model_class, error, where
+        labels = labels_of(model_class) | dict(names or {})
+        self.labelled = _error_sentence(model_class, error, where, labels)
 
     def about(self, name: object) -> InputError:  # type: ignore[override]
         return InputError(f"{name}: {self}")
 
     def __reduce__(self) -> tuple[Any, ...]:
         return InputError, self.args  # a worker's error is a sentence
-
-    @property
-    def labelled(self) -> str:
-        model_class, error, where = self._cause
-        return _error_sentence(model_class, error, where, labels_of(model_class))
 
 
 def labels_of(model_class: type[BaseModel]) -> dict[str, str]:
