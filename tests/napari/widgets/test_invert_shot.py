@@ -577,7 +577,7 @@ def test_doubts_stand_under_run_with_a_notification(
     (text,) = messages
     assert text.startswith("Failed: ")
     assert "--" not in tool.verdict.text()
-    assert layer_of(window, "field").name.endswith("(failed)")
+    assert layer_of(window, "field").name.startswith("✗ ")
     messages.clear()
     x = np.mgrid[:48, :60][1]
     edge = synthetic_image(np.stack([0 * x, 0.03 * (x - 20.0)]))
@@ -591,7 +591,7 @@ def test_doubts_stand_under_run_with_a_notification(
     assert messages[-1].startswith("Doubtful: ")
     verdict = result_of(layer_of(window, "field")).content.verdict
     assert verdict.upper() in tool.verdict.text()
-    assert layer_of(window, "field").name.endswith(f"({verdict})")
+    assert layer_of(window, "field").name.startswith("? ")
     assert "Iterations" in texts_of(tool.report)
     assert not tool.report.details.isExpanded()
 

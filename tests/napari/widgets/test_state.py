@@ -402,7 +402,7 @@ def test_a_mask_over_the_object_is_refused(
     estimating.method.set_kind("polynomial")
     estimating.masks.layer = labels
     estimating.panel.button.click()
-    qtbot.waitUntil(lambda: "shot source" in viewer.layers, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: "shot source: fitted polynomial" in viewer.layers, timeout=PATIENCE)
     for kind, data in ((InvertShot, None), (InvertStack, np.stack([shot, shot]))):
         later = opened(kind)
         if data is not None:
@@ -411,7 +411,7 @@ def test_a_mask_over_the_object_is_refused(
         else:
             later.image.layer = image
         later.source.set_kind("layer")
-        assert later.source.layers.layer.name == "shot source"
+        assert later.source.layers.layer.name == "shot source: fitted polynomial"
         later.masks.layer = labels
         with pytest.raises(InputError, match=words):
             later.request()

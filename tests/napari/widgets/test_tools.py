@@ -114,8 +114,8 @@ def test_an_estimate_becomes_a_layer_after_its_preview(
     tool.masks.layer.data[10:20, 20:30] = 1
     tool.method.form.editors["degree"].set_value(2)
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: "shot source" in window.layers, timeout=PATIENCE)
-    source = window.layers["shot source"]
+    qtbot.waitUntil(lambda: "shot source: fitted polynomial" in window.layers, timeout=PATIENCE)
+    source = window.layers["shot source: fitted polynomial"]
     usable = np.ones(shot.shape, bool)
     usable[10:20, 20:30] = False
     expected = polynomial_source(shot, degree=2, mask=usable)
