@@ -10,7 +10,7 @@ import pytest
 
 from helpers.night import OPTIONS, grouped, make_shots
 from napari_shadowinv import invert, plan_sites, run_stack
-from napari_shadowinv.stack import _folder_events, watch
+from napari_shadowinv.stack import _arrivals
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,5 @@ def folder(tmp_path: Path, compiled: None) -> Path:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """End at once when asked to."""
-    monkeypatch.setattr(watch, "_POLL_S", 0.02)
-    monkeypatch.setattr(_folder_events, "_FOLDER_CHECK_S", 0.1)
+    """Look often into watched folders, and end at once when asked to."""
+    monkeypatch.setattr(_arrivals.Arrivals, "poll_s", 0.02)

@@ -106,8 +106,8 @@ class WatchOptions(_StoreOptions):
     )
     status_file: Path | None = Field(
         default=None,
-        description="JSON file with the newest shot, its age and field, the numbers of shots, the "
-        "rate and the last warning, replaced at least once a second, for another program to show.",
+        description="JSON file with the newest shot and its field, the numbers of shots, the rate "
+        "and the last warning, replaced after each shot, for another program to show.",
         json_schema_extra={"metavar": "FILE"},
     )
     skip_existing: bool = _rare(
@@ -116,15 +116,11 @@ class WatchOptions(_StoreOptions):
         description="Skip files that are in the folder at the start.",
     )
     settle: float = _rare(
-        default=1.0,
+        default=0.5,
         gt=0,
         title="Settling time (s)",
-        description="Seconds without a change after which a file is complete, where the system "
-        "does not report that it was closed (network file systems, macOS, Windows).",
-    )
-    polling: bool = _rare(
-        default=False,
-        description="Poll the folder once a second instead of relying on file-system events.",
+        description="Seconds for which size and time of a file have not changed when it is "
+        "complete; longer for a camera or network that pauses within a file.",
     )
     idle: float | None = Field(
         default=None,

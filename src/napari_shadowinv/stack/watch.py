@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -34,7 +34,7 @@ from napari_shadowinv.io.store import DONE, FAILED, PENDING, SKIPPED, StackStore
 from napari_shadowinv.io.store_writing import GrowingStore, create_store, remove_unfinished
 from napari_shadowinv.pipeline.run_options import WatchOptions
 from napari_shadowinv.preprocessing import Recipe
-from napari_shadowinv.stack._folder_events import Arrivals, checked_folder, observing
+from napari_shadowinv.stack._arrivals import Arrivals, checked_folder
 from napari_shadowinv.stack._plan import (
     MAX_TRIED_SHOTS,
     Stack,
@@ -59,7 +59,7 @@ from napari_shadowinv.stack._shots import (
     read_shot,
     stamp,
 )
-from napari_shadowinv.stack._status_file import StatusFile
+from napari_shadowinv.stack._status_file import status_file
 from napari_shadowinv.stack._worker import (
     AnyTask,
     Attempt,
@@ -77,7 +77,6 @@ if TYPE_CHECKING:
 # results must not depend on the machine.
 _LANES = 2
 _CLOCK_RESOLUTION_S = 2.0  # of file times, on any file system
-_POLL_S = 0.25  # between two looks at `should_stop` while nothing arrives
 
 
 def _is_unchanged(file: FileReference, report: dict[str, Any], stamp_now: dict[str, int]) -> bool:
@@ -152,7 +151,7 @@ class Watch:
             failed=early + (0 if store is None else store.count(FAILED)),
             doubtful=len(self._doubtful),
             skipped=len(self._skipped) + (0 if store is None else store.count(SKIPPED)),
-            waiting=self._arrivals.waiting + len(self._running),
+            waiting=len(self._arrivals.waiting) + len(self._running),
             ended=self._ended,
             seconds=self._busy_s + (time.monotonic() - self._busy_since if self._running else 0.0),
             engine=WATCHING,
@@ -191,8 +190,10 @@ class Watch:
 
     def run(self) -> None:
         """Invert existing and arriving files until the watch ends."""
-        for name in () if self._options.latest else sorted(self._redo):
-            self._arrivals.put_back(name)
+        self._last = time.monotonic()
+        self._arrivals.look()
+        for name in () if self._options.latest else self._redo:
+            self._arrivals.look_again(name)
         self.report()
         try:
             while not self._is_over():
@@ -207,9 +208,10 @@ class Watch:
             self._abandoned.set()
             self._pool.shutdown(cancel_futures=True)
             if self._options.latest:
-                unfinished = [shot.name for shot in self._running]
+                names = [*(shot.name for shot in self._running), *self._arrivals.waiting]
                 self._running.clear()
-                self._skip([*unfinished, *self._arrivals.take_all()])
+                self._arrivals.waiting.clear()
+                self._skip(names)
             if self.store is not None:
                 with suppress(OSError):  # a watch without this choice finds their files
                     self._store_skipped(self.store)
@@ -227,7 +229,7 @@ class Watch:
         idle, most = self._options.idle, self._options.max_shots
         if (most is not None and self._ended >= most) or self._is_stopped():
             return True
-        quiet = time.monotonic() - max(self._arrivals.last_event, self._last)
+        quiet = time.monotonic() - max(self._arrivals.last_change, self._last)
         return idle is not None and quiet > idle and self._arrivals.is_quiet and not self._running
 
     def _is_stopped(self) -> bool:
@@ -235,38 +237,32 @@ class Watch:
         return requested or self._abandoned.is_set()
 
     def _advance(self) -> None:
-        """Write the oldest shot once it is done, or start the next one."""
-        if self._running and (self._is_full or self._running[0].attempt.done()):
-            self._finish(begin_next=True)
+        """Write the oldest shot once it is done, or start the next one, or wait."""
+        if self._running and self._running[0].attempt.done():
+            self._finish()
             return
-        arrived = self._arrivals.next_name(_POLL_S)
-        if arrived is not None and self._options.latest:
-            *older, arrived = arrived, *self._arrivals.take_all()
-            self._skip(older)
-        if arrived is not None:
-            self._begin(arrived)
+        self._arrivals.look()
+        if self._begin_next():
+            self.report()
+        elif self._running:
+            wait([self._running[0].attempt], self._arrivals.poll_s)
+        else:
+            time.sleep(self._arrivals.poll_s)
 
-    @property
-    def _is_full(self) -> bool:
-        """Whether no other shot may begin now."""
-        begun, most = len(self._running), self._options.max_shots
-        return begun == _LANES or (most is not None and self._ended + begun >= most)
-
-    def _begin_waiting(self, finished: str) -> None:
-        """Begin the next shot, if it waits, before the finished one is written."""
-        # The latest shot is numbered when it begins, and the first ones create the store.
-        if self._options.latest or self._task is None or self.store is None or self._is_full:
-            return
-        # A file that was written again waits for its earlier version to be written to the store.
-        at_work = {finished, *(shot.name for shot in self._running)}
-        waiting = self._arrivals.peek(1)
-        if not waiting or waiting[0] in at_work:
-            return
-        arrived = self._arrivals.next_name(0.0)
-        if arrived in at_work:
-            self._arrivals.put_back(arrived)
-        elif arrived is not None:
-            self._begin(arrived, quietly=True)
+    def _begin_next(self) -> bool:
+        """Start the next shot that waits, if it can be now; return whether one waited."""
+        waiting, begun, most = self._arrivals.waiting, len(self._running), self._options.max_shots
+        is_full = begun == _LANES or (most is not None and self._ended + begun >= most)
+        name = waiting[-1 if self._options.latest else 0] if waiting and not is_full else None
+        # A file that was written again waits until its earlier version is in the store.
+        if name is None or any(name == shot.name for shot in self._running):
+            return False
+        waiting.remove(name)
+        if self._options.latest:
+            self._skip(waiting)
+            waiting.clear()
+        self._begin(name)
+        return True
 
     def _skip(self, names: Iterable[str]) -> None:
         """Note shots that are not inverted, unless an earlier version of them was."""
@@ -281,17 +277,13 @@ class Watch:
         store.skip(self._skipped, *following)
         self._skipped.clear()
 
-    def _begin(self, name: str, *, quietly: bool = False) -> None:
+    def _begin(self, name: str) -> None:
         self._skipped.pop(text_of(name), None)
-        while any(name == running.name for running in self._running):
-            self._finish()  # it may have changed since it was read
         file = self._file(name)
         try:
             stamp_now = stamp(file.path)
             report = self._previous_report(text_of(name))
             if report is not None and _is_unchanged(file, report, stamp_now):
-                if not (quietly or self._arrivals.waiting):
-                    self.report()
                 return
         except OSError:
             self._arrivals.check()
@@ -299,21 +291,17 @@ class Watch:
         lane = self._begun % _LANES
         self._begun += 1
         attempt = self._submit(name, lane)
-        attempt.add_done_callback(lambda _: self._arrivals.wake())
         self._busy_since = self._busy_since if self._running else time.monotonic()
         self._running.append(_RunningShot(name, stamp_now, lane, attempt))
         if self._options.latest and self.store is not None:
             # Now, as the shot must not wait for it once it is done.
             with defer_interrupts():
                 self._store_skipped(self.store, text_of(name))
-        if not quietly:
-            self.report()
 
-    def _finish(self, *, begin_next: bool = False) -> None:
-        """Wait for the oldest attempt, let the next one begin, and write the outcome."""
-        running = self._running[0]
+    def _finish(self) -> None:
+        """Take the oldest attempt, let the next one begin, and write the outcome."""
+        running = self._running.popleft()
         attempt, stamp_before = running.attempt.result(), running.stamp_before
-        self._running.popleft()
         if not self._running:
             self._busy_s += time.monotonic() - self._busy_since
         origin = stamp_after = {**stamp_before, **attempt.origin}
@@ -321,7 +309,7 @@ class Watch:
             with suppress(OSError):
                 stamp_after = stamp(self._file(running.name).path)
         if not stamp_before.items() <= stamp_after.items():
-            self._arrivals.put_back(running.name)  # it was written to while it was read
+            self._arrivals.look_again(running.name)  # it was written to while it was read
             return
         if attempt.failure:
             self._arrivals.check()
@@ -330,8 +318,10 @@ class Watch:
         self._lanes[running.lane] = attempt.result if chained and good else None
         self._ended += 1
         try:
-            if begin_next:
-                self._begin_waiting(running.name)
+            # The latest shot is numbered when it begins, and the first ones create the store.
+            is_numbered = not self._options.latest and self.store is not None
+            if is_numbered and self._task and running.name not in self._arrivals.waiting[:1]:
+                self._begin_next()
         finally:
             self._store_outcome(running.name, replace(attempt, origin=origin))
 
@@ -379,7 +369,7 @@ class Watch:
     def _prepare(self, name: str, shot: Shot) -> Attempt | None:
         """Describe the stack by its first shot; return a failed attempt if that is impossible."""
         began = time.perf_counter()
-        waiting = [*reversed(self._skipped), *self._arrivals.peek(MAX_TRIED_SHOTS)]
+        waiting = [*reversed(self._skipped), *self._arrivals.waiting[:MAX_TRIED_SHOTS]]
         names = [name, *waiting[: MAX_TRIED_SHOTS - 1]]
         stack = self._stack
         if stack is None:
@@ -504,8 +494,8 @@ def watch_stack(
     on_progress = on_progress or (lambda _: None)
     with ExitStack() as opened:
         if watch.status_file is not None:
-            status_file = StatusFile(watch.status_file, arrivals, path, on_progress)
-            on_progress = opened.enter_context(status_file).update
+            status = status_file(watch.status_file, arrivals, path, on_progress)
+            on_progress = opened.enter_context(status)
         loop = Watch(path, watch, describe, reader, arrivals, on_progress, should_stop)
         try:
             ensure_compiled(
@@ -516,8 +506,5 @@ def watch_stack(
         with clear_up_when_terminated(), locked(path):
             loop.open()
             remove_unfinished(path)
-            with observing(
-                arrivals, polling=watch.polling, on_note=lambda text: loop.report(note=text)
-            ):
-                loop.run()
+            loop.run()
         return None if loop.store is None else read_stack(path)
